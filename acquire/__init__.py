@@ -1,0 +1,25 @@
+"""Instrument software for TDI-based compressed video.
+
+The way of the data is one direction::
+
+    scene -> forward -> simulated devices -+
+    trigger (FPGA) -> tags ----------------+-> ring -> tagger -> writer -> Zarr -> cut -> reconstruct -> video
+    camera A, B -> blocks of lines --------+
+
+The layers, top to bottom; imports point downwards only (checked by the tests)::
+
+    cli                              commands: one file per group
+    daemon        evaluate           the capture service · metrics, report
+    rig           reconstruct        config -> devices · recording -> video
+    sim           recon              simulated devices · solvers, priors
+    stream        forward            capture path · Eq. (1)-(4) of the paper and their adjoints
+    store  camera  trigger           recording format · device protocols
+    config        lines              what a rig is · what travels from camera to disk
+    codes  geometry  clock           the code, the shear, the time: plain arithmetic
+    errors                           every failure a user can meet, with its exit code
+
+Equation numbers in docstrings refer to Li, Wang and Liu, "TDI-based continuous window compressed
+spatio-temporal imaging capable of flexible voxels post-interpretation".
+"""
+
+__version__ = "0.1.0"

@@ -1,0 +1,1 @@
+"""Cameras: what the capture path asks of one, whatever library drives it."""

@@ -1,0 +1,77 @@
+"""The protocol of a camera: it is armed, delivers blocks of lines, and is disarmed.
+
+A camera counts the lines it delivers from 0 since it was armed. It knows nothing of the trigger's
+line numbers: the grabber subtracts the sensor's depth.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class CameraIdentity:
+    """Who answers: vendor, model, serial number, firmware version."""
+
+    vendor: str
+    model: str
+    serial: str
+    firmware: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CameraBlock:
+    """Consecutive lines as delivered; valid until released.
+
+    ``first_line`` counts since arm, gaps included; ``pixels`` is (line, pixel), uint8 or uint16;
+    ``flags`` is (line) uint16 of LineFlag.
+    """
+
+    first_line: int
+    pixels: NDArray[Any]
+    flags: NDArray[np.uint16]
+
+
+class Camera(Protocol):
+    """One camera, opened and set. Calls are bounded in time and raise CameraError."""
+
+    def identify(self) -> CameraIdentity: ...
+
+    def settings(self) -> dict[str, Any]:
+        """Settings as read back from the camera, under their SFNC names."""
+        ...
+
+    def arm(self) -> None:
+        """Be ready for line triggers; the count of lines begins at 0."""
+        ...
+
+    def next_block(self, timeout_s: float) -> CameraBlock | None:
+        """The next lines, or None when ``timeout_s`` passed without any."""
+        ...
+
+    def release(self, block: CameraBlock) -> None:
+        """Give the block's memory back to the camera."""
+        ...
+
+    def disarm(self) -> None:
+        """Stop delivering. Idempotent."""
+        ...
+
+    def statistics(self) -> dict[str, int]:
+        """Counters since arm: at least ``lines`` delivered and ``lost`` by the camera itself."""
+        ...
+
+    def close(self) -> None:
+        """Let go of the device. Idempotent."""
+        ...
+
+
+class CameraOpener(Protocol):
+    """Opens one camera in the process that calls it; picklable, so that a spawned grabber can be given it."""
+
+    def __call__(self) -> Camera: ...

@@ -1,0 +1,186 @@
+"""Exposure codes: the bit E(k) that gates the light during sub-step k of a run.
+
+The pseudo-random code is a maximal-length Galois register that shifts right, as the gateware does::
+
+    bit = state & 1;  state >>= 1;  if bit: state ^= mask        mask = Σ 1 << (tap - 1)
+
+Its output obeys  o_k = ⊕_{tap} o_{k - tap}, hence also  o_k = ⊕ o_{k - 2^m·tap}  (squaring is linear in
+GF(2)). The first gives the jump to any index by one power of x modulo the characteristic polynomial,
+the second lets numpy generate blocks that double in length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+import numpy as np
+
+from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+TAPS: dict[int, tuple[int, ...]] = {
+    7: (7, 6),
+    9: (9, 5),
+    11: (11, 9),
+    15: (15, 14),
+    23: (23, 18),
+    31: (31, 28),
+    48: (48, 47, 21, 20),
+    64: (64, 63, 61, 60),
+}
+"""Degree → taps of a maximal-length register. Degree 64 never repeats: 3·10⁵ years at 1.8 MHz."""
+
+
+class Code(Protocol):
+    """The light's code of a run: bits by index, and what a recording must say to regenerate them."""
+
+    def bits(self, start: int, length: int) -> NDArray[np.uint8]:
+        """Bits ``start .. start + length - 1`` (uint8, 0 or 1). The light is off before index 0."""
+        ...
+
+    def to_attrs(self) -> dict[str, Any]:
+        """The recording's ``code`` attribute."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class PrbsCode:
+    """Maximal-length pseudo-random code; ``seed`` is the register's state at index 0."""
+
+    degree: int
+    seed: int
+    kind: Literal["prbs"] = "prbs"
+
+    def __post_init__(self) -> None:
+        _check_register(self.degree, self.seed)
+
+    def bits(self, start: int, length: int) -> NDArray[np.uint8]:
+        dark = min(max(-start, 0), length)
+        lit = prbs(self.degree, self.seed, max(start, 0), length - dark)
+        return np.concatenate([np.zeros(dark, np.uint8), lit])
+
+    def to_attrs(self) -> dict[str, Any]:
+        # Seeds of degree 64 exceed what JSON readers in other languages keep exactly: hexadecimal text.
+        return {
+            "kind": self.kind,
+            "degree": self.degree,
+            "taps": list(TAPS[self.degree]),
+            "seed": f"{self.seed:#x}",
+            "start": 0,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class ConstantCode:
+    """Light always on (1) or off (0): flat fields, dark frames and alignment."""
+
+    value: int
+    kind: Literal["constant"] = "constant"
+
+    def __post_init__(self) -> None:
+        if self.value not in (0, 1):
+            raise UsageError(f"constant code {self.value!r}", possible="0 or 1")
+
+    def bits(self, start: int, length: int) -> NDArray[np.uint8]:
+        index = np.arange(start, start + length)
+        return np.where(index < 0, 0, self.value).astype(np.uint8)
+
+    def to_attrs(self) -> dict[str, Any]:
+        return {"kind": self.kind, "value": self.value, "start": 0}
+
+
+def code_from_attrs(attrs: Mapping[str, Any]) -> Code:
+    """The code that a recording's ``code`` attribute describes."""
+    kind = attrs.get("kind")
+    if kind == "prbs":
+        degree = int(attrs["degree"])
+        if tuple(attrs["taps"]) != TAPS.get(degree):
+            raise UsageError(
+                f"prbs code of degree {degree} with taps {attrs['taps']}", possible=f"taps {TAPS.get(degree)}"
+            )
+        return PrbsCode(degree, int(str(attrs["seed"]), 0))
+    if kind == "constant":
+        return ConstantCode(int(attrs["value"]))
+    raise UsageError(f"code of kind {kind!r}", possible="'prbs', 'constant'")
+
+
+def prbs(degree: int, seed: int, start: int, length: int) -> NDArray[np.uint8]:
+    """Bits ``start .. start + length - 1`` of the pseudo-random code (uint8, 0 or 1).
+
+    The cost of ``start`` is logarithmic, of ``length`` linear with numpy speed.
+    """
+    _check_register(degree, seed)
+    if start < 0 or length < 0:
+        raise UsageError(f"prbs start = {start}, length = {length}", possible="0 or more")
+    window = _window(degree, seed, start)
+    if length <= degree:
+        return window[:length]
+    return _extend(window, TAPS[degree], length)
+
+
+def mix_seed(number: int, degree: int) -> int:
+    """A register state with about as many ones as zeros from any small integer (splitmix64, never 0).
+
+    A register started at 1 emits tens of zeros first; people like to say ``--seed 1``.
+    """
+    z = (number + 1) * 0x9E3779B97F4A7C15 & 0xFFFFFFFFFFFFFFFF
+    z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9 & 0xFFFFFFFFFFFFFFFF
+    z = (z ^ (z >> 27)) * 0x94D049BB133111EB & 0xFFFFFFFFFFFFFFFF
+    return (z ^ (z >> 31)) & ((1 << degree) - 1) or 1
+
+
+def _check_register(degree: int, seed: int) -> None:
+    if degree not in TAPS:
+        raise UsageError(f"prbs degree {degree}", possible=", ".join(map(str, TAPS)))
+    if not 0 < seed < 1 << degree:
+        raise UsageError(f"prbs seed {seed:#x} of degree {degree}", possible=f"1 to {(1 << degree) - 1:#x}")
+
+
+def _window(degree: int, seed: int, start: int) -> NDArray[np.uint8]:
+    """The ``degree`` output bits from index ``start``: o_{N+i} = Σ_j a_j·o_{j+i} with x^N ≡ Σ_j a_j·x^j."""
+    head = 0  # o_0 .. o_{2·degree - 1}, bit k = o_k
+    state, mask = seed, sum(1 << (tap - 1) for tap in TAPS[degree])
+    for k in range(2 * degree):
+        bit = state & 1
+        head |= bit << k
+        state = state >> 1 ^ (mask if bit else 0)
+    a = _x_power(start, degree)
+    return np.array([(a & head >> i).bit_count() & 1 for i in range(degree)], dtype=np.uint8)
+
+
+def _x_power(exponent: int, degree: int) -> int:
+    """x^exponent modulo the characteristic polynomial x^d + Σ_tap x^(d - tap); bit j belongs to x^j."""
+    poly = 1 << degree | sum(1 << (degree - tap) for tap in TAPS[degree])
+    result = 1
+    for digit in f"{exponent:b}":
+        square = int(f"{result:b}", 4)  # squaring in GF(2) spreads the bits: digits read in base 4
+        result = _reduce(square << 1 if digit == "1" else square, poly, degree)
+    return result
+
+
+def _reduce(value: int, poly: int, degree: int) -> int:
+    while (excess := value.bit_length() - 1 - degree) >= 0:
+        value ^= poly << excess
+    return value
+
+
+def _extend(window: NDArray[np.uint8], taps: tuple[int, ...], length: int) -> NDArray[np.uint8]:
+    """Continue ``window`` to ``length`` bits by blocks whose lag doubles whenever enough bits are known."""
+    out = np.empty(length, np.uint8)
+    out[: len(window)] = window
+    known, scale = len(window), 1
+    while known < length:
+        while max(taps) * 2 * scale <= known:
+            scale *= 2
+        count = min(min(taps) * scale, length - known)
+        block = out[known : known + count]
+        block[:] = 0
+        for tap in taps:
+            block ^= out[known - tap * scale : known - tap * scale + count]
+        known += count
+    return out

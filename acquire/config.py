@@ -1,0 +1,320 @@
+"""Models of the files in ``configs/``: what a rig is, what a scene shows.
+
+Unknown keys are refused. An error names the file, the key, what stood there and what is allowed.
+"""
+
+from __future__ import annotations
+
+import os
+import tomllib
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from acquire.codes import TAPS, Code, ConstantCode, PrbsCode, mix_seed
+from acquire.errors import ConfigError
+from acquire.geometry import Geometry
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+PIXEL_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16}
+"""SFNC PixelFormat → significant bits of an (unpacked) pixel."""
+
+
+M = TypeVar("M", bound=BaseModel)
+
+
+def default_socket() -> Path:
+    """The control socket where none is configured: the user's runtime directory, else /tmp."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    return Path(runtime) / "acquire.sock" if runtime else Path(f"/tmp/acquire-{os.getuid()}.sock")  # noqa: S108
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class GeometryConfig(_Model):
+    """The sensor as the model sees it."""
+
+    stages: int = Field(ge=1, le=4096, description="M, TDI stages; also pixels per line")
+    substeps: int = Field(ge=1, le=16, description="S, charge-transfer steps per line")
+
+    def segment(self, lines: int) -> Geometry:
+        return Geometry(self.stages, self.substeps, lines)
+
+
+class PrbsConfig(_Model):
+    """Maximal-length pseudo-random exposure code."""
+
+    kind: Literal["prbs"] = "prbs"
+    degree: int = Field(default=64, description="degree of the register: " + ", ".join(map(str, TAPS)))
+    seed: int = Field(default=1, ge=0, description="any number; the register's first state is mixed from it")
+
+    @model_validator(mode="after")
+    def _degree_known(self) -> PrbsConfig:
+        if self.degree not in TAPS:
+            raise ValueError(f"degree {self.degree} is not one of {', '.join(map(str, TAPS))}")
+        return self
+
+    def build(self) -> Code:
+        return PrbsCode(self.degree, mix_seed(self.seed, self.degree))
+
+
+class ConstantCodeConfig(_Model):
+    """Light always on or off."""
+
+    kind: Literal["constant"]
+    value: Literal[0, 1] = 1
+
+    def build(self) -> Code:
+        return ConstantCode(self.value)
+
+
+class TriggerConfig(_Model):
+    """The sync trigger and its timing."""
+
+    driver: Literal["simulated"] = "simulated"
+    clock_hz: int = Field(default=90_000_000, ge=1_000_000, le=1_000_000_000)
+    substep_ticks: int = Field(default=900, ge=5, le=2**24, description="duration of a sub-step in ticks")
+    tag_every_lines: int = Field(default=256, ge=1, le=65536)
+
+
+class CameraConfig(_Model):
+    """One camera. DN = black level + responsivity · Y, with Y of Eq. (1)."""
+
+    driver: Literal["simulated"] = "simulated"
+    serial: str = "simulated"
+    pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16"] = "Mono12"
+    black_level_dn: float = Field(default=0.0, ge=0)
+    responsivity_dn: float = Field(default=1.0, gt=0, description="DN per unit of scene light and sub-step")
+
+    @property
+    def bits(self) -> int:
+        return PIXEL_BITS[self.pixel_format]
+
+    @property
+    def white_dn(self) -> int:
+        """The largest value a pixel can take; a pixel that has it is saturated."""
+        return (1 << self.bits) - 1
+
+    @property
+    def dtype(self) -> Literal["uint8", "uint16"]:
+        return "uint8" if self.bits == 8 else "uint16"
+
+
+class CamerasConfig(_Model):
+    """The camera of either arm."""
+
+    a: CameraConfig
+    b: CameraConfig
+
+    def arm(self, name: str) -> CameraConfig:
+        return {"a": self.a, "b": self.b}[name]
+
+    @model_validator(mode="after")
+    def _alike(self) -> CamerasConfig:
+        if self.a.dtype != self.b.dtype:
+            raise ValueError(
+                f"both arms need one sample type, not {self.a.pixel_format} and {self.b.pixel_format}"
+            )
+        return self
+
+
+class StreamConfig(_Model):
+    """The capture path between camera and disk."""
+
+    block_lines: int = Field(default=256, ge=1, le=65536, description="lines per camera block and ring slot")
+    ring_slots: int = Field(default=64, ge=2, le=4096)
+
+
+class RecordingConfig(_Model):
+    """How recordings are written."""
+
+    directory: Path = Path()
+    chunk_lines: int = Field(default=4096, ge=16, le=2**20, description="lines per chunk, and per commit")
+    shard_chunks: int = Field(default=64, ge=1, le=255, description="chunks per file")
+    codec: Literal["none", "lz4", "zstd"] = "none"
+    fsync: Literal["commit", "seal"] = Field(
+        default="seal", description="when bytes are forced to the medium"
+    )
+
+
+class ControlConfig(_Model):
+    """Where the daemon listens."""
+
+    socket: Path = Field(default_factory=default_socket)
+
+
+class SimulationConfig(_Model):
+    """What simulated devices see, and how fast their time runs."""
+
+    scene: str = Field(description="a scene file, beside this file or one of the built-in ones")
+    speed: float = Field(default=1.0, gt=0, le=1000, description="simulated seconds per second")
+
+
+class RigConfig(_Model):
+    """A whole instrument: everything the daemon needs to know."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
+    geometry: GeometryConfig
+    code: Annotated[PrbsConfig | ConstantCodeConfig, Field(discriminator="kind")] = PrbsConfig()
+    trigger: TriggerConfig = TriggerConfig()
+    cameras: CamerasConfig
+    stream: StreamConfig = StreamConfig()
+    recording: RecordingConfig = RecordingConfig()
+    control: ControlConfig = Field(default_factory=ControlConfig)
+    simulation: SimulationConfig
+
+    @property
+    def line_period_ticks(self) -> int:
+        return self.geometry.substeps * self.trigger.substep_ticks
+
+    @property
+    def line_rate_hz(self) -> float:
+        return self.trigger.clock_hz / self.line_period_ticks
+
+
+class SineDrive(_Model):
+    """Duty cycle low + (high − low)·(1 + sin(2π·f·t + phase))/2; the PWM is far faster than a sub-step."""
+
+    waveform: Literal["sine"]
+    frequency_hz: float = Field(gt=0)
+    low: float = Field(default=0.0, ge=0, le=1)
+    high: float = Field(default=1.0, ge=0, le=1)
+    phase_deg: float = 0.0
+
+
+class ConstantDrive(_Model):
+    """A fixed duty cycle."""
+
+    waveform: Literal["constant"]
+    level: float = Field(default=1.0, ge=0, le=1)
+
+
+class LedConfig(_Model):
+    """One LED behind a mask. Positions and sizes are fractions of the scene's side."""
+
+    name: str
+    shape: Literal["x", "triangle", "circle", "equals", "square"]
+    row: float = Field(ge=0, le=1, description="centre")
+    column: float = Field(ge=0, le=1, description="centre")
+    size: float = Field(gt=0, le=1, description="side of the bounding square")
+    drive: Annotated[SineDrive | ConstantDrive, Field(discriminator="waveform")]
+    saturation: float | None = Field(
+        default=None,
+        gt=0,
+        description="drive at which the LED gives 1 − 1/e of its asymptote; absent: linear",
+    )
+
+
+class LedSceneConfig(_Model):
+    """LEDs behind masks, each with its own drive (Fig. 9)."""
+
+    kind: Literal["leds"]
+    title: str
+    leds: tuple[LedConfig, ...] = Field(min_length=1)
+
+
+SceneConfig = LedSceneConfig
+
+
+def builtin_directory() -> Path:
+    """The directory of the configurations that come with the program."""
+    installed = Path(__file__).parent / "configs"
+    return installed if installed.is_dir() else Path(__file__).parent.parent / "configs"
+
+
+def find(name: str | Path, beside: Path | None = None) -> Path:
+    """The file ``name``: as a path, beside another file, or among the built-in ones (with or without .toml)."""
+    candidates = [Path(name)]
+    if beside is not None:
+        candidates.append(beside.parent / name)
+    candidates += [builtin_directory() / name, builtin_directory() / f"{name}.toml"]
+    for path in candidates:
+        if path.is_file():
+            return path
+    have = ", ".join(sorted(p.name for p in builtin_directory().glob("*.toml")))
+    raise ConfigError(
+        f"configuration file {str(name)!r} does not exist", possible=f"a path, or one of {have}"
+    )
+
+
+def load_rig(name: str | Path, overrides: Mapping[str, Any] | None = None) -> RigConfig:
+    """Read, override (dotted keys, as ``{"simulation.speed": 10}``) and validate a rig file.
+
+    Relative paths of scenes are resolved against the file.
+    """
+    path = find(name)
+    table = _read(path)
+    for key, value in (overrides or {}).items():
+        _set(table, key, value)
+    rig = _validate(RigConfig, table, path)
+    scene = find(rig.simulation.scene, beside=path).resolve()
+    return rig.model_copy(update={"simulation": rig.simulation.model_copy(update={"scene": str(scene)})})
+
+
+def load_scene(name: str | Path) -> SceneConfig:
+    """Read and validate a scene file."""
+    path = find(name)
+    return _validate(LedSceneConfig, _read(path), path)
+
+
+def _read(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not TOML: {error}") from error
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
+
+
+def _set(table: dict[str, Any], dotted: str, value: Any) -> None:
+    *parents, last = dotted.split(".")
+    for key in parents:
+        table = table.setdefault(key, {})
+    table[last] = value
+
+
+def _validate(model: type[M], table: dict[str, Any], path: Path) -> M:
+    try:
+        return model.model_validate(table)
+    except ValidationError as error:
+        raise ConfigError(_explain(error, model, path)) from error
+
+
+def _explain(error: ValidationError, model: type[BaseModel], path: Path) -> str:
+    lines = [f"{path}: {error.error_count()} thing(s) to mend"]
+    for item in error.errors():
+        keys, allowed = _locate(model, item["loc"])
+        key = ".".join(keys) or "(file)"
+        if item["type"] == "extra_forbidden":
+            lines.append(f"  {key}: unknown key; allowed here: {', '.join(allowed)}")
+        elif item["type"] == "missing":
+            lines.append(f"  {key}: missing")
+        else:
+            lines.append(f"  {key} = {item['input']!r}: {item['msg']}")
+    return "\n".join(lines)
+
+
+def _locate(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list[str], list[str]]:
+    """The key as the file writes it, and the keys allowed beside it.
+
+    pydantic's location also holds the tags of unions, which no file contains: the schema tells them apart.
+    """
+    schema = model.model_json_schema()
+    node: dict[str, Any] = schema
+    keys: list[str] = []
+    allowed: list[str] = []
+    for part in location:
+        while "$ref" in node:
+            node = schema["$defs"][node["$ref"].rsplit("/", 1)[1]]
+        if "mapping" in node.get("discriminator", {}) and part in node["discriminator"]["mapping"]:
+            node = {"$ref": node["discriminator"]["mapping"][part]}
+            continue
+        keys.append(str(part))
+        allowed = sorted(node.get("properties", {}))
+        node = node.get("items", {}) if isinstance(part, int) else node.get("properties", {}).get(part, {})
+    return keys, allowed

@@ -1,0 +1,95 @@
+"""Every failure a user can meet, and the exit code that the command line gives for it.
+
+::
+
+    AcquireError                1  (a defect of ours, or a refused computation)
+    ├── UsageError              2  what was asked for is impossible as asked
+    │   └── ConfigError         2  a configuration file or value
+    ├── NoDaemonError           3  nobody answers on the control socket
+    ├── StateError              4  the daemon cannot do this now
+    ├── DeviceError             5  trigger, camera or host hardware
+    │   ├── TriggerError        5
+    │   └── CameraError         5
+    ├── DataError               6  a recording is damaged, or lines were lost
+    └── NumericsError           1  a computation left the finite numbers
+
+A message states what was asked; ``possible`` and ``hint`` add what can be had and what to try.
+"""
+
+from __future__ import annotations
+
+EXIT_INTERRUPTED = 130
+
+
+class AcquireError(Exception):
+    """Base of the tree. ``str()`` gives the whole text, one sentence after the other."""
+
+    exit_code = 1
+
+    def __init__(self, message: str, *, possible: str = "", hint: str = "") -> None:
+        super().__init__(message)
+        self.message = message
+        self.possible = possible
+        self.hint = hint
+
+    def __str__(self) -> str:
+        parts = [self.message]
+        if self.possible:
+            parts.append(f"possible: {self.possible}")
+        if self.hint:
+            parts.append(f"try: {self.hint}")
+        return "; ".join(parts)
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return _rebuild, (type(self), self.message, self.possible, self.hint)
+
+
+def _rebuild(cls: type[AcquireError], message: str, possible: str, hint: str) -> AcquireError:
+    """Errors cross process boundaries; keyword-only arguments need this help to be unpickled."""
+    return cls(message, possible=possible, hint=hint)
+
+
+class UsageError(AcquireError):
+    """What was asked for is impossible as asked."""
+
+    exit_code = 2
+
+
+class ConfigError(UsageError):
+    """A configuration file or one of its values; the message names the key."""
+
+
+class NoDaemonError(AcquireError):
+    """Nobody answers on the control socket."""
+
+    exit_code = 3
+
+
+class StateError(AcquireError):
+    """The daemon's state does not allow the command."""
+
+    exit_code = 4
+
+
+class DeviceError(AcquireError):
+    """Trigger, camera or host hardware failed or refused."""
+
+    exit_code = 5
+
+
+class TriggerError(DeviceError):
+    """The sync trigger failed or refused."""
+
+
+class CameraError(DeviceError):
+    """A camera failed or refused."""
+
+
+class DataError(AcquireError):
+    """A recording is damaged, incomplete, or not a recording."""
+
+    exit_code = 6
+
+
+class NumericsError(AcquireError):
+    """A computation left the finite numbers, or would have."""

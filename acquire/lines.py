@@ -1,0 +1,141 @@
+"""What travels from a camera to the disk and back: blocks of lines, their flags, and cut segments."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntFlag
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.geometry import Geometry
+
+ARMS = ("a", "b")
+"""Names of the two arms, in the order of the ``arm`` axis."""
+
+
+class LineFlag(IntFlag):
+    """What is known about one line beyond its pixels (CF ``flag_masks`` of the recording)."""
+
+    MISSING = 1
+    """Never arrived; the row is filled with 0."""
+    INCOMPLETE = 2
+    """The camera reported that part of the line is not valid."""
+    SATURATED = 4
+    """At least one pixel stands at the top of the range."""
+    TIME_ESTIMATED = 8
+    """No tag of the trigger confirmed tick and time; they are extrapolated."""
+    CODE_UNVERIFIED = 16
+    """No tag of the trigger confirmed the code index; it is extrapolated."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LineBlock:
+    """Consecutive lines of one arm as the camera delivered them.
+
+    ``first_line`` is the trigger's line number; ``pixels`` is (line, pixel), uint8 or uint16;
+    ``flags`` is (line) uint16 of LineFlag.
+    """
+
+    arm: str
+    first_line: int
+    pixels: NDArray[Any]
+    flags: NDArray[np.uint16]
+
+    def __post_init__(self) -> None:
+        if self.arm not in ARMS or self.first_line < 0:
+            raise UsageError(f"line block of arm {self.arm!r} from line {self.first_line}")
+        if self.pixels.ndim != 2 or self.flags.shape != self.pixels.shape[:1]:
+            raise UsageError(f"line block with pixels {self.pixels.shape} and flags {self.flags.shape}")
+
+    def __len__(self) -> int:
+        return len(self.flags)
+
+    @property
+    def end_line(self) -> int:
+        """Number of the line after the last."""
+        return self.first_line + len(self)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TaggedBlock:
+    """Consecutive lines with what the trigger says about each; all arrays have the length of ``pixels``."""
+
+    arm: str
+    first_line: int
+    pixels: NDArray[Any]
+    flags: NDArray[np.uint16]
+    code_index: NDArray[np.uint64]
+    code: NDArray[np.uint8]
+    tick: NDArray[np.uint64]
+    time_ns: NDArray[np.int64]
+
+    def __len__(self) -> int:
+        return len(self.flags)
+
+    @property
+    def end_line(self) -> int:
+        return self.first_line + len(self)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Segment:
+    """Lines of both arms cut out of a recording, with everything a reconstruction needs.
+
+    Attributes
+    ----------
+    lines : (2, L_R, M) in DN, as recorded
+    mask : (2, L_R, M) bool, True where the sample can be used
+    code : (T,) uint8, E of the sub-steps that the lines touch, from the first line's first sub-step on
+    geometry : M, S, L_R of the segment
+    time_ns : (L_R,) int64 UTC at which each line's read-out begins
+    first_line : the trigger's number of the first line
+    substep_ns : duration of a sub-step
+    black_level_dn, responsivity_dn : DN = black level + responsivity · Y, with Y of Eq. (1)
+    """
+
+    lines: NDArray[Any]
+    mask: NDArray[np.bool_]
+    code: NDArray[np.uint8]
+    geometry: Geometry
+    time_ns: NDArray[np.int64]
+    first_line: int = 0
+    substep_ns: float = 1.0
+    black_level_dn: float = 0.0
+    responsivity_dn: float = 1.0
+
+    def __post_init__(self) -> None:
+        shape = self.geometry.lines_shape
+        if self.lines.shape != shape or self.mask.shape != shape:
+            raise UsageError(
+                f"segment with lines {self.lines.shape}, mask {self.mask.shape}", possible=f"{shape}"
+            )
+        if self.code.shape != (self.geometry.span,):
+            raise UsageError(
+                f"segment with {self.code.shape} code bits", possible=f"T = {self.geometry.span}"
+            )
+        if self.time_ns.shape != (self.geometry.lines,):
+            raise UsageError(
+                f"segment with {self.time_ns.shape} time stamps", possible=f"{self.geometry.lines}"
+            )
+
+    def samples(self, dtype: type[np.floating[Any]] = np.float32) -> NDArray[Any]:
+        """Y of Eq. (1) (2, L_R, M): black level removed, in units of the scene; 0 where masked."""
+        scaled = (self.lines.astype(dtype) - dtype(self.black_level_dn)) / dtype(self.responsivity_dn)
+        return np.where(self.mask, scaled, dtype(0))
+
+    def frame_time_ns(self, temporal_merge: int = 1) -> NDArray[np.int64]:
+        """UTC at which each frame of T_m sub-steps begins.
+
+        A line's time stamp is the beginning of its sub-step n − 1, so that the first trusted sub-step
+        carries the time of the segment's first line (Fig. 9).
+        """
+        frames = self.geometry.video_shape(1, temporal_merge)[0]
+        offset = np.arange(frames) * temporal_merge - self.geometry.readout_substep
+        time_ns: NDArray[np.int64] = self.time_ns[0] + np.rint(offset * self.substep_ns).astype(np.int64)
+        return time_ns

@@ -1,0 +1,81 @@
+"""The protocol of a sync trigger.
+
+At the pulse of line ``k`` the trigger is at code index ``S·k`` of its run: charge packet ``k`` enters the
+first row. It is read out M + 1 pulses later, so a camera armed before the start delivers M + 1 lines of
+no use first (`Geometry.depth_lines`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    from acquire.clock import ClockFit
+    from acquire.codes import Code
+
+
+@dataclass(frozen=True, slots=True)
+class TriggerIdentity:
+    """Who answers: model, serial number, firmware version, its clock."""
+
+    model: str
+    serial: str
+    firmware: str
+    clock_hz: int
+
+
+@dataclass(frozen=True, slots=True)
+class TriggerRun:
+    """What one run asks of the trigger; a trigger that cannot honour it refuses in `Trigger.prepare`."""
+
+    run_id: str
+    code: Code
+    substeps: int
+    """S, code bits per line."""
+    substep_ticks: int
+    """Duration of a sub-step in ticks of the trigger's clock."""
+    tag_every_lines: int
+
+    @property
+    def line_period_ticks(self) -> int:
+        return self.substeps * self.substep_ticks
+
+
+@dataclass(frozen=True, slots=True)
+class LineTag:
+    """The trigger's word on one line: at the pulse of ``line`` it stood at ``code_index`` and ``tick``."""
+
+    line: int
+    code_index: int
+    tick: int
+
+
+class Trigger(Protocol):
+    """One sync trigger. Calls are bounded in time and raise TriggerError."""
+
+    def identify(self) -> TriggerIdentity: ...
+
+    def prepare(self, run: TriggerRun) -> None:
+        """Load code and timing; raise TriggerError for what cannot be honoured. The light stays off."""
+        ...
+
+    def start(self) -> ClockFit:
+        """Start pulses and code at line 0; return the fit of the trigger's clock to UTC at that moment."""
+        ...
+
+    def tags(self, timeout_s: float) -> list[LineTag]:
+        """Tags that arrived since the last call, in order; waits at most ``timeout_s`` for the first."""
+        ...
+
+    def stop(self) -> int:
+        """Stop after a whole line, light off; return the number of pulses issued. Idempotent."""
+        ...
+
+    def statistics(self) -> dict[str, Any]:
+        """Counters of this trigger, at least ``pulses`` and ``tags``."""
+        ...
+
+    def close(self) -> None:
+        """Stop and let go of the device. Idempotent."""
+        ...
