@@ -228,7 +228,7 @@ def builtin_directory() -> Path:
 
 
 def find(name: str | Path, beside: Path | None = None) -> Path:
-    """The file ``name``: as a path, beside another file, or among the built-in ones (with or without .toml)."""
+    """The file ``name``: as a path, beside another file, or a built-in one (with or without .toml)."""
     candidates = [Path(name)]
     if beside is not None:
         candidates.append(beside.parent / name)

@@ -87,13 +87,13 @@ class Geometry:
         self.check_merge(1, temporal_merge)
         trusted = self.trusted
         first = -(-trusted.start // temporal_merge)
-        last = (
-            -(-self.span // temporal_merge) if trusted.stop >= self.span else trusted.stop // temporal_merge
-        )
+        last = trusted.stop // temporal_merge
+        if trusted.stop >= self.span:
+            last = -(-self.span // temporal_merge)
         return slice(first, max(first, last))
 
     def seam_substeps(self, temporal_merge: int = 1) -> int:
-        """Sub-steps dropped on either side of an inner seam: n − 1, rounded up to whole frames (Fig. 5, 8)."""
+        """Sub-steps dropped on either side of an inner seam: n − 1, up to whole frames (Fig. 5, 8)."""
         self.check_merge(1, temporal_merge)
         return -(-(self.size - 1) // temporal_merge) * temporal_merge
 

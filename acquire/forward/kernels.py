@@ -1,0 +1,108 @@
+"""Compiled loops of the shear.
+
+One line sums the voxels along a staircase in (time, row): at fixed row block q, with fine rows
+``start .. start + length - 1``, line ``i`` meets the sub-steps ``t = i·S + start + d`` with multiplicity
+
+    m(d) = #{(r, u): r + u = d, r < length, u < S} = min(d + 1, length, S, length + S - 1 - d)
+
+and weight ``m(d)·E(t)``. Weights that fall into the same frame (T_m > 1) are summed before the row of
+voxels is touched. An own kernel because sparse libraries need the matrix in memory (tens to hundreds of
+MB per arm) to be as fast.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numba
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+@numba.njit(cache=True, inline="always")
+def _multiplicity(d: int, length: int, S: int) -> int:
+    return min(d + 1, length, S, length + S - 1 - d)
+
+
+@numba.njit(parallel=True, cache=True, fastmath={"contract", "reassoc", "nsz"})
+def shear(
+    voxels: NDArray[Any],
+    code: NDArray[np.uint8],
+    starts: NDArray[np.int64],
+    lengths: NDArray[np.int64],
+    S: int,
+    T_m: int,
+    out: NDArray[Any],
+) -> None:
+    """out[i, c] = Σ_q Σ_d m(d)·E(t)·voxels[t // T_m, q, c]."""
+    for i in numba.prange(out.shape[0]):
+        row = out[i]
+        row[:] = 0
+        for q in range(len(starts)):
+            first = i * S + starts[q]
+            steps = lengths[q] + S - 1
+            weight, frame = 0, first // T_m
+            for d in range(steps):
+                t = first + d
+                if t // T_m != frame:
+                    _add_scaled(row, weight, voxels[frame, q])
+                    weight, frame = 0, t // T_m
+                if code[t]:
+                    weight += _multiplicity(d, lengths[q], S)
+            _add_scaled(row, weight, voxels[frame, q])
+
+
+@numba.njit(parallel=True, cache=True, fastmath={"contract", "reassoc", "nsz"})
+def unshear(
+    lines: NDArray[Any],
+    code: NDArray[np.uint8],
+    starts: NDArray[np.int64],
+    lengths: NDArray[np.int64],
+    S: int,
+    T_m: int,
+    out: NDArray[Any],
+) -> None:
+    """The transpose of `shear`: out[f, q, c] = Σ_i Σ_{d: t in frame f} m(d)·E(t)·lines[i, c]."""
+    for f in numba.prange(out.shape[0]):
+        t_first, t_end = f * T_m, min((f + 1) * T_m, len(code))
+        for q in range(len(starts)):
+            row = out[f, q]
+            row[:] = 0
+            steps = lengths[q] + S - 1
+            i_first = max(0, -((steps - 1 + starts[q] - t_first) // S))
+            i_end = min(lines.shape[0], (t_end - 1 - starts[q]) // S + 1)
+            for i in range(i_first, i_end):
+                first = i * S + starts[q]
+                weight = 0
+                for t in range(max(first, t_first), min(first + steps, t_end)):
+                    if code[t]:
+                        weight += _multiplicity(t - first, lengths[q], S)
+                _add_scaled(row, weight, lines[i])
+
+
+@numba.njit(cache=True, inline="always")
+def _add_scaled(row: NDArray[Any], weight: int, addend: NDArray[Any]) -> None:
+    if weight:
+        w = row.dtype.type(weight)
+        for c in range(len(row)):
+            row[c] += w * addend[c]
+
+
+@numba.njit(parallel=True, cache=True)
+def transpose_frames(video: NDArray[Any], out: NDArray[Any]) -> None:
+    """out[t] = video[t].T, frame by frame, so that both arms read rows that are contiguous."""
+    for t in numba.prange(video.shape[0]):
+        for r in range(video.shape[1]):
+            for c in range(video.shape[2]):
+                out[t, c, r] = video[t, r, c]
+
+
+@numba.njit(parallel=True, cache=True)
+def add_transposed_frames(video: NDArray[Any], out: NDArray[Any]) -> None:
+    """out[t] += video[t].T."""
+    for t in numba.prange(video.shape[0]):
+        for r in range(video.shape[1]):
+            for c in range(video.shape[2]):
+                out[t, c, r] += video[t, r, c]

@@ -1,0 +1,62 @@
+"""Merging of voxels: which fine rows, columns and sub-steps one voxel of X′ stands for.
+
+X is X′ held constant over its block, so merging a projection matrix sums the columns of a block
+(M_T, M_N of Eq. 3), and C_N counts the fine columns that a block shares with a pixel. N_m need not divide
+n, nor T_m divide T: the last block is then shorter.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.geometry import Geometry
+
+
+def block_bounds(length: int, merge: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First element and length of each block of ``merge`` elements that tile ``length``."""
+    starts = np.arange(0, length, merge, dtype=np.int64)
+    return starts, np.minimum(merge, length - starts)
+
+
+def column_overlap(geometry: Geometry, spatial_merge: int) -> NDArray[np.float64]:
+    """C_N (n/N_m, M): fine columns that block c′ shares with pixel j (Eq. 3, 4); N_m·I where N_m = S."""
+    n, S = geometry.size, geometry.substeps
+    block = np.arange(n) // spatial_merge
+    pixel = np.arange(n) // S
+    overlap = np.zeros((block[-1] + 1, geometry.stages))
+    np.add.at(overlap, (block, pixel), 1.0)
+    return overlap
+
+
+def merge_video(video: NDArray[Any], spatial_merge: int, temporal_merge: int) -> NDArray[Any]:
+    """Mean of a fine video (T, n, n) over the blocks of each voxel: (⌈T/T_m⌉, ⌈n/N_m⌉, ⌈n/N_m⌉)."""
+    if video.ndim != 3:
+        raise UsageError(f"video of shape {video.shape}", possible="(time, row, column)")
+    merged = video.astype(np.result_type(video.dtype, np.float32))
+    for axis, merge in enumerate((temporal_merge, spatial_merge, spatial_merge)):
+        if merge == 1:
+            continue
+        starts, lengths = block_bounds(merged.shape[axis], merge)
+        shape = [1, 1, 1]
+        shape[axis] = -1
+        merged = np.add.reduceat(merged, starts, axis=axis) / lengths.reshape(shape).astype(merged.dtype)
+    return merged
+
+
+def hold_video(
+    voxels: NDArray[Any], geometry: Geometry, spatial_merge: int, temporal_merge: int
+) -> NDArray[Any]:
+    """X (T, n, n): each voxel of X′ held over its block. The size of the fine video; for small cases."""
+    fine = voxels
+    for axis, (merge, length) in enumerate(
+        ((temporal_merge, geometry.span), (spatial_merge, geometry.size), (spatial_merge, geometry.size))
+    ):
+        fine = np.repeat(fine, merge, axis=axis).take(np.arange(length), axis=axis)
+    return fine

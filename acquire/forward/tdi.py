@@ -1,0 +1,68 @@
+"""One arm: Y = A·M_T·M_N·X′·C_N of Eq. (3) and its transpose, without any of the matrices."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.errors import UsageError
+from acquire.forward.kernels import shear, unshear
+from acquire.forward.merge import block_bounds, column_overlap
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.geometry import Geometry
+
+
+class TdiArm:
+    """The lines of one TDI sensor that looks at voxels (frame, row block, column block).
+
+    ``flipped`` reverses the rows' order on their way to the register: A_B = fliplr(A_A) by group of n.
+    The rows are then blocks of the scene's columns, counted as the scene counts them.
+    """
+
+    def __init__(
+        self,
+        geometry: Geometry,
+        code: NDArray[np.uint8],
+        spatial_merge: int = 1,
+        temporal_merge: int = 1,
+        *,
+        flipped: bool = False,
+        dtype: type[np.floating[Any]] = np.float32,
+    ) -> None:
+        self.voxels_shape = geometry.video_shape(spatial_merge, temporal_merge)
+        self.lines_shape = (geometry.lines, geometry.stages)
+        self.dtype = np.dtype(dtype)
+        self._code = _checked_code(code, geometry.span)
+        self._starts, self._lengths = block_bounds(geometry.size, spatial_merge)
+        if flipped:
+            self._starts = geometry.size - self._starts - self._lengths
+        self._C_N = column_overlap(geometry, spatial_merge).astype(dtype)
+        self._S, self._T_m = geometry.substeps, temporal_merge
+
+    def forward(self, voxels: NDArray[Any]) -> NDArray[Any]:
+        """(T/T_m, n/N_m, n/N_m) → (L_R, M)."""
+        sheared = np.empty((self.lines_shape[0], self.voxels_shape[2]), self.dtype)
+        shear(voxels, self._code, self._starts, self._lengths, self._S, self._T_m, sheared)
+        return sheared @ self._C_N
+
+    def adjoint(self, lines: NDArray[Any]) -> NDArray[Any]:
+        """(L_R, M) → (T/T_m, n/N_m, n/N_m)."""
+        voxels = np.empty(self.voxels_shape, self.dtype)
+        spread = np.ascontiguousarray(lines @ self._C_N.T)
+        unshear(spread, self._code, self._starts, self._lengths, self._S, self._T_m, voxels)
+        return voxels
+
+
+def _checked_code(code: NDArray[np.uint8], span: int) -> NDArray[np.uint8]:
+    code = np.asarray(code)
+    if code.shape != (span,):
+        raise UsageError(
+            f"exposure code of shape {code.shape}", possible=f"({span},): T = S·(M + L_R) − 1 bits"
+        )
+    if not np.isin(code, (0, 1)).all():
+        raise UsageError("exposure code with values other than 0 and 1", possible="E ∈ {0, 1}")
+    return np.ascontiguousarray(code, dtype=np.uint8)
