@@ -217,6 +217,13 @@ class LedSceneConfig(_Model):
     title: str
     leds: tuple[LedConfig, ...] = Field(min_length=1)
 
+    @model_validator(mode="after")
+    def _names_differ(self) -> LedSceneConfig:
+        names = [led.name for led in self.leds]
+        if len(set(names)) < len(names):
+            raise ValueError(f"LEDs need different names, not {', '.join(names)}")
+        return self
+
 
 SceneConfig = LedSceneConfig
 

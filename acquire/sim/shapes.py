@@ -1,0 +1,73 @@
+"""Shapes of masks with smooth edges.
+
+A shape is the signed distance to its outline in a square of side 1 around the origin: negative inside,
+rows growing downwards. A pixel whose centre lies within half a pixel of the outline is partly covered;
+so a shape moves by fractions of a pixel without a jump.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    Grid = NDArray[np.float64]
+
+_STROKE = 0.11
+"""Half the width of the strokes of x and equals."""
+_SPREAD = 0.22
+"""Distance of the two bars of equals from the middle."""
+
+
+def coverage(shape: str, row: Grid, column: Grid, pixel: float) -> NDArray[np.float32]:
+    """Covered part of pixels (0 to 1, float32) whose centres are (row, column), each of side ``pixel``.
+
+    ``row`` and ``column`` broadcast; lengths are fractions of the shape's bounding square.
+    """
+    covered = np.clip(0.5 - SHAPES[shape](row, column) / pixel, 0, 1)
+    return covered.astype(np.float32)
+
+
+def _both(one: Grid, other: Grid) -> Grid:
+    """What lies inside both outlines."""
+    distance: Grid = np.maximum(one, other)
+    return distance
+
+
+def _box(row: Grid, column: Grid, half_height: float = 0.5) -> Grid:
+    return _both(np.abs(row) - half_height, np.abs(column) - 0.5)
+
+
+def _disc(row: Grid, column: Grid) -> Grid:
+    radius: Grid = np.hypot(row, column)
+    return radius - 0.5
+
+
+def _triangle(row: Grid, column: Grid) -> Grid:
+    """Apex at the middle of the upper side, the lower side is the base."""
+    flank = (np.abs(column) - (row + 0.5) / 2) * (2 / np.sqrt(5))
+    return _both(row - 0.5, flank)
+
+
+def _cross(row: Grid, column: Grid) -> Grid:
+    """Both diagonals, cut off at the bounding square."""
+    diagonals = np.minimum(np.abs(row + column), np.abs(row - column)) / np.sqrt(2)
+    return _both(diagonals - _STROKE, _box(row, column))
+
+
+def _bars(row: Grid, column: Grid) -> Grid:
+    return _box(np.abs(row) - _SPREAD, column, half_height=_STROKE)
+
+
+SHAPES: dict[str, Callable[[Grid, Grid], Grid]] = {
+    "x": _cross,
+    "triangle": _triangle,
+    "circle": _disc,
+    "equals": _bars,
+    "square": _box,
+}

@@ -1,0 +1,54 @@
+"""The truth about a simulated scene, in the voxels that a reconstruction gives."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.sim.scenes import Scene
+
+_BLOCK_BYTES = 16 << 20
+"""Frames at full resolution held at once."""
+
+
+def truth(
+    scene: Scene, first_substep: int, count: int, spatial_merge: int = 1, temporal_merge: int = 1
+) -> NDArray[np.float32]:
+    """Mean light of each voxel of N_m × N_m pixels and T_m sub-steps: (⌈count/T_m⌉, ⌈n/N_m⌉, ⌈n/N_m⌉).
+
+    Voxels begin at ``first_substep``. The last ones along an axis are averaged over what there is of them.
+    The scene is sampled in blocks; only the result is held whole.
+    """
+    if count < 1 or temporal_merge < 1 or not 1 <= spatial_merge <= scene.size:
+        raise UsageError(
+            f"truth of {count} sub-steps with N_m = {spatial_merge}, T_m = {temporal_merge}",
+            possible=f"at least 1 sub-step, N_m from 1 to {scene.size}, T_m of 1 or more",
+        )
+    side = -(-scene.size // spatial_merge)
+    voxels = np.zeros((-(-count // temporal_merge), side, side))
+    block = max(1, _BLOCK_BYTES // (4 * scene.size**2))
+    for offset in range(0, count, block):
+        frames = scene.frames(first_substep + offset, min(block, count - offset))
+        voxel = np.arange(offset, offset + len(frames)) // temporal_merge
+        begins = np.flatnonzero(np.diff(voxel, prepend=-1))
+        summed = np.add.reduceat(_merge_plane(frames, spatial_merge), begins, axis=0)
+        voxels[voxel[0] : voxel[-1] + 1] += summed
+    voxels /= np.bincount(np.arange(count) // temporal_merge)[:, None, None]
+    return voxels.astype(np.float32)
+
+
+def _merge_plane(frames: NDArray[np.float32], spatial_merge: int) -> NDArray[np.float64]:
+    """Mean over blocks of rows and columns."""
+    size = frames.shape[1]
+    starts = np.arange(0, size, spatial_merge)
+    extent = np.diff([*starts, size])
+    summed = np.add.reduceat(frames, starts, axis=1, dtype=np.float64)
+    summed = np.add.reduceat(summed, starts, axis=2)
+    merged: NDArray[np.float64] = summed / (extent[:, None] * extent)
+    return merged

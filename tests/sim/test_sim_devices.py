@@ -1,0 +1,383 @@
+"""Simulated trigger and cameras: on a clock that is told to move, and in processes of their own."""
+
+from __future__ import annotations
+
+import multiprocessing
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sim_helpers import (
+    CODE,
+    LEDS,
+    ManualClock,
+    blas_child,
+    camera_child,
+    camera_config,
+    naive_lines,
+    optics,
+    read_lines,
+    trigger_run,
+)
+
+from acquire.codes import ConstantCode
+from acquire.errors import CameraError, TriggerError
+from acquire.sim.clock import Wire
+from acquire.sim.devices import SimulatedCamera, SimulatedCameraOpener, SimulatedTrigger
+from acquire.sim.scenes import build_scene
+
+LINE_NS = 30_000
+LINE_RATE_HZ = 1e9 / LINE_NS
+M, S, DEPTH = 4, 3, 5
+
+
+@pytest.fixture
+def clock():
+    return ManualClock()
+
+
+@pytest.fixture
+def wire(clock):
+    wire = Wire(clock)
+    yield wire
+    wire.close()
+
+
+@pytest.fixture
+def trigger(wire):
+    return SimulatedTrigger(wire, 90_000_000, S)
+
+
+def camera(wire, arm="a", block_lines=8, **config):
+    return SimulatedCamera(wire, optics(arm), camera_config(**config), block_lines, LINE_RATE_HZ)
+
+
+def start(trigger, **changes):
+    trigger.prepare(trigger_run(**changes))
+    return trigger.start()
+
+
+def expected_dn(arm, pulses, code=CODE, substep_s=1e-5, first_pulse=0):
+    scene = build_scene(LEDS, M * S, substep_s)
+    Y = naive_lines(scene, code, M, S, arm, range(first_pulse - DEPTH, pulses - DEPTH))
+    return np.clip(np.rint(5.0 + 40.0 * Y), 0, 4095)
+
+
+# the trigger
+
+
+def test_the_trigger_says_who_it_is(trigger):
+    identity = trigger.identify()
+    assert (identity.model, identity.clock_hz) == ("simulated trigger", 90_000_000)
+    assert trigger.statistics() == {"pulses": 0, "tags": 0}
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"substep_ticks": 4}, "sub-step of 4 ticks; possible: 5 to 16777216"),
+        ({"substep_ticks": 2**24 + 1}, "sub-step of"),
+        ({"substeps": 4}, "4 sub-steps per line; possible: 3"),
+        ({"tag_every_lines": 0}, "a tag every 0 lines"),
+    ],
+)
+def test_a_run_that_cannot_be_honoured_is_refused(trigger, change, word):
+    with pytest.raises(TriggerError, match=word):
+        trigger.prepare(trigger_run(**change))
+    with pytest.raises(TriggerError, match="without a run"):
+        trigger.start()
+
+
+def test_a_code_that_a_trigger_cannot_generate_is_refused(trigger):
+    class Whim:
+        def bits(self, start, length):
+            return np.zeros(length, np.uint8)
+
+        def to_attrs(self):
+            return {"kind": "whim"}
+
+    with pytest.raises(TriggerError, match="'whim'"):
+        trigger.prepare(trigger_run(code=Whim()))
+
+
+def test_preparing_a_run_again_changes_nothing_another_one_needs_a_stop(trigger):
+    trigger.prepare(trigger_run())
+    start(trigger)
+    trigger.prepare(trigger_run())
+    assert trigger.statistics()["pulses"] == 1
+    with pytest.raises(TriggerError, match="'other' prepared while another one runs"):
+        trigger.prepare(trigger_run(run_id="other"))
+    with pytest.raises(TriggerError, match="without a run"):
+        trigger.start()
+    trigger.stop()
+    start(trigger, run_id="other")
+
+
+@pytest.mark.parametrize("speed", [0.5, 1.0, 50.0])
+def test_pulses_follow_the_clock_at_the_configured_speed(wire, clock, speed):
+    trigger = SimulatedTrigger(wire, 90_000_000, S, speed)
+    start(trigger)
+    for _ in range(5):
+        clock.now_ns += 7 * LINE_NS
+    assert trigger.stop() == int(35 * speed) + 1
+    clock.now_ns += 10 * LINE_NS
+    assert trigger.stop() == int(35 * speed) + 1
+
+
+@pytest.mark.parametrize("step_ns", [0, 1, 90, 12_345])
+def test_the_clock_fit_holds_within_its_uncertainty(clock, wire, trigger, step_ns):
+    clock.step_ns = step_ns
+    fit = start(trigger)
+    true_utc_ns = wire.look().train.start_ns + clock.utc_offset_ns
+    assert abs(fit.utc_ns_at_tick_0 - true_utc_ns) <= fit.uncertainty_ns
+    assert fit.uncertainty_ns <= step_ns + 1
+    assert fit.clock_hz == 90_000_000
+
+
+def test_tags_tell_line_code_index_and_tick(clock, trigger):
+    start(trigger)
+    (first,) = trigger.tags(0.1)
+    assert (first.line, first.code_index, first.tick) == (0, 0, 0)
+    clock.now_ns += 40 * LINE_NS
+    tags = trigger.tags(0.1)
+    assert [tag.line for tag in tags] == [16, 32]
+    assert all((tag.code_index, tag.tick) == (3 * tag.line, 2700 * tag.line) for tag in tags)
+    assert [tag.line for tag in trigger.tags(10.0)] == [48], "waits for the first to come"
+
+
+def test_tags_wait_no_longer_than_asked_and_end_with_a_stop(clock, trigger):
+    begin_ns = clock.now_ns
+    assert trigger.tags(0.05) == []
+    assert clock.now_ns - begin_ns == pytest.approx(0.05e9, rel=1e-3)
+    start(trigger, tag_every_lines=65536)
+    trigger.tags(0)
+    clock.on_sleep = trigger.stop
+    begin_ns = clock.now_ns
+    assert trigger.tags(1.0) == []
+    assert clock.now_ns - begin_ns < 0.01e9, "a stop ends the wait"
+    clock.on_sleep = lambda: None
+    begin_ns = clock.now_ns
+    assert trigger.tags(0.5) == []
+    assert clock.now_ns - begin_ns == pytest.approx(0.5e9, rel=1e-3), "and nothing spins afterwards"
+
+
+def test_many_tags_come_in_bounded_portions_up_to_the_stop(clock, trigger):
+    start(trigger, tag_every_lines=1)
+    clock.now_ns += 9_999 * LINE_NS
+    assert trigger.stop() == 10_000
+    portions = [trigger.tags(0), trigger.tags(0), trigger.tags(0), trigger.tags(0)]
+    assert [len(portion) for portion in portions] == [4096, 4096, 1808, 0]
+    assert [tag.line for portion in portions for tag in portion] == list(range(10_000))
+
+
+def test_a_new_run_begins_its_tags_anew(clock, trigger):
+    start(trigger)
+    clock.now_ns += 100 * LINE_NS
+    trigger.tags(0)
+    trigger.close()
+    trigger.close()
+    start(trigger, run_id="second")
+    assert [tag.line for tag in trigger.tags(0)] == [0]
+    assert trigger.statistics() == {"pulses": 1, "tags": 1}
+
+
+# a camera
+
+
+def test_a_camera_must_be_armed(wire):
+    with pytest.raises(CameraError, match="not armed"):
+        camera(wire).next_block(0.1)
+
+
+def test_settings_are_read_back_under_sfnc_names(wire):
+    settings = camera(wire, pixel_format="Mono10").settings()
+    assert (settings["TriggerSelector"], settings["TriggerMode"]) == ("LineStart", "On")
+    assert settings["AcquisitionLineRate"] == pytest.approx(33_333.3, abs=0.1)
+    assert (settings["Width"], settings["PixelFormat"], settings["white_dn"]) == (4, "Mono10", 1023)
+    assert (settings["black_level_dn"], settings["responsivity_dn"]) == (5.0, 40.0)
+    assert camera(wire, serial="S-1").identify().serial == "S-1"
+
+
+def test_blocks_come_whole_and_only_when_their_pulses_were_issued(wire, clock, trigger):
+    eye = camera(wire)
+    eye.arm()
+    assert eye.next_block(0.01) is None, "no trigger, no lines"
+    start(trigger)
+    begin_ns = clock.now_ns
+    block = eye.next_block(1.0)
+    assert (block.first_line, len(block.pixels), block.pixels.dtype) == (0, 8, np.uint16)
+    assert clock.now_ns - begin_ns >= 7 * LINE_NS
+    clock.now_ns = begin_ns + 14 * LINE_NS
+    assert eye.next_block(0) is None, "pulse 15 is still to come"
+    clock.now_ns += LINE_NS
+    assert eye.next_block(0).first_line == 8
+
+
+@given(
+    block_lines=st.integers(1, 40),
+    pulses=st.integers(1, 90),
+    arm=st.sampled_from("ab"),
+    looks=st.lists(st.integers(0, 30), max_size=4),
+)
+@settings(max_examples=40, deadline=None)
+def test_a_stop_leaves_exactly_the_issued_lines_however_they_are_blocked(block_lines, pulses, arm, looks):
+    clock = ManualClock()
+    wire = Wire(clock)
+    trigger, eye = SimulatedTrigger(wire, 90_000_000, S), camera(wire, arm, block_lines)
+    eye.arm()
+    start(trigger)
+    blocks = []
+    for lines in looks:
+        clock.now_ns = min(clock.now_ns + lines * LINE_NS, wire.look().train.due_ns(pulses - 1))
+        blocks += [block.pixels for block in [eye.next_block(0)] if block is not None]
+    clock.now_ns = max(clock.now_ns, wire.look().train.due_ns(pulses - 1))
+    assert trigger.stop() == pulses
+    while (block := eye.next_block(0.001)) is not None:
+        blocks.append(block.pixels)
+    assert all(len(block) == block_lines for block in blocks[:-1])
+    np.testing.assert_array_equal(np.concatenate(blocks), expected_dn(arm, pulses))
+    assert eye.statistics() == {"lines": pulses, "lost": 0, "behind_lines": 0}
+    wire.close()
+
+
+def test_nothing_spins_after_the_last_line(wire, clock, trigger):
+    eye = camera(wire)
+    eye.arm()
+    start(trigger)
+    trigger.stop()
+    assert len(read_lines(eye, 1)) == 1
+    begin_ns = clock.now_ns
+    assert eye.next_block(0.5) is None
+    assert clock.now_ns - begin_ns == pytest.approx(0.5e9, rel=1e-3)
+
+
+def test_code_and_timing_come_with_the_pulses(wire, clock, trigger):
+    eye = camera(wire)
+    eye.arm()
+    start(trigger, code=ConstantCode(1), substep_ticks=4500)
+    clock.now_ns += 39 * 5 * LINE_NS
+    trigger.stop()
+    dn = np.concatenate(read_lines(eye, 40))
+    np.testing.assert_array_equal(dn, expected_dn("a", 40, ConstantCode(1), substep_s=5e-5))
+
+
+def test_a_late_camera_delivers_everything_and_says_how_late_it_is(wire, clock, trigger):
+    eye = camera(wire)
+    eye.arm()
+    start(trigger)
+    clock.now_ns += 999 * LINE_NS
+    assert eye.statistics() == {"lines": 0, "lost": 0, "behind_lines": 1000}
+    eye.next_block(0)
+    assert eye.statistics() == {"lines": 8, "lost": 0, "behind_lines": 992}
+
+
+@pytest.mark.parametrize(("pixel_format", "white", "dtype"), [("Mono8", 255, "u1"), ("Mono12", 4095, "u2")])
+def test_the_converter_rounds_and_clips(wire, clock, trigger, pixel_format, white, dtype):
+    eye = camera(wire, pixel_format=pixel_format, responsivity_dn=200.0)
+    eye.arm()
+    start(trigger, code=ConstantCode(1))
+    clock.now_ns += 39 * LINE_NS
+    dn = np.concatenate(read_lines(eye, 40))
+    assert dn.dtype == dtype
+    assert (dn.min(), dn.max()) == (5, white)
+
+
+def test_a_camera_armed_while_pulses_come_counts_from_there(wire, clock, trigger):
+    start(trigger)
+    clock.now_ns += 20 * LINE_NS
+    eye = camera(wire)
+    eye.arm()
+    clock.now_ns += 8 * LINE_NS
+    block = eye.next_block(0)
+    assert block.first_line == 0
+    np.testing.assert_array_equal(block.pixels, expected_dn("a", 29, first_pulse=21))
+
+
+def test_a_second_start_under_an_armed_camera_is_an_error_not_a_mixture(wire, clock, trigger):
+    eye = camera(wire)
+    eye.arm()
+    start(trigger)
+    trigger.stop()
+    start(trigger, run_id="second")
+    with pytest.raises(CameraError, match="started train 2 with a camera armed for train 1"):
+        eye.next_block(0.1)
+    eye.disarm()
+    eye.arm()
+    assert eye.next_block(0.1).first_line == 0
+
+
+def test_a_camera_armed_after_a_run_waits_for_the_next(wire, clock, trigger):
+    start(trigger)
+    clock.now_ns += 100 * LINE_NS
+    trigger.stop()
+    eye = camera(wire)
+    eye.arm()
+    assert eye.next_block(0.1) is None
+    start(trigger, run_id="second")
+    assert eye.next_block(0.1).first_line == 0
+
+
+# processes of their own
+
+
+@contextmanager
+def spawned(target, *openers):
+    context = multiprocessing.get_context("spawn")
+    children = []
+    try:
+        for opener in openers:
+            ours, theirs = context.Pipe()
+            child = context.Process(target=target, args=(opener, theirs), daemon=True)
+            child.start()
+            theirs.close()
+            children.append((child, ours))
+        yield [link for _, link in children]
+        for child, _ in children:
+            child.join(20)
+            assert child.exitcode == 0
+    finally:
+        for child, link in children:
+            child.kill()
+            child.join(10)
+            link.close()
+
+
+def received(link):
+    assert link.poll(60), "nothing came from the child"
+    return link.recv()
+
+
+def test_two_cameras_in_processes_of_their_own_follow_one_trigger():
+    wire = Wire()
+    trigger = SimulatedTrigger(wire, 90_000_000, S)
+    openers = [SimulatedCameraOpener(wire, optics(arm), camera_config(), 64, LINE_RATE_HZ) for arm in "ab"]
+    with spawned(camera_child, *openers) as links:
+        assert [received(link) for link in links] == ["armed", "armed"]
+        start(trigger)
+        tags = trigger.tags(5.0)
+        while tags[-1].line < 4000:
+            tags += trigger.tags(5.0)
+        pulses = trigger.stop()
+        for link in links:
+            link.send(pulses)
+        results = [received(link) for link in links]
+    assert pulses >= 4001
+    assert [tag.line for tag in tags] == list(range(0, tags[-1].line + 1, 16))
+    for arm, (dn, after, statistics) in zip("ab", results, strict=True):
+        assert (len(dn), after) == (pulses, None)
+        assert statistics == {"lines": pulses, "lost": 0, "behind_lines": 0}
+        np.testing.assert_array_equal(dn[:300], expected_dn(arm, 300))
+        np.testing.assert_array_equal(dn[-300:], expected_dn(arm, pulses, first_pulse=pulses - 300))
+    wire.close()
+
+
+def test_a_camera_process_multiplies_on_one_thread():
+    wire = Wire()
+    with spawned(blas_child, SimulatedCameraOpener(wire, optics("a"), camera_config(), 8, LINE_RATE_HZ)) as (
+        link,
+    ):
+        own_s, others_s = received(link)
+    wire.close()
+    assert others_s < 0.3 * own_s, "threads of BLAS worked, or span, beside the camera's own"

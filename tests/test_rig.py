@@ -1,0 +1,111 @@
+"""The composition root: a configuration becomes devices that belong together."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from acquire.config import LedSceneConfig, load_rig
+from acquire.errors import ConfigError
+from acquire.geometry import Geometry
+from acquire.rig import Rig, open_trigger
+from acquire.sim import build_scene, truth
+from acquire.trigger.base import TriggerRun
+
+OVERRIDES = {"geometry.stages": 8, "stream.block_lines": 16, "simulation.speed": 20.0}
+
+
+def run_of(config):
+    trigger = config.trigger
+    return TriggerRun(
+        "r", config.code.build(), config.geometry.substeps, trigger.substep_ticks, trigger.tag_every_lines
+    )
+
+
+def open_descriptors():
+    return sum(1 for _ in Path("/proc/self/fd").iterdir())
+
+
+@pytest.fixture
+def config():
+    return load_rig("rig-demo.toml", OVERRIDES)
+
+
+def test_trigger_and_cameras_of_a_rig_share_one_wire(config):
+    with Rig(config) as rig:
+        cameras = {arm: opener() for arm, opener in rig.openers().items()}
+        for camera in cameras.values():
+            camera.arm()
+        rig.trigger.prepare(run_of(config))
+        fit = rig.trigger.start()
+        blocks = {arm: [camera.next_block(10.0) for _ in range(4)] for arm, camera in cameras.items()}
+        pulses = rig.trigger.stop()
+    assert fit.clock_hz == config.trigger.clock_hz
+    assert pulses >= 64
+    assert [block.first_line for block in blocks["a"]] == [0, 16, 32, 48]
+    lines = {arm: np.concatenate([block.pixels for block in of_arm]) for arm, of_arm in blocks.items()}
+    assert all(dn.shape == (64, 8) and dn.any() for dn in lines.values())
+    assert not np.array_equal(lines["a"], lines["b"])
+
+
+def test_both_arms_collect_the_light_of_the_same_scene(config):
+    """The truth, summed over rows and columns, is what a line gathers: arm by arm the same total."""
+    bright = config.model_copy(
+        update={"code": config.code.model_validate({"kind": "prbs", "degree": 7, "seed": 3})}
+    )
+    geometry = Geometry(8, 3, 1)
+    with Rig(bright) as rig:
+        scene, code = rig.scene(), bright.code.build()
+        cameras = [opener() for opener in rig.openers().values()]
+        for camera in cameras:
+            camera.arm()
+        rig.trigger.prepare(run_of(bright))
+        rig.trigger.start()
+        blocks = [[camera.next_block(10.0).pixels for _ in range(4)] for camera in cameras]
+    line = 40
+    substeps = geometry.line_substeps(line)
+    X = scene.frames(substeps.start, len(substeps)) * code.bits(substeps.start, len(substeps))[:, None, None]
+    for dn, turns in zip(blocks, (0, 1), strict=True):
+        seen = np.rot90(X, turns, axes=(1, 2))
+        total = sum(seen[r + u, r].sum() for r in range(24) for u in range(3))
+        measured = np.concatenate(dn)[line + geometry.depth_lines].sum() / 6.0
+        assert measured == pytest.approx(total, abs=8 * 0.5 / 6)
+
+
+def test_what_a_recording_is_told_rebuilds_the_scene(config):
+    with Rig(config) as rig:
+        described = json.loads(json.dumps(rig.describe()))
+        scene = rig.scene()
+    assert (described["simulated"], described["effects"]) == (True, [])
+    again = build_scene(LedSceneConfig.model_validate(described["scene"]), 24, 1e-5)
+    np.testing.assert_array_equal(truth(scene, 100, 40, 3, 4), truth(again, 100, 40, 3, 4))
+
+
+def test_a_rig_without_its_scene_is_refused_before_anything_is_made(config, tmp_path):
+    missing = config.simulation.model_copy(update={"scene": str(tmp_path / "none.toml")})
+    before = open_descriptors()
+    with pytest.raises(ConfigError, match=r"none\.toml"):
+        Rig(config.model_copy(update={"simulation": missing}))
+    assert open_descriptors() == before
+
+
+def test_closing_stops_the_trigger_takes_the_wire_away_and_can_be_repeated(config):
+    before = open_descriptors()
+    rig = Rig(config)
+    rig.trigger.prepare(run_of(config))
+    rig.trigger.start()
+    rig.close()
+    rig.close()
+    assert open_descriptors() == before
+
+
+def test_a_trigger_can_be_opened_on_its_own(config):
+    trigger = open_trigger(config)
+    assert trigger.identify().clock_hz == 90_000_000
+    trigger.prepare(run_of(config))
+    trigger.start()
+    assert trigger.stop() >= 1
+    trigger.close()
