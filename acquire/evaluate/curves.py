@@ -1,0 +1,243 @@
+"""Intensity of a region over time, the sinusoid in it, and how both compare with theory (Fig. 9c).
+
+A sinusoid of frequency f is linear in everything but f::
+
+    v(t) = offset + Σ_k  p_k·sin(2π·k·f·t) + q_k·cos(2π·k·f·t)          k = 1 .. harmonics
+
+so the residual of a linear least-squares fit is a function of f alone (variable projection). It is
+minimised within the main lobe about the highest peak of the spectrum. Overtones (k > 1) describe the
+distortion of an LED that is driven into saturation; "amplitude" always means that of the fundamental.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.optimize import minimize_scalar
+
+from acquire.errors import UsageError
+from acquire.evaluate.metrics import check_finite
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+CONSTANT_SWING = 1e-6
+"""A curve whose swing is below this share of its largest value is a constant: rounding of float32."""
+HARMONICS = 3
+"""Fundamental, second and third: what a saturating LED makes of a sinusoid."""
+SPECTRUM_PADDING = 8
+"""The spectrum is evaluated at 1/8 of its natural spacing: the peak starts the search inside its lobe."""
+
+
+@dataclass(frozen=True, slots=True)
+class SineFit:
+    """``offset + amplitude·sin(2π·frequency_hz·t + phase_rad)`` plus overtones; t = 0 at the first sample.
+
+    A constant is the sinusoid of frequency 0 and amplitude 0. ``overtones`` holds (amplitude, phase) of
+    the harmonics 2, 3, … that were fitted; ``residual_rms`` is what no term explains.
+    """
+
+    frequency_hz: float
+    amplitude: float
+    offset: float
+    phase_rad: float
+    residual_rms: float
+    overtones: tuple[tuple[float, float], ...] = ()
+
+    @property
+    def distortion(self) -> float:
+        """Root of the overtones' power over that of the fundamental (THD); 0 for a constant."""
+        if self.amplitude == 0:
+            return 0.0
+        return (
+            float(np.hypot.reduce([amplitude for amplitude, _ in self.overtones] or [0.0])) / self.amplitude
+        )
+
+    def at(self, times_s: NDArray[Any]) -> NDArray[np.float64]:
+        """The fitted curve at these times, in seconds from the first sample."""
+        terms = ((self.amplitude, self.phase_rad), *self.overtones)
+        values = np.full(np.shape(times_s), self.offset, np.float64)
+        for k, (amplitude, phase) in enumerate(terms, start=1):
+            values += amplitude * np.sin(2 * np.pi * k * self.frequency_hz * times_s + phase)
+        return values
+
+
+@dataclass(frozen=True, slots=True)
+class CurveComparison:
+    """A region's measured intensity beside the theoretical one.
+
+    ``correlation`` is Pearson's, None where either curve is constant; ``rms_error`` and the fits are in
+    the scene's units; ``level_ratio`` compares the means.
+    """
+
+    name: str
+    theory: SineFit
+    measured: SineFit
+    correlation: float | None
+    level_ratio: float | None
+    rms_error: float
+
+    @property
+    def constant(self) -> bool:
+        """Theory says that this region does not change: frequencies and amplitudes say nothing."""
+        return self.theory.amplitude == 0
+
+    @property
+    def amplitude_ratio(self) -> float | None:
+        """Measured over theoretical amplitude of the fundamental: below 1 the swing was lost."""
+        return None if self.constant else self.measured.amplitude / self.theory.amplitude
+
+    @property
+    def frequency_error_hz(self) -> float | None:
+        return None if self.constant else self.measured.frequency_hz - self.theory.frequency_hz
+
+
+def region_mean(video: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Mean (t,) over the pixels of ``mask`` (row, column) in each frame of ``video`` (t, row, column).
+
+    Raises UsageError for a mask of another shape or without a pixel.
+    """
+    if video.ndim != 3 or mask.shape != video.shape[1:] or mask.dtype != np.bool_ or not mask.any():
+        mask_text = f"{np.count_nonzero(mask)} pixels of a {mask.dtype} mask {mask.shape}"
+        raise UsageError(
+            f"mean of a video {video.shape} over {mask_text}",
+            possible="a boolean mask of the frame's shape with at least one pixel",
+        )
+    means: NDArray[np.float64] = video[:, mask].mean(axis=1, dtype=np.float64)
+    return means
+
+
+def fit_sine(
+    values: NDArray[Any],
+    interval_s: float,
+    *,
+    frequency_hz: float | None = None,
+    guess_hz: float | None = None,
+    harmonics: int = 1,
+) -> SineFit:
+    """Least-squares sinusoid through ``values`` (t,), sampled every ``interval_s`` seconds.
+
+    The frequency is ``frequency_hz`` where given; else it is searched about ``guess_hz``, or about the
+    highest peak of the spectrum. Harmonics at or above half the sampling rate are left out.
+    Raises UsageError for too few samples or a frequency that cannot be seen in them, NumericsError for
+    values that are not finite.
+    """
+    values = np.asarray(values, np.float64)
+    _check_curve(values, interval_s, harmonics)
+    times_s = np.arange(len(values), dtype=np.float64) * np.float64(interval_s)
+    if frequency_hz is None and np.ptp(values) <= CONSTANT_SWING * np.abs(values).max():
+        return fit_constant(values)
+    if frequency_hz is None:
+        start = _spectrum_peak(values, interval_s) if guess_hz is None else guess_hz
+        frequency_hz, harmonics = _refine(values, times_s, start, harmonics)
+    else:
+        harmonics = _visible_harmonics(frequency_hz, interval_s, harmonics)
+    coefficients, residual = _project(values, times_s, frequency_hz, harmonics)
+    return _as_sine(frequency_hz, coefficients, residual)
+
+
+def fit_constant(values: NDArray[Any]) -> SineFit:
+    """The mean as a sinusoid of frequency and amplitude 0; the residual is the ripple."""
+    values = np.asarray(values, np.float64)
+    return SineFit(0.0, 0.0, float(values.mean()), 0.0, float(values.std()))
+
+
+def compare_curve(
+    name: str, theory: NDArray[Any], measured: NDArray[Any], interval_s: float, harmonics: int = HARMONICS
+) -> CurveComparison:
+    """Fit both curves (t,) and compare them; where theory is constant, so is the model of the measured one.
+
+    Raises UsageError for lengths that differ, and as :func:`fit_sine`.
+    """
+    theory, measured = np.asarray(theory, np.float64), np.asarray(measured, np.float64)
+    if theory.shape != measured.shape:
+        raise UsageError(f"comparison of a curve {measured.shape} with a theory {theory.shape}")
+    theory_fit = fit_sine(theory, interval_s, harmonics=harmonics)
+    check_finite(measured, "the measured curve")
+    return CurveComparison(
+        name=name,
+        theory=theory_fit,
+        measured=fit_sine(measured, interval_s, harmonics=harmonics)
+        if theory_fit.amplitude
+        else fit_constant(measured),
+        correlation=_correlation(theory, measured),
+        level_ratio=float(measured.mean() / theory.mean()) if theory.mean() else None,
+        rms_error=float(np.sqrt(np.mean(np.square(measured - theory)))),
+    )
+
+
+def _check_curve(values: NDArray[np.float64], interval_s: float, harmonics: int) -> None:
+    least = 2 * harmonics + 2
+    if values.ndim != 1 or harmonics < 1 or len(values) < least:
+        raise UsageError(
+            f"sinusoid with {harmonics} harmonics through {values.shape} values",
+            possible=f"a curve (t,) of at least {least} values, 1 harmonic or more",
+        )
+    if not (np.isfinite(interval_s) and interval_s > 0):
+        raise UsageError(f"sampling interval of {interval_s} s", possible="a positive number of seconds")
+    check_finite(values, "the curve")
+
+
+def _spectrum_peak(values: NDArray[np.float64], interval_s: float) -> float:
+    size = SPECTRUM_PADDING * len(values)
+    spectrum = np.abs(np.fft.rfft(values - values.mean(), size))
+    peak = 1 + int(np.argmax(spectrum[1:-1]))
+    return peak / (size * interval_s)
+
+
+def _visible_harmonics(frequency_hz: float, interval_s: float, harmonics: int) -> int:
+    """How many multiples of the frequency lie below half the sampling rate; UsageError for none."""
+    nyquist_hz = 0.5 / interval_s
+    if not 0 < frequency_hz < nyquist_hz:
+        raise UsageError(f"sinusoid of {frequency_hz} Hz", possible=f"above 0 and below {nyquist_hz:g} Hz")
+    return min(harmonics, int(np.ceil(nyquist_hz / frequency_hz)) - 1)
+
+
+def _refine(
+    values: NDArray[np.float64], times_s: NDArray[np.float64], start_hz: float, harmonics: int
+) -> tuple[float, int]:
+    """The frequency of the smallest residual within one lobe of ``start_hz``, and the harmonics fitted."""
+    interval_s = times_s[1]
+    harmonics = _visible_harmonics(start_hz, interval_s, harmonics)
+    lobe_hz = 1 / (len(values) * interval_s)
+    low_hz = max(start_hz - lobe_hz, 0.25 * lobe_hz)
+    high_hz = min(start_hz + lobe_hz, 0.5 / interval_s)
+    best = minimize_scalar(
+        lambda f: float(np.sum(np.square(_project(values, times_s, f, harmonics)[1]))),
+        bounds=(low_hz, high_hz),
+        method="bounded",
+        options={"xatol": 1e-7 * lobe_hz},
+    )
+    return float(best.x), harmonics
+
+
+def _project(
+    values: NDArray[np.float64], times_s: NDArray[np.float64], frequency_hz: float, harmonics: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Coefficients (offset, p_1, q_1, p_2, …) of the best fit at this frequency, and the residual (t,)."""
+    angle = 2 * np.pi * frequency_hz * times_s
+    columns = [np.ones_like(angle)]
+    for k in range(1, harmonics + 1):
+        columns += [np.sin(k * angle), np.cos(k * angle)]
+    design = np.stack(columns, axis=1)
+    coefficients = np.linalg.lstsq(design, values, rcond=None)[0].astype(np.float64, copy=False)
+    return coefficients, values - design @ coefficients
+
+
+def _as_sine(
+    frequency_hz: float, coefficients: NDArray[np.float64], residual: NDArray[np.float64]
+) -> SineFit:
+    p, q = coefficients[1::2], coefficients[2::2]
+    terms = [(float(a), float(phase)) for a, phase in zip(np.hypot(p, q), np.arctan2(q, p), strict=True)]
+    (amplitude, phase_rad), *overtones = terms
+    rms = float(np.sqrt(np.mean(np.square(residual))))
+    return SineFit(frequency_hz, amplitude, float(coefficients[0]), phase_rad, rms, tuple(overtones))
+
+
+def _correlation(theory: NDArray[np.float64], measured: NDArray[np.float64]) -> float | None:
+    for curve in (theory, measured):
+        if np.ptp(curve) <= CONSTANT_SWING * np.abs(curve).max():
+            return None
+    return float(np.corrcoef(theory, measured)[0, 1])

@@ -1,0 +1,268 @@
+"""The figures of the report, after Fig. 9 of the paper: line streams, frames, curves, error over time.
+
+Each function makes one matplotlib ``Figure`` from a :class:`~acquire.evaluate.result.DemoResult`, without
+pyplot and its global state; :func:`save_figures` writes all of them as PNG. This is the only module that
+imports matplotlib, so that no command pays for it which draws nothing.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import MaxNLocator
+
+from acquire.evaluate.curves import region_mean
+from acquire.lines import ARMS
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from matplotlib.axes import Axes
+    from numpy.typing import NDArray
+
+    from acquire.evaluate.curves import CurveComparison
+    from acquire.evaluate.result import DemoResult, Region
+
+DPI = 150
+WIDTH_IN = 10.0
+FRAME_COLUMNS = 6
+DETAIL_PERIODS = 3
+DETAIL_SHARE = 0.1
+ERROR_SHARE = 0.5
+"""The error's scale ends at this share of the peak."""
+
+INK = "#1f2933"
+THEORY = "#9aa5b1"
+HIGHLIGHT = "#f0b429"
+MASKED = "#d55e00"
+SOLVER_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
+"""Okabe and Ito's palette, which stays distinct under the common colour deficiencies."""
+
+STYLE: Any = {
+    "font.size": 9.5,
+    "axes.titlesize": 10.5,
+    "axes.titlelocation": "left",
+    "axes.titleweight": "bold",
+    "axes.labelcolor": INK,
+    "axes.edgecolor": "#7b8794",
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#e4e7eb",
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+    "legend.frameon": False,
+    "image.interpolation": "nearest",
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+}
+
+
+def save_figures(result: DemoResult, directory: Path) -> dict[str, Path]:
+    """Write ``lines.png``, ``frames.png``, ``curves.png`` and ``psnr.png``; returns name -> path.
+
+    Without regions there are no curves.
+    """
+    makers = {"lines": line_streams, "frames": frames, "curves": intensity_curves, "psnr": psnr_over_time}
+    if not result.regions:
+        del makers["curves"]
+    paths = {name: directory / f"{name}.png" for name in makers}
+    with mpl.rc_context(STYLE):
+        for name, make in makers.items():
+            make(result).savefig(paths[name], dpi=DPI)
+    return paths
+
+
+def line_streams(result: DemoResult) -> Figure:
+    """Both arms' lines as pictures, time downwards (Fig. 9a); samples that are masked stand out in colour."""
+    segment, times = result.segment, result.line_ms
+    figure = _figure(4.6)
+    axes = figure.subplots(1, 2, sharey=True, squeeze=False)[0]
+    usable = segment.lines[segment.mask]
+    low, high = (float(usable.min()), float(usable.max())) if usable.size else (0.0, 1.0)
+    half = np.diff(times).mean() / 2 if len(times) > 1 else 0.5
+    extent = (-0.5, segment.geometry.stages - 0.5, times[-1] + half, times[0] - half)
+    colours = mpl.colormaps["gray"].with_extremes(bad=MASKED)
+    for arm, ax in enumerate(axes):
+        values = np.ma.masked_where(~segment.mask[arm], segment.lines[arm])
+        image = ax.imshow(values, cmap=colours, vmin=low, vmax=high, extent=extent, aspect="auto")
+        ax.set_title(f"Camera {ARMS[arm].upper()}")
+        masked = np.count_nonzero(~segment.mask[arm])
+        if masked:
+            ax.set_title(f"{masked} samples masked", loc="right", color=MASKED, fontweight="normal")
+        ax.set_xlabel("pixel of the line")
+        ax.grid(visible=False)
+    axes[0].set_ylabel("time since start (ms)")
+    figure.colorbar(image, ax=list(axes), label="recorded value (DN)", pad=0.015, aspect=30)
+    return figure
+
+
+def frames(result: DemoResult) -> Figure:
+    """Representative frames (Fig. 9b): the truth, then each solver above its absolute error."""
+    rows = [("truth", result.truth, False)]
+    for solver in result.solvers:
+        error = np.abs(solver.video - result.truth)
+        rows += [(solver.label.replace(" (", "\n("), solver.video, False), ("|error|", error, True)]
+    picks = representative_frames(result)
+    aspect = result.truth.shape[1] / result.truth.shape[2]
+    figure = _figure(0.3 + 1.5 * aspect * len(rows))
+    axes = figure.subplots(len(rows), len(picks), squeeze=False)
+    for (label, video, is_error), row in zip(rows, axes, strict=True):
+        for frame, ax in zip(picks, row, strict=True):
+            _show_frame(ax, result, video[frame], is_error=is_error)
+            if not is_error:
+                _stamp(ax, f"#{frame}  {result.frame_ms[frame]:.2f} ms")
+        row[0].set_ylabel(label, fontweight="normal" if is_error else "bold")
+    _colour_bar(figure, axes[0], "intensity", "neither")
+    _colour_bar(figure, axes[2], "|error|", "max")
+    return figure
+
+
+def intensity_curves(result: DemoResult) -> Figure:
+    """Mean intensity of each region against theory (Fig. 9c): where, the whole, a few periods, the fits."""
+    figure = _figure(0.7 + 1.45 * len(result.regions))
+    axes = figure.subplots(len(result.regions), 3, squeeze=False, width_ratios=[1, 4.6, 2.1])
+    for row, (where, whole, detail) in enumerate(axes):
+        window = _detail_window(result, row)
+        _show_region(where, result, result.regions[row])
+        _plot_curves(whole, result, row)
+        whole.axvspan(*window, color=HIGHLIGHT, alpha=0.2, lw=0)
+        whole.set(xlim=(result.frame_ms[0], result.frame_ms[-1]), ylabel="intensity")
+        whole.tick_params(labelbottom=row == len(axes) - 1)
+        _plot_curves(detail, result, row)
+        detail.set_xlim(*window)
+        detail.tick_params(labelleft=False)
+        detail.xaxis.set_major_locator(MaxNLocator(3))
+        _list_fits(detail, result, row)
+    axes[0, 2].set_title("detail")
+    for ax in axes[-1, 1:]:
+        ax.set_xlabel("time since start (ms)")
+    handles, labels = axes[0, 1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
+    return figure
+
+
+def psnr_over_time(result: DemoResult) -> Figure:
+    """PSNR of each frame for every solver, with the PSNR of the whole video as a dashed line."""
+    figure = _figure(2.9)
+    ax = figure.subplots()
+    for solver, colour in _coloured(result):
+        ax.plot(result.frame_ms, solver.psnr_per_frame, color=colour, lw=1.1, label=solver.label)
+        ax.axhline(solver.psnr_db, color=colour, lw=0.9, ls=(0, (5, 4)))
+    ax.set_xlim(result.frame_ms[0], result.frame_ms[-1])
+    ax.set_xlabel("time since start (ms)")
+    ax.set_ylabel("PSNR (dB)")
+    figure.legend(loc="outside upper right", ncols=len(result.solvers))
+    return figure
+
+
+def representative_frames(result: DemoResult, count: int = FRAME_COLUMNS) -> NDArray[np.int64]:
+    """Indices (count,) spread over one period of the slowest region; over the whole video without one."""
+    total = len(result.frame_ms)
+    period = _slowest_period(result)
+    if not count <= period <= total:
+        return np.linspace(0, total - 1, min(count, total)).round().astype(np.int64)
+    first = min(total // 2, total - period)
+    return first + (np.arange(count) * period) // count
+
+
+def _slowest_period(result: DemoResult) -> int:
+    """Frames in one period of the slowest region that changes; 0 without one."""
+    rates = [curve.theory.frequency_hz for curve in result.solvers[0].curves if not curve.constant]
+    return round(1e6 / (min(rates) * result.frame_interval_us)) if rates else 0
+
+
+def _detail_window(result: DemoResult, row: int) -> tuple[float, float]:
+    """A few periods of this region about the middle of the video, in ms."""
+    first, last = result.frame_ms[0], result.frame_ms[-1]
+    curve = result.solvers[0].curves[row]
+    share_ms = DETAIL_SHARE * (last - first)
+    wanted_ms = share_ms if curve.constant else DETAIL_PERIODS * 1e3 / curve.theory.frequency_hz
+    half = min(wanted_ms, last - first) / 2
+    return (first + last) / 2 - half, (first + last) / 2 + half
+
+
+def _show_frame(ax: Axes, result: DemoResult, frame: NDArray[Any], *, is_error: bool) -> None:
+    if is_error:
+        ax.imshow(frame, cmap="inferno", vmin=0, vmax=ERROR_SHARE * result.peak)
+    else:
+        ax.imshow(frame, cmap="gray", vmin=0, vmax=result.peak)
+    _bare(ax)
+
+
+def _colour_bar(figure: Figure, row: NDArray[Any], label: str, extend: str) -> None:
+    image = row[-1].get_images()[0]
+    figure.colorbar(image, ax=list(row), label=label, extend=extend, pad=0.01, aspect=11, shrink=0.9)
+
+
+def _show_region(ax: Axes, result: DemoResult, region: Region) -> None:
+    ax.imshow(result.truth.mean(axis=0), cmap="gray", vmin=0)
+    if not region.mask.all():  # a region without an edge has no contour
+        ax.contour(region.mask, levels=[0.5], colors=HIGHLIGHT, linewidths=1.2)
+    ax.set_ylabel(region.name, fontweight="bold")
+    _bare(ax)
+
+
+def _plot_curves(ax: Axes, result: DemoResult, row: int) -> None:
+    region = result.regions[row]
+    scale = _brightest(region)
+    ax.plot(result.frame_ms, region.theory / scale, color=THEORY, lw=3.0, label="theory")
+    for rank, (solver, colour) in enumerate(_coloured(result)):
+        measured = region_mean(solver.video, region.mask) / scale
+        # the default solver comes first in the legend and lies on top
+        ax.plot(result.frame_ms, measured, color=colour, lw=1.0, label=solver.label, zorder=3 - 0.1 * rank)
+    ax.set_ylim(min(0.0, ax.get_ylim()[0]), max(1.05, ax.get_ylim()[1]))
+
+
+def _list_fits(ax: Axes, result: DemoResult, row: int) -> None:
+    """Right of the axes: what was set, and below it each solver's fit in the solver's colour."""
+    set_hz = result.regions[row].set_hz
+    texts = [("constant" if set_hz is None else f"set {set_hz:.0f} Hz", INK)]
+    texts += [(_fit_text(solver.curves[row]), colour) for solver, colour in _coloured(result)]
+    for i, (text, colour) in enumerate(texts):
+        y = 0.5 + 0.22 * ((len(texts) - 1) / 2 - i)
+        ax.text(1.05, y, text, color=colour, fontsize=9, va="center", transform=ax.transAxes)
+
+
+def _brightest(region: Region) -> float:
+    """What the figure shows as 1; theory and measurement share it, so that a lost amplitude is seen."""
+    return float(np.max(np.abs(region.theory))) or 1.0
+
+
+def _fit_text(curve: CurveComparison) -> str:
+    if curve.amplitude_ratio is not None:
+        return f"{curve.measured.frequency_hz:.1f} Hz × {curve.amplitude_ratio:.2f}"
+    return "–" if curve.level_ratio is None else f"level × {curve.level_ratio:.2f}"
+
+
+def _coloured(result: DemoResult) -> list[tuple[Any, str]]:
+    colours = [SOLVER_COLOURS[i % len(SOLVER_COLOURS)] for i in range(len(result.solvers))]
+    return list(zip(result.solvers, colours, strict=True))
+
+
+def _figure(height_in: float) -> Figure:
+    return Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+
+
+def _bare(ax: Axes) -> None:
+    """A picture without ticks and frame."""
+    ax.set(xticks=[], yticks=[])
+    ax.grid(visible=False)
+    for spine in ax.spines.values():
+        spine.set_visible(False)
+
+
+def _stamp(ax: Axes, text: str) -> None:
+    """Time within the picture, lower left; outlined, because it may lie on white."""
+    outline = [withStroke(linewidth=1.6, foreground="black")]
+    ax.text(0.03, 0.03, text, color="white", fontsize=7, transform=ax.transAxes, path_effects=outline)

@@ -1,0 +1,122 @@
+"""How far a video is from the truth: PSNR and SSIM, whole and per frame, in float64.
+
+Both compare ``(time, row, column)`` arrays (one picture ``(row, column)`` is a video of one frame) and
+take the peak, the brightest value that the scene can have, from the truth unless it is given.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from acquire.errors import NumericsError, UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+SSIM_SIGMA = 1.5
+"""Standard deviation of the Gaussian window in pixels (Wang et al. 2004, Section III.C)."""
+SSIM_TRUNCATE = 3.5
+SSIM_RADIUS = int(SSIM_TRUNCATE * SSIM_SIGMA + 0.5)
+"""The window reaches 5 pixels to each side; a border of that width is left out of the mean."""
+SSIM_K1, SSIM_K2 = 0.01, 0.03
+
+
+def psnr(video: NDArray[Any], truth: NDArray[Any], peak: float | None = None) -> float:
+    """10·log10(peak² / mean squared error) in dB over all voxels; ``inf`` for equal arrays.
+
+    ``peak`` is the truth's maximum unless given. Raises UsageError for shapes that differ or a peak that
+    is not positive, NumericsError for values that are not finite.
+    """
+    video, truth = check_pair(video, truth)
+    error = _mean_squared_error(video, truth)
+    return float(_decibel(np.array([error]), checked_peak(truth, peak))[0])
+
+
+def psnr_per_frame(
+    video: NDArray[Any], truth: NDArray[Any], peak: float | None = None
+) -> NDArray[np.float64]:
+    """PSNR of each frame (t,) in dB against one common peak; raises as :func:`psnr`."""
+    video, truth = check_pair(video, truth)
+    pairs = zip(video, truth, strict=True)
+    errors = np.array([_mean_squared_error(frame, true_frame) for frame, true_frame in pairs])
+    return _decibel(errors, checked_peak(truth, peak))
+
+
+def ssim(video: NDArray[Any], truth: NDArray[Any], data_range: float | None = None) -> float:
+    """Mean over the frames of the structural similarity, 1 for equal frames (Wang et al. 2004).
+
+    ``data_range`` is the truth's maximum unless given. Raises as :func:`psnr`, and UsageError for frames
+    smaller than the 11 x 11 window.
+    """
+    return float(ssim_per_frame(video, truth, data_range).mean())
+
+
+def ssim_per_frame(
+    video: NDArray[Any], truth: NDArray[Any], data_range: float | None = None
+) -> NDArray[np.float64]:
+    """Structural similarity of each frame (t,); raises as :func:`ssim`."""
+    video, truth = check_pair(video, truth)
+    window = 2 * SSIM_RADIUS + 1
+    if min(video.shape[1:]) < window:
+        raise UsageError(f"SSIM of frames {video.shape[1:]}", possible=f"at least {window} x {window} pixels")
+    peak = checked_peak(truth, data_range)
+    # frame by frame: the five filtered moments of a whole video would be five more videos in memory
+    return np.array([_ssim_frame(x, y, peak) for x, y in zip(video, truth, strict=True)])
+
+
+def check_pair(video: NDArray[Any], truth: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Both as (time, row, column); UsageError unless the shapes agree, NumericsError unless all is finite."""
+    video, truth = np.asarray(video), np.asarray(truth)
+    if video.shape != truth.shape or video.ndim not in {2, 3} or video.size == 0:
+        raise UsageError(
+            f"comparison of a video {video.shape} with a truth {truth.shape}",
+            possible="two arrays of one shape (time, row, column) or (row, column)",
+        )
+    check_finite(video, "the video")
+    check_finite(truth, "the truth")
+    return (video, truth) if video.ndim == 3 else (video[None], truth[None])
+
+
+def check_finite(values: NDArray[Any], what: str) -> None:
+    """Raise NumericsError that counts the values which are not finite."""
+    bad = values.size - np.count_nonzero(np.isfinite(values))
+    if bad:
+        raise NumericsError(f"{bad} of {values.size} values of {what} are not finite")
+
+
+def checked_peak(truth: NDArray[Any], peak: float | None = None) -> float:
+    """``peak``, or the truth's maximum; UsageError unless it is positive and finite."""
+    value = float(np.max(truth)) if peak is None else float(peak)
+    if not (np.isfinite(value) and value > 0):
+        raise UsageError(f"peak {value} for a comparison", possible="a positive number")
+    return value
+
+
+def _mean_squared_error(video: NDArray[Any], truth: NDArray[Any]) -> float:
+    return float(np.mean(np.square(np.subtract(video, truth, dtype=np.float64))))
+
+
+def _decibel(errors: NDArray[np.float64], peak: float) -> NDArray[np.float64]:
+    with np.errstate(divide="ignore"):
+        decibel: NDArray[np.float64] = -10 * np.log10(errors / peak**2)
+    return decibel
+
+
+def _local_mean(image: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Gaussian-weighted mean about each pixel whose window lies inside the image."""
+    smooth: NDArray[np.float64] = gaussian_filter(image, SSIM_SIGMA, truncate=SSIM_TRUNCATE)
+    return smooth[SSIM_RADIUS:-SSIM_RADIUS, SSIM_RADIUS:-SSIM_RADIUS]
+
+
+def _ssim_frame(video: NDArray[Any], truth: NDArray[Any], data_range: float) -> float:
+    x, y = video.astype(np.float64), truth.astype(np.float64)
+    c1, c2 = (SSIM_K1 * data_range) ** 2, (SSIM_K2 * data_range) ** 2
+    mx, my = _local_mean(x), _local_mean(y)
+    var_x, var_y = _local_mean(x * x) - mx * mx, _local_mean(y * y) - my * my
+    cov = _local_mean(x * y) - mx * my
+    luminance = (2 * mx * my + c1) / (mx * mx + my * my + c1)
+    contrast_structure = (2 * cov + c2) / (var_x + var_y + c2)
+    return float(np.mean(luminance * contrast_structure))

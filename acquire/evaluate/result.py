@@ -1,0 +1,206 @@
+"""What a demonstration run found out: the facts behind the report, with nothing of how they are shown.
+
+:class:`DemoResult` holds the arrays and facts of one run, checked against one another;
+:func:`evaluate_solver` makes what it needs of each reconstruction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.errors import UsageError
+from acquire.evaluate import metrics
+from acquire.evaluate.curves import CurveComparison, compare_curve, region_mean
+from acquire.evaluate.summary import summarise
+from acquire.lines import ARMS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from datetime import datetime
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from acquire.lines import Segment
+
+
+@dataclass(frozen=True, slots=True)
+class RigFacts:
+    """What took the recording. ``code`` and ``scene`` are one line of text each."""
+
+    name: str
+    code: str
+    scene: str
+    simulated: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ArmLedger:
+    """What became of one arm's lines since it was armed.
+
+    ``delivered`` by the camera, of which ``preroll`` were exposed before the start and discarded;
+    ``lost`` by cause. The recording has ``recorded`` rows, of which ``missing`` hold no line.
+    ``ring_peak`` of ``ring_slots`` blocks were waiting at the worst moment.
+    """
+
+    delivered: int
+    preroll: int
+    recorded: int
+    missing: int
+    ring_peak: int
+    ring_slots: int
+    lost: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def lost_lines(self) -> int:
+        return sum(self.lost.values())
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureFacts:
+    """The recording and how it came about; ``arms`` maps arm -> ledger."""
+
+    recording: Path
+    condition: str
+    end_reason: str
+    seconds: float
+    size_bytes: int
+    arms: Mapping[str, ArmLedger]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Region:
+    """An area whose intensity is followed: ``mask`` (row, column) bool, ``theory`` (t,) in the scene's units.
+
+    ``set_hz`` is the frequency that the scene was asked for, None for a constant.
+    """
+
+    name: str
+    mask: NDArray[np.bool_]
+    theory: NDArray[np.float64]
+    set_hz: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One step of the run and how long it took."""
+
+    name: str
+    seconds: float
+    detail: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SolverResult:
+    """One reconstruction of the segment against the truth; :func:`evaluate_solver` makes it.
+
+    ``video`` (t, row, column) and ``psnr_per_frame`` (t,) cover the trusted frames only;
+    ``curves`` has one entry per region.
+    """
+
+    label: str
+    video: NDArray[Any]
+    seconds: float
+    iterations: int
+    psnr_db: float
+    ssim: float
+    psnr_per_frame: NDArray[np.float64]
+    curves: tuple[CurveComparison, ...]
+
+
+def evaluate_solver(
+    label: str,
+    video: NDArray[Any],
+    truth: NDArray[Any],
+    regions: tuple[Region, ...],
+    frame_interval_s: float,
+    *,
+    seconds: float,
+    iterations: int,
+) -> SolverResult:
+    """Compare the trusted frames of a reconstruction with the truth; raises as the metrics and fits do."""
+    return SolverResult(
+        label=label,
+        video=video,
+        seconds=seconds,
+        iterations=iterations,
+        psnr_db=metrics.psnr(video, truth),
+        ssim=metrics.ssim(video, truth),
+        psnr_per_frame=metrics.psnr_per_frame(video, truth),
+        curves=tuple(
+            compare_curve(region.name, region.theory, region_mean(video, region.mask), frame_interval_s)
+            for region in regions
+        ),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DemoResult:
+    """Everything that the report shows.
+
+    ``frame_time_ns`` (t,) are the UTC times of the trusted frames, which ``truth`` and every solver's
+    video hold; ``start_ns`` is the start of the trigger's run, from which the figures count.
+    ``solvers[0]`` is the default one, which the headline quotes. Raises UsageError when the arrays do not
+    fit together.
+    """
+
+    title: str
+    when: datetime
+    command: str
+    seed: int
+    rig: RigFacts
+    capture: CaptureFacts
+    segment: Segment
+    start_ns: int
+    frame_time_ns: NDArray[np.int64]
+    truth: NDArray[Any]
+    solvers: tuple[SolverResult, ...]
+    regions: tuple[Region, ...]
+    stages: tuple[Stage, ...]
+
+    def __post_init__(self) -> None:
+        frames = len(self.frame_time_ns)
+        if self.truth.ndim != 3 or self.truth.shape[0] != frames or frames < 2:
+            raise UsageError(f"report of a truth {self.truth.shape} with {frames} time stamps")
+        if not self.solvers:
+            raise UsageError("report without a reconstruction", possible="one or more")
+        if set(self.capture.arms) != set(ARMS):
+            raise UsageError(f"report with ledgers of {sorted(self.capture.arms)}", possible=f"{list(ARMS)}")
+        for region in self.regions:
+            found = (region.mask.shape, region.theory.shape)
+            self._check(f"region {region.name!r}", found, (self.truth.shape[1:], (frames,)))
+        for solver in self.solvers:
+            names = tuple(curve.name for curve in solver.curves)
+            expected = (self.truth.shape, tuple(region.name for region in self.regions))
+            self._check(f"solver {solver.label!r}", (solver.video.shape, names), expected)
+
+    @staticmethod
+    def _check(what: str, found: tuple[Any, ...], expected: tuple[Any, ...]) -> None:
+        if found != expected:
+            raise UsageError(f"report of {what} with {found}", possible=f"{expected}, as the truth has it")
+
+    @property
+    def frame_ms(self) -> NDArray[np.float64]:
+        """Time of each frame since the start of the run."""
+        return (self.frame_time_ns - self.start_ns) / 1e6
+
+    @property
+    def line_ms(self) -> NDArray[np.float64]:
+        """Time at which each line's read-out began, since the start of the run."""
+        return (self.segment.time_ns - self.start_ns) / 1e6
+
+    @property
+    def frame_interval_us(self) -> float:
+        return float(np.diff(self.frame_ms).mean()) * 1e3
+
+    @property
+    def peak(self) -> float:
+        """White of the figures: the brightest value of the truth."""
+        return metrics.checked_peak(self.truth)
+
+    def summary(self) -> dict[str, Any]:
+        """All numbers of the report as JSON-able values; see :func:`acquire.evaluate.summary.summarise`."""
+        return summarise(self)
