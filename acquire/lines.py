@@ -96,7 +96,8 @@ class Segment:
     time_ns : (L_R,) int64 UTC at which each line's read-out begins
     first_line : the trigger's number of the first line
     substep_ns : duration of a sub-step
-    black_level_dn, responsivity_dn : DN = black level + responsivity · Y, with Y of Eq. (1)
+    black_level_dn, responsivity_dn : DN = black level + responsivity · Y, with Y of Eq. (1);
+        one number for both arms, or one per arm
     """
 
     lines: NDArray[Any]
@@ -106,8 +107,8 @@ class Segment:
     time_ns: NDArray[np.int64]
     first_line: int = 0
     substep_ns: float = 1.0
-    black_level_dn: float = 0.0
-    responsivity_dn: float = 1.0
+    black_level_dn: float | tuple[float, float] = 0.0
+    responsivity_dn: float | tuple[float, float] = 1.0
 
     def __post_init__(self) -> None:
         shape = self.geometry.lines_shape
@@ -126,7 +127,11 @@ class Segment:
 
     def samples(self, dtype: type[np.floating[Any]] = np.float32) -> NDArray[Any]:
         """Y of Eq. (1) (2, L_R, M): black level removed, in units of the scene; 0 where masked."""
-        scaled = (self.lines.astype(dtype) - dtype(self.black_level_dn)) / dtype(self.responsivity_dn)
+        black, gain = (
+            np.asarray(value, dtype).reshape(-1, 1, 1)
+            for value in (self.black_level_dn, self.responsivity_dn)
+        )
+        scaled = (self.lines.astype(dtype) - black) / gain
         return np.where(self.mask, scaled, dtype(0))
 
     def frame_time_ns(self, temporal_merge: int = 1) -> NDArray[np.int64]:

@@ -1,0 +1,49 @@
+"""The temporal subspace: the first K cosines of the segment's time axis (orthonormal DCT-II).
+
+A video of T frames whose coefficients beyond K are 0 is band-limited to K/(2T) of the frame rate. Working
+with the K coefficient frames instead of T frames is what makes the solvers fast.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.fft import dct, idct
+
+from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+class TemporalBasis:
+    """D (K, T), orthonormal rows: θ = D·x analyses, x = Dᵀ·θ synthesises, along axis 0."""
+
+    def __init__(self, frames: int, count: int, dtype: type[np.floating[Any]] = np.float32) -> None:
+        if not 1 <= count <= frames:
+            raise UsageError(
+                f"{count} temporal coefficients", possible=f"1 to {frames} (frames of the segment)"
+            )
+        self.frames, self.count, self.dtype = frames, count, np.dtype(dtype)
+
+    def matrix(self, grid: int | None = None) -> NDArray[Any]:
+        """D (K, grid) at ``grid`` ≥ K equidistant instants of the span (default: the frames)."""
+        points = grid or self.frames
+        if points < self.count:
+            raise UsageError(f"{points} instants for {self.count} cosines", possible=f"{self.count} or more")
+        k = np.arange(self.count)[:, None]
+        rows = np.sqrt(2 / points) * np.cos(np.pi * k * (np.arange(points) + 0.5) / points)
+        rows[0] /= np.sqrt(2)
+        matrix: NDArray[Any] = rows.astype(self.dtype)
+        return matrix
+
+    def synthesize(self, theta: NDArray[Any]) -> NDArray[Any]:
+        """x = Dᵀ·θ: (K, …) → (T, …)."""
+        video: NDArray[Any] = idct(theta, n=self.frames, axis=0, norm="ortho", workers=2)
+        return video.astype(self.dtype, copy=False)
+
+    def analyze(self, video: NDArray[Any]) -> NDArray[Any]:
+        """θ = D·x: (T, …) → (K, …)."""
+        theta: NDArray[Any] = dct(video, axis=0, norm="ortho", workers=2)[: self.count]
+        return theta.astype(self.dtype, copy=False)

@@ -1,0 +1,117 @@
+"""A test that leaves something behind fails: threads, child processes, descriptors, shared memory.
+
+What is left is looked at again and again for a grace period, since processes and sockets take a moment to
+go. Things that a library makes once and keeps for the life of the process are made before the first test.
+"""
+
+from __future__ import annotations
+
+import gc
+import multiprocessing.resource_tracker
+import re
+import sys
+import threading
+import time
+import types
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+import zarr
+import zarr.storage
+from numcodecs import blosc
+
+from acquire.forward.kernels import transpose_frames
+
+POOL_THREADS = re.compile(r"asyncio_\d+|zarr|fsspec|pydevd|AnyIO worker thread")
+"""Worker threads that libraries keep for reuse; they hold nothing of a test."""
+
+LOOK_AGAIN_S = 0.02
+
+Found = dict[str, str]
+"""Key of a thing that exists → how to name it to the reader."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addini("leak_grace_s", "seconds that a test's leftovers may take to go", default="5")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _made_once() -> None:
+    """What lives as long as the process, however many tests use it."""
+    multiprocessing.resource_tracker.ensure_running()
+    array = zarr.create_array(zarr.storage.MemoryStore(), shape=(1,), dtype="u1")
+    array[:] = np.ones(1, "u1")
+    assert array[0] == 1
+    blosc.compress(b"1", b"lz4", 1)  # makes its lock
+    transpose_frames(np.zeros((1, 1, 1), np.float32), np.zeros((1, 1, 1), np.float32))  # numba's threads
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _children_need_no_pytest() -> Iterator[None]:
+    """A spawned child imports its parent's main module: with pytest's, half of its start would be that."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "__main__", types.ModuleType("__main__"))
+        yield
+
+
+@pytest.fixture(autouse=True)
+def _nothing_left(request: pytest.FixtureRequest, _made_once: None) -> Iterator[None]:
+    before = existing()
+    yield
+    grace_s = float(request.config.getini("leak_grace_s"))
+    if left := leftovers(before, grace_s):
+        pytest.fail("left behind: " + "; ".join(sorted(left.values())), pytrace=False)
+
+
+def leftovers(before: Found, grace_s: float) -> Found:
+    """What exists now and did not before, once ``grace_s`` has not made it go."""
+    deadline = time.monotonic() + grace_s
+    while left := {key: name for key, name in existing().items() if key not in before}:
+        if time.monotonic() > deadline:
+            return left
+        gc.collect()
+        time.sleep(LOOK_AGAIN_S)
+    return {}
+
+
+def existing() -> Found:
+    return threads() | children() | descriptors() | shared_memory()
+
+
+def threads() -> Found:
+    alive = [thread for thread in threading.enumerate() if not POOL_THREADS.match(thread.name)]
+    return {f"thread {id(thread)}": f"thread {thread.name!r}" for thread in alive}
+
+
+def children() -> Found:
+    """Descendants of this process, by number and birth, since numbers are used again."""
+    found: Found = {}
+    for child in psutil.Process().children(recursive=True):
+        try:
+            found[f"process {child.pid} {child.create_time()}"] = (
+                f"process {child.pid} ({' '.join(child.cmdline())[-120:]}), {child.status()}"
+            )
+        except psutil.NoSuchProcess:
+            continue  # gone while it was looked at: not left behind
+    return found
+
+
+def descriptors() -> Found:
+    found: Found = {}
+    for entry in list(Path("/proc/self/fd").iterdir()):
+        try:
+            target = entry.readlink()
+        except FileNotFoundError:
+            continue  # the descriptor of the listing itself
+        found[f"fd {entry.name} {target}"] = f"descriptor {entry.name} of {target}"
+    return found
+
+
+def shared_memory() -> Found:
+    """Mappings of anonymous files and of named shared memory in this process."""
+    maps = Path("/proc/self/maps").read_text(encoding="utf-8").splitlines()
+    shared = [line.split(maxsplit=5) for line in maps if "/memfd:" in line or "/dev/shm/" in line]
+    return {f"map {fields[0]} {fields[4]}": f"mapping of {fields[5]}" for fields in shared}

@@ -1,0 +1,66 @@
+"""The temporal basis, and Λ′ restricted to it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from acquire.errors import UsageError
+from acquire.forward import DualArm
+from acquire.geometry import Geometry
+from acquire.recon.band import BandOperator, InBasis
+from acquire.recon.basis import TemporalBasis
+
+
+def test_basis_is_orthonormal_and_both_ways_agree() -> None:
+    basis = TemporalBasis(50, 12, np.float64)
+    D = basis.matrix()
+    np.testing.assert_allclose(D @ D.T, np.eye(12), atol=1e-12)
+    np.testing.assert_allclose(basis.matrix(24) @ basis.matrix(24).T, np.eye(12), atol=1e-12)
+    theta = np.random.default_rng(0).standard_normal((12, 3, 4))
+    video = basis.synthesize(theta)
+    np.testing.assert_allclose(video, np.tensordot(D.T, theta, 1), atol=1e-12)
+    np.testing.assert_allclose(basis.analyze(video), theta, atol=1e-12)
+
+
+def test_the_coarse_grid_samples_the_same_function() -> None:
+    """A video of twice the rate's worth of instants passes through the same band-limited signal."""
+    basis = TemporalBasis(60, 10, np.float64)
+    theta = np.random.default_rng(1).standard_normal(10)
+    coarse = basis.matrix(20).T @ theta * np.sqrt(20 / 60)
+    fine = basis.synthesize(theta)
+    np.testing.assert_allclose(coarse, fine[1::3], atol=1e-12)
+
+
+def test_basis_refuses_more_cosines_than_instants() -> None:
+    with pytest.raises(UsageError, match="1 to 5"):
+        TemporalBasis(5, 6)
+    with pytest.raises(UsageError, match="3 instants for 4"):
+        TemporalBasis(5, 4).matrix(3)
+
+
+@st.composite
+def cases(draw: st.DrawFn) -> tuple[Geometry, int, int, int, int]:
+    g = Geometry(draw(st.integers(1, 5)), draw(st.integers(1, 3)), draw(st.integers(1, 6)))
+    N_m, T_m = draw(st.integers(1, g.size)), draw(st.integers(1, g.span + 1))
+    frames = g.video_shape(N_m, T_m)[0]
+    return g, N_m, T_m, draw(st.integers(1, frames)), draw(st.integers(0, 2**32 - 1))
+
+
+@settings(max_examples=60, deadline=None)
+@given(cases())
+def test_band_operator_is_the_sensing_matrix_in_the_basis(case: tuple[Geometry, int, int, int, int]) -> None:
+    g, N_m, T_m, K, seed = case
+    rng = np.random.default_rng(seed)
+    code = rng.integers(0, 2, g.span).astype(np.uint8)
+    whole = DualArm(g, code, N_m, T_m, np.float64)
+    basis = TemporalBasis(whole.video_shape[0], K, np.float64)
+    band, composed = BandOperator(g, code, basis, N_m, T_m), InBasis(whole, basis)
+    theta = rng.standard_normal(band.theta_shape)
+    lines = rng.standard_normal(g.lines_shape)
+    np.testing.assert_allclose(band.forward(theta), composed.forward(theta), atol=1e-11)
+    np.testing.assert_allclose(band.adjoint(lines), composed.adjoint(lines), atol=1e-11)
+    left, right = np.vdot(band.forward(theta), lines), np.vdot(theta, band.adjoint(lines))
+    assert left == pytest.approx(right, abs=1e-9)
