@@ -40,7 +40,7 @@ class GeometryConfig(_Model):
     """The sensor as the model sees it."""
 
     stages: int = Field(ge=1, le=4096, description="M, TDI stages; also pixels per line")
-    substeps: int = Field(ge=1, le=16, description="S, charge-transfer steps per line")
+    substeps: int = Field(ge=1, le=8, description="S, charge-transfer steps per line")
 
     def segment(self, lines: int) -> Geometry:
         return Geometry(self.stages, self.substeps, lines)

@@ -1,0 +1,93 @@
+"""The growing arrays of one arm; row i of each is the same line."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from acquire.errors import DataError
+from acquire.store import layout
+from acquire.store.shard import ArrayWriter
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from acquire.lines import TaggedBlock
+    from acquire.store.files import Publisher
+    from acquire.store.spec import RecordingSpec
+
+
+class ArmWriter:
+    """The arrays of one arm; all of them get the same rows."""
+
+    def __init__(self, directory: Path, spec: RecordingSpec) -> None:
+        self.directory = directory
+        self._attributes = {"arm": directory.name, "first_line": spec.first_line}
+        self._first_line = spec.first_line
+        self._row_shape = (spec.pixels,)
+        durable = spec.fsync == "commit"
+        self._arrays = {
+            column: ArrayWriter(directory / column.name, layout.column_shape(column, spec), durable=durable)
+            for column in layout.line_columns(spec.dtype)
+        }
+
+    @property
+    def next_line(self) -> int:
+        return self._first_line + min(array.rows for array in self._arrays.values())
+
+    @property
+    def whole_rows(self) -> int:
+        """Rows that are on disk in every array, in whole chunks."""
+        return min(array.whole_rows for array in self._arrays.values())
+
+    @property
+    def bytes_written(self) -> int:
+        return sum(array.bytes_written for array in self._arrays.values())
+
+    def create(self) -> None:
+        for array in self._arrays.values():
+            array.directory.mkdir(parents=True)
+
+    def append(self, block: TaggedBlock) -> None:
+        self._check(block)
+        for column, array in self._arrays.items():
+            array.append(getattr(block, column.source))
+
+    def pad(self) -> None:
+        for array in self._arrays.values():
+            array.pad()
+
+    def sync(self) -> None:
+        for array in self._arrays.values():
+            array.sync()
+
+    def close(self) -> None:
+        for array in self._arrays.values():
+            array.close()
+
+    def publish(self, publisher: Publisher, rows: int) -> dict[str, layout.Document]:
+        """Make ``rows`` rows visible; returns the metadata by path below the recording."""
+        documents = {
+            column.name: layout.line_array(column, array.shape, rows)
+            for column, array in self._arrays.items()
+        }
+        for name, document in documents.items():
+            publisher.replace(self.directory / name / "zarr.json", layout.to_json(document))
+        group = layout.group_document(self._attributes, documents)
+        publisher.replace(self.directory / "zarr.json", layout.to_json(group))
+        arm = self.directory.name
+        return {arm: group} | {f"{arm}/{name}": document for name, document in documents.items()}
+
+    def _check(self, block: TaggedBlock) -> None:
+        if block.first_line != self.next_line:
+            raise DataError(
+                f"arm {block.arm}: a block from line {block.first_line} on",
+                possible=f"line {self.next_line}, the next; a lost line keeps its row, flagged as missing",
+            )
+        for column, array in self._arrays.items():
+            rows = getattr(block, column.source)
+            expected = (len(block), *array.shape.row_shape)
+            if rows.shape != expected or rows.dtype != array.shape.dtype:
+                raise DataError(
+                    f"arm {block.arm}: {column.source} of a block is {rows.dtype} {rows.shape}",
+                    possible=f"{array.shape.dtype} {expected}",
+                )

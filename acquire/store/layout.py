@@ -1,0 +1,206 @@
+"""The recording format as Zarr v3 metadata: pure functions from what is known to JSON documents.
+
+::
+
+    NAME.zarr/        zarr.json    the commit record: attributes and the metadata of everything below
+      a/  b/          zarr.json    one arm; its own copy of its arrays' metadata
+        lines         (line, pixel)
+        code_index  code  tick  time  flags       (line)
+      events/  gaps/  zarr.json    tables: one 1-D array per column
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.lines import LineFlag
+from acquire.store.shard import ArrayShape
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from acquire.store.shard import Codec
+    from acquire.store.spec import RecordingSpec
+
+Document = dict[str, Any]
+"""The content of one zarr.json."""
+
+BYTES = {"name": "bytes", "configuration": {"endian": "little"}}
+CRC32C = {"name": "crc32c"}
+VLEN_UTF8 = {"name": "vlen-utf8", "configuration": {}}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Column:
+    """One array of an arm: its name in the recording, where a TaggedBlock has it, and its attributes."""
+
+    name: str
+    source: str
+    dtype: str
+    attributes: dict[str, Any] = field(default_factory=dict)
+
+
+def line_columns(dtype: str) -> tuple[Column, ...]:
+    """The arrays of an arm; ``lines`` is (line, pixel) of ``dtype``, the others are (line)."""
+    return (Column("lines", "pixels", dtype, LINES_ATTRIBUTES), *TAG_COLUMNS)
+
+
+LINES_ATTRIBUTES = {
+    "long_name": "lines as recorded",
+    "units": "DN",
+    "description": "row i is the trigger's line first_line + i; a missing line is flagged and filled with 0",
+    "coordinates": "time tick code_index",
+    "ancillary_variables": "flags code",
+}
+
+TAG_COLUMNS = (
+    Column(
+        "code_index",
+        "code_index",
+        "uint64",
+        {
+            "long_name": "index of the exposure code's bit in the line's first sub-step",
+            "units": "1",
+            "description": "the code's bit k gates the light in sub-step k of the run; one bit per sub-step",
+        },
+    ),
+    Column(
+        "code",
+        "code",
+        "uint8",
+        {
+            "long_name": "exposure code bits of the line's S new sub-steps",
+            "description": "bit u (value 1 << u) is the code's bit code_index + u; 1: light on",
+        },
+    ),
+    Column(
+        "tick",
+        "tick",
+        "uint64",
+        {
+            "long_name": "trigger clock at which the line's read-out begins",
+            "units": "1",
+            "description": "ticks since the start of the run; rate: attribute clock of the root",
+        },
+    ),
+    Column(
+        "time",
+        "time_ns",
+        "int64",
+        {
+            "standard_name": "time",
+            "long_name": "UTC at which the line's read-out begins",
+            "units": "nanoseconds since 1970-01-01T00:00:00",
+            "calendar": "proleptic_gregorian",
+        },
+    ),
+    Column(
+        "flags",
+        "flags",
+        "uint16",
+        {
+            "long_name": "what is known about the line beyond its pixels",
+            "flag_masks": [int(flag) for flag in LineFlag],
+            "flag_meanings": " ".join(flag.name.lower() for flag in LineFlag if flag.name),
+        },
+    ),
+)
+
+
+def column_shape(column: Column, spec: RecordingSpec) -> ArrayShape:
+    """How ``column`` is cut into pieces. Tags are predictable: packed even where pixels are not."""
+    pixels = column.name == "lines"
+    codec: Codec = spec.codec if pixels or spec.codec != "none" else "lz4"
+    return ArrayShape(
+        dtype=np.dtype(column.dtype).newbyteorder("<"),
+        row_shape=(spec.pixels,) if pixels else (),
+        chunk_rows=spec.chunk_lines,
+        shard_chunks=spec.shard_chunks,
+        codec=codec,
+    )
+
+
+def line_array(column: Column, shape: ArrayShape, rows: int) -> Document:
+    """Metadata of an arm's array of ``rows`` lines."""
+    sharding = {
+        "chunk_shape": list(shape.chunk_shape),
+        "codecs": [BYTES, *_packing(shape), CRC32C],
+        "index_codecs": [BYTES, CRC32C],
+        "index_location": "start",
+    }
+    return array_document(
+        shape=(rows, *shape.row_shape),
+        data_type=shape.dtype.name,
+        dimensions=("line", "pixel")[: len(shape.chunk_shape)],
+        chunk_shape=shape.shard_shape,
+        codecs=[{"name": "sharding_indexed", "configuration": sharding}],
+        attributes=column.attributes,
+    )
+
+
+def array_document(
+    *,
+    shape: Sequence[int],
+    data_type: str,
+    dimensions: Sequence[str],
+    chunk_shape: Sequence[int],
+    codecs: list[Document],
+    attributes: Mapping[str, Any],
+) -> Document:
+    """Metadata of any array; the fill value is 0, or the empty text."""
+    return {
+        "zarr_format": 3,
+        "node_type": "array",
+        "shape": list(shape),
+        "data_type": data_type,
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(chunk_shape)}},
+        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+        "fill_value": "" if data_type == "string" else 0,
+        "codecs": codecs,
+        "attributes": dict(attributes),
+        "dimension_names": list(dimensions),
+        "storage_transformers": [],
+    }
+
+
+def group_document(attributes: Mapping[str, Any], nodes: Mapping[str, Document]) -> Document:
+    """Metadata of a group, with those of ``nodes`` (path below the group → document) consolidated."""
+    return {
+        "zarr_format": 3,
+        "node_type": "group",
+        "attributes": dict(attributes),
+        "consolidated_metadata": {
+            "kind": "inline",
+            "must_understand": False,
+            "metadata": {path: _inner(document) for path, document in nodes.items()},
+        },
+    }
+
+
+def to_json(document: Document) -> bytes:
+    """One zarr.json; compact, since it is rewritten at every commit."""
+    return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+
+
+def _inner(document: Document) -> Document:
+    """A node inside consolidated metadata: zarr keeps that flat, inner groups carry none of their own."""
+    if document["node_type"] == "array":
+        return document
+    return group_document(document["attributes"], {})
+
+
+def _packing(shape: ArrayShape) -> list[Document]:
+    if shape.codec == "none":
+        return []
+    blosc = {
+        "cname": shape.codec,
+        "clevel": 1,
+        "shuffle": "bitshuffle",
+        "typesize": shape.dtype.itemsize,
+        "blocksize": 0,
+    }
+    return [{"name": "blosc", "configuration": blosc}]

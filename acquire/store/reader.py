@@ -1,0 +1,286 @@
+"""Reading recordings: what they say about themselves, and segments cut out of them for reconstruction.
+
+A `Recording` is a snapshot: of one that is still growing it shows what was committed when it was opened;
+open it again to see more. Nothing is read before it is asked for.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import zarr
+
+from acquire.clock import NS_PER_S, ClockFit
+from acquire.codes import code_from_attrs
+from acquire.errors import DataError, UsageError
+from acquire.geometry import Geometry
+from acquire.lines import ARMS, LineFlag, Segment
+from acquire.store.camera_stream import DAMAGE, CameraStream, child_array, child_group
+from acquire.store.files import tree_bytes
+from acquire.store.layout import line_columns
+from acquire.store.spec import CAMERA_KEYS, FORMAT
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+UNUSABLE = LineFlag.MISSING | LineFlag.INCOMPLETE
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Lines of one arm that were lost."""
+
+    arm: str
+    first_line: int
+    count: int
+    cause: str
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """What happened when, on the trigger's clock."""
+
+    kind: str
+    tick: int
+    line: int
+    text: str
+
+
+class Recording:
+    """One recording, opened for reading; `open_recording` makes it."""
+
+    def __init__(self, path: Path, group: zarr.Group) -> None:
+        self.path = path
+        self.attrs: dict[str, Any] = dict(group.attrs)
+        self._group = group
+        self.arms = {arm: CameraStream(path / arm, child_group(group, arm), self.first_line) for arm in ARMS}
+
+    @property
+    def state(self) -> str:
+        """``recording`` until it is sealed."""
+        return str(self.attrs["state"])
+
+    @property
+    def first_line(self) -> int:
+        """The trigger's number of the line in row 0."""
+        return int(self.attrs["first_line"])
+
+    @property
+    def lines(self) -> int:
+        """Rows of each arm."""
+        return min(len(stream) for stream in self.arms.values())
+
+    @property
+    def clock(self) -> ClockFit:
+        return ClockFit.from_attrs(self.attrs["clock"])
+
+    @property
+    def line_period_ns(self) -> float:
+        return int(self.attrs["trigger"]["line_period_ticks"]) * NS_PER_S / self.clock.clock_hz
+
+    def camera(self, arm: str) -> CameraStream:
+        """The arrays of arm ``"a"`` or ``"b"``."""
+        if arm not in self.arms:
+            raise UsageError(f"arm {arm!r} of {self.path}", possible=", ".join(self.arms))
+        return self.arms[arm]
+
+    def geometry_for(self, lines: int) -> Geometry:
+        """Geometry of a segment of ``lines`` lines."""
+        sizes = self.attrs["geometry"]
+        return Geometry(int(sizes["stages"]), int(sizes["substeps"]), lines)
+
+    @cached_property
+    def gaps(self) -> tuple[Gap, ...]:
+        """Lost lines in the order in which they were noticed."""
+        table = child_group(self._group, "gaps")
+        first, count = _numbers(table, "first_line"), _numbers(table, "count")
+        return tuple(map(Gap, _words(table, "arm"), first, count, _words(table, "cause")))
+
+    @cached_property
+    def events(self) -> tuple[Event, ...]:
+        """What happened, in the order in which it was noted."""
+        table = child_group(self._group, "events")
+        texts = [str(text) for text in _column(table, "text")]
+        ticks, lines = _numbers(table, "tick"), _numbers(table, "line")
+        return tuple(map(Event, _words(table, "kind"), ticks, lines, texts))
+
+    def cut(self, first_line: int, lines: int) -> Segment:
+        """The segment of ``lines`` lines from the trigger's line ``first_line`` on.
+
+        A sample is masked when its line is missing or incomplete, or when it stands at the top of the range.
+        Raises UsageError for lines that are not there, and DataError when the file is damaged or the code
+        that the attributes describe is not the one recorded with the lines.
+        """
+        start, stop = self._rows(first_line, lines)
+        geometry = self.geometry_for(lines)
+        if (pixels := self.arms["a"].lines.shape[1]) != geometry.stages:
+            raise UsageError(f"cut of lines with {pixels} pixels", possible=f"M = {geometry.stages} pixels")
+        arms = self.arms.values()
+        samples = np.stack([stream.read("lines", start, stop) for stream in arms])
+        flags = np.stack([stream.read("flags", start, stop) for stream in arms])
+        return Segment(
+            lines=samples,
+            mask=self._usable(samples, flags),
+            code=self._checked_code(first_line, geometry, flags),
+            geometry=geometry,
+            time_ns=self.arms["a"].read("time", start, stop),
+            first_line=first_line,
+            substep_ns=self.line_period_ns / geometry.substeps,
+            black_level_dn=self._per_arm("black_level_dn"),
+            responsivity_dn=self._per_arm("responsivity_dn"),
+        )
+
+    def info(self) -> dict[str, Any]:
+        """What one wants to know of a recording at a glance; everything is JSON."""
+        period_ns, lines = self.line_period_ns, self.lines
+        keys = ("run_id", "state", "run_condition", "end_reason", "layout", "geometry", "code", "clock")
+        return {
+            "path": str(self.path),
+            **{key: self.attrs[key] for key in keys},
+            "first_line": self.first_line,
+            "lines": lines,
+            "duration_s": lines * period_ns / NS_PER_S,
+            "line_rate_hz": NS_PER_S / period_ns,
+            "start_ns": int(self.arms["a"].read("time", 0, 1)[0]) if lines else None,
+            "dtype": str(self.arms["a"].lines.dtype),
+            "bytes": tree_bytes(self.path),
+            "gaps": len(self.gaps),
+            "lost_lines": {arm: sum(gap.count for gap in self.gaps if gap.arm == arm) for arm in ARMS},
+            "events": len(self.events),
+            "simulated": bool(self.attrs.get("simulated", False)),
+            "cameras": self.attrs["cameras"],
+            "ledger": self.attrs["ledger"],
+            "versions": self.attrs["versions"],
+        }
+
+    def _rows(self, first_line: int, lines: int) -> tuple[int, int]:
+        start = first_line - self.first_line
+        if lines < 1 or start < 0 or start + lines > self.lines:
+            have = (
+                f"lines {self.first_line} to {self.first_line + self.lines - 1}"
+                if self.lines
+                else "no lines yet"
+            )
+            raise UsageError(f"cut of {lines} lines from line {first_line} on", possible=have)
+        return start, start + lines
+
+    def _camera_numbers(self, key: str) -> list[float]:
+        return [float(self.attrs["cameras"][arm][key]) for arm in ARMS]
+
+    def _per_arm(self, key: str) -> float | tuple[float, float]:
+        a, b = self._camera_numbers(key)
+        return a if a == b else (a, b)
+
+    def _usable(self, samples: NDArray[Any], flags: NDArray[np.uint16]) -> NDArray[np.bool_]:
+        white = np.array(self._camera_numbers("white_dn"))[:, None, None]
+        usable: NDArray[np.bool_] = (samples < white) & ((flags & UNUSABLE) == 0)[:, :, None]
+        return usable
+
+    def _checked_code(
+        self, first_line: int, geometry: Geometry, flags: NDArray[np.uint16]
+    ) -> NDArray[np.uint8]:
+        """E of the segment from the attributes, compared with what stands beside each line of either arm."""
+        S, lines = geometry.substeps, geometry.lines
+        bits = code_from_attrs(self.attrs["code"]).bits(S * first_line, geometry.span)
+        index = S * np.arange(first_line, first_line + lines, dtype=np.uint64)
+        packed = np.packbits(bits[: S * lines].reshape(lines, S), axis=1, bitorder="little")[:, 0]
+        start = first_line - self.first_line
+        for stream, arm_flags in zip(self.arms.values(), flags, strict=True):
+            recorded = stream.read("code", start, start + lines)
+            recorded_index = stream.read("code_index", start, start + lines)
+            wrong = (recorded != packed) | (recorded_index != index)
+            self._refuse_code(stream, first_line, wrong & ((arm_flags & LineFlag.MISSING) == 0))
+        return bits
+
+    def _refuse_code(self, stream: CameraStream, first_line: int, wrong: NDArray[np.bool_]) -> None:
+        if wrong.any():
+            raise DataError(
+                f"{stream.path}: the code recorded with line {first_line + int(wrong.argmax())} is not what "
+                f"the recording's attributes describe ({wrong.sum()} of {len(wrong)} lines disagree)",
+                hint="lines from before or after; the lines themselves are intact",
+            )
+
+
+def open_recording(path: Path) -> Recording:
+    """Open a recording, growing or sealed. Raises DataError when ``path`` is not one, or is damaged."""
+    _check_format(path, _root_attributes(path))
+    try:
+        group = zarr.open_group(path, mode="r", zarr_format=3)
+        recording = Recording(path, group)
+        _check_complete(recording)
+    except DAMAGE as error:
+        raise DataError(
+            f"{path}: the metadata of the recording is damaged: {type(error).__name__}: {error}",
+            hint="a copy of the recording",
+        ) from error
+    return recording
+
+
+def _root_attributes(path: Path) -> object:
+    if not path.exists():
+        raise DataError(f"{path} does not exist", hint="the path of a recording (a directory NAME.zarr)")
+    try:
+        document = json.loads((path / "zarr.json").read_bytes())
+        attributes: object = document["attributes"]
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise DataError(f"{path} is not a recording: it holds no zarr.json") from error
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror}") from error
+    except (ValueError, LookupError, TypeError) as error:
+        raise DataError(f"{path}: zarr.json is damaged: {error}", hint="a copy of the recording") from error
+    return attributes
+
+
+def _check_format(path: Path, attributes: object) -> None:
+    name = attributes.get("format") if isinstance(attributes, dict) else None
+    if name == FORMAT:
+        return
+    if isinstance(name, str) and name.startswith(FORMAT.split("/")[0] + "/"):
+        raise DataError(
+            f"{path} is a recording of format {name!r}",
+            possible=f"{FORMAT!r}",
+            hint="a newer version of acquire",
+        )
+    raise DataError(f"{path} is a Zarr group, but not a recording: format {name!r}", possible=f"{FORMAT!r}")
+
+
+def _check_complete(recording: Recording) -> None:
+    """Touch everything that a recording needs; what is absent raises LookupError, TypeError or ValueError."""
+    attributes = recording.attrs
+    for key in ("state", "run_condition", "ledger", "versions", "layout", "run_id", "end_reason"):
+        attributes[key]
+    for arm, stream in recording.arms.items():
+        for column in line_columns("any"):
+            if len(stream.array(column.name).shape) != (2 if column.name == "lines" else 1):
+                raise ValueError(f"{arm}/{column.name} has the wrong number of axes")
+        for key in CAMERA_KEYS:
+            float(attributes["cameras"][arm][key])
+    recording.geometry_for(1)
+    if recording.line_period_ns <= 0 or "kind" not in attributes["code"]:
+        raise ValueError("timing or code")
+
+
+def _column(table: zarr.Group, name: str) -> NDArray[Any]:
+    try:
+        return np.asarray(child_array(table, name)[:])
+    except DAMAGE as error:
+        raise DataError(f"table {table.path}/{name} cannot be read: {error}") from error
+
+
+def _numbers(table: zarr.Group, name: str) -> list[int]:
+    return [int(value) for value in _column(table, name)]
+
+
+def _words(table: zarr.Group, name: str) -> list[str]:
+    """A column of CF flag values as their meanings."""
+    attributes = table[name].attrs
+    meanings = str(attributes["flag_meanings"]).split()
+    values: Any = attributes["flag_values"]
+    by_value = dict(zip(values, meanings, strict=True))
+    return [by_value[value] for value in _numbers(table, name)]

@@ -1,0 +1,182 @@
+"""What a recording is told about itself when it is created, and what its end adds."""
+
+from __future__ import annotations
+
+import json
+import platform
+from dataclasses import dataclass, field
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+import acquire
+from acquire.codes import code_from_attrs
+from acquire.errors import UsageError
+from acquire.lines import ARMS
+from acquire.store.shard import MAX_CHUNK_BYTES, MAX_SHARD_CHUNKS, Codec
+
+if TYPE_CHECKING:
+    from acquire.clock import ClockFit
+
+FORMAT = "acquire-recording/1"
+
+CAMERA_KEYS = ("white_dn", "black_level_dn", "responsivity_dn")
+"""What a reader needs of each camera to turn DN into samples of Eq. (1)."""
+
+State = Literal["recording", "sealed"]
+
+
+class RunCondition(StrEnum):
+    """What the recorded lines are worth."""
+
+    GOOD = "GOOD"
+    """Every line is there, and tags confirm the code."""
+    TAINTED = "TAINTED"
+    """Every line is there, but something about them is doubtful."""
+    INCOMPLETE = "INCOMPLETE"
+    """Lines are missing; they are flagged and listed."""
+    INTERRUPTED = "INTERRUPTED"
+    """Ended before its end by an operator's or the system's wish."""
+    ABORTED = "ABORTED"
+    """Ended by a fault."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingSpec:
+    """Everything that is known when a recording begins; refuses with UsageError what cannot be recorded.
+
+    Attributes
+    ----------
+    stages, substeps, pixels : M, S, pixels per line
+    first_line : the trigger's number of the line in row 0
+    clock : the trigger's ticks → UTC
+    code : `Code.to_attrs()` of the run's code
+    substep_ticks : duration of a sub-step in ticks
+    trigger, config : identity and settings of the trigger; the resolved configuration
+    cameras : per arm the settings as read back, with ``white_dn``, ``black_level_dn``, ``responsivity_dn``
+    extra : further attributes (``scene``, ``effects``, ``simulated`` ...)
+    chunk_lines, shard_chunks : lines per chunk; chunks per file
+    codec : of the pixels
+    fsync : force bytes to the medium at every ``"commit"``, or only at the ``"seal"``
+    """
+
+    run_id: str
+    stages: int
+    substeps: int
+    pixels: int
+    dtype: str
+    first_line: int
+    clock: ClockFit
+    code: dict[str, Any]
+    substep_ticks: int
+    trigger: dict[str, Any]
+    cameras: dict[str, dict[str, Any]]
+    config: dict[str, Any]
+    extra: dict[str, Any] = field(default_factory=dict)
+    chunk_lines: int = 4096
+    shard_chunks: int = 64
+    codec: Codec = "none"
+    fsync: Literal["commit", "seal"] = "seal"
+
+    def __post_init__(self) -> None:
+        self._check_choices()
+        self._check_numbers()
+        self._check_attributes()
+
+    @property
+    def line_dtype(self) -> np.dtype[Any]:
+        return np.dtype(self.dtype).newbyteorder("<")
+
+    def _check_choices(self) -> None:
+        choices = {
+            "dtype": ("uint8", "uint16"),
+            "codec": ("none", "lz4", "zstd"),
+            "fsync": ("commit", "seal"),
+        }
+        for name, allowed in choices.items():
+            if getattr(self, name) not in allowed:
+                raise UsageError(
+                    f"recording with {name} = {getattr(self, name)!r}", possible=", ".join(allowed)
+                )
+
+    def _check_numbers(self) -> None:
+        limits = {
+            "stages": (1, 2**16),
+            "substeps": (1, 8),  # the code of a line is one byte
+            "pixels": (1, 2**16),
+            "first_line": (0, 2**63 - 1),
+            "substep_ticks": (1, 2**32),
+            "shard_chunks": (1, MAX_SHARD_CHUNKS),
+            "chunk_lines": (1, MAX_CHUNK_BYTES // max(8, self.pixels * self.line_dtype.itemsize)),
+        }
+        for name, (low, high) in limits.items():
+            if not low <= getattr(self, name) <= high:
+                raise UsageError(
+                    f"recording with {name} = {getattr(self, name)}", possible=f"{low} to {high}"
+                )
+
+    def _check_attributes(self) -> None:
+        code_from_attrs(self.code)
+        for arm in ARMS:
+            for key in CAMERA_KEYS:
+                if key not in self.cameras.get(arm, {}):
+                    raise UsageError(f"recording without {key} of camera {arm}", possible="a number")
+        clash = sorted(set(self.extra) & set(_own_attributes(self, None)))
+        if clash:
+            raise UsageError(f"extra attributes {', '.join(clash)} are the format's own")
+        try:
+            json.dumps([self.trigger, self.cameras, self.config, self.extra], allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise UsageError(
+                f"attributes of a recording are not JSON: {error}",
+                possible="text, finite numbers, lists, dicts",
+            ) from error
+
+
+@dataclass(frozen=True, slots=True)
+class Ending:
+    """What is known only at the end."""
+
+    condition: RunCondition
+    reason: str
+    ledger: dict[str, Any]
+
+
+def root_attributes(spec: RecordingSpec, ending: Ending | None = None) -> dict[str, Any]:
+    """Attributes of the recording's root group; ``ending`` makes it sealed."""
+    return {**spec.extra, **_own_attributes(spec, ending)}
+
+
+def _own_attributes(spec: RecordingSpec, ending: Ending | None) -> dict[str, Any]:
+    state: State = "sealed" if ending else "recording"
+    return {
+        "format": FORMAT,
+        "description": (
+            "Lines of both arms of a TDI compressed-video rig. Row i of every array of a/ and b/ is the "
+            "trigger's line first_line + i; a line that is missing keeps its row, flagged and filled with 0."
+        ),
+        "run_id": spec.run_id,
+        "state": state,
+        "run_condition": str(ending.condition) if ending else None,
+        "end_reason": ending.reason if ending else None,
+        "layout": "dual",
+        "first_line": spec.first_line,
+        "geometry": {"stages": spec.stages, "substeps": spec.substeps, "pixels": spec.pixels},
+        "trigger": {
+            **spec.trigger,
+            "clock_hz": spec.clock.clock_hz,
+            "substep_ticks": spec.substep_ticks,
+            "line_period_ticks": spec.substep_ticks * spec.substeps,
+        },
+        "code": spec.code,
+        "clock": spec.clock.to_attrs(),
+        "cameras": spec.cameras,
+        "config": spec.config,
+        "versions": {
+            "acquire": acquire.__version__,
+            "python": platform.python_version(),
+            "numpy": np.__version__,
+        },
+        "ledger": ending.ledger if ending else {},
+    }

@@ -1,0 +1,270 @@
+"""The writer of a recording. What it has acknowledged can be read, whatever happens to its process.
+
+The order of a commit, each step complete before the next begins::
+
+    chunks → shard indices → (forced to the medium, if so configured) → arrays' zarr.json → groups'
+           → root zarr.json with the metadata of everything: the commit record
+
+A reader that starts at the root therefore sees one consistent, slightly older recording; no length ever
+covers a line that is not on disk, in both arms.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import shutil
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Self
+
+from acquire.errors import DataError, UsageError
+from acquire.lines import ARMS
+from acquire.store import layout
+from acquire.store.arm_writer import ArmWriter
+from acquire.store.files import Publisher, check_new_path, reserve, sync_directory, sync_tree
+from acquire.store.spec import Ending, RunCondition, root_attributes
+from acquire.store.table import event_table, gap_table
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from acquire.lines import TaggedBlock
+    from acquire.store.spec import RecordingSpec
+
+RESERVE_BYTES = 2**20
+"""Kept free for the metadata of the end: more than the tables and the root take."""
+
+
+class RecordingWriter:
+    """Writes one recording; one thread at a time.
+
+    Lines go to disk in whole chunks of ``spec.chunk_lines``. Lines of the last chunk that is not whole yet
+    are held in memory and become readable at `seal` only: ``kill -9`` can lose them, and what was not
+    committed, but nothing that `committed_lines` has acknowledged. (With ``fsync="seal"`` a power failure
+    can; with ``"commit"`` it cannot, for a reader that starts at the root.)
+
+    A row is committed when both arms have it. An arm that runs ahead is written but not visible; how far
+    it may run is the caller's to bound.
+
+    After a disk error the writer takes no more lines; `seal` then ends the recording with the whole chunks
+    that are on disk (a little room is kept for that on a disk that is full), and `close` leaves it as the
+    last commit made it.
+    """
+
+    def __init__(self, path: Path, spec: RecordingSpec) -> None:
+        """Use `create`."""
+        self.path = path
+        self.spec = spec
+        self._arms = {arm: ArmWriter(path / arm, spec) for arm in ARMS}
+        self._gaps = gap_table(path)
+        self._events = event_table(path)
+        self._tables = (self._gaps, self._events)
+        # No Zarr reader lists what is inside an array's directory.
+        hidden = path / ARMS[0] / "lines"
+        self._publisher = Publisher(hidden / ".next")
+        self._reserve = hidden / ".reserve"
+        self._committed = 0
+        self._failure: str | None = None
+        self._closed = False
+
+    @classmethod
+    def create(cls, path: Path, spec: RecordingSpec) -> RecordingWriter:
+        """A new, empty recording at ``path``.
+
+        Raises UsageError when ``path`` exists or cannot be created, before anything is touched, and
+        DataError when the disk refuses; then nothing is left behind.
+        """
+        check_new_path(path)
+        try:
+            path.mkdir()
+        except FileExistsError as error:  # somebody was faster
+            raise UsageError(f"{path} exists already", hint="another name") from error
+        except OSError as error:
+            raise DataError(f"{path} cannot be created: {error.strerror}") from error
+        try:
+            return cls._create_inside(path, spec)
+        except (DataError, UsageError):
+            shutil.rmtree(path, ignore_errors=True)
+            raise
+
+    @classmethod
+    def _create_inside(cls, path: Path, spec: RecordingSpec) -> RecordingWriter:
+        writer = cls(path, spec)
+        with writer._disk("creating the recording"):
+            for arm in writer._arms.values():
+                arm.create()
+            for table in writer._tables:
+                table.create()
+            reserve(writer._reserve, RESERVE_BYTES)
+            writer._publish_root(0, writer._publish_parts(0), durable=False)
+            if spec.fsync == "commit":
+                sync_tree(path)
+                sync_directory(path.parent)
+        return writer
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def next_line(self, arm: str) -> int:
+        """Number of the line that the next block of ``arm`` must begin with."""
+        return self._arms[arm].next_line
+
+    @property
+    def committed_lines(self) -> int:
+        """Rows that a reader finds in both arms, counted from ``spec.first_line``."""
+        return self._committed
+
+    @property
+    def bytes_written(self) -> int:
+        """Bytes of chunks on disk, as encoded, both arms."""
+        return sum(arm.bytes_written for arm in self._arms.values())
+
+    def append(self, block: TaggedBlock) -> None:
+        """Take the next lines of one arm; its arrays may be reused afterwards.
+
+        Raises DataError unless the block begins with the next line of its arm, and when the disk fails.
+        """
+        self._check_alive()
+        with self._disk(f"writing lines of arm {block.arm}"):
+            self._arms[block.arm].append(block)
+
+    def add_gap(self, arm: str, first_line: int, count: int, cause: str) -> None:
+        """List ``count`` lines of ``arm`` as lost because of ``cause``, a short name.
+
+        Visible at the next commit. Their rows are appended like any others, flagged as missing.
+        """
+        if count < 1 or first_line < 0:
+            raise UsageError(f"gap of {count} lines from line {first_line}")
+        self._gaps.add({"first_line": first_line, "count": count, "cause": cause, "arm": ARMS.index(arm)})
+
+    def add_event(self, kind: str, tick: int, line: int, text: str = "") -> None:
+        """Note what happened when, on the trigger's clock; visible at the next commit."""
+        if tick < 0 or line < 0:
+            raise UsageError(f"event {kind!r} at tick {tick}, line {line}", possible="0 or more")
+        self._events.add({"tick": tick, "line": line, "kind": kind, "text": text})
+
+    def commit(self) -> None:
+        """Make every row that both arms have in whole chunks visible, and all gaps and events.
+
+        Cheap when there is nothing new. Raises DataError when the disk fails: `committed_lines` is then
+        what it was.
+        """
+        self._check_alive()
+        rows = self._whole_rows()
+        if rows == self._committed and not any(table.dirty for table in self._tables):
+            return
+        durable = self.spec.fsync == "commit"
+        with self._disk("committing"):
+            if durable:
+                for arm in self._arms.values():
+                    arm.sync()
+            self._publish_root(rows, self._publish_parts(rows), durable=durable)
+
+    def seal(self, condition: RunCondition, end_reason: str, ledger: dict[str, Any]) -> None:
+        """Write the lines that wait, pad their chunk with 0, end the recording, and force it to the medium.
+
+        The recording ends with the last line that both arms have; what else was appended is counted in
+        ``ledger["store"]``. Raises DataError when the disk fails; a second call then seals what is there.
+        """
+        self._check_open()
+        _check_ledger(ledger)
+        with self._disk("sealing"):
+            rows = self._whole_rows() if self._failure else self._pad()
+            self._reserve.unlink(missing_ok=True)
+            sync_tree(self.path)
+            nodes = self._publish_parts(rows)
+            sync_tree(self.path)
+            ending = Ending(condition, end_reason, {**ledger, "store": self._ledger(rows)})
+            self._publish_root(rows, nodes, durable=True, ending=ending)
+            sync_directory(self.path.parent)
+        self.close()
+
+    def close(self) -> None:
+        """Let go of all files; what was not committed is dropped. Idempotent."""
+        self._closed = True
+        with self._disk("closing files"):
+            for arm in self._arms.values():
+                arm.close()
+
+    def _whole_rows(self) -> int:
+        return min(arm.whole_rows for arm in self._arms.values())
+
+    def _pad(self) -> int:
+        rows = min(arm.next_line for arm in self._arms.values()) - self.spec.first_line
+        for arm in self._arms.values():
+            arm.pad()
+        return rows
+
+    def _publish_parts(self, rows: int) -> dict[str, layout.Document]:
+        """Replace all metadata but the root's; returns it by path below the recording."""
+        nodes: dict[str, layout.Document] = {}
+        for arm in self._arms.values():
+            nodes |= arm.publish(self._publisher, rows)
+        for table in self._tables:
+            table.publish(self._publisher)
+            nodes |= table.nodes()
+        return nodes
+
+    def _publish_root(
+        self, rows: int, nodes: dict[str, layout.Document], *, durable: bool, ending: Ending | None = None
+    ) -> None:
+        """The commit itself."""
+        root = layout.group_document(root_attributes(self.spec, ending), nodes)
+        self._publisher.replace(self.path / "zarr.json", layout.to_json(root), durable=durable)
+        self._committed = rows
+
+    def _ledger(self, rows: int) -> dict[str, Any]:
+        end = self.spec.first_line + rows
+        return {
+            "lines": rows,
+            "lines_left_out": {name: arm.next_line - end for name, arm in self._arms.items()},
+            "bytes_written": self.bytes_written,
+            "gaps_not_listed": self._gaps.not_listed,
+            "events_not_listed": self._events.not_listed,
+            "disk_error": self._failure,
+        }
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise UsageError(f"{self.path} is closed for writing")
+
+    def _check_alive(self) -> None:
+        self._check_open()
+        if self._failure:
+            raise DataError(
+                f"{self.path}: no more lines after a disk error ({self._failure})", possible=self._safe()
+            )
+
+    def _safe(self) -> str:
+        return f"{self._committed} lines of each arm are committed and can be read"
+
+    @contextmanager
+    def _disk(self, doing: str) -> Iterator[None]:
+        """Turn what the disk refuses into DataError, and remember it: nothing after it is acknowledged."""
+        try:
+            yield
+        except OSError as error:
+            what = f"{doing}: {error.strerror or error}"
+            self._failure = self._failure or what
+            raise DataError(
+                f"{self.path}: the disk failed while {what}",
+                possible=self._safe(),
+                hint=_advice(error),
+            ) from error
+
+
+def _advice(error: OSError) -> str:
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        return "free space there, or record to another disk"
+    return "check that the directory still exists and the kernel's log for errors of the disk"
+
+
+def _check_ledger(ledger: dict[str, Any]) -> None:
+    try:
+        json.dumps(ledger, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"the ledger of a recording is not JSON: {error}") from error
