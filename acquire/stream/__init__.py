@@ -1,0 +1,19 @@
+"""The capture path: from cameras and trigger to a recording, each line counted.
+
+::
+
+    camera a ─▶ grabber a ─▶ ring a ─┐
+    camera b ─▶ grabber b ─▶ ring b ─┼─▶ recorder ─▶ Zarr
+    trigger  ─▶ supervisor ─▶ tags ──┘   (session, tagger)
+
+Grabbers and recorder are processes, the supervisor is a thread; `Capture` owns them all. Rings are shared
+memory: nothing between a camera's buffer and the recorder's is sent, and nothing waits for a reader.
+
+`shared` memory, counters · `losses` causes · `ring` · `process` children and their pipe · `messages` ·
+`grabber` · `tagger` · `session` one recording · `recorder` · `plan` · `supervisor` · `capture`
+"""
+
+from acquire.stream.capture import Capture
+from acquire.stream.plan import CapturePlan, CaptureStatus
+
+__all__ = ["Capture", "CapturePlan", "CaptureStatus"]

@@ -1,0 +1,127 @@
+"""The demo's recording: a daemon of its own, driven through its socket as any client would."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from acquire.cli.progress import stage_progress
+from acquire.daemon.client import Client
+from acquire.daemon.states import State
+from acquire.errors import AcquireError, DataError, NoDaemonError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from acquire.cli.demo import Journal
+    from acquire.daemon.messages import Status
+
+START_TIMEOUT_S = 60.0
+END_TIMEOUT_S = 30.0
+STALL_TIMEOUT_S = 30.0
+"""The recording is given up when no line was added for so long."""
+POLL_S = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Captured:
+    """The recording and the daemon's last word on it."""
+
+    path: Path
+    status: Status
+    seconds: float
+
+
+def record(out: Path, config: str, seed: int, lines: int, journal: Journal) -> Captured:
+    """Start a daemon, arm, record ``lines`` lines, and end the daemon again; its log goes to daemon.log."""
+    with tempfile.TemporaryDirectory(prefix="acquire-") as directory:  # socket paths must be short
+        socket = Path(directory) / "acquire.sock"
+        overrides = [f"--set=code.seed={seed}", f"--set=recording.directory='{out.absolute()}'"]
+        with _daemon(config, socket, overrides, out / "daemon.log") as process, Client(socket) as client:
+            with journal.stage("Start the daemon") as note:
+                _await_daemon(client, process, out / "daemon.log")
+                note["detail"] = f"process {process.pid}"
+            with journal.stage("Arm trigger and cameras"):
+                client.arm()
+            with journal.stage("Record") as note:
+                captured = _record(client, out / "recording.zarr", lines)
+                note["detail"] = f"{lines} lines of both arms"
+            with journal.stage("End the daemon"):
+                process.send_signal(signal.SIGTERM)
+                process.wait(END_TIMEOUT_S)
+    return captured
+
+
+@contextmanager
+def _daemon(config: str, socket: Path, overrides: list[str], log: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """``acquire serve`` as a process of its own; killed if it is still there at the end."""
+    command = [
+        sys.executable,
+        "-m",
+        "acquire",
+        "serve",
+        "--config",
+        config,
+        "--socket",
+        str(socket),
+        *overrides,
+    ]
+    with (
+        log.open("wb") as file,
+        subprocess.Popen(  # noqa: S603  # ourselves
+            command, stderr=file, stdout=file
+        ) as process,
+    ):
+        try:
+            yield process
+        finally:
+            if process.poll() is None:
+                process.kill()
+
+
+def _await_daemon(client: Client, process: subprocess.Popen[bytes], log: Path) -> None:
+    deadline = time.monotonic() + START_TIMEOUT_S
+    while True:
+        try:
+            client.status()
+        except NoDaemonError:
+            if process.poll() is not None:
+                last = log.read_text(errors="replace").strip().splitlines()[-3:]
+                raise AcquireError(f"the daemon ended at once: {' '.join(last)}", hint=str(log)) from None
+            if time.monotonic() > deadline:
+                raise
+            time.sleep(POLL_S)
+        else:
+            return
+
+
+def _record(client: Client, path: Path, lines: int) -> Captured:
+    started = time.perf_counter()
+    client.start(path, lines=lines)
+    with stage_progress("recording") as advance:
+        status = _follow(client, lines, advance)
+    if status.last is None or status.last.condition != "GOOD":
+        reason = status.fault or (status.last and f"{status.last.condition}: {status.last.end_reason}")
+        raise DataError(f"the recording {path} is not whole: {reason}", hint=f"acquire info {path}")
+    return Captured(path, status, time.perf_counter() - started)
+
+
+def _follow(client: Client, lines: int, advance: Callable[[int, int], None]) -> Status:
+    """Poll until the daemon is idle again; give up when nothing moves."""
+    seen, moved = -1, time.monotonic()
+    while (status := client.status()).state not in {State.IDLE, State.FAULTED}:
+        now = status.recording.recorded_lines if status.recording else lines
+        advance(now, lines)
+        if now != seen:
+            seen, moved = now, time.monotonic()
+        elif time.monotonic() - moved > STALL_TIMEOUT_S:
+            raise DataError(f"no line was recorded for {STALL_TIMEOUT_S:g} s", hint="acquire status")
+        time.sleep(POLL_S)
+    return status

@@ -1,0 +1,52 @@
+"""From a recording on disk to a video on disk: cut, reconstruct, write."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+from acquire import __version__
+from acquire.store import write_video
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from acquire.lines import Segment
+    from acquire.recon import Reconstruction
+    from acquire.store import Recording
+
+
+def save_reconstruction(
+    path: Path, result: Reconstruction, recording: Recording, segment: Segment, spatial_merge: int
+) -> dict[str, Any]:
+    """Write the whole video of a reconstruction as OME-Zarr; returns the provenance written with it.
+
+    ``provenance.trusted`` holds the first frame and the frame after the last that were sampled in full; the
+    frames around them are there because the lines depend on them, not because they can be believed.
+    The side of a voxel is given in pixels of the scene at full resolution, the only length that is known.
+    """
+    provenance = describe(result, recording, segment)
+    interval_ns = segment.substep_ns * float(provenance["parameters"]["temporal_merge"])
+    write_video(
+        path, result.video, result.time_ns, float(spatial_merge), interval_ns, provenance, pixel_unit=None
+    )
+    return provenance
+
+
+def describe(result: Reconstruction, recording: Recording, segment: Segment) -> dict[str, Any]:
+    """Where a video comes from and how good it is, as JSON."""
+    quality = {key: value if math.isfinite(value) else None for key, value in asdict(result.quality).items()}
+    return {
+        "recording": str(recording.path),
+        "run_id": recording.attrs["run_id"],
+        "first_line": segment.first_line,
+        "lines": segment.geometry.lines,
+        "solver": result.solver,
+        "iterations": result.iterations,
+        "seconds": round(result.seconds, 3),
+        "parameters": result.parameters,
+        "quality": quality,
+        "trusted": [result.trusted.start, result.trusted.stop],
+        "versions": {"acquire": __version__},
+    }

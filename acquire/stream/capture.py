@@ -1,0 +1,269 @@
+"""The owner of one armed run: three processes, one thread, and the order in which they begin and end.
+
+::
+
+    arm     memory → recorder, grabbers → cameras armed → trigger → tags flow
+    close   recording → tags → trigger → grabbers → recorder → memory
+
+Whatever fails first is what is told. A capture is used once: armed, and closed.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import asdict, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from acquire.errors import AcquireError, DataError, StateError, UsageError
+from acquire.lines import ARMS
+from acquire.stream import grabber, recorder
+from acquire.stream.losses import Cause
+from acquire.stream.messages import Begin, End, Interrupt, Quit, Ready, RunStarted
+from acquire.stream.plan import CaptureStatus
+from acquire.stream.process import Worker
+from acquire.stream.ring import Ring, RingShape
+from acquire.stream.shared import Counters
+from acquire.stream.supervisor import RECORDER, Supervisor
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from acquire.clock import ClockFit
+    from acquire.store import RecordingSpec
+    from acquire.stream.plan import CapturePlan
+    from acquire.trigger.base import Trigger
+
+_TAG_RING = RingShape(slots=64, rows=256, width=3, dtype="uint64")
+_UNDO_S = 1.0
+_LEAST_END_S = 1.0
+
+
+class Capture:
+    """One armed run of the capture path.
+
+    `start`, `stop` and `close` are for one thread at a time; `poll` may be called by any and never waits.
+    The trigger stays its giver's: it is started and stopped here, not closed.
+
+    Attributes
+    ----------
+    clock : the fit of the trigger's clock to UTC, once armed
+    cameras : arm → settings as read back, with ``identity``, once armed
+    """
+
+    clock: ClockFit
+    cameras: dict[str, dict[str, Any]]
+
+    def __init__(self, plan: CapturePlan, trigger: Trigger) -> None:
+        self._plan = plan
+        self._trigger = trigger
+        self._trigger_used = False
+        self._rings: dict[str, Ring] = {}
+        self._tags: Ring | None = None
+        self._counters: dict[str, Counters] = {}
+        self._workers: dict[str, Worker] = {}
+        self._supervisor: Supervisor | None = None
+        self._memory = threading.Lock()
+        self._final: CaptureStatus | None = None
+        self._used = self._closed = False
+
+    def arm(self, timeout_s: float = 20.0) -> None:
+        """Start everything; lines flow and are discarded.
+
+        On failure everything is undone and the first error raised: the camera's or trigger's own, or
+        DeviceError for a process that dies or does not answer within ``timeout_s``.
+        """
+        if self._used or self._closed:
+            raise StateError("arm: this capture has been used", hint="make another")
+        self._used = True
+        try:
+            self._begin(time.monotonic() + timeout_s)
+        except BaseException as error:
+            try:
+                self.close(_UNDO_S)
+            except (AcquireError, OSError) as second:
+                error.add_note(f"while undoing it: {second}")
+            raise
+
+    def start(self, path: Path, spec: RecordingSpec, lines: int | None = None) -> None:
+        """Record ``lines`` lines, or until `stop`, to ``path``, from the next line that both arms can give.
+
+        ``spec`` tells all but the first line, which the recorder sets. Returns once the recording exists.
+        Raises UsageError or DataError when it cannot be made; nothing has changed then.
+        """
+        supervisor = self._running("start")
+        if supervisor.recording:
+            raise StateError("start: a recording is being written", hint="stop it first")
+        if supervisor.fault:
+            raise StateError(f"start: the capture has failed ({supervisor.fault})", hint="arm again")
+        if lines is not None and lines < 1:
+            raise UsageError(f"start with a budget of {lines} lines", possible="1 or more")
+        supervisor.begin(Begin(path, spec, lines))
+
+    def stop(self, reason: str = "stopped") -> None:
+        """End the recording at the newest line; `poll` tells when it is sealed. Idempotent."""
+        supervisor = self._running("stop")
+        if supervisor.began is None:
+            raise StateError("stop: nothing has been recorded", possible="start")
+        if supervisor.recording:
+            self._workers[RECORDER].post(End(reason))
+
+    def poll(self) -> CaptureStatus:
+        """What is seen at this moment; after `close`, what was seen last."""
+        with self._memory:
+            if self._final is not None:
+                return self._final
+            return self._look(self._supervisor) if self._supervisor else CaptureStatus()
+
+    @property
+    def pids(self) -> dict[str, int | None]:
+        """Process numbers: of the recorder, and of each arm's grabber."""
+        return {name: worker.pid for name, worker in self._workers.items()}
+
+    def close(self, timeout_s: float = 10.0) -> None:
+        """End everything, in the module's order; a recording under way is sealed as interrupted. Idempotent.
+
+        Takes little more than ``timeout_s``: what has not ended by then is killed. Raises the first error
+        that it met, after everything has ended.
+        """
+        if self._closed:
+            return
+        self._closed = True
+        deadline = time.monotonic() + timeout_s
+        _run_all(
+            lambda: self._end_recording(deadline),
+            self._end_tags,
+            self._end_trigger,
+            lambda: self._end_workers(deadline),
+            self._end_memory,
+        )
+
+    # ---- begin
+
+    def _begin(self, deadline: float) -> None:
+        self._make_memory()
+        self._spawn()
+        self._workers[RECORDER].expect(Ready, deadline)
+        self.cameras = {arm: self._workers[arm].expect(Ready, deadline).facts for arm in ARMS}
+        self._trigger_used = True
+        self._trigger.prepare(self._plan.run)
+        self.clock = self._trigger.start()
+        self._workers[RECORDER].post(RunStarted(self.clock))
+        assert self._tags is not None
+        self._supervisor = Supervisor(self._trigger, self._workers, self._tags)
+        self._supervisor.start()
+
+    def _make_memory(self) -> None:
+        self._tags = Ring("tags", _TAG_RING)
+        self._counters[RECORDER] = Counters(recorder.COUNTERS)
+        for arm in ARMS:
+            self._rings[arm] = Ring(arm, self._plan.ring_shape)
+            self._counters[arm] = Counters(grabber.COUNTERS)
+
+    def _spawn(self) -> None:
+        plan = self._plan
+        what = recorder.RecorderPlan(
+            plan.run, plan.stages, plan.stall_timeout_s, plan.tag_wait_s, plan.max_skew_lines
+        )
+        self._workers[RECORDER] = Worker(
+            RECORDER, recorder.record, what, self._rings, self._tags, self._counters[RECORDER]
+        )
+        for arm, ring in self._rings.items():
+            task = grabber.GrabberPlan(arm, plan.openers[arm], plan.depth_lines, plan.white_dn)
+            self._workers[arm] = Worker(f"grabber {arm}", grabber.grab, task, ring, self._counters[arm])
+
+    def _running(self, command: str) -> Supervisor:
+        if self._supervisor is None or self._closed:
+            raise StateError(f"{command}: this capture is not armed", possible="arm, once")
+        return self._supervisor
+
+    # ---- watch
+
+    def _look(self, supervisor: Supervisor) -> CaptureStatus:
+        began, sealed, counters = supervisor.began, supervisor.sealed, self._counters[RECORDER]
+        status = CaptureStatus(
+            ring={arm: self._ring_counts(arm) for arm in ARMS},
+            lines={arm: self._line_counts(arm, began=began is not None) for arm in ARMS},
+            fault=supervisor.fault,
+        )
+        if began is None:
+            return status
+        return replace(
+            status,
+            recording=supervisor.recording,
+            draining=supervisor.recording and bool(counters["draining"]),
+            done=sealed is not None,
+            first_line=began.first_line,
+            recorded_lines=counters["recorded"],
+            committed_lines=counters["committed"],
+            condition=sealed.condition if sealed else None,
+            end_reason=sealed.end_reason if sealed else None,
+            ledger=sealed.ledger if sealed else {},
+        )
+
+    def _ring_counts(self, arm: str) -> dict[str, int]:
+        counts = asdict(self._rings[arm].statistics())
+        counts["drops"] = counts.pop("dropped_blocks")
+        return counts
+
+    def _line_counts(self, arm: str, *, began: bool) -> dict[str, Any]:
+        grabbed, recorded = self._counters[arm], self._counters[RECORDER]
+        lost = {
+            str(Cause.CAMERA): grabbed["camera_lost"],
+            str(Cause.RING_FULL): self._rings[arm].statistics().dropped_lines,
+        }
+        return {
+            "delivered": grabbed["delivered"],
+            "preroll": grabbed["preroll"],
+            "lost": lost,
+            "recorded": recorded[f"rows_{arm}"] if began else 0,
+            "missing": recorded[f"missing_{arm}"] if began else 0,
+        }
+
+    # ---- end
+
+    def _end_recording(self, deadline: float) -> None:
+        supervisor = self._supervisor
+        if supervisor is None or not supervisor.recording:
+            return
+        self._workers[RECORDER].post(Interrupt("the capture was closed", ARMS, Cause.INTERRUPTED))
+        if not supervisor.wait_sealed(deadline):
+            raise DataError("the recording could not be sealed in time", hint="recover it")
+
+    def _end_tags(self) -> None:
+        if self._supervisor is not None:
+            self._supervisor.end()
+
+    def _end_trigger(self) -> None:
+        if self._trigger_used:
+            self._trigger.stop()
+
+    def _end_workers(self, deadline: float) -> None:
+        deadline = max(deadline, time.monotonic() + _LEAST_END_S)
+        order = [self._workers[name] for name in (*ARMS, RECORDER) if name in self._workers]
+        for worker in order:
+            worker.post(Quit())
+        _run_all(*(partial(worker.end, deadline) for worker in order))
+
+    def _end_memory(self) -> None:
+        with self._memory:
+            self._final = self._look(self._supervisor) if self._supervisor else CaptureStatus()
+            for counters in self._counters.values():
+                counters.close()
+            for ring in (*self._rings.values(), self._tags):
+                if ring is not None:
+                    ring.close()
+
+
+def _run_all(*steps: Callable[[], None]) -> None:
+    """Take every step, whatever the ones before did; then raise the first error."""
+    first: AcquireError | OSError | None = None
+    for step in steps:
+        try:
+            step()
+        except (AcquireError, OSError) as error:
+            first = first or error
+    if first is not None:
+        raise first

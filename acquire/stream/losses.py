@@ -1,0 +1,67 @@
+"""Lines that never reached the recording: where, how many, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+MAX_LOSSES = 8
+"""Losses that one ring slot can report about the lines before it."""
+
+
+class Cause(StrEnum):
+    """Why lines are missing; the word that the recording's gaps carry."""
+
+    CAMERA = "camera"
+    """The camera's own count jumped."""
+    RING_FULL = "ring_full"
+    """The recorder was late: the grabber found no free slot."""
+    MIXED = "mixed"
+    """Too many different losses at one place to tell them apart."""
+    STALLED = "stalled"
+    """The arm fell silent, or too far behind the other."""
+    ARM_LOST = "arm_lost"
+    """The arm's camera or grabber failed."""
+    INTERRUPTED = "interrupted"
+    """The recording was cut off before this arm delivered the line."""
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """``count`` consecutive lines from ``first_line``, missing for one cause."""
+
+    first_line: int
+    count: int
+    cause: Cause
+
+    @property
+    def end_line(self) -> int:
+        return self.first_line + self.count
+
+
+class LossLog:
+    """Losses since the last committed slot. They follow one another without a hole, so they stay few.
+
+    Past ``MAX_LOSSES`` the last one grows and becomes `Cause.MIXED`: bounded, and never silent.
+    """
+
+    def __init__(self) -> None:
+        self._losses: list[Loss] = []
+
+    def add(self, loss: Loss) -> None:
+        if not self._losses:
+            self._losses.append(loss)
+            return
+        last = self._losses[-1]
+        if last.cause is loss.cause:
+            self._losses[-1] = Loss(last.first_line, last.count + loss.count, last.cause)
+        elif len(self._losses) < MAX_LOSSES:
+            self._losses.append(loss)
+        else:
+            self._losses[-1] = Loss(last.first_line, last.count + loss.count, Cause.MIXED)
+
+    def take(self) -> tuple[Loss, ...]:
+        """All of them, in order; the log is empty afterwards."""
+        taken = tuple(self._losses)
+        self._losses.clear()
+        return taken

@@ -1,0 +1,98 @@
+"""What the capture's owner and its processes say to each other. Few and rare: counts go by shared memory.
+
+::
+
+    owner ──▶ recorder      RunStarted, Begin, End, Interrupt, Quit
+    recorder ──▶ owner      Ready, Began | Refused, Sealed
+    owner ──▶ grabber       Quit
+    grabber ──▶ owner       Ready
+    any process ──▶ owner   Failed, then it ends
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from acquire.stream.losses import Cause
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from acquire.clock import ClockFit
+    from acquire.errors import AcquireError
+    from acquire.store import RecordingSpec, RunCondition
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """The process has what it needs; a grabber tells who its camera is and how it is set."""
+
+    facts: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Failed:
+    """The process ends because of this."""
+
+    error: AcquireError
+
+
+@dataclass(frozen=True, slots=True)
+class RunStarted:
+    """The trigger started; from now on its tags arrive."""
+
+    clock: ClockFit
+
+
+@dataclass(frozen=True, slots=True)
+class Begin:
+    """Write a recording to ``path``, of ``lines`` lines or until told to end."""
+
+    path: Path
+    spec: RecordingSpec
+    lines: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Began:
+    """The recording exists."""
+
+    first_line: int
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """The recording cannot be made; nothing changed."""
+
+    error: AcquireError
+
+
+@dataclass(frozen=True, slots=True)
+class End:
+    """End the recording at the newest line, for ``reason``."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class Interrupt:
+    """End the recording early, for ``reason``; what the arms in ``lost`` owe is missing by ``cause``."""
+
+    reason: str
+    lost: tuple[str, ...] = ()
+    cause: Cause = Cause.ARM_LOST
+
+
+@dataclass(frozen=True, slots=True)
+class Sealed:
+    """The recording is over and closed."""
+
+    condition: RunCondition
+    end_reason: str
+    ledger: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Quit:
+    """Finish what is under way and end."""

@@ -1,0 +1,110 @@
+"""What a capture is asked to do, and what it says about itself while it does it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from acquire.errors import UsageError
+from acquire.geometry import Geometry
+from acquire.lines import ARMS
+from acquire.stream.ring import RingShape
+
+if TYPE_CHECKING:
+    from acquire.camera.base import CameraOpener
+    from acquire.store import RunCondition
+    from acquire.trigger.base import TriggerRun
+
+MAX_SUBSTEPS = 8
+"""A line's code is recorded in one byte."""
+
+SKEW_RINGS = 32
+"""An arm that lags behind the other by the lines of so many rings is taken for stalled."""
+
+
+@dataclass(frozen=True, slots=True)
+class CapturePlan:
+    """One run of the capture path. Picklable; refuses with UsageError what cannot work.
+
+    Attributes
+    ----------
+    run : what the trigger is asked to do
+    stages, pixels, dtype : M; pixels per line; "uint8" or "uint16"
+    block_lines, ring_slots : lines per ring slot; slots per arm
+    white_dn : a pixel that has this value is saturated
+    openers : arm → how its camera is opened, in the grabber's process
+    stall_timeout_s : an arm that delivers nothing for so long ends the recording
+    tag_wait_s : how long lines wait for the tag that confirms them before they are flagged
+    """
+
+    run: TriggerRun
+    stages: int
+    pixels: int
+    dtype: str
+    block_lines: int
+    ring_slots: int
+    white_dn: int
+    openers: dict[str, CameraOpener]
+    stall_timeout_s: float = 3.0
+    tag_wait_s: float = 1.0
+
+    def __post_init__(self) -> None:
+        if tuple(sorted(self.openers)) != ARMS:
+            raise UsageError(f"capture with cameras {', '.join(self.openers)}", possible=", ".join(ARMS))
+        if not 1 <= self.run.substeps <= MAX_SUBSTEPS:
+            raise UsageError(f"capture with S = {self.run.substeps}", possible=f"1 to {MAX_SUBSTEPS}")
+        if self.dtype not in ("uint8", "uint16"):
+            raise UsageError(f"capture of {self.dtype!r} samples", possible="uint8, uint16")
+        # Lines wait for their tag in the ring, of which half must stay free for the cameras.
+        most = self.ring_shape.slots * self.block_lines // 2
+        if not 1 <= self.run.tag_every_lines <= most:
+            raise UsageError(
+                f"capture with a tag every {self.run.tag_every_lines} lines",
+                possible=f"1 to {most}, half of what a ring holds",
+                hint="more tags, or more ring slots",
+            )
+
+    @property
+    def depth_lines(self) -> int:
+        """Lines that a camera delivers before the trigger's line 0."""
+        return Geometry(self.stages, self.run.substeps, 1).depth_lines
+
+    @property
+    def ring_shape(self) -> RingShape:
+        return RingShape(self.ring_slots, self.block_lines, self.pixels, self.dtype)
+
+    @property
+    def max_skew_lines(self) -> int:
+        """Lines by which one arm may be ahead of the other."""
+        return SKEW_RINGS * self.ring_slots * self.block_lines
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureStatus:
+    """The capture at one moment; counts may be a few milliseconds apart. JSON, but for ``condition``.
+
+    Attributes
+    ----------
+    recording : a recording is being written
+    draining : its last line is known
+    done : the latest recording is closed; ``condition``, ``end_reason`` and ``ledger`` are final
+    first_line : the trigger's number of its row 0, or None before the first recording
+    recorded_lines, committed_lines : rows that both arms have; rows that a reader finds
+    ring : arm → slots, fill, peak, drops (blocks), dropped_lines, all since arm
+    lines : arm → delivered, preroll, and lost by cause, since arm; and of the latest recording
+        ``recorded`` rows, of which ``missing``
+    fault : what failed first, or None
+    """
+
+    recording: bool = False
+    draining: bool = False
+    done: bool = False
+    first_line: int | None = None
+    recorded_lines: int = 0
+    committed_lines: int = 0
+    ring: dict[str, dict[str, int]] = field(default_factory=dict)
+    lines: dict[str, dict[str, Any]] = field(default_factory=dict)
+    fault: str | None = None
+    condition: RunCondition | None = None
+    end_reason: str | None = None
+    ledger: dict[str, Any] = field(default_factory=dict)

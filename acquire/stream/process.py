@@ -1,0 +1,158 @@
+"""Processes of a run: each has one owner, one pipe to it, and ends with it.
+
+A child leaves SIGINT to its owner. The owner's death shows as the end of the pipe, and counts like SIGTERM
+or `Quit`: the child finishes what is under way, within a bounded time, and ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import multiprocessing
+import pickle
+import select
+import signal
+import sys
+import threading
+import time
+from typing import TYPE_CHECKING, Any
+
+from acquire.errors import AcquireError, DeviceError
+from acquire.stream.messages import Failed, Quit
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from multiprocessing.connection import Connection
+    from types import FrameType
+
+_KILL_WAIT_S = 5.0
+
+
+class OwnerGone(Exception):  # noqa: N818 - an event, not an error: the child ends in order
+    """The owner has died, or wants the process to end."""
+
+
+class Mailbox:
+    """The child's end of the pipe."""
+
+    def __init__(self, pipe: Connection[Any, Any]) -> None:
+        self._pipe = pipe
+        self._waiting = select.poll()
+        self._waiting.register(pipe, select.POLLIN | select.POLLHUP)
+        self._terminated = False
+
+    def take(self) -> object | None:
+        """The next message, or None when there is none now. Raises OwnerGone."""
+        if self._terminated:
+            raise OwnerGone("told to terminate")
+        if not self._waiting.poll(0):
+            return None
+        try:
+            message = self._pipe.recv()
+        except (EOFError, OSError) as error:
+            raise OwnerGone("the owner of the capture is gone") from error
+        if isinstance(message, Quit):
+            raise OwnerGone("the capture was closed")
+        return message  # type: ignore[no-any-return]
+
+    def post(self, message: object) -> None:
+        """Tell the owner; in vain when it is gone."""
+        with contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            self._pipe.send(message)
+
+    def terminate(self, signum: int, frame: FrameType | None) -> None:  # noqa: ARG002 - a signal handler
+        """Take SIGTERM for the owner's word, but never in the middle of a write."""
+        self._terminated = True
+
+    def fileno(self) -> int:
+        return self._pipe.fileno()
+
+
+class Worker:
+    """The owner's side of one child process: ``target(mailbox, *args)``, spawned."""
+
+    def __init__(self, name: str, target: Callable[..., None], *args: Any) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.name = name
+        self._sending = threading.Lock()
+        self.pipe, theirs = context.Pipe()
+        self._process = context.Process(
+            target=_live, args=(theirs, name, target, *args), name=f"acquire-{name}", daemon=True
+        )
+        try:
+            self._process.start()
+        except (OSError, pickle.PicklingError, AttributeError, TypeError) as error:
+            self.pipe.close()
+            raise DeviceError(f"{name}: the process cannot be started: {error}") from error
+        finally:
+            theirs.close()
+        self.pid = self._process.pid
+
+    @property
+    def death(self) -> str | None:
+        """How the process ended, or None while it lives."""
+        code = self._process.exitcode
+        if code is None:
+            return None
+        return f"killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+
+    def post(self, message: object) -> None:
+        """Tell the child; in vain when it is dead, which `death` tells."""
+        with self._sending, contextlib.suppress(BrokenPipeError, ConnectionResetError):
+            self.pipe.send(message)
+
+    def message(self, timeout_s: float = 0.0) -> object | None:
+        """The child's next message, or None when there is none."""
+        try:
+            return self.pipe.recv() if self.pipe.poll(timeout_s) else None
+        except (EOFError, OSError):
+            return None
+
+    def expect(self, kind: type[Any], deadline: float) -> Any:
+        """The next message, which must be a ``kind``, before the monotonic ``deadline``.
+
+        Raises the child's own error, or DeviceError when it dies or says nothing.
+        """
+        message = self.message(max(0.0, deadline - time.monotonic()))
+        if isinstance(message, Failed):
+            raise message.error
+        if isinstance(message, kind):
+            return message
+        self._process.join(0.1 if message is None else 0.0)
+        raise DeviceError(f"{self.name}: {self.death or 'no answer in time'}")
+
+    def end(self, deadline: float) -> None:
+        """End the process: by word until the monotonic ``deadline``, then by force. Idempotent.
+
+        Raises DeviceError, after the end, when it took force.
+        """
+        if self.pipe.closed:
+            return
+        self.post(Quit())
+        self._process.join(max(0.0, deadline - time.monotonic()))
+        forced = self._process.exitcode is None
+        if forced:
+            self._process.kill()
+            self._process.join(_KILL_WAIT_S)
+        self.pipe.close()
+        self._process.close()
+        if forced:
+            raise DeviceError(f"{self.name}: the process did not end when told to, and was killed")
+
+
+def _live(pipe: Connection[Any, Any], name: str, target: Callable[..., None], *args: Any) -> None:
+    """The life of a child, from its first to its last instruction."""
+    mailbox = Mailbox(pipe)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, mailbox.terminate)
+    gc.freeze()  # what was imported never dies: no collection needs to look at it again
+    try:
+        target(mailbox, *args)
+    except OwnerGone:
+        return
+    except AcquireError as error:
+        mailbox.post(Failed(error))
+        sys.exit(1)
+    except Exception as error:  # noqa: BLE001 - the outermost boundary: told to the owner
+        mailbox.post(Failed(AcquireError(f"{name}: {type(error).__name__}: {error}")))
+        sys.exit(1)

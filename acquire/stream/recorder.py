@@ -1,0 +1,296 @@
+"""The process that empties both rings: while armed it discards, while recording it writes.
+
+::
+
+    discarding ──Begin──▶ opening ──▶ recording ──last line──▶ closing ──▶ discarding
+
+A block waits in its ring until a tag of the trigger confirms its lines, but not longer than ``tag_wait_s``
+and not once the ring is half full; then its lines are written flagged. Creating and sealing a recording
+wait for the disk: a second thread does them, so that the rings are emptied meanwhile. What is counted is
+published in shared memory at every turn of the loop, so that nobody has to ask; only beginnings and ends
+are told.
+"""
+
+from __future__ import annotations
+
+import select
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from acquire.errors import AcquireError, StateError
+from acquire.lines import ARMS
+from acquire.store import RecordingWriter, RunCondition
+from acquire.stream.losses import Cause
+from acquire.stream.messages import Began, Begin, End, Interrupt, Ready, Refused, RunStarted
+from acquire.stream.process import OwnerGone
+from acquire.stream.session import Session
+from acquire.stream.stalls import Arm, find_stall
+from acquire.stream.tagger import Tagger
+
+if TYPE_CHECKING:
+    from acquire.stream.messages import Sealed
+    from acquire.stream.process import Mailbox
+    from acquire.stream.ring import Ring, RingBlock
+    from acquire.stream.shared import Counters
+    from acquire.trigger.base import TriggerRun
+
+COUNTERS = ("recorded", "committed", "draining", "rows_a", "rows_b", "missing_a", "missing_b")
+"""Of the latest recording: rows in both arms, rows that a reader finds, whether its last line is known; per
+arm the rows written and those of them that are missing."""
+
+OPENING_S = {"seal": 0.1, "commit": 0.5}
+"""What creating a recording takes, by when its bytes are forced to the medium; generously."""
+
+_WAIT_S = 0.02
+_COMMIT_INTERVAL_S = 0.1
+_COMMIT_SHARE = 4
+"""Commits take at most one part in so many of the time, however slow the disk."""
+_BLOCKS_PER_TURN = 8
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderPlan:
+    """What the recorder needs to know. Picklable."""
+
+    run: TriggerRun
+    stages: int
+    stall_timeout_s: float
+    tag_wait_s: float
+    max_skew_lines: int
+
+
+@dataclass(frozen=True, slots=True)
+class Opening:
+    """A recording that is being created, for lines from ``first_line`` on."""
+
+    first_line: int
+    lines: int | None
+    writer: Future[RecordingWriter]
+
+
+def record(
+    mailbox: Mailbox, plan: RecorderPlan, rings: dict[str, Ring], tags: Ring, counters: Counters
+) -> None:
+    """Life of the recorder: empty the rings, write recordings when told to, until told to end."""
+    with ThreadPoolExecutor(1, thread_name_prefix="store") as disk:
+        recorder = Recorder(mailbox, plan, rings, tags, counters, disk)
+        mailbox.post(Ready())
+        while recorder.turn():
+            recorder.wait()
+
+
+class Recorder:
+    """See the module. `turn` does what can be done now and never waits."""
+
+    def __init__(
+        self,
+        mailbox: Mailbox,
+        plan: RecorderPlan,
+        rings: dict[str, Ring],
+        tags: Ring,
+        counters: Counters,
+        disk: ThreadPoolExecutor,
+    ) -> None:
+        self._mailbox = mailbox
+        self._plan = plan
+        self._arms = {name: Arm(ring) for name, ring in rings.items()}
+        self._tags = tags
+        self._counters = counters
+        self._disk = disk
+        self._tagger: Tagger | None = None
+        self._opening: Opening | None = None
+        self._session: Session | None = None
+        self._closing: tuple[Session, Future[Sealed]] | None = None
+        self._trouble: tuple[str, dict[str, Cause]] | None = None
+        self._owner = True
+        self._busy = False
+        self._commit_s = 0.0
+        self._waited_in_vain_for = -1
+        shape = rings[ARMS[0]].shape
+        self._blank = np.zeros((shape.rows, shape.width), shape.dtype)
+        self._waiting = select.poll()
+        sources: list[Mailbox | Ring] = [mailbox, tags, *rings.values()]
+        for source in sources:
+            self._waiting.register(source, select.POLLIN | select.POLLHUP)
+
+    def turn(self) -> bool:
+        """One round over messages, disk, tags and rings; False when nothing is left to live for."""
+        try:
+            self._listen()
+            self._look_at_disk()
+            self._read_tags()
+            moved = [self._drain(name, arm) for name, arm in self._arms.items()]
+            self._busy = any(moved)
+            if self._session is not None:
+                self._look_after(self._session)
+        except (AcquireError, OSError) as error:
+            if self._session is None:
+                raise
+            self._close(self._session, error)
+        return self._owner or any((self._opening, self._session, self._closing))
+
+    def wait(self) -> None:
+        """Until something may have come, at most for a moment; not at all while there is work."""
+        if self._busy:
+            return
+        self._waiting.poll(_WAIT_S * 1000)
+        for ring in (self._tags, *(arm.ring for arm in self._arms.values())):
+            ring.hush()
+
+    # ---- messages
+
+    def _listen(self) -> None:
+        try:
+            while self._owner and (message := self._mailbox.take()) is not None:
+                self._obey(message)
+        except OwnerGone as gone:
+            self._owner = False
+            self._waiting.unregister(self._mailbox)
+            self._interrupt(str(gone), dict.fromkeys(ARMS, Cause.INTERRUPTED))
+
+    def _obey(self, message: object) -> None:
+        match message:
+            case RunStarted(clock):
+                self._tagger = Tagger(self._plan.run, self._plan.stages, clock)
+            case Begin():
+                self._begin(message)
+            case End(reason) if self._session is not None:
+                self._session.end(self._newest_line(), reason)
+            case Interrupt(reason, lost, cause):
+                self._interrupt(reason, dict.fromkeys(lost, cause))
+
+    def _begin(self, begin: Begin) -> None:
+        """At the next line that both arms can still deliver whole when the recording exists."""
+        if self._tagger is None or self._opening or self._session or self._closing:
+            self._mailbox.post(Refused(StateError("start: the recorder is not armed, or is recording")))
+            return
+        first_line = self._newest_line() + self._lead_lines(OPENING_S[begin.spec.fsync])
+        spec = replace(begin.spec, first_line=first_line)
+        writer = self._disk.submit(RecordingWriter.create, begin.path, spec)
+        self._opening = Opening(first_line, begin.lines, writer)
+
+    def _lead_lines(self, opening_s: float) -> int:
+        """Lines that will come while a recording is created, and that half a ring cannot hold."""
+        half = min(arm.ring.shape.slots * arm.ring.shape.rows // 2 for arm in self._arms.values())
+        rate_hz = max(arm.rate_hz(time.monotonic()) for arm in self._arms.values())
+        return max(0, int(rate_hz * opening_s) - half)
+
+    def _interrupt(self, reason: str, lost: dict[str, Cause]) -> None:
+        """What is lost stays lost: a recording that is only being created will know."""
+        before = self._trouble[1] if self._trouble else {}
+        self._trouble = reason, lost | before
+        if self._session is not None:
+            self._session.lost = lost | self._session.lost
+            self._session.end(self._common_line(), reason, RunCondition.INTERRUPTED)
+
+    def _newest_line(self) -> int:
+        """The line before which everything has come, from one arm at least."""
+        return max(arm.ring.newest_line for arm in self._arms.values())
+
+    def _common_line(self) -> int:
+        """The line up to which both arms have delivered."""
+        return min(arm.ring.newest_line for arm in self._arms.values())
+
+    # ---- the disk's answers
+
+    def _look_at_disk(self) -> None:
+        if self._opening is not None and self._opening.writer.done():
+            opening, self._opening = self._opening, None
+            self._opened(opening)
+        if self._closing is not None and self._closing[1].done():
+            (session, sealed), self._closing = self._closing, None
+            self._publish(session)
+            self._mailbox.post(sealed.result())
+
+    def _opened(self, opening: Opening) -> None:
+        assert self._tagger is not None
+        try:
+            writer = opening.writer.result()
+        except AcquireError as error:
+            self._mailbox.post(Refused(error))
+            return
+        self._session = Session(writer, self._tagger, self._blank, opening.first_line, opening.lines)
+        for arm in self._arms.values():
+            arm.revive(time.monotonic())
+        self._publish(self._session)
+        self._mailbox.post(Began(opening.first_line))
+        if self._trouble is not None:
+            self._interrupt(*self._trouble)
+
+    def _close(self, session: Session, error: Exception | None = None) -> None:
+        self._session = None
+        self._publish(session)
+        self._closing = session, self._disk.submit(session.close, error)
+
+    # ---- tags and lines
+
+    def _read_tags(self) -> None:
+        while (block := self._tags.acquire()) is not None:
+            found = self._tagger.verify(block.pixels) if self._tagger else []
+            self._tags.release()
+            if self._session is not None:
+                self._session.mismatches(found)
+
+    def _drain(self, name: str, arm: Arm) -> bool:
+        """Take what the arm has, some blocks at most; says whether there was any."""
+        arm.watch(time.monotonic())
+        for taken in range(_BLOCKS_PER_TURN):
+            block = arm.ring.acquire()
+            if block is None or not self._may_go(arm.ring, block):
+                return taken > 0
+            if self._session is not None:
+                self._session.take(name, block)
+            arm.ring.release()
+        return True
+
+    def _may_go(self, ring: Ring, block: RingBlock) -> bool:
+        """Nothing is gained by letting the block wait any longer: for its recording, or for its tag."""
+        if self._opening is not None:
+            return block.end_line <= self._opening.first_line
+        if self._session is None or self._tagger is None or block.end_line <= self._tagger.confirmed_end:
+            return True
+        return self._tags_overdue(self._tagger.confirmed_end, ring, block) or not self._owner
+
+    def _tags_overdue(self, confirmed_end: int, ring: Ring, block: RingBlock) -> bool:
+        """The block has waited long enough; those after it do not wait at all until a tag comes again."""
+        waited_ns = time.monotonic_ns() - block.time_ns
+        if waited_ns > self._plan.tag_wait_s * 1e9 or 2 * ring.fill > ring.shape.slots:
+            self._waited_in_vain_for = confirmed_end
+        return self._waited_in_vain_for == confirmed_end
+
+    # ---- the recording under way
+
+    def _look_after(self, session: Session) -> None:
+        for name, arm in self._arms.items():
+            if name in session.lost and not arm.ring.fill:
+                session.give_up(name)
+        if session.done:
+            self._close(session)
+            return
+        stall = find_stall(session, self._arms, self._plan.stall_timeout_s, self._plan.max_skew_lines)
+        if stall is not None:
+            session.lost.update(dict.fromkeys(stall.arms, Cause.STALLED))
+            session.end(self._common_line(), stall.reason, stall.condition)
+        self._commit_now_and_then(session)
+        self._publish(session)
+
+    def _commit_now_and_then(self, session: Session) -> None:
+        begun = time.monotonic()
+        if begun >= self._commit_s:
+            session.commit()
+            ended = time.monotonic()
+            self._commit_s = ended + max(_COMMIT_INTERVAL_S, (_COMMIT_SHARE - 1) * (ended - begun))
+
+    def _publish(self, session: Session) -> None:
+        counters = self._counters
+        rows = {name: book.next_line - session.first_line for name, book in session.books.items()}
+        counters["recorded"] = min(rows.values())
+        counters["committed"] = session.committed_lines
+        counters["draining"] = session.ending
+        for name, book in session.books.items():
+            counters[f"rows_{name}"] = rows[name]
+            counters[f"missing_{name}"] = book.missing.total()

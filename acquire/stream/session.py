@@ -1,0 +1,234 @@
+"""One recording while it is written: every line of its range gets its row, from a ring or as missing.
+
+A session knows neither processes nor time. It is fed blocks, told where to end and which arms will not
+deliver any more, and keeps the books: per arm, rows = stored + missing by cause.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from acquire.errors import AcquireError
+from acquire.lines import ARMS, LineBlock, LineFlag
+from acquire.store import RunCondition
+from acquire.stream.losses import Cause
+from acquire.stream.messages import Sealed
+from acquire.stream.tagger import UNCONFIRMED
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.lines import TaggedBlock
+    from acquire.stream.ring import RingBlock
+    from acquire.stream.tagger import Tagger, TagMismatch
+
+OPEN_END = 1 << 62
+"""End line of a recording without a budget."""
+
+MAX_MISMATCH_EVENTS = 100
+_BEST_FIRST = (
+    RunCondition.GOOD,
+    RunCondition.TAINTED,
+    RunCondition.INCOMPLETE,
+    RunCondition.INTERRUPTED,
+    RunCondition.ABORTED,
+)
+
+
+class Writer(Protocol):
+    """What a session needs of `acquire.store.RecordingWriter`."""
+
+    @property
+    def committed_lines(self) -> int: ...
+    def append(self, block: TaggedBlock) -> None: ...
+    def add_gap(self, arm: str, first_line: int, count: int, cause: str) -> None: ...
+    def add_event(self, kind: str, tick: int, line: int, text: str = "") -> None: ...
+    def commit(self) -> None: ...
+    def seal(self, condition: RunCondition, end_reason: str, ledger: dict[str, Any]) -> None: ...
+    def close(self) -> None: ...
+
+
+@dataclass(slots=True)
+class Book:
+    """One arm's account, in lines."""
+
+    next_line: int
+    stored: int = 0
+    missing: Counter[Cause] = field(default_factory=Counter)
+    unverified: int = 0
+    incomplete: int = 0
+    saturated: int = 0
+
+    def store(self, flags: NDArray[np.uint16]) -> None:
+        self.next_line += len(flags)
+        self.stored += len(flags)
+        if flags.any():
+            self.unverified += int(np.count_nonzero(flags & UNCONFIRMED))
+            self.incomplete += int(np.count_nonzero(flags & LineFlag.INCOMPLETE))
+            self.saturated += int(np.count_nonzero(flags & LineFlag.SATURATED))
+
+    def miss(self, count: int, cause: Cause) -> None:
+        self.next_line += count
+        self.missing[cause] += count
+
+    def balances(self, lines: int) -> bool:
+        return lines == self.stored + self.missing.total()
+
+    def to_attrs(self, lines: int) -> dict[str, Any]:
+        return {
+            "stored": self.stored,
+            "missing": {str(cause): count for cause, count in self.missing.items()},
+            "unverified": self.unverified,
+            "incomplete": self.incomplete,
+            "saturated": self.saturated,
+            "balanced": self.balances(lines),
+        }
+
+
+class Session:
+    """See the module. Methods raise what the writer raises; then `close` is what remains.
+
+    ``blank`` is (line, pixel) of zeros, the rows of a missing stretch of at most so many lines.
+    """
+
+    def __init__(
+        self, writer: Writer, tagger: Tagger, blank: NDArray[Any], first_line: int, lines: int | None
+    ) -> None:
+        self.first_line = first_line
+        self.end_line = OPEN_END if lines is None else first_line + lines
+        self.end_reason = "line budget reached"
+        self.books = {arm: Book(first_line) for arm in ARMS}
+        self.lost: dict[str, Cause] = {}
+        self._writer = writer
+        self._tagger = tagger
+        self._blank = blank
+        self._floor = RunCondition.GOOD
+        self._mismatches = 0
+        self._told_to_end = False
+        self._note("started", first_line, "")
+
+    @property
+    def done(self) -> bool:
+        """Every row is written."""
+        return all(self.reached(arm) for arm in ARMS)
+
+    @property
+    def ending(self) -> bool:
+        """The last line is known, or one arm has it already."""
+        return self._told_to_end or any(self.reached(arm) for arm in ARMS)
+
+    @property
+    def skew(self) -> int:
+        """Lines by which the arms are apart."""
+        lines = [book.next_line for book in self.books.values()]
+        return max(lines) - min(lines)
+
+    @property
+    def committed_lines(self) -> int:
+        """Rows that a reader finds."""
+        return self._writer.committed_lines
+
+    def reached(self, arm: str) -> bool:
+        """The arm has all its rows."""
+        return self.books[arm].next_line >= self.end_line
+
+    def take(self, arm: str, block: RingBlock) -> None:
+        """Write what was lost before the block, and what of the block is in range."""
+        book = self.books[arm]
+        if block.end_line <= book.next_line:
+            return
+        for loss in block.losses:
+            self._miss_until(arm, loss.end_line, loss.cause)
+        self._miss_until(arm, block.first_line, Cause.MIXED)
+        part = slice(book.next_line - block.first_line, self.end_line - block.first_line)
+        if part.stop > part.start:
+            self._append(LineBlock(arm, book.next_line, block.pixels[part], block.flags[part]))
+
+    def give_up(self, arm: str) -> None:
+        """Fill the remaining rows of a lost arm."""
+        self._miss_until(arm, self.end_line, self.lost[arm])
+
+    def end(self, line: int, reason: str, condition: RunCondition = RunCondition.GOOD) -> None:
+        """End before ``line``, or after what is written already; the condition is at best ``condition``."""
+        reach = max(book.next_line for book in self.books.values())
+        last = max(reach, min(line, self.end_line))
+        if last < self.end_line or _worse(self._floor, condition) is not self._floor:
+            self.end_reason = reason
+            self._note("stopped" if condition is RunCondition.GOOD else "fault", last, reason)
+        self.end_line = last
+        self._told_to_end = True
+        self._floor = _worse(self._floor, condition)
+
+    def mismatches(self, found: list[TagMismatch]) -> None:
+        """The trigger contradicts the count of lines; all are counted, the first are listed."""
+        for mismatch in found[: max(0, MAX_MISMATCH_EVENTS - self._mismatches)]:
+            self._writer.add_event("tag_mismatch", mismatch.tag.tick, mismatch.tag.line, str(mismatch))
+        self._mismatches += len(found)
+
+    def commit(self) -> None:
+        """Make what is written visible to readers."""
+        self._writer.commit()
+
+    def close(self, error: Exception | None = None) -> Sealed:
+        """Seal the recording; as aborted after a write ``error``, or one now, if the disk still allows it."""
+        if error is None:
+            try:
+                return self._seal(self._condition(), self.end_reason)
+            except (AcquireError, OSError) as found:
+                error = found
+        reason = f"write error: {error}"
+        try:
+            return self._seal(RunCondition.ABORTED, reason)
+        except (AcquireError, OSError) as second:
+            self._writer.close()
+            return Sealed(RunCondition.ABORTED, f"{reason}; not sealed: {second}", self._ledger())
+
+    def _seal(self, condition: RunCondition, reason: str) -> Sealed:
+        ledger = self._ledger()
+        self._writer.seal(condition, reason, ledger)
+        return Sealed(condition, reason, ledger)
+
+    def _miss_until(self, arm: str, line: int, cause: Cause) -> None:
+        book = self.books[arm]
+        count = min(line, self.end_line) - book.next_line
+        if count <= 0:
+            return
+        self._writer.add_gap(arm, book.next_line, count, cause)
+        while count:
+            pixels = self._blank[:count]
+            flags = np.full(len(pixels), LineFlag.MISSING, np.uint16)
+            self._writer.append(self._tagger.tag(LineBlock(arm, book.next_line, pixels, flags)))
+            book.miss(len(pixels), cause)
+            count -= len(pixels)
+
+    def _append(self, block: LineBlock) -> None:
+        tagged = self._tagger.tag(block)
+        self._writer.append(tagged)
+        self.books[block.arm].store(tagged.flags)
+
+    def _condition(self) -> RunCondition:
+        books = self.books.values()
+        lines = self.end_line - self.first_line
+        found = RunCondition.GOOD
+        if self._mismatches or any(book.unverified or book.incomplete for book in books):
+            found = RunCondition.TAINTED
+        if any(book.missing or not book.balances(lines) for book in books):
+            found = RunCondition.INCOMPLETE
+        return _worse(found, self._floor)
+
+    def _ledger(self) -> dict[str, Any]:
+        end = min(self.end_line, max(book.next_line for book in self.books.values()))
+        lines = end - self.first_line
+        arms = {arm: book.to_attrs(lines) for arm, book in self.books.items()}
+        return {"pulses": lines, "tag_mismatches": self._mismatches, **arms}
+
+    def _note(self, kind: str, line: int, text: str) -> None:
+        self._writer.add_event(kind, int(self._tagger.table(line, 1).tick[0]), line, text)
+
+
+def _worse(one: RunCondition, other: RunCondition) -> RunCondition:
+    return max(one, other, key=_BEST_FIRST.index)

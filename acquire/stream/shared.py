@@ -1,0 +1,88 @@
+"""Memory that the processes of one run share: anonymous files, passed to spawned children by descriptor.
+
+An anonymous file (memfd) has no name that could outlive a process killed without warning: the kernel
+frees it with the last descriptor and mapping. No resource tracker takes part.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+from multiprocessing import reduction
+from typing import Any
+
+from acquire.errors import DeviceError
+
+WORD_BYTES = 8
+
+
+class SharedBytes:
+    """``size`` bytes, zero at first; every process that holds them has them mapped and touched.
+
+    Pickled only while a child is being spawned; the child gets the same bytes.
+    """
+
+    def __init__(self, name: str, size: int, fd: int | None = None) -> None:
+        self.name = name
+        self.size = size
+        self._fd = _allocate(name, size) if fd is None else fd
+        # Populated now: a first touch during capture would cost more than the copy itself.
+        self.map = mmap.mmap(self._fd, size, flags=mmap.MAP_SHARED | mmap.MAP_POPULATE)
+
+    def words(self, first: int, count: int) -> memoryview:
+        """``count`` signed 64-bit words from word ``first``; a store of one word is never torn."""
+        start = first * WORD_BYTES
+        return memoryview(self.map)[start : start + count * WORD_BYTES].cast("q")
+
+    def close(self) -> None:
+        """Unmap; the owner of views must have released them before. Idempotent."""
+        if not self.map.closed:
+            self.map.close()
+            os.close(self._fd)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _attach, (self.name, self.size, reduction.DupFd(self._fd))
+
+
+class Counters:
+    """Named whole numbers that one process writes and any process reads, without a lock or a pipe."""
+
+    def __init__(self, names: tuple[str, ...], memory: SharedBytes | None = None) -> None:
+        self.names = names
+        self._memory = memory or SharedBytes("counters", len(names) * WORD_BYTES)
+        self._words = self._memory.words(0, len(names))
+        self._position = {name: position for position, name in enumerate(names)}
+
+    def __getitem__(self, name: str) -> int:
+        return int(self._words[self._position[name]])
+
+    def __setitem__(self, name: str, value: int) -> None:
+        self._words[self._position[name]] = value
+
+    def add(self, name: str, value: int) -> None:
+        self._words[self._position[name]] += value
+
+    def close(self) -> None:
+        """Let go of the memory. Idempotent."""
+        self._words.release()
+        self._memory.close()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Counters, (self.names, self._memory)
+
+
+def _allocate(name: str, size: int) -> int:
+    fd = os.memfd_create(f"acquire-{name}")
+    try:
+        os.posix_fallocate(fd, 0, size)
+    except OSError as error:
+        os.close(fd)
+        raise DeviceError(
+            f"{name}: {size / 2**20:.0f} MiB of shared memory: {error.strerror}",
+            hint="fewer or shorter ring slots",
+        ) from error
+    return fd
+
+
+def _attach(name: str, size: int, descriptor: Any) -> SharedBytes:
+    return SharedBytes(name, size, descriptor.detach())

@@ -1,0 +1,74 @@
+"""When an arm counts as stalled: it is silent for too long, or has fallen too far behind the other."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from acquire.lines import ARMS
+from acquire.store import RunCondition
+
+if TYPE_CHECKING:
+    from acquire.stream.ring import Ring
+    from acquire.stream.session import Session
+
+
+@dataclass(frozen=True, slots=True)
+class Stall:
+    """Which arms will not be waited for any more, and what that makes of the recording."""
+
+    arms: tuple[str, ...]
+    reason: str
+    condition: RunCondition
+
+
+class Arm:
+    """A ring as the recorder sees it: when it last showed life, and how fast it lives."""
+
+    def __init__(self, ring: Ring) -> None:
+        self.ring = ring
+        self.alive_s = time.monotonic()
+        self._newest = ring.newest_line
+        self._since: tuple[float, int] | None = None
+
+    def watch(self, now_s: float) -> None:
+        """Note life: something new, or something that still waits to be taken."""
+        newest = self.ring.newest_line
+        if newest != self._newest or self.ring.fill:
+            self._newest = newest
+            self.alive_s = now_s
+            self._since = self._since or (now_s, newest)
+
+    def revive(self, now_s: float) -> None:
+        """Count silence from now."""
+        self.alive_s = now_s
+
+    def rate_hz(self, now_s: float) -> float:
+        """Lines per second since the first one; 0 while that is not known."""
+        if self._since is None or now_s <= self._since[0]:
+            return 0.0
+        return (self.ring.newest_line - self._since[1]) / (now_s - self._since[0])
+
+
+def find_stall(session: Session, arms: dict[str, Arm], limit_s: float, max_skew_lines: int) -> Stall | None:
+    """The stall that ends the recording, or None; arms that are given up already do not count again."""
+    waited_for = [name for name in ARMS if not session.reached(name) and name not in session.lost]
+    if not waited_for:
+        return None
+    now_s = time.monotonic()
+    silent_s = {name: now_s - arm.alive_s for name, arm in arms.items()}
+    if any(silent_s[name] > limit_s for name in waited_for):
+        # Arms that fall silent together do so to within a block: half the limit tells both from one.
+        silent = tuple(name for name in ARMS if silent_s[name] > limit_s / 2)
+        return _stall(silent, f"no line for {limit_s:g} s")
+    if session.skew > max_skew_lines:
+        late = min(waited_for, key=lambda name: session.books[name].next_line)
+        return _stall((late,), f"{session.skew} lines behind the other")
+    return None
+
+
+def _stall(arms: tuple[str, ...], text: str) -> Stall:
+    if len(arms) == len(ARMS):
+        return Stall(arms, f"both arms stalled: {text}", RunCondition.INTERRUPTED)
+    return Stall(arms, f"arm {arms[0]} stalled: {text}", RunCondition.INCOMPLETE)

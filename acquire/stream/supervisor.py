@@ -1,0 +1,156 @@
+"""The thread of an armed run: it moves tags to the recorder and hears what the processes say."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import TYPE_CHECKING
+
+from acquire.errors import AcquireError, DeviceError, TriggerError
+from acquire.lines import ARMS
+from acquire.stream.messages import Began, Failed, Interrupt, Refused, Sealed
+from acquire.stream.tagger import tag_rows
+
+if TYPE_CHECKING:
+    from acquire.stream.messages import Begin
+    from acquire.stream.process import Worker
+    from acquire.stream.ring import Ring
+    from acquire.trigger.base import LineTag, Trigger
+
+RECORDER = "recorder"
+"""Key of the recorder among the workers; the grabbers have their arms'."""
+
+_TAG_WAIT_S = 0.02
+_ANSWER_S = 20.0
+_JOIN_S = 5.0
+
+
+class Supervisor:
+    """Owns the thread. What it learnt can be read at any time: `began`, `sealed`, `fault`.
+
+    Attributes
+    ----------
+    began : the answer to the latest `begin`, unless that was refused
+    sealed : how the latest recording ended
+    fault : what failed first
+    """
+
+    def __init__(self, trigger: Trigger, workers: dict[str, Worker], tags: Ring) -> None:
+        self.began: Began | None = None
+        self.sealed: Sealed | None = None
+        self.fault: str | None = None
+        self._trigger = trigger
+        self._workers = workers
+        self._tags = tags
+        self._refused: Refused | None = None
+        self._trigger_lost = False
+        self._dead: set[str] = set()
+        self._last_words: dict[str, str] = {}
+        self._news = threading.Condition()
+        self._ending = threading.Event()
+        self._thread = threading.Thread(target=self._live, name="acquire-supervisor", daemon=True)
+
+    @property
+    def recording(self) -> bool:
+        """A recording is open, as far as the living can tell."""
+        return self.began is not None and self.sealed is None and RECORDER not in self._dead
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def end(self) -> None:
+        """End the thread. Raises TriggerError when the trigger holds it. Idempotent."""
+        self._ending.set()
+        if self._thread.ident is not None:
+            self._thread.join(_JOIN_S)
+        if self._thread.is_alive():
+            raise TriggerError(
+                f"the trigger has not returned from a wait of {_TAG_WAIT_S} s for {_JOIN_S:g} s"
+            )
+
+    def begin(self, message: Begin) -> None:
+        """Have the recorder begin; returns when it has. Raises what it refuses with."""
+        with self._news:
+            self.began = self.sealed = self._refused = None
+            self._workers[RECORDER].post(message)
+            self._news.wait_for(lambda: self.began or self._refused or RECORDER in self._dead, _ANSWER_S)
+            if self.began is not None:
+                return
+            if self._refused is not None:
+                raise self._refused.error
+        if RECORDER not in self._dead:
+            self._fail(f"recorder: no answer within {_ANSWER_S:g} s")
+        raise DeviceError(f"start: {self.fault}")
+
+    def wait_sealed(self, deadline: float) -> bool:
+        """Until the recording is closed, or cannot be any more, or the monotonic ``deadline``."""
+        with self._news:
+            self._news.wait_for(lambda: not self.recording, max(0.0, deadline - time.monotonic()))
+            return not self.recording
+
+    def _live(self) -> None:
+        try:
+            while not self._ending.is_set():
+                self._turn()
+        except Exception as error:  # noqa: BLE001 - the outermost boundary of the thread: a fault, told
+            self._fail(f"supervisor: {type(error).__name__}: {error}")
+
+    def _turn(self) -> None:
+        begun = time.monotonic()
+        tags = self._take_tags()
+        for name, worker in self._workers.items():
+            self._hear(name, worker)
+        if not tags:  # a trigger that does not wait by itself must not make this loop spin
+            self._ending.wait(max(0.0, begun + _TAG_WAIT_S - time.monotonic()))
+
+    def _take_tags(self) -> list[LineTag]:
+        if self._trigger_lost:
+            return []
+        try:
+            tags = self._trigger.tags(_TAG_WAIT_S)
+        except Exception as error:  # noqa: BLE001 - told; a driver's defect must not cost the recording
+            self._trigger_lost = True
+            kind = "" if isinstance(error, AcquireError) else f"{type(error).__name__}: "
+            self._fail(f"trigger: {kind}{error}")
+            return []
+        rows = self._tags.shape.rows
+        for at in range(0, len(tags), rows):
+            self._pass_on(tags[at : at + rows])
+        return tags
+
+    def _pass_on(self, tags: list[LineTag]) -> None:
+        """To the recorder; should it be too late to take them, later tags confirm the same lines."""
+        slot = self._tags.claim()
+        if slot is None:
+            self._tags.drop(len(tags))
+            return
+        slot.pixels[: len(tags)] = tag_rows(tags)
+        self._tags.commit(0, len(tags))
+
+    def _hear(self, name: str, worker: Worker) -> None:
+        death = worker.death  # looked at before the messages: what a process said last counts
+        while (message := worker.message()) is not None:
+            self._note(name, message)
+        if death and name not in self._dead:
+            self._dead.add(name)
+            self._fail(f"{worker.name}: {self._last_words.get(name, death)}", name)
+
+    def _note(self, name: str, message: object) -> None:
+        with self._news:
+            match message:
+                case Began():
+                    self.began = message
+                case Refused():
+                    self._refused = message
+                case Sealed():
+                    self.sealed = message
+                case Failed(error):
+                    self._last_words[name] = str(error)
+            self._news.notify_all()
+
+    def _fail(self, text: str, name: str | None = None) -> None:
+        """Keep the first fault, and have the recording sealed if the recorder lives."""
+        with self._news:
+            self.fault = self.fault or text
+            self._news.notify_all()
+        self._workers[RECORDER].post(Interrupt(text, tuple(arm for arm in ARMS if arm == name)))

@@ -1,0 +1,148 @@
+"""From line numbers to code, ticks and time; and from the trigger's tags to the certainty of it.
+
+All of it follows from the line's number: line ``l`` begins at code index S·l and is read out from
+tick (S·l + n - 1)·substep_ticks on. A tag that says the same confirms every line up to its own. Pure: no I/O.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.geometry import Geometry
+from acquire.lines import LineFlag, TaggedBlock
+from acquire.trigger.base import LineTag
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from acquire.clock import ClockFit
+    from acquire.lines import LineBlock
+    from acquire.trigger.base import TriggerRun
+
+UNCONFIRMED = np.uint16(LineFlag.TIME_ESTIMATED | LineFlag.CODE_UNVERIFIED)
+
+_PAGE_LINES = 8192
+_PAGES_KEPT = 4
+
+
+@dataclass(frozen=True, slots=True)
+class TagMismatch:
+    """A tag of the trigger that contradicts the count of lines, and what it should have said."""
+
+    tag: LineTag
+    expected: LineTag
+
+    def __str__(self) -> str:
+        tag, expected = self.tag, self.expected
+        if tag == expected:
+            return f"the trigger came back to line {tag.line}: it started again"
+        return (
+            f"tag of line {tag.line}: code index {tag.code_index}, tick {tag.tick}; "
+            f"expected {expected.code_index} and {expected.tick}"
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LineTable:
+    """What the trigger's run says about consecutive lines; arrays of one value per line."""
+
+    code_index: NDArray[np.uint64]
+    code: NDArray[np.uint8]
+    tick: NDArray[np.uint64]
+    time_ns: NDArray[np.int64]
+
+    def __getitem__(self, part: slice) -> LineTable:
+        return LineTable(self.code_index[part], self.code[part], self.tick[part], self.time_ns[part])
+
+
+def tag_rows(tags: Sequence[LineTag]) -> NDArray[np.uint64]:
+    """Tags as (tag, 3) uint64: line, code index, tick."""
+    rows = np.array([(tag.line, tag.code_index, tag.tick) for tag in tags], np.uint64)
+    return rows.reshape(len(tags), 3)
+
+
+class Tagger:
+    """Tags blocks of one run. ``confirmed_end`` is the line after the last that a tag confirmed."""
+
+    def __init__(self, run: TriggerRun, stages: int, clock: ClockFit) -> None:
+        self._run = run
+        self._clock = clock
+        self._readout_substep = Geometry(stages, run.substeps, 1).readout_substep
+        self._pages: dict[int, LineTable] = {}
+        self._last_line = -1
+        self._restarted = False
+        self.confirmed_end = 0
+
+    def verify(self, rows: NDArray[np.uint64]) -> list[TagMismatch]:
+        """Hold tags (tag, 3), see `tag_rows`, against the prediction; return those that contradict it.
+
+        A trigger that is right by itself but goes back in lines has started again: nothing after that is
+        confirmed any more.
+        """
+        expected = self._expected(rows[:, 0])
+        wrong = (rows != expected).any(axis=1)
+        right = np.flatnonzero(~wrong)
+        lines = rows[right, 0].astype(np.int64)
+        back = np.diff(lines, prepend=self._last_line) <= 0
+        ahead = lines[~np.logical_or.accumulate(back)]
+        if len(ahead) and not self._restarted:
+            self._last_line = int(ahead[-1])
+            self.confirmed_end = self._last_line + 1
+        self._restarted |= bool(back.any())
+        suspects = np.union1d(np.flatnonzero(wrong), right[back])
+        return [_mismatch(rows[k], expected[k]) for k in suspects]
+
+    def tag(self, block: LineBlock) -> TaggedBlock:
+        """The block with code and time; lines that no tag confirmed so far are flagged."""
+        table = self.table(block.first_line, len(block))
+        flags = block.flags
+        confirmed = max(0, self.confirmed_end - block.first_line)
+        if confirmed < len(block):
+            flags = flags.copy()
+            flags[confirmed:] |= UNCONFIRMED
+        return TaggedBlock(
+            arm=block.arm,
+            first_line=block.first_line,
+            pixels=block.pixels,
+            flags=flags,
+            code_index=table.code_index,
+            code=table.code,
+            tick=table.tick,
+            time_ns=table.time_ns,
+        )
+
+    def table(self, first_line: int, count: int) -> LineTable:
+        """The lines ``first_line .. first_line + count - 1``; both arms share the pages it is cut from."""
+        page, at = divmod(first_line, _PAGE_LINES)
+        if at + count <= _PAGE_LINES:
+            return self._page(page)[at : at + count]
+        return self._compute(first_line, count)
+
+    def _page(self, number: int) -> LineTable:
+        page = self._pages.pop(number, None) or self._compute(number * _PAGE_LINES, _PAGE_LINES)
+        self._pages[number] = page
+        if len(self._pages) > _PAGES_KEPT:
+            del self._pages[next(iter(self._pages))]  # the one not used for longest
+        return page
+
+    def _compute(self, first_line: int, count: int) -> LineTable:
+        substeps = self._run.substeps
+        first_bit = substeps * first_line
+        code_index = np.arange(first_bit, first_bit + substeps * count, substeps, dtype=np.uint64)
+        tick = (code_index + np.uint64(self._readout_substep)) * np.uint64(self._run.substep_ticks)
+        bits = self._run.code.bits(first_bit, substeps * count).reshape(count, substeps)
+        code = np.packbits(bits, axis=1, bitorder="little")[:, 0]
+        return LineTable(code_index, code, tick, self._clock.time_ns(tick))
+
+    def _expected(self, lines: NDArray[np.uint64]) -> NDArray[np.uint64]:
+        code_index = lines * np.uint64(self._run.substeps)
+        return np.stack([lines, code_index, code_index * np.uint64(self._run.substep_ticks)], axis=1)
+
+
+def _mismatch(row: NDArray[Any], expected: NDArray[Any]) -> TagMismatch:
+    return TagMismatch(LineTag(*map(int, row)), LineTag(*map(int, expected)))

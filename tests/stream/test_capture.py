@@ -1,0 +1,394 @@
+"""The whole capture path: real processes, real shared memory, real recordings; devices made of a wire."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+import zarr
+from wired_devices import (
+    CLOCK_HZ,
+    CODE,
+    PIXELS,
+    SATURATED_EVERY,
+    STAGES,
+    SUBSTEP_TICKS,
+    SUBSTEPS,
+    Bench,
+    make_bench,
+    make_spec,
+    pixels_of,
+)
+
+from acquire.errors import AcquireError, CameraError, DeviceError, StateError, TriggerError, UsageError
+from acquire.lines import ARMS, LineFlag
+from acquire.store import Recording, RunCondition, open_recording
+from acquire.stream import Capture, CaptureStatus
+from acquire.trigger.base import TriggerRun
+
+PATIENCE_S = 30.0
+UNCONFIRMED = LineFlag.TIME_ESTIMATED | LineFlag.CODE_UNVERIFIED
+
+
+def until(condition: Callable[[], object], what: str) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline, f"waited {PATIENCE_S} s for {what}"
+        time.sleep(0.005)
+
+
+@contextmanager
+def armed(bench: Bench) -> Iterator[Capture]:
+    capture = Capture(bench.plan, bench.trigger)
+    try:
+        capture.arm()
+        yield capture
+    finally:
+        try:
+            capture.close()
+        finally:
+            bench.wire.close()
+
+
+def record_until(capture: Capture, path: Path, rows: int) -> None:
+    """Start without a budget and let ``rows`` rows be written."""
+    capture.start(path, make_spec())
+    until(lambda: capture.poll().recorded_lines > rows, f"{rows} rows")
+
+
+def sealed(capture: Capture) -> CaptureStatus:
+    until(lambda: capture.poll().done, "the seal")
+    return capture.poll()
+
+
+def check_rows(path: Path) -> tuple[Recording, dict[str, np.ndarray]]:
+    """Every row of both arms against what the devices made; returns where lines are missing (arm → rows).
+
+    Read by zarr-python alone, but for the table of gaps.
+    """
+    recording, group = open_recording(path), zarr.open_group(path, mode="r")
+    first, rows = group.attrs["first_line"], group["a/lines"].shape[0]
+    line = np.arange(first, first + rows)
+    missing = {}
+    for arm in ARMS:
+        stored = {name: array[:] for name, array in group[arm].arrays()}
+        gone = missing[arm] = (stored["flags"] & LineFlag.MISSING) != 0
+        expected = pixels_of(arm, line)
+        expected[gone] = 0
+        assert stored["lines"].shape == (rows, PIXELS)
+        assert np.array_equal(stored["lines"], expected)
+        saturated = (stored["flags"] & LineFlag.SATURATED) != 0
+        assert np.array_equal(saturated, (line % SATURATED_EVERY == 0) & ~gone)
+        check_tags(stored, line)
+        listed = np.zeros(rows, int)
+        for gap in recording.gaps:
+            if gap.arm == arm:
+                listed[gap.first_line - first :][: gap.count] += 1
+        assert np.array_equal(listed, gone)
+        account = group.attrs["ledger"][arm]
+        assert account["balanced"]
+        assert account["stored"] == rows - gone.sum()
+        assert sum(account["missing"].values()) == gone.sum()
+    assert group.attrs["ledger"]["pulses"] == rows
+    return recording, missing
+
+
+def check_tags(stored: dict[str, np.ndarray], line: np.ndarray) -> None:
+    tick = (SUBSTEPS * line + STAGES * SUBSTEPS - 1) * SUBSTEP_TICKS
+    bits = CODE.bits(int(line[0]) * SUBSTEPS, len(line) * SUBSTEPS).reshape(-1, SUBSTEPS)
+    assert np.array_equal(stored["code_index"], SUBSTEPS * line)
+    assert np.array_equal(stored["code"], bits @ (1 << np.arange(SUBSTEPS)))
+    assert np.array_equal(stored["tick"], tick)
+    assert np.array_equal(stored["time"], 1_700_000_000_000_000_000 + tick * 10**9 // CLOCK_HZ)
+
+
+def causes(recording: Recording) -> set[tuple[str, str]]:
+    return {(gap.arm, gap.cause) for gap in recording.gaps}
+
+
+def test_records_every_line_of_both_arms_as_it_was(tmp_path: Path) -> None:
+    bench = make_bench()
+    with armed(bench) as capture:
+        assert capture.clock.clock_hz == CLOCK_HZ
+        assert capture.cameras["b"]["Width"] == PIXELS
+        assert capture.cameras["b"]["identity"]["serial"] == "b"
+        with pytest.raises(StateError, match="nothing has been recorded"):
+            capture.stop()
+        until(lambda: capture.poll().lines["a"]["delivered"] > 2000, "lines while armed")
+        with pytest.raises(UsageError, match="does not exist"):
+            capture.start(tmp_path / "no" / "r.zarr", make_spec())
+        with pytest.raises(UsageError, match="budget of 0"):
+            capture.start(tmp_path / "r.zarr", make_spec(), 0)
+        assert not any(tmp_path.iterdir())
+
+        capture.start(tmp_path / "budget.zarr", make_spec(), 5000)
+        with pytest.raises(StateError, match="being written"):
+            capture.start(tmp_path / "second.zarr", make_spec())
+        budget = sealed(capture)
+        capture.stop()  # of what has ended by itself: nothing to do
+
+        record_until(capture, tmp_path / "stopped.zarr", 3000)
+        seen = capture.poll()
+        assert (seen.recording, seen.done, seen.condition) == (True, False, None)
+        capture.stop("told to")
+        stopped = sealed(capture)
+    after = capture.poll()
+    assert after.lines["a"]["preroll"] == after.lines["b"]["preroll"] == STAGES + 1
+    assert after.ring["a"]["dropped_lines"] == 0
+    assert after.ring["a"]["peak"] <= after.ring["a"]["slots"] == 64
+    assert bench.trigger.stops == 1
+    for status, name, reason in (
+        (budget, "budget", "line budget reached"),
+        (stopped, "stopped", "told to"),
+    ):
+        recording, missing = check_rows(tmp_path / f"{name}.zarr")
+        assert not missing["a"].any()
+        assert not missing["b"].any()
+        assert recording.state == "sealed"
+        assert (status.condition, status.end_reason, status.fault) == (RunCondition.GOOD, reason, None)
+        assert recording.attrs["run_condition"] == "GOOD"
+        assert status.recorded_lines == status.committed_lines == recording.lines
+        assert status.first_line == recording.first_line > 1900
+    assert open_recording(tmp_path / "budget.zarr").lines == 5000
+    assert open_recording(tmp_path / "stopped.zarr").lines > 3000
+
+
+def test_losses_are_located_to_the_line(tmp_path: Path) -> None:
+    """A camera loses a block, and the recorder is held up until both rings overflow."""
+    bench = make_bench()
+    with armed(bench) as capture:
+        record_until(capture, tmp_path / "r.zarr", 1000)
+        bench.wire["drop_b"] = 1
+        until(lambda: capture.poll().lines["b"]["lost"]["camera"], "the camera's loss")
+        lost_by_camera = capture.poll().lines["b"]["lost"]["camera"]
+        recorder = capture.pids["recorder"]
+        assert recorder is not None
+        os.kill(recorder, signal.SIGSTOP)
+        until(lambda: all(capture.poll().ring[arm]["drops"] > 3 for arm in ARMS), "overflowing rings")
+        os.kill(recorder, signal.SIGCONT)
+        rows = capture.poll().recorded_lines
+        until(lambda: capture.poll().recorded_lines > rows + 14_000, "lines after the overflow")
+        capture.stop()
+        status = sealed(capture)
+        dropped = {arm: status.ring[arm]["dropped_lines"] for arm in ARMS}
+    recording, missing = check_rows(tmp_path / "r.zarr")
+    assert status.condition is RunCondition.INCOMPLETE
+    assert causes(recording) == {("a", "ring_full"), ("b", "ring_full"), ("b", "camera")}
+    assert lost_by_camera == 256
+    for arm in ARMS:
+        account = recording.attrs["ledger"][arm]["missing"]
+        assert account["ring_full"] == dropped[arm] > 0
+        assert missing[arm].sum() == status.lines[arm]["missing"]
+    assert recording.attrs["ledger"]["b"]["missing"]["camera"] == 256
+
+
+def test_a_stalled_arm_ends_the_recording_in_bounded_time(tmp_path: Path) -> None:
+    bench = make_bench(stall_timeout_s=1.0)
+    with armed(bench) as capture:
+        record_until(capture, tmp_path / "r.zarr", 1000)
+        bench.wire["stall_b"] = 1
+        begun = time.monotonic()
+        status = sealed(capture)
+        assert time.monotonic() - begun < 5
+    recording, missing = check_rows(tmp_path / "r.zarr")
+    assert (status.condition, status.fault) == (RunCondition.INCOMPLETE, None)
+    assert status.end_reason == "arm b stalled: no line for 1 s"
+    assert causes(recording) == {("b", "stalled")}
+    assert 0 < missing["b"].sum() < recording.lines
+    assert np.flatnonzero(missing["b"])[-1] == recording.lines - 1
+
+
+def test_a_stopped_trigger_ends_the_recording_without_missing_lines_in_doubt(tmp_path: Path) -> None:
+    bench = make_bench(stall_timeout_s=1.0)
+    with armed(bench) as capture:
+        record_until(capture, tmp_path / "r.zarr", 1000)
+        bench.wire["stop_ns"] = time.monotonic_ns()
+        status = sealed(capture)
+    check_rows(tmp_path / "r.zarr")
+    assert status.condition is RunCondition.INTERRUPTED
+    assert status.end_reason == "both arms stalled: no line for 1 s"
+
+
+@pytest.mark.parametrize(
+    ("fault", "text"),
+    [("die", "grabber b: killed by SIGKILL"), ("raise", "grabber b: the link is down")],
+)
+def test_a_dead_grabber_is_a_fault_and_what_was_written_is_sealed(
+    tmp_path: Path, fault: str, text: str
+) -> None:
+    bench = make_bench()
+    with armed(bench) as capture:
+        record_until(capture, tmp_path / "r.zarr", 1000)
+        bench.wire[f"{fault}_b"] = 1
+        until(lambda: capture.poll().fault, "the fault")
+        status = sealed(capture)
+        with pytest.raises(StateError, match="has failed"):
+            capture.start(tmp_path / "next.zarr", make_spec())
+    recording, missing = check_rows(tmp_path / "r.zarr")
+    assert status.fault == status.end_reason == text
+    assert status.condition is RunCondition.INTERRUPTED
+    assert recording.attrs["run_condition"] == "INTERRUPTED"
+    assert not missing["a"].any()
+    assert causes(recording) <= {("b", "arm_lost")}
+
+
+def test_a_killed_recorder_leaves_what_was_committed(tmp_path: Path) -> None:
+    with armed(make_bench()) as capture:
+        capture.start(tmp_path / "r.zarr", make_spec())
+        until(lambda: capture.poll().committed_lines > 1000, "commits")
+        recorder = capture.pids["recorder"]
+        assert recorder is not None
+        os.kill(recorder, signal.SIGKILL)
+        until(lambda: capture.poll().fault, "the fault")
+        status = capture.poll()
+    assert status.fault == "recorder: killed by SIGKILL"
+    assert (status.recording, status.done, status.condition) == (False, False, None)
+    recording = open_recording(tmp_path / "r.zarr")
+    assert recording.state == "recording"
+    assert recording.lines >= status.committed_lines > 1000
+    line = np.arange(recording.first_line, recording.first_line + recording.lines)
+    assert np.array_equal(recording.camera("b").lines[:], pixels_of("b", line))
+
+
+def test_a_killed_owner_ends_everything_and_the_recording_is_sealed(tmp_path: Path) -> None:
+    here = Path(__file__).parent
+    command = [sys.executable, str(here / "doomed_owner.py"), str(tmp_path / "r.zarr")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as owner:
+        try:
+            assert owner.stdout is not None
+            pids = json.loads(owner.stdout.readline())
+            processes = [psutil.Process(pid) for pid in pids.values()]
+        finally:
+            owner.kill()
+    _, alive = psutil.wait_procs(processes, timeout=10)
+    assert not alive
+    recording, _ = check_rows(tmp_path / "r.zarr")
+    assert recording.lines >= 2000
+    assert recording.attrs["run_condition"] == "INTERRUPTED"
+    assert recording.attrs["end_reason"] == "the owner of the capture is gone"
+
+
+def test_close_seals_what_is_being_recorded(tmp_path: Path) -> None:
+    bench = make_bench()
+    with armed(bench) as capture:
+        record_until(capture, tmp_path / "r.zarr", 1000)
+        capture.close()
+        capture.close()
+        status = capture.poll()
+        with pytest.raises(StateError, match="not armed"):
+            capture.start(tmp_path / "next.zarr", make_spec())
+        with pytest.raises(StateError, match="been used"):
+            capture.arm()
+    check_rows(tmp_path / "r.zarr")
+    assert (status.done, status.recording) == (True, False)
+    assert (status.condition, status.end_reason) == (RunCondition.INTERRUPTED, "the capture was closed")
+
+
+def test_a_write_error_aborts_and_the_rings_are_emptied_all_the_same(tmp_path: Path) -> None:
+    with armed(make_bench()) as capture:
+        record_until(capture, tmp_path / "r.zarr", 1000)
+        shutil.rmtree(tmp_path / "r.zarr")
+        status = sealed(capture)
+        assert status.condition is RunCondition.ABORTED
+        assert status.end_reason is not None
+        assert status.end_reason.startswith("write error: ")
+        capture.start(tmp_path / "next.zarr", make_spec(), 1000)
+        assert sealed(capture).condition is RunCondition.GOOD
+    check_rows(tmp_path / "next.zarr")
+
+
+def test_lines_without_tags_are_flagged_not_lost(tmp_path: Path) -> None:
+    bench = make_bench(tag_wait_s=0.05)
+    bench.trigger.mute = True
+    with armed(bench) as capture:
+        capture.start(tmp_path / "r.zarr", make_spec(), 3000)
+        status = sealed(capture)
+    assert status.condition is RunCondition.TAINTED
+    assert status.ledger["a"]["unverified"] == status.ledger["b"]["unverified"] == 3000
+    check_rows(tmp_path / "r.zarr")
+    flags = open_recording(tmp_path / "r.zarr").camera("a").flags[:]
+    assert ((flags & UNCONFIRMED) == UNCONFIRMED).all()
+
+
+def test_tags_that_contradict_the_lines_taint_the_recording(tmp_path: Path) -> None:
+    bench = make_bench(tag_wait_s=0.05)
+    with armed(bench) as capture:
+        record_until(capture, tmp_path / "r.zarr", 1000)
+        bench.trigger.shift = 1
+        until(lambda: capture.poll().recorded_lines > 3000, "lines under wrong tags")
+        capture.stop()
+        status = sealed(capture)
+    recording, _ = check_rows(tmp_path / "r.zarr")
+    assert status.condition is RunCondition.TAINTED
+    assert status.ledger["tag_mismatches"] > 0
+    assert any(event.kind == "tag_mismatch" for event in recording.events)
+
+
+@pytest.mark.parametrize(
+    ("error", "fault"),
+    [
+        (TriggerError("unplugged"), "trigger: unplugged"),
+        (ZeroDivisionError("a bug"), "trigger: ZeroDivisionError: a bug"),
+    ],
+)
+def test_a_trigger_that_fails_is_a_fault(tmp_path: Path, error: Exception, fault: str) -> None:
+    bench = make_bench()
+    with armed(bench) as capture:
+        record_until(capture, tmp_path / "r.zarr", 1000)
+        bench.trigger.broken = error
+        until(lambda: capture.poll().fault, "the fault")
+        assert capture.poll().fault == fault
+    recording, _ = check_rows(tmp_path / "r.zarr")
+    assert recording.attrs["run_condition"] == "INTERRUPTED"
+    assert recording.attrs["end_reason"] == fault
+
+
+@pytest.mark.parametrize(
+    ("fault", "kind", "text"),
+    [
+        ("refuse", CameraError, "camera b is in use; possible: another; try: unplug it"),
+        ("bug", AcquireError, "grabber b: ZeroDivisionError: a bug"),
+        ("die", DeviceError, "grabber b: killed by SIGKILL"),
+        ("hang", DeviceError, "grabber b: no answer in time"),
+        ("trigger", TriggerError, "the run is too fast"),
+    ],
+)
+def test_arm_undoes_everything_when_something_fails(fault: str, kind: type[AcquireError], text: str) -> None:
+    bench = make_bench(fault_b=fault)
+    bench.trigger.refuse = fault == "trigger"
+    capture = Capture(bench.plan, bench.trigger)
+    with pytest.raises(kind) as failure:
+        capture.arm(timeout_s=3.0)
+    assert str(failure.value) == text
+    assert bench.trigger.stops == (fault == "trigger")
+    assert capture.poll() == CaptureStatus()
+    bench.wire.close()
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ({"openers": {"a": None}}, "cameras a"),
+        ({"dtype": "float32"}, "float32"),
+        ({"ring_slots": 0}, "0 slots"),
+        ({"ring_slots": 1, "block_lines": 100}, "a tag every 100 lines"),
+        ({"run": TriggerRun("r", CODE, 9, 900, 100)}, "S = 9"),
+    ],
+)
+def test_plans_that_cannot_work_are_refused(change: dict[str, object], text: str) -> None:
+    bench = make_bench()
+    with pytest.raises(UsageError, match=text):
+        replace(bench.plan, **change)
+    bench.wire.close()
