@@ -6,8 +6,9 @@ One line sums the voxels along a staircase in (time, row): at fixed row block q,
     m(d) = #{(r, u): r + u = d, r < length, u < S} = min(d + 1, length, S, length + S - 1 - d)
 
 and weight ``m(d)·E(t)``. Weights that fall into the same frame (T_m > 1) are summed before the row of
-voxels is touched. An own kernel because sparse libraries need the matrix in memory (tens to hundreds of
-MB per arm) to be as fast.
+voxels is touched. An own kernel because sparse libraries need the matrix in memory, tens to hundreds of MB
+per arm, to be as fast (tools/bench_operator.py). Elements are addressed one by one: a slice of an array
+costs a reference count, which is more than the work on a short row.
 """
 
 from __future__ import annotations
@@ -38,8 +39,7 @@ def shear(
 ) -> None:
     """out[i, c] = Σ_q Σ_d m(d)·E(t)·voxels[t // T_m, q, c]."""
     for i in numba.prange(out.shape[0]):
-        row = out[i]
-        row[:] = 0
+        out[i, :] = 0
         for q in range(len(starts)):
             first = i * S + starts[q]
             steps = lengths[q] + S - 1
@@ -47,11 +47,17 @@ def shear(
             for d in range(steps):
                 t = first + d
                 if t // T_m != frame:
-                    _add_scaled(row, weight, voxels[frame, q])
+                    if weight:
+                        scale = out.dtype.type(weight)
+                        for c in range(out.shape[1]):
+                            out[i, c] += scale * voxels[frame, q, c]
                     weight, frame = 0, t // T_m
                 if code[t]:
                     weight += _multiplicity(d, lengths[q], S)
-            _add_scaled(row, weight, voxels[frame, q])
+            if weight:
+                scale = out.dtype.type(weight)
+                for c in range(out.shape[1]):
+                    out[i, c] += scale * voxels[frame, q, c]
 
 
 @numba.njit(parallel=True, cache=True, fastmath={"contract", "reassoc", "nsz"})
@@ -68,8 +74,7 @@ def unshear(
     for f in numba.prange(out.shape[0]):
         t_first, t_end = f * T_m, min((f + 1) * T_m, len(code))
         for q in range(len(starts)):
-            row = out[f, q]
-            row[:] = 0
+            out[f, q, :] = 0
             steps = lengths[q] + S - 1
             i_first = max(0, -((steps - 1 + starts[q] - t_first) // S))
             i_end = min(lines.shape[0], (t_end - 1 - starts[q]) // S + 1)
@@ -79,15 +84,30 @@ def unshear(
                 for t in range(max(first, t_first), min(first + steps, t_end)):
                     if code[t]:
                         weight += _multiplicity(t - first, lengths[q], S)
-                _add_scaled(row, weight, lines[i])
+                if weight:
+                    scale = out.dtype.type(weight)
+                    for c in range(out.shape[2]):
+                        out[f, q, c] += scale * lines[i, c]
 
 
-@numba.njit(cache=True, inline="always")
-def _add_scaled(row: NDArray[Any], weight: int, addend: NDArray[Any]) -> None:
-    if weight:
-        w = row.dtype.type(weight)
-        for c in range(len(row)):
-            row[c] += w * addend[c]
+@numba.njit(cache=True)
+def blocks_to_pixels(blocks: NDArray[Any], n: int, S: int, N_m: int) -> NDArray[Any]:
+    """blocks·C_N: (L_R, n/N_m) → (L_R, M); every fine column carries its block's value into its pixel."""
+    pixels = np.zeros((blocks.shape[0], n // S), blocks.dtype)
+    for i in range(blocks.shape[0]):
+        for column in range(n):
+            pixels[i, column // S] += blocks[i, column // N_m]
+    return pixels
+
+
+@numba.njit(cache=True)
+def pixels_to_blocks(pixels: NDArray[Any], n: int, S: int, N_m: int) -> NDArray[Any]:
+    """pixels·C_Nᵀ: (L_R, M) → (L_R, n/N_m)."""
+    blocks = np.zeros((pixels.shape[0], (n + N_m - 1) // N_m), pixels.dtype)
+    for i in range(pixels.shape[0]):
+        for column in range(n):
+            blocks[i, column // N_m] += pixels[i, column // S]
+    return blocks
 
 
 @numba.njit(parallel=True, cache=True)

@@ -25,16 +25,6 @@ def block_bounds(length: int, merge: int) -> tuple[NDArray[np.int64], NDArray[np
     return starts, np.minimum(merge, length - starts)
 
 
-def column_overlap(geometry: Geometry, spatial_merge: int) -> NDArray[np.float64]:
-    """C_N (n/N_m, M): fine columns that block c′ shares with pixel j (Eq. 3, 4); N_m·I where N_m = S."""
-    n, S = geometry.size, geometry.substeps
-    block = np.arange(n) // spatial_merge
-    pixel = np.arange(n) // S
-    overlap = np.zeros((block[-1] + 1, geometry.stages))
-    np.add.at(overlap, (block, pixel), 1.0)
-    return overlap
-
-
 def merge_video(video: NDArray[Any], spatial_merge: int, temporal_merge: int) -> NDArray[Any]:
     """Mean of a fine video (T, n, n) over the blocks of each voxel: (⌈T/T_m⌉, ⌈n/N_m⌉, ⌈n/N_m⌉)."""
     if video.ndim != 3:

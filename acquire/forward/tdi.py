@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.errors import UsageError
-from acquire.forward.kernels import shear, unshear
-from acquire.forward.merge import block_bounds, column_overlap
+from acquire.forward.kernels import blocks_to_pixels, pixels_to_blocks, shear, unshear
+from acquire.forward.merge import block_bounds
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -40,19 +40,20 @@ class TdiArm:
         self._starts, self._lengths = block_bounds(geometry.size, spatial_merge)
         if flipped:
             self._starts = geometry.size - self._starts - self._lengths
-        self._C_N = column_overlap(geometry, spatial_merge).astype(dtype)
-        self._S, self._T_m = geometry.substeps, temporal_merge
+        self._n, self._S = geometry.size, geometry.substeps
+        self._N_m, self._T_m = spatial_merge, temporal_merge
 
     def forward(self, voxels: NDArray[Any]) -> NDArray[Any]:
         """(T/T_m, n/N_m, n/N_m) → (L_R, M)."""
         sheared = np.empty((self.lines_shape[0], self.voxels_shape[2]), self.dtype)
         shear(voxels, self._code, self._starts, self._lengths, self._S, self._T_m, sheared)
-        return sheared @ self._C_N
+        pixels: NDArray[Any] = blocks_to_pixels(sheared, self._n, self._S, self._N_m)
+        return pixels
 
     def adjoint(self, lines: NDArray[Any]) -> NDArray[Any]:
         """(L_R, M) → (T/T_m, n/N_m, n/N_m)."""
         voxels = np.empty(self.voxels_shape, self.dtype)
-        spread = np.ascontiguousarray(lines @ self._C_N.T)
+        spread = pixels_to_blocks(lines, self._n, self._S, self._N_m)
         unshear(spread, self._code, self._starts, self._lengths, self._S, self._T_m, voxels)
         return voxels
 

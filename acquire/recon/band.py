@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.forward import block_bounds, column_overlap
+from acquire.forward import block_bounds
+from acquire.forward.kernels import blocks_to_pixels, pixels_to_blocks
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -37,7 +38,7 @@ class BandOperator:
         self.theta_shape = (basis.count, side, side)
         self.lines_shape = geometry.lines_shape
         self.dtype = basis.dtype
-        self._C_N = column_overlap(geometry, spatial_merge).astype(self.dtype)
+        self._columns = (geometry.size, geometry.substeps, spatial_merge)
         starts, lengths = block_bounds(geometry.size, spatial_merge)
         lit = self._lit_cosines(code, basis, temporal_merge)
         flipped = geometry.size - starts - lengths
@@ -52,7 +53,7 @@ class BandOperator:
         side = self.theta_shape[1]
         return np.stack(
             [
-                (factor @ np.ascontiguousarray(view).reshape(-1, side)) @ self._C_N
+                blocks_to_pixels(factor @ np.ascontiguousarray(view).reshape(-1, side), *self._columns)
                 for factor, view in zip(self._factors, (rows, columns), strict=True)
             ]
         )
@@ -61,7 +62,7 @@ class BandOperator:
         """Bᵀ·y."""
         K, side, _ = self.theta_shape
         rows, columns = (
-            (factor.T @ (arm @ self._C_N.T)).reshape(side, K, side)
+            (factor.T @ pixels_to_blocks(arm, *self._columns)).reshape(side, K, side)
             for factor, arm in zip(self._factors, lines, strict=True)
         )
         theta: NDArray[Any] = rows.transpose(1, 0, 2) + columns.transpose(1, 2, 0)

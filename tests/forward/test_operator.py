@@ -8,7 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from acquire.errors import NumericsError, UsageError
-from acquire.forward import DualArm, column_overlap, hold_video, merge_video
+from acquire.forward import DualArm, hold_video, merge_video
+from acquire.forward.kernels import blocks_to_pixels, pixels_to_blocks
 from acquire.geometry import Geometry
 
 
@@ -121,8 +122,13 @@ def test_merge_and_hold_are_inverse_and_weigh_short_blocks_truly() -> None:
     rng = np.random.default_rng(0)
     voxels = rng.random(g.video_shape(3, 4))
     np.testing.assert_allclose(merge_video(hold_video(voxels, g, 3, 4), 3, 4), voxels, rtol=1e-6)
-    np.testing.assert_array_equal(column_overlap(g, 3), [[2, 1], [0, 1]])
-    np.testing.assert_array_equal(column_overlap(g, 2), 2 * np.eye(2))
+
+
+def test_columns_are_weighted_by_what_block_and_pixel_share() -> None:
+    """C_N of Eq. (3), and its transpose: N_m·I where N_m = S, true overlap counts elsewhere."""
+    np.testing.assert_array_equal(blocks_to_pixels(np.eye(2), 4, 2, 3), [[2, 1], [0, 1]])
+    np.testing.assert_array_equal(blocks_to_pixels(np.eye(2), 4, 2, 2), 2 * np.eye(2))
+    np.testing.assert_array_equal(pixels_to_blocks(np.eye(2), 4, 2, 3), [[2, 0], [1, 1]])
 
 
 def test_refusals_name_what_is_possible() -> None:
