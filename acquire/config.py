@@ -17,7 +17,7 @@ from acquire.errors import ConfigError
 from acquire.geometry import Geometry
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Mapping, Sequence
 
 PIXEL_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16}
 """SFNC PixelFormat → significant bits of an (unpacked) pixel."""
@@ -116,9 +116,9 @@ class CamerasConfig(_Model):
 
     @model_validator(mode="after")
     def _alike(self) -> CamerasConfig:
-        if self.a.dtype != self.b.dtype:
+        if self.a.pixel_format != self.b.pixel_format:
             raise ValueError(
-                f"both arms need one sample type, not {self.a.pixel_format} and {self.b.pixel_format}"
+                f"both arms need one pixel_format, not {self.a.pixel_format} and {self.b.pixel_format}"
             )
         return self
 
@@ -261,6 +261,21 @@ def load_rig(name: str | Path, overrides: Mapping[str, Any] | None = None) -> Ri
     rig = _validate(RigConfig, table, path)
     scene = find(rig.simulation.scene, beside=path).resolve()
     return rig.model_copy(update={"simulation": rig.simulation.model_copy(update={"scene": str(scene)})})
+
+
+def parse_settings(settings: Sequence[str]) -> dict[str, Any]:
+    """``["code.seed=7", "name='x'"]`` as overrides of `load_rig`; values are TOML."""
+    overrides = {}
+    for setting in settings:
+        key, equals, value = setting.partition("=")
+        try:
+            overrides[key.strip()] = tomllib.loads(f"value = {value}")["value"]
+        except tomllib.TOMLDecodeError as error:
+            raise ConfigError(
+                f"setting {setting!r}: {error}" if equals else f"setting {setting!r} has no '='",
+                possible="KEY=VALUE with a TOML value: code.seed=7, name='lab', cameras.a.serial='12'",
+            ) from error
+    return overrides
 
 
 def load_scene(name: str | Path) -> SceneConfig:

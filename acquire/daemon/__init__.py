@@ -1,0 +1,10 @@
+"""The capture service: a process that owns the devices, and the API over which it is controlled.
+
+::
+
+    acquire arm ──▶ client ══ HTTP + JSON over a Unix socket ══▶ control ──▶ service ──▶ Capture
+                                     (messages)                   server      states      devices
+
+``states`` is the table of what may follow what; ``service`` does the work on devices, in one thread;
+``control`` is the API; ``server`` is the process: socket, signals, supervision.
+"""

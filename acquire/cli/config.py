@@ -1,0 +1,101 @@
+"""``acquire config check | show | schema``: rig files without devices."""
+
+from __future__ import annotations
+
+import json as json_text
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from acquire.cli.output import JsonFlag, print_facts, print_json, quantity
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from acquire.config import RigConfig
+
+FileArgument = Annotated[str, typer.Argument(metavar="FILE", help="Rig file, or the name of a built-in one.")]
+
+
+def register(app: typer.Typer) -> None:
+    group = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
+    for command in (check, show, schema):
+        group.command()(command)
+    app.add_typer(group, name="config", help="Check and show rig files.", rich_help_panel="Rig")
+
+
+def check(file: FileArgument, json: JsonFlag = False) -> None:
+    """Validate a rig file and the scene it names; say what it amounts to.
+
+    Example: [bold]acquire config check rig-demo[/]
+    """
+    from acquire.config import load_rig, load_scene
+
+    rig = load_rig(file)
+    load_scene(rig.simulation.scene)
+    facts = _facts(rig)
+    if json:
+        print_json({"file": file, "valid": True, **facts})
+        return
+    typer.echo(f"{file}: valid")
+    print_facts(
+        {
+            "rig": facts["name"],
+            "geometry": f"M = {facts['stages']} stages, S = {facts['substeps']} sub-steps, "
+            f"n = {facts['size']} rows and columns",
+            "lines": quantity(facts["line_rate_hz"], "Hz"),
+            "sub-steps": quantity(facts["substep_rate_hz"], "Hz"),
+            "data": f"{quantity(facts['bytes_per_s'], 'B')}/s from both arms, {facts['dtype']}",
+            "socket": facts["socket"],
+        }
+    )
+
+
+def show(file: FileArgument, json: JsonFlag = False) -> None:
+    """The whole configuration with every default filled in: TOML that can be used as a file.
+
+    Example: [bold]acquire config show rig-demo[/]
+    """
+    from acquire.config import load_rig
+
+    table = load_rig(file).model_dump(mode="json")
+    if json:
+        print_json(table)
+        return
+    for line in _dotted(table):
+        typer.echo(line)
+
+
+def schema() -> None:
+    """JSON schema of rig files, for editors: every key, its limits and default.
+
+    Example: [bold]acquire config schema > rig.schema.json[/]
+    """
+    from acquire.config import RigConfig
+
+    print_json(RigConfig.model_json_schema())
+
+
+def _facts(rig: RigConfig) -> dict[str, Any]:
+    stages, substeps = rig.geometry.stages, rig.geometry.substeps
+    sample_bytes = 1 if rig.cameras.a.dtype == "uint8" else 2
+    return {
+        "name": rig.name,
+        "stages": stages,
+        "substeps": substeps,
+        "size": stages * substeps,
+        "line_rate_hz": rig.line_rate_hz,
+        "substep_rate_hz": rig.line_rate_hz * substeps,
+        "dtype": rig.cameras.a.dtype,
+        "bytes_per_s": 2 * rig.line_rate_hz * stages * sample_bytes,
+        "socket": str(rig.control.socket),
+    }
+
+
+def _dotted(table: dict[str, Any], prefix: str = "") -> Iterator[str]:
+    """``a.b = value`` per leaf: JSON's numbers, texts, booleans and lists are TOML's, null is no key."""
+    for key, value in table.items():
+        if isinstance(value, dict):
+            yield from _dotted(value, f"{prefix}{key}.")
+        elif value is not None:
+            yield f"{prefix}{key} = {json_text.dumps(value, ensure_ascii=False)}"

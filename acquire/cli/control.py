@@ -1,0 +1,153 @@
+"""``acquire arm | start | stop | disarm | status``: one command to the daemon each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, quantity
+from acquire.errors import DataError, UsageError
+
+if TYPE_CHECKING:
+    from acquire.daemon.client import Client
+    from acquire.daemon.messages import LastRecording, Status
+
+SocketOption = Annotated[
+    Path | None, typer.Option("--socket", envvar="ACQUIRE_SOCKET", help="The daemon's control socket.")
+]
+DAMAGED = ("INCOMPLETE", "ABORTED", None)
+"""Conditions of a recording that lost something."""
+
+
+def register(app: typer.Typer) -> None:
+    for command in (arm, start, stop, disarm, status):
+        app.command(rich_help_panel="Capture")(command)
+
+
+def arm(socket: SocketOption = None, json: JsonFlag = False) -> None:
+    """Start trigger and cameras; nothing is written yet.
+
+    Example: [bold]acquire arm[/]
+    """
+    with _daemon(socket) as daemon:
+        _show(daemon.arm(), json)
+
+
+def start(
+    path: Annotated[
+        Path | None, typer.Argument(metavar="[RECORDING]", help="New recording; else named by rig and time.")
+    ] = None,
+    lines: Annotated[int | None, typer.Option(help="Stop after so many lines.")] = None,
+    duration: Annotated[float | None, typer.Option(help="Stop after so many seconds.")] = None,
+    socket: SocketOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Record from the next line on, until stopped or for a number of lines or seconds.
+
+    Example: [bold]acquire start run.zarr --lines 100000[/]
+    """
+    with _daemon(socket) as daemon:
+        _show(daemon.start(path, lines=lines, duration_s=duration), json)
+
+
+def stop(socket: SocketOption = None, json: JsonFlag = False) -> None:
+    """End the recording; returns once it is sealed. Exit code 6 if lines were lost.
+
+    Example: [bold]acquire stop[/]
+    """
+    with _daemon(socket) as daemon:
+        status = daemon.stop()
+    _show(status, json)
+    if status.last is not None and status.last.condition in DAMAGED:
+        raise DataError(_damage(status.last), hint=f"acquire info {status.last.path}")
+
+
+def disarm(socket: SocketOption = None, json: JsonFlag = False) -> None:
+    """Stop trigger and cameras, or clear a fault.
+
+    Example: [bold]acquire disarm[/]
+    """
+    with _daemon(socket) as daemon:
+        _show(daemon.disarm(), json)
+
+
+def status(
+    wait: Annotated[
+        str | None, typer.Option(metavar="STATE", help="Wait until the daemon is in this state first.")
+    ] = None,
+    timeout: Annotated[float, typer.Option(metavar="SECONDS", help="Longest wait; then exit code 4.")] = 60.0,
+    socket: SocketOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """What the daemon is doing, and how well.
+
+    Example: [bold]acquire status --wait idle --timeout 30[/]
+    """
+    from acquire.daemon.states import State
+
+    if wait is not None and wait not in list(State):
+        raise UsageError(f"status --wait {wait}", possible=", ".join(State))
+    with _daemon(socket) as daemon:
+        _show(daemon.status() if wait is None else daemon.wait({State(wait)}, timeout), json)
+
+
+def _daemon(socket: Path | None) -> Client:
+    from acquire.config import default_socket
+    from acquire.daemon.client import Client
+
+    return Client(socket or default_socket())
+
+
+def _damage(last: LastRecording) -> str:
+    return f"recording {last.path} is {last.condition or 'not sealed'}: {last.end_reason or 'no end reason'}"
+
+
+def _show(status: Status, json: bool) -> None:
+    if json:
+        print_json(status.model_dump(mode="json"))
+        return
+    print_facts(
+        {
+            "state": f"{status.state} since {status.since:%Y-%m-%d %H:%M:%S} UTC",
+            "busy": status.busy,
+            "fault": status.fault,
+            "rig": f"{status.name} (process {status.pid}, up {status.uptime_s:.0f} s)",
+            "run": status.run_id,
+            "recording": _recording(status),
+            "last": _last(status.last),
+            "possible": ", ".join(status.possible) or "wait until it is idle",
+        }
+    )
+    if status.arms:
+        _show_arms(status)
+
+
+def _recording(status: Status) -> str | None:
+    now = status.recording
+    if now is None:
+        return None
+    budget = "" if now.budget_lines is None else f" of {now.budget_lines}"
+    return (
+        f"{now.path}, {now.recorded_lines}{budget} lines from line {now.first_line} on, "
+        f"{now.committed_lines} readable"
+    )
+
+
+def _last(last: LastRecording | None) -> str | None:
+    if last is None:
+        return None
+    return f"{last.path}, {last.lines} lines, {last.condition or 'not sealed'} ({last.end_reason})"
+
+
+def _show_arms(status: Status) -> None:
+    columns = ("arm", "rate", "delivered", "preroll", "recorded", "missing", "lost", "ring", "peak", "drops")
+    rows = []
+    for name, arm in status.arms.items():
+        lost = ", ".join(f"{cause} {lines}" for cause, lines in arm.lost.items() if lines) or "0"
+        counts = (arm.delivered, arm.preroll, arm.recorded, arm.missing)
+        ring = (f"{arm.ring.fill}/{arm.ring.slots}", arm.ring.peak, arm.ring.drops)
+        rows.append((name, quantity(arm.rate_hz, "Hz"), *counts, lost, *ring))
+    typer.echo()
+    print_table(columns, rows)

@@ -1,0 +1,180 @@
+"""``acquire ls | info | cut``: recordings on disk; no daemon needed."""
+
+from __future__ import annotations
+
+import os
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, quantity
+from acquire.errors import DataError, UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from acquire.lines import Segment
+
+RecordingArgument = Annotated[Path, typer.Argument(metavar="RECORDING", help="A directory NAME.zarr.")]
+
+
+def register(app: typer.Typer) -> None:
+    app.command("ls", rich_help_panel="Recordings")(list_recordings)
+    for command in (info, cut):
+        app.command(rich_help_panel="Recordings")(command)
+
+
+def list_recordings(
+    directory: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where to look.")] = Path(),
+    json: JsonFlag = False,
+) -> None:
+    """List the recordings of a directory; damaged ones are listed as such.
+
+    Example: [bold]acquire ls /data[/]
+    """
+    if not directory.is_dir():
+        raise UsageError(f"ls {directory}: no such directory")
+    found = [_summary(path) for path in _candidates(directory)]
+    if json:
+        print_json(found)
+    elif not found:
+        typer.echo(f"no recordings in {directory}")
+    else:
+        print_table(("recording", "lines", "duration", "size", "state", "started (UTC)"), map(_row, found))
+
+
+def info(recording: RecordingArgument, json: JsonFlag = False) -> None:
+    """What a recording holds: geometry, code, clock, losses, how it ended.
+
+    Example: [bold]acquire info run.zarr[/]
+    """
+    from acquire.store import open_recording
+
+    opened = open_recording(recording)
+    facts = opened.info()
+    if json:
+        gaps = [
+            {"arm": gap.arm, "first_line": gap.first_line, "count": gap.count, "cause": gap.cause}
+            for gap in opened.gaps
+        ]
+        print_json({**facts, "gap_list": gaps})
+        return
+    print_facts(_readable(facts))
+    if opened.gaps:
+        typer.echo()
+        rows = [(gap.arm, gap.first_line, gap.count, gap.cause) for gap in opened.gaps]
+        print_table(("arm", "first lost line", "lines", "cause"), rows)
+
+
+def cut(
+    recording: RecordingArgument,
+    first_line: Annotated[int, typer.Option(help="The trigger's number of the first line.")],
+    lines: Annotated[int, typer.Option(help="How many lines.")],
+    out: Annotated[Path, typer.Option(metavar="FILE.npz", help="New file.")],
+    json: JsonFlag = False,
+) -> None:
+    """Write a stretch of both arms to an npz file: lines, mask, code, time_ns, stages, substeps and scales.
+
+    Example: [bold]acquire cut run.zarr --first-line 2000 --lines 256 --out segment.npz[/]
+    """
+    from acquire.store import open_recording
+
+    _check_new(out)
+    segment = open_recording(recording).cut(first_line, lines)
+    size = _save(segment, out)
+    facts = {"path": str(out), "first_line": first_line, "lines": lines, "bytes": size}
+    if json:
+        print_json(facts)
+    else:
+        typer.echo(f"{out}: lines {first_line} to {first_line + lines - 1}, {quantity(size, 'B')}")
+
+
+def _candidates(directory: Path) -> Iterator[Path]:
+    """Zarr groups that say they are recordings, and those that cannot say what they are."""
+    for path in sorted(directory.glob("*.zarr")):
+        if path.is_dir():
+            yield path
+
+
+def _summary(path: Path) -> dict[str, Any]:
+    from acquire.store import open_recording
+
+    try:
+        facts = open_recording(path).info()
+    except DataError as error:
+        return {"path": str(path), "error": error.message}
+    keys = ("path", "run_id", "state", "run_condition", "lines", "duration_s", "bytes", "start_ns")
+    return {key: facts[key] for key in keys}
+
+
+def _row(facts: dict[str, Any]) -> tuple[str, ...]:
+    name = Path(facts["path"]).name
+    if "error" in facts:
+        return (name, "-", "-", "-", facts["error"], "-")
+    state = facts["run_condition"] or facts["state"]
+    size = quantity(facts["bytes"], "B")
+    return (name, str(facts["lines"]), f"{facts['duration_s']:.3f} s", size, state, _utc(facts["start_ns"]))
+
+
+def _readable(facts: dict[str, Any]) -> dict[str, Any]:
+    sizes = facts["geometry"]
+    first, lines = facts["first_line"], facts["lines"]
+    return {
+        "recording": facts["path"],
+        "run": facts["run_id"],
+        "state": f"{facts['state']}, {facts['run_condition'] or 'no condition yet'}",
+        "end": facts["end_reason"],
+        "lines": f"{lines} ({first} to {first + lines - 1})" if lines else "0",
+        "duration": f"{facts['duration_s']:.6f} s at {quantity(facts['line_rate_hz'], 'Hz')}",
+        "started": _utc(facts["start_ns"]),
+        "geometry": f"M = {sizes['stages']}, S = {sizes['substeps']}, {sizes['pixels']} pixels",
+        "samples": facts["dtype"],
+        "code": ", ".join(f"{key} {value}" for key, value in facts["code"].items()),
+        "clock": f"{facts['clock']['clock_hz']} Hz, UTC known to {facts['clock']['uncertainty_ns']} ns",
+        "size": quantity(facts["bytes"], "B"),
+        "lost lines": ", ".join(f"{arm} {count}" for arm, count in facts["lost_lines"].items()),
+        "simulated": "yes" if facts["simulated"] else "no",
+        "written by": f"acquire {facts['versions']['acquire']}",
+    }
+
+
+def _utc(time_ns: int | None) -> str:
+    if time_ns is None:
+        return "-"
+    return datetime.fromtimestamp(time_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S.%f")
+
+
+def _check_new(out: Path) -> None:
+    if out.exists():
+        raise UsageError(f"cut to {out}: it exists and stays untouched", hint="another --out")
+    if not out.parent.is_dir() or not os.access(out.parent, os.W_OK):
+        raise UsageError(f"cut to {out}: its directory does not exist or cannot be written")
+
+
+def _save(segment: Segment, out: Path) -> int:
+    """Write the segment; a file that is there is whole. The file's size."""
+    import numpy as np
+
+    part = out.with_name(out.name + ".part")
+    try:
+        with part.open("xb") as file:
+            np.savez(
+                file,
+                lines=segment.lines,
+                mask=segment.mask,
+                code=segment.code,
+                time_ns=segment.time_ns,
+                stages=segment.geometry.stages,
+                substeps=segment.geometry.substeps,
+                first_line=segment.first_line,
+                substep_ns=segment.substep_ns,
+                black_level_dn=segment.black_level_dn,
+                responsivity_dn=segment.responsivity_dn,
+            )
+        part.rename(out)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise DataError(f"cut to {out}: {error.strerror}") from error
+    return out.stat().st_size

@@ -1,0 +1,45 @@
+"""``acquire serve``: the daemon in the foreground."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def register(app: typer.Typer) -> None:
+    app.command(rich_help_panel="Capture")(serve)
+
+
+def serve(
+    config: Annotated[
+        str, typer.Option("--config", "-c", metavar="FILE", help="Rig file, or the name of a built-in one.")
+    ],
+    socket: Annotated[
+        Path | None,
+        typer.Option(envvar="ACQUIRE_SOCKET", help="Control socket; else the configuration's."),
+    ] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Change one value of the file, e.g. code.seed=7."),
+    ] = None,
+) -> None:
+    """Own the rig's devices and take commands, until SIGTERM or Ctrl-C.
+
+    A recording under way is drained and sealed first; a second Ctrl-C seals what there is at once.
+
+    Example: [bold]acquire serve --config rig-demo[/]
+    """
+    import logging
+
+    from acquire.config import load_rig, parse_settings
+    from acquire.daemon.server import serve as run_daemon
+
+    overrides = parse_settings(settings or [])
+    if socket is not None:
+        overrides["control.socket"] = str(socket.absolute())
+    rig = load_rig(config, overrides)
+    logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO)
+    logging.getLogger("uvicorn").setLevel(logging.WARNING)
+    raise typer.Exit(run_daemon(rig))

@@ -1,0 +1,100 @@
+"""The control API: one route per command, described at /openapi.json.
+
+Commands run one after the other in the service's thread; the status is answered from what that thread
+published last, so that it never waits for a device.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Protocol
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+
+from acquire import __version__
+from acquire.daemon.messages import (
+    HTTP_STATUS,
+    ErrorMessage,
+    StartRequest,
+    Status,
+    error_body,
+    http_status,
+)
+from acquire.errors import AcquireError, UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+
+class Commands(Protocol):
+    """What the API controls."""
+
+    def status(self) -> Status: ...
+    def arm(self) -> None: ...
+    def start(self, request: StartRequest) -> None: ...
+    def stop(self) -> None: ...
+    def disarm(self) -> None: ...
+
+
+def build_app(service: Commands, run: Callable[[Callable[[], None]], Awaitable[None]]) -> FastAPI:
+    """The API over ``service``; ``run`` carries a command out in the thread that owns the devices."""
+    app = FastAPI(
+        title="acquire",
+        version=__version__,
+        description="Control of the capture service.",
+        responses={code: {"model": ErrorMessage} for _, code in HTTP_STATUS},
+        docs_url=None,  # the pages would load scripts from elsewhere
+        redoc_url=None,
+    )
+    _add_errors(app)
+
+    @app.get("/status", summary="What the daemon is doing, and how well")
+    async def status() -> Status:
+        return service.status()
+
+    @app.post("/arm", summary="idle → armed")
+    async def arm() -> Status:
+        await run(service.arm)
+        return service.status()
+
+    @app.post("/start", summary="armed → recording")
+    async def start(request: StartRequest) -> Status:
+        await run(lambda: service.start(request))
+        return service.status()
+
+    @app.post("/stop", summary="recording → draining → idle; returns once the recording is sealed")
+    async def stop() -> Status:
+        await run(service.stop)
+        return service.status()
+
+    @app.post("/disarm", summary="armed → idle; clears a fault")
+    async def disarm() -> Status:
+        await run(service.disarm)
+        return service.status()
+
+    return app
+
+
+def _add_errors(app: FastAPI) -> None:
+    @app.exception_handler(AcquireError)
+    async def refused(_: Request, error: AcquireError) -> JSONResponse:
+        return _answer(error)
+
+    @app.exception_handler(RequestValidationError)
+    async def malformed(_: Request, error: RequestValidationError) -> JSONResponse:
+        return _answer(UsageError("; ".join(map(_explain, error.errors()))))
+
+    @app.exception_handler(Exception)
+    async def defect(_: Request, error: Exception) -> JSONResponse:
+        # The server logs the traceback; the user gets one line and a way to tell us.
+        return _answer(AcquireError(f"defect in the daemon: {error!r}", hint="see the daemon's log"))
+
+
+def _explain(item: dict[str, Any]) -> str:
+    key = ".".join(str(part) for part in item["loc"] if part != "body") or "request"
+    return f"{key} = {item.get('input')!r}: {item['msg']}"
+
+
+def _answer(error: AcquireError) -> JSONResponse:
+    return JSONResponse(error_body(error), status_code=http_status(error))

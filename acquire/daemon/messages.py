@@ -1,0 +1,144 @@
+"""What travels over the control socket: requests, the status, and errors as JSON.
+
+The daemon and its clients share these models; the API description is made from them.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from acquire import errors
+from acquire.daemon.states import State
+from acquire.errors import AcquireError, DeviceError, StateError, UsageError
+
+
+class _Message(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class StartRequest(_Message):
+    """Where to record, and how much."""
+
+    path: Path | None = Field(
+        default=None,
+        description="absolute path of the new recording; absent: named after rig and time in the "
+        "configured directory",
+    )
+    lines: int | None = Field(default=None, ge=1, le=2**53, description="line budget; absent: until stop")
+    duration_s: float | None = Field(
+        default=None, gt=0, le=1e9, allow_inf_nan=False, description="budget in seconds instead of lines"
+    )
+
+    @model_validator(mode="after")
+    def _one_budget(self) -> StartRequest:
+        if self.lines is not None and self.duration_s is not None:
+            raise ValueError("lines and duration_s are two ways to say the same: give one")
+        if self.path is not None and not self.path.is_absolute():
+            raise ValueError(f"path {str(self.path)!r} is not absolute: the daemon has another directory")
+        return self
+
+
+class RingStatus(_Message):
+    """Fill of the ring between a camera and the recorder, in slots."""
+
+    slots: int
+    fill: int
+    peak: int
+    drops: int = Field(description="blocks that found no free slot")
+
+
+class ArmStatus(_Message):
+    """One arm since it was armed: what its camera delivered and what became of it, in lines."""
+
+    delivered: int = Field(description="by the camera, the preroll included")
+    preroll: int = Field(description="exposed before the run's start, discarded")
+    lost: dict[str, int] = Field(description="cause → lines")
+    recorded: int = Field(description="rows of the latest recording")
+    missing: int = Field(description="those of them that hold no line")
+    rate_hz: float = Field(description="lines per second over the last seconds")
+    ring: RingStatus
+
+
+class RecordingStatus(_Message):
+    """The recording being written."""
+
+    path: Path
+    first_line: int | None = Field(description="the trigger's number of row 0")
+    budget_lines: int | None
+    recorded_lines: int = Field(description="rows that both arms have")
+    committed_lines: int = Field(description="rows that a reader can see, in both arms")
+
+
+class LastRecording(_Message):
+    """The recording that was closed last."""
+
+    path: Path
+    lines: int
+    condition: str | None = Field(description="what the lines are worth; null: it could not be sealed")
+    end_reason: str | None
+
+
+class Status(_Message):
+    """What the daemon is doing, and how well."""
+
+    state: State
+    since: datetime
+    possible: list[str] = Field(description="commands that the state allows")
+    busy: str | None = Field(description="the command being carried out")
+    name: str = Field(description="of the rig")
+    version: str
+    pid: int
+    uptime_s: float
+    run_id: str | None
+    recording: RecordingStatus | None
+    arms: dict[str, ArmStatus]
+    last: LastRecording | None
+    fault: str | None
+
+
+class ErrorMessage(_Message):
+    """An AcquireError on the wire."""
+
+    error: str = Field(description="name of the class in acquire.errors")
+    message: str
+    possible: str = ""
+    hint: str = ""
+    exit_code: int
+
+    @classmethod
+    def of(cls, error: AcquireError) -> ErrorMessage:
+        return cls(
+            error=type(error).__name__,
+            message=error.message,
+            possible=error.possible,
+            hint=error.hint,
+            exit_code=error.exit_code,
+        )
+
+    def rebuild(self) -> AcquireError:
+        """The error again, of its own class where this version knows it."""
+        known = getattr(errors, self.error, None)
+        if not (isinstance(known, type) and issubclass(known, AcquireError)):
+            known = AcquireError
+        return known(self.message, possible=self.possible, hint=self.hint)
+
+
+HTTP_STATUS: tuple[tuple[type[AcquireError], int], ...] = (
+    (UsageError, 422),
+    (StateError, 409),
+    (DeviceError, 503),
+    (AcquireError, 500),
+)
+"""The first class that fits decides."""
+
+
+def http_status(error: AcquireError) -> int:
+    return next(status for kind, status in HTTP_STATUS if isinstance(error, kind))
+
+
+def error_body(error: AcquireError) -> dict[str, Any]:
+    return ErrorMessage.of(error).model_dump()

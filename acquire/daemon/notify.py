@@ -1,0 +1,22 @@
+"""Readiness and liveness for systemd (``Type=notify``): datagrams to the socket it names, if it does."""
+
+from __future__ import annotations
+
+import os
+import socket
+
+
+def notify(message: str) -> bool:
+    """Send ``READY=1``, ``STOPPING=1``, ``WATCHDOG=1`` …; False where nobody asked to be told.
+
+    A notification that cannot be delivered must not end a measurement: False as well.
+    """
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if not address.startswith(("/", "@")):
+        return False
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
+        try:
+            sender.sendto(message.encode(), address.replace("@", "\0", 1) if address[0] == "@" else address)
+        except OSError:
+            return False
+    return True

@@ -1,0 +1,122 @@
+"""From the rig's configuration to one run: the capture's plan, and what its recording says of itself."""
+
+from __future__ import annotations
+
+import secrets
+from dataclasses import asdict
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+from acquire.store import RecordingSpec
+from acquire.stream import Capture, CapturePlan
+from acquire.trigger.base import TriggerRun
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from acquire.config import RigConfig
+    from acquire.rig import Rig
+    from acquire.stream import CaptureStatus
+
+
+class Run:
+    """One run of a rig: armed once, records at most once, closed once."""
+
+    def __init__(self, config: RigConfig, rig: Rig) -> None:
+        """Nothing is touched yet. Raises UsageError for a configuration that cannot work."""
+        self.run_id = new_run_id(config.name)
+        self._config = config
+        self._rig = rig
+        self._capture = Capture(capture_plan(config, rig, self.run_id), rig.trigger)
+
+    def arm(self) -> None:
+        """Cameras and trigger run; on failure everything is undone and the first error raised."""
+        self._capture.arm()
+
+    def start(self, path: Path, lines: int | None) -> None:
+        """Record to ``path``. Raises UsageError where it cannot be, before anything is touched."""
+        self._capture.start(path, self._spec(), lines)
+
+    def stop(self, reason: str) -> None:
+        """End the recording at the newest line; ``reason`` is recorded."""
+        self._capture.stop(reason)
+
+    def poll(self) -> CaptureStatus:
+        """What the capture path does at this moment."""
+        return self._capture.poll()
+
+    def close(self) -> None:
+        """Seal what is being recorded and release the devices. Idempotent."""
+        self._capture.close()
+
+    def _spec(self) -> RecordingSpec:
+        """What the recording says of itself; the recorder fills in its first line."""
+        config = self._config
+        return RecordingSpec(
+            run_id=self.run_id,
+            stages=config.geometry.stages,
+            substeps=config.geometry.substeps,
+            pixels=config.geometry.stages,
+            dtype=config.cameras.a.dtype,
+            first_line=0,
+            clock=self._capture.clock,
+            code=config.code.build().to_attrs(),
+            substep_ticks=config.trigger.substep_ticks,
+            trigger={**asdict(self._rig.trigger.identify()), "settings": config.trigger.model_dump()},
+            cameras={arm: self._camera(arm, facts) for arm, facts in self._capture.cameras.items()},
+            config=config.model_dump(mode="json"),
+            extra=self._rig.describe(),
+            chunk_lines=config.recording.chunk_lines,
+            shard_chunks=config.recording.shard_chunks,
+            codec=config.recording.codec,
+            fsync=config.recording.fsync,
+        )
+
+    def _camera(self, arm: str, facts: dict[str, Any]) -> dict[str, Any]:
+        camera = self._config.cameras.arm(arm)
+        calibration = {
+            "white_dn": camera.white_dn,
+            "black_level_dn": camera.black_level_dn,
+            "responsivity_dn": camera.responsivity_dn,
+        }
+        return {**calibration, **facts}
+
+
+def capture_plan(config: RigConfig, rig: Rig, run_id: str) -> CapturePlan:
+    """What the capture path is asked to do. Raises UsageError for what cannot work."""
+    return CapturePlan(
+        run=TriggerRun(
+            run_id=run_id,
+            code=config.code.build(),
+            substeps=config.geometry.substeps,
+            substep_ticks=config.trigger.substep_ticks,
+            tag_every_lines=config.trigger.tag_every_lines,
+        ),
+        stages=config.geometry.stages,
+        pixels=config.geometry.stages,
+        dtype=config.cameras.a.dtype,
+        block_lines=config.stream.block_lines,
+        ring_slots=config.stream.ring_slots,
+        white_dn=config.cameras.a.white_dn,
+        openers=rig.openers(),
+    )
+
+
+def new_run_id(name: str) -> str:
+    """A name for a run that no other run has: rig, UTC, and chance for runs within one second."""
+    return f"{name}-{_stamp()}-{secrets.token_hex(3)}"
+
+
+def default_path(config: RigConfig) -> Path:
+    """A free path in the configured directory, named after rig and UTC."""
+    directory = config.recording.directory.absolute()
+    path = directory / f"{config.name}-{_stamp()}.zarr"
+    number = 2
+    while path.exists():
+        path = directory / f"{config.name}-{_stamp()}-{number}.zarr"
+        number += 1
+    return path
+
+
+def _stamp() -> str:
+    return datetime.now(UTC).strftime("%Y%m%dT%H%M%SZ")

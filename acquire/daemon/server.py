@@ -1,0 +1,131 @@
+"""The daemon's process: socket, signals, supervision, and the order in which all of it ends.
+
+The event loop answers requests; one thread owns the devices, so that commands and supervision come one
+after the other and a slow device never keeps the status from being answered.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import signal
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, TypeVar
+
+import uvicorn
+
+from acquire.daemon.control import build_app
+from acquire.daemon.endpoint import Endpoint
+from acquire.daemon.notify import notify
+from acquire.daemon.plan import Run
+from acquire.daemon.service import Service
+from acquire.errors import EXIT_INTERRUPTED, StateError
+from acquire.rig import Rig
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from acquire.config import RigConfig
+
+SUPERVISE_S = 0.2
+"""Time between two looks at the capture path."""
+GRACE_S = 2
+"""Time that requests under way are given when the daemon ends, in whole seconds."""
+
+log = logging.getLogger("acquire.daemon")
+T = TypeVar("T")
+
+
+def serve(config: RigConfig) -> int:
+    """Own the devices of ``config`` until a signal; the exit code.
+
+    Raises StateError where another daemon has the socket, before any device is touched.
+    """
+    with contextlib.closing(Endpoint(config.control.socket.absolute())) as endpoint, Rig(config) as rig:
+        service = Service(config, lambda: Run(config, rig))
+        return asyncio.run(Daemon(service, endpoint).run())
+
+
+class _Server(uvicorn.Server):
+    """Leaves the signals to us: they must drain the recording before the API goes away."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+
+class Daemon:
+    """One service on one endpoint, for the life of an event loop in the main thread."""
+
+    def __init__(self, service: Service, endpoint: Endpoint) -> None:
+        self._service = service
+        self._endpoint = endpoint
+        self._devices = ThreadPoolExecutor(1, thread_name_prefix="devices")
+        self._ending = asyncio.Event()
+        self._exit_code = 0
+        self._server = _Server(
+            uvicorn.Config(
+                build_app(service, self._command),
+                log_config=None,
+                access_log=False,
+                lifespan="off",
+                http="h11",
+                ws="none",
+                timeout_graceful_shutdown=GRACE_S,
+            )
+        )
+
+    async def run(self) -> int:
+        """Serve until a signal; the exit code."""
+        self._take_signals()
+        serving = asyncio.create_task(self._server.serve(sockets=[self._endpoint.socket]))
+        log.info("listening on %s (process %d)", self._endpoint.path, os.getpid())
+        notify("READY=1")
+        try:
+            await self._supervise(serving)
+        finally:
+            await self._end(serving)
+        return self._exit_code
+
+    async def _supervise(self, serving: asyncio.Task[None]) -> None:
+        while not (self._ending.is_set() or serving.done()):
+            await self._in_device_thread(self._service.supervise)
+            notify("WATCHDOG=1")
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(self._ending.wait(), SUPERVISE_S)
+
+    async def _end(self, serving: asyncio.Task[None]) -> None:
+        """Seal and release first, while the status is still answered; then close the API."""
+        self._ending.set()
+        notify("STOPPING=1")
+        try:
+            await self._in_device_thread(self._service.shutdown)
+        finally:
+            self._server.should_exit = True
+            await serving
+            self._devices.shutdown()
+        log.info("ended")
+
+    async def _command(self, work: Callable[[], None]) -> None:
+        if self._ending.is_set():
+            raise StateError("the daemon is ending", possible="status")
+        await self._in_device_thread(work)
+
+    async def _in_device_thread(self, work: Callable[[], T]) -> T:
+        return await asyncio.get_running_loop().run_in_executor(self._devices, work)
+
+    def _take_signals(self) -> None:
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            loop.add_signal_handler(number, self._on_signal, number)
+
+    def _on_signal(self, number: signal.Signals) -> None:
+        if self._ending.is_set():
+            log.warning("%s again: ending without waiting for lines on the way", number.name)
+            self._service.hurry()
+            return
+        log.info("%s: ending", number.name)
+        self._exit_code = EXIT_INTERRUPTED if number is signal.SIGINT else 0
+        self._ending.set()

@@ -1,0 +1,282 @@
+"""The capture service: carries the commands out, watches the capture path, and says what it sees.
+
+One thread calls everything here except `Service.status` and `Service.hurry`, which any thread may call:
+the device thread publishes an immutable `Status` after every change, and others read the latest.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import math
+import os
+import threading
+import time
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Protocol
+
+from acquire import __version__
+from acquire.daemon.messages import LastRecording, RecordingStatus, Status
+from acquire.daemon.plan import default_path
+from acquire.daemon.report import Rates, arm_statuses, delivered_lines
+from acquire.daemon.states import Event, State, after, commands
+from acquire.errors import AcquireError, DeviceError
+from acquire.stream import CaptureStatus
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from acquire.config import RigConfig
+    from acquire.daemon.messages import StartRequest
+
+DRAIN_TIMEOUT_S = 30.0
+"""From the last line's number to the sealed recording; more is a fault."""
+POLL_S = 0.05
+
+log = logging.getLogger("acquire.daemon")
+
+
+class Run(Protocol):
+    """What the service needs of `acquire.daemon.plan.Run`."""
+
+    run_id: str
+
+    def arm(self) -> None: ...
+    def start(self, path: Path, lines: int | None) -> None: ...
+    def stop(self, reason: str) -> None: ...
+    def poll(self) -> CaptureStatus: ...
+    def close(self) -> None: ...
+
+
+class Service:
+    """One instrument, at most one run at a time. See the module for who may call what."""
+
+    def __init__(self, config: RigConfig, open_run: Callable[[], Run]) -> None:
+        self._config = config
+        self._open_run = open_run
+        self._hurried = threading.Event()
+        self._born = time.monotonic()
+        self._state = State.IDLE
+        self._since = datetime.now(UTC)
+        self._busy: Event | None = None
+        self._run: Run | None = None
+        self._seen = CaptureStatus()
+        self._rates = Rates()
+        self._target: tuple[Path, int | None] | None = None
+        self._drain_until = math.inf
+        self._last: LastRecording | None = None
+        self._fault: str | None = None
+        self._publish()
+
+    # ---- any thread
+
+    def status(self) -> Status:
+        """What was published last; never waits."""
+        return self._status.model_copy(update={"uptime_s": round(time.monotonic() - self._born, 3)})
+
+    def hurry(self) -> None:
+        """Do not wait for lines on the way any more: seal what there is."""
+        self._hurried.set()
+
+    # ---- commands
+
+    def arm(self) -> None:
+        """idle → armed. Raises what the devices refuse with; the state is idle then."""
+        with self._doing(Event.ARM):
+            run = self._open_run()
+            run.arm()
+            self._run, self._seen, self._rates = run, CaptureStatus(), Rates()
+            self._go(Event.ARM, run.run_id)
+            self.supervise()
+
+    def start(self, request: StartRequest) -> None:
+        """armed → recording. Raises UsageError for a path that cannot be; the state is armed then."""
+        with self._doing(Event.START):
+            assert self._run is not None
+            path = request.path or default_path(self._config)
+            lines = self._budget(request)
+            self._run.start(path, lines)
+            self._target = path, lines
+            self._go(Event.START, f"{path}, {'until stopped' if lines is None else f'{lines} lines'}")
+            self.supervise()
+
+    def stop(self) -> None:
+        """recording → draining → idle; returns once the recording is sealed and the devices are released."""
+        with self._doing(Event.STOP):
+            self._stop("stopped")
+
+    def disarm(self) -> None:
+        """armed → idle; or clears a fault."""
+        with self._doing(Event.DISARM):
+            self._fault = None
+            try:
+                self._release()
+            finally:
+                self._go(Event.DISARM)
+
+    # ---- supervision
+
+    def supervise(self) -> None:
+        """Look at the capture path once and act on what is seen. Any failure of it becomes a fault."""
+        if self._run is None:
+            return
+        try:
+            self._look()
+        except AcquireError as error:
+            self._fail(str(error))
+        self._publish()
+
+    def shutdown(self) -> None:
+        """Whatever the state: seal, release. Bounded in time; raises only what closing a run raises."""
+        try:
+            if self._state is State.RECORDING:
+                self._stop("signal")
+            while self._state is State.DRAINING:
+                self._drain_on()
+            if self._state is State.ARMED:
+                self.disarm()
+        except AcquireError as error:
+            log.error("while ending: %s", error)  # noqa: TRY400 - users get no traceback
+        finally:
+            self._release()
+
+    def _stop(self, reason: str) -> None:
+        assert self._run is not None
+        self._run.stop(reason)
+        self._go(Event.STOP, reason)
+        while self._state is State.DRAINING:
+            self._drain_on()
+
+    def _drain_on(self) -> None:
+        self.supervise()
+        if self._state is State.DRAINING:
+            self._hurried.wait(POLL_S)
+
+    def _look(self) -> None:
+        """One step of the state table, as the capture path dictates it."""
+        seen = self._poll()
+        if seen.fault is not None:
+            self._fail(seen.fault)
+            return
+        if self._state is State.RECORDING and (seen.draining or seen.done):
+            self._go(Event.FULL)
+        if self._state is not State.DRAINING:
+            return
+        if seen.done or self._hurried.is_set():
+            self._finish()
+        elif time.monotonic() > self._drain_until:
+            self._fail(f"the recording was not sealed within {DRAIN_TIMEOUT_S:g} s after its last line")
+
+    def _poll(self) -> CaptureStatus:
+        assert self._run is not None
+        self._seen = self._run.poll()
+        self._rates.look(delivered_lines(self._seen))
+        return self._seen
+
+    def _finish(self) -> None:
+        self._release()
+        self._go(Event.SEALED, self._last_words())
+
+    def _fail(self, text: str) -> None:
+        """Tell the fault at once, release the devices, then wait to be read."""
+        self._fault = text
+        self._publish()
+        try:
+            self._release()
+        except AcquireError as error:
+            self._fault = f"{text}; then, while ending: {error}"
+        self._go(Event.FAULT, self._fault)
+
+    def _release(self) -> None:
+        """Close the run and remember its recording. Idempotent."""
+        if self._run is None:
+            return
+        run, self._run = self._run, None
+        try:
+            run.close()
+        finally:
+            self._seen, self._rates = run.poll(), Rates()
+            self._remember()
+            self._publish()
+
+    def _remember(self) -> None:
+        if self._target is None:
+            return
+        (path, _), self._target = self._target, None
+        self._last = LastRecording(
+            path=path,
+            lines=self._seen.recorded_lines,
+            condition=None if self._seen.condition is None else str(self._seen.condition),
+            end_reason=self._seen.end_reason,
+        )
+
+    def _last_words(self) -> str:
+        last = self._last
+        return "" if last is None else f"{last.path}, {last.lines} lines, {last.condition}, {last.end_reason}"
+
+    # ---- state
+
+    @contextlib.contextmanager
+    def _doing(self, command: Event) -> Iterator[None]:
+        """Refuse what the state does not allow, before anything is touched; say what is under way.
+
+        A command that ends in a fault raises it.
+        """
+        after(self._state, command)
+        self._busy = command
+        self._publish()
+        try:
+            yield
+            if self._state is State.FAULTED:
+                raise DeviceError(f"fault: {self._fault}", hint="acquire disarm, then look at the device")
+        except AcquireError as error:
+            log.error("%s: %s", command, error)  # noqa: TRY400
+            raise
+        finally:
+            self._busy = None
+            self._publish()
+
+    def _go(self, event: Event, why: str = "") -> None:
+        before, self._state = self._state, after(self._state, event)
+        self._since = datetime.now(UTC)
+        self._drain_until = math.inf
+        if self._state is State.DRAINING:
+            self._drain_until = time.monotonic() + DRAIN_TIMEOUT_S
+        level = logging.ERROR if event is Event.FAULT else logging.INFO
+        log.log(level, "%s → %s (%s%s)", before, self._state, event, f": {why}" if why else "")
+        self._publish()
+
+    def _budget(self, request: StartRequest) -> int | None:
+        if request.duration_s is None:
+            return request.lines
+        return math.ceil(request.duration_s * self._config.line_rate_hz)
+
+    def _publish(self) -> None:
+        self._status = Status(
+            state=self._state,
+            since=self._since,
+            possible=[str(command) for command in commands(self._state)],
+            busy=self._busy,
+            name=self._config.name,
+            version=__version__,
+            pid=os.getpid(),
+            uptime_s=0.0,
+            run_id=None if self._run is None else self._run.run_id,
+            recording=self._recording(),
+            arms=arm_statuses(self._seen, self._rates),
+            last=self._last,
+            fault=self._fault,
+        )
+
+    def _recording(self) -> RecordingStatus | None:
+        if self._target is None:
+            return None
+        path, budget = self._target
+        return RecordingStatus(
+            path=path,
+            first_line=self._seen.first_line,
+            budget_lines=budget,
+            recorded_lines=self._seen.recorded_lines,
+            committed_lines=self._seen.committed_lines,
+        )

@@ -1,0 +1,81 @@
+"""What the daemon may do next: a table of (state, event) → state.
+
+::
+
+                ARM             START               STOP, FULL               SEALED
+       idle ──────────▶ armed ──────────▶ recording ──────────▶ draining ──────────▶ idle
+         ▲               │  │                 │                    │
+         ├── DISARM ─────┘  │ FAULT           │ FAULT              │ FAULT
+         │                  ▼                 ▼                    ▼
+         └── DISARM ───────────────────── faulted ◀────────────────┘
+
+ARM, START, STOP and DISARM are commands; FULL (the line budget is recorded), SEALED (the recording is
+closed and the devices are released) and FAULT come from the capture path. What is not drawn is refused.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+from acquire.errors import StateError
+
+
+class State(StrEnum):
+    """What the daemon is doing."""
+
+    IDLE = "idle"
+    """No device is in use."""
+    ARMED = "armed"
+    """The trigger runs, the cameras deliver, every line is discarded."""
+    RECORDING = "recording"
+    """Lines are written."""
+    DRAINING = "draining"
+    """The last line is known; what is on the way is written, then the recording is sealed."""
+    FAULTED = "faulted"
+    """A device or the capture path failed; the devices are released, the fault waits to be read."""
+
+
+class Event(StrEnum):
+    """What can happen to the daemon."""
+
+    ARM = "arm"
+    START = "start"
+    STOP = "stop"
+    DISARM = "disarm"
+    FULL = "full"
+    SEALED = "sealed"
+    FAULT = "fault"
+
+
+COMMANDS = (Event.ARM, Event.START, Event.STOP, Event.DISARM)
+"""Events that a user can cause."""
+
+TABLE: dict[tuple[State, Event], State] = {
+    (State.IDLE, Event.ARM): State.ARMED,
+    (State.ARMED, Event.START): State.RECORDING,
+    (State.ARMED, Event.DISARM): State.IDLE,
+    (State.ARMED, Event.FAULT): State.FAULTED,
+    (State.RECORDING, Event.STOP): State.DRAINING,
+    (State.RECORDING, Event.FULL): State.DRAINING,
+    (State.RECORDING, Event.FAULT): State.FAULTED,
+    (State.DRAINING, Event.SEALED): State.IDLE,
+    (State.DRAINING, Event.FAULT): State.FAULTED,
+    (State.FAULTED, Event.DISARM): State.IDLE,
+}
+
+
+def after(state: State, event: Event) -> State:
+    """The state that ``event`` leads to; StateError where the table has no row for it."""
+    try:
+        return TABLE[state, event]
+    except KeyError:
+        raise StateError(f"cannot {event} while {state}", possible=_possible(state)) from None
+
+
+def commands(state: State) -> tuple[Event, ...]:
+    """The commands that ``state`` allows."""
+    return tuple(event for event in COMMANDS if (state, event) in TABLE)
+
+
+def _possible(state: State) -> str:
+    return ", ".join(commands(state)) or "wait until it is idle"

@@ -1,0 +1,43 @@
+"""Commands in this process, as the entry point runs them."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+
+from acquire.cli import main
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a command said."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.out)
+
+
+@pytest.fixture
+def cli(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., Answer]:
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.delenv("ACQUIRE_SOCKET", raising=False)
+
+    def run(*words: object) -> Answer:
+        monkeypatch.setattr(sys, "argv", ["acquire", *map(str, words)])
+        try:
+            code = main()
+        except SystemExit as ended:
+            code = ended.code if isinstance(ended.code, int) else 1
+        said = capsys.readouterr()
+        return Answer(code, said.out, said.err)
+
+    return run

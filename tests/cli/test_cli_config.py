@@ -1,0 +1,73 @@
+"""``acquire config``: what it says of good files, and of bad ones."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from acquire.config import RigConfig, builtin_directory, load_rig
+
+Cli = Callable[..., Any]
+
+
+@pytest.fixture
+def rig_file(tmp_path: Path) -> Path:
+    path = tmp_path / "rig.toml"
+    text = (builtin_directory() / "rig-demo.toml").read_text(encoding="utf-8")
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_check(cli: Cli, rig_file: Path) -> None:
+    answer = cli("config", "check", rig_file)
+    assert answer.code == 0
+    assert "valid" in answer.out
+    assert "n = 192" in answer.out
+    facts = cli("config", "check", rig_file, "--json").json
+    assert facts["valid"]
+    assert facts["line_rate_hz"] == pytest.approx(90e6 / 2700)
+    assert facts["bytes_per_s"] == pytest.approx(2 * 64 * 2 * 90e6 / 2700)
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "key"),
+    [
+        ("stages = 64", "stages = 0", "geometry.stages"),
+        ("substeps = 3", "substeps = 3\nsubstep = 4", "geometry.substep"),
+        ('codec = "lz4"', 'codec = "zip"', "recording.codec"),
+        ('scene = "scene-leds.toml"', 'scene = "none.toml"', "none.toml"),
+        ("[geometry]", "[geometry", "not TOML"),
+    ],
+)
+def test_bad_files_name_the_key(cli: Cli, rig_file: Path, before: str, after: str, key: str) -> None:
+    rig_file.write_text(rig_file.read_text().replace(before, after))
+    for command in ("check", "show"):
+        answer = cli("config", command, rig_file)
+        assert answer.code == 2
+        assert key in answer.err
+        assert answer.out == ""
+
+
+def test_bad_scene_is_found_by_check(cli: Cli, rig_file: Path) -> None:
+    scene = (builtin_directory() / "scene-leds.toml").read_text(encoding="utf-8")
+    (rig_file.parent / "scene-leds.toml").write_text(scene.replace("size = 0.36", "size = 3.6", 1))
+    answer = cli("config", "check", rig_file)
+    assert answer.code == 2
+    assert "leds.0.size" in answer.err
+
+
+def test_show_is_a_file_that_means_the_same(cli: Cli, rig_file: Path, tmp_path: Path) -> None:
+    shown = tmp_path / "shown.toml"
+    shown.write_text(cli("config", "show", rig_file).out)
+    assert load_rig(shown) == load_rig(rig_file)
+    assert tomllib.loads(shown.read_text())["stream"]["ring_slots"] == 64
+    assert RigConfig.model_validate(cli("config", "show", rig_file, "--json").json) == load_rig(rig_file)
+
+
+def test_schema_describes_every_key(cli: Cli) -> None:
+    schema = cli("config", "schema").json
+    assert set(RigConfig.model_fields) == set(schema["properties"])

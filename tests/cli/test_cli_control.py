@@ -1,0 +1,130 @@
+"""The control commands' words, over a client that the test scripts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from acquire.cli import control
+from acquire.daemon.messages import ArmStatus, LastRecording, RecordingStatus, RingStatus, Status
+from acquire.daemon.states import State, commands
+
+Cli = Callable[..., Any]
+
+
+def status(state: State, **more: Any) -> Status:
+    ring = RingStatus(slots=64, fill=3, peak=9, drops=0)
+    arm = ArmStatus(
+        delivered=1000,
+        preroll=65,
+        lost={"camera": 2, "ring_full": 0},
+        recorded=500,
+        missing=1,
+        rate_hz=33_333.3,
+        ring=ring,
+    )
+    facts: dict[str, Any] = {
+        "busy": None,
+        "run_id": None,
+        "recording": None,
+        "arms": {"a": arm},
+        "last": None,
+        "fault": None,
+    }
+    return Status(
+        state=state,
+        since=datetime(2025, 1, 2, 3, 4, 5, tzinfo=UTC),
+        possible=[str(command) for command in commands(state)],
+        name="demo",
+        version="0",
+        pid=42,
+        uptime_s=7.0,
+        **(facts | more),
+    )
+
+
+def last(condition: str | None) -> LastRecording:
+    return LastRecording(path=Path("/d/x.zarr"), lines=500, condition=condition, end_reason="stopped")
+
+
+class FakeClient:
+    """Answers every command with one status."""
+
+    def __init__(self, answer: Status) -> None:
+        self.answer = answer
+        self.calls: list[Any] = []
+
+    def __enter__(self) -> FakeClient:
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def __getattr__(self, name: str) -> Callable[..., Status]:
+        def command(*words: Any, **options: Any) -> Status:
+            self.calls.append((name, *words, options))
+            return self.answer
+
+        return command
+
+
+@pytest.fixture
+def answering(monkeypatch: pytest.MonkeyPatch) -> Callable[[Status], FakeClient]:
+    def use(answer: Status) -> FakeClient:
+        client = FakeClient(answer)
+        monkeypatch.setattr(control, "_daemon", lambda _: client)
+        return client
+
+    return use
+
+
+def test_status_in_words(cli: Cli, answering: Callable[[Status], FakeClient]) -> None:
+    now = RecordingStatus(
+        path=Path("/d/x.zarr"), first_line=40, budget_lines=900, recorded_lines=500, committed_lines=256
+    )
+    answering(status(State.RECORDING, recording=now, run_id="r-1", busy="stop"))
+    out = cli("status").out
+    assert "recording since 2025-01-02 03:04:05 UTC" in out
+    assert "/d/x.zarr, 500 of 900 lines from line 40 on, 256 readable" in out
+    assert "process 42" in out
+    arm = out.splitlines()[-1].split()
+    assert arm == ["a", "33.3", "kHz", "1000", "65", "500", "1", "camera", "2", "3/64", "9", "0"]
+
+
+def test_status_as_json_is_the_message(cli: Cli, answering: Callable[[Status], FakeClient]) -> None:
+    answer = status(State.FAULTED, fault="camera a is gone")
+    answering(answer)
+    assert Status.model_validate(cli("status", "--json").json) == answer
+    assert "camera a is gone" in cli("status").out
+
+
+def test_start_passes_everything_on(cli: Cli, answering: Callable[[Status], FakeClient]) -> None:
+    client = answering(status(State.RECORDING))
+    assert cli("start", "x.zarr", "--lines", 5).code == 0
+    assert cli("start", "--duration", 0.5).code == 0
+    assert client.calls == [
+        ("start", Path("x.zarr"), {"lines": 5, "duration_s": None}),
+        ("start", None, {"lines": None, "duration_s": 0.5}),
+    ]
+
+
+def test_wait_passes_state_and_time_on(cli: Cli, answering: Callable[[Status], FakeClient]) -> None:
+    client = answering(status(State.IDLE))
+    assert cli("status", "--wait", "idle", "--timeout", 5).code == 0
+    assert client.calls == [("wait", {State.IDLE}, 5.0, {})]
+
+
+@pytest.mark.parametrize(
+    ("condition", "code"), [("GOOD", 0), ("TAINTED", 0), ("INCOMPLETE", 6), ("ABORTED", 6), (None, 6)]
+)
+def test_stop_tells_of_lost_lines(
+    cli: Cli, answering: Callable[[Status], FakeClient], condition: str | None, code: int
+) -> None:
+    answering(status(State.IDLE, last=last(condition)))
+    answer = cli("stop")
+    assert answer.code == code
+    assert "/d/x.zarr, 500 lines" in answer.out
+    assert ("acquire info /d/x.zarr" in answer.err) == bool(code)

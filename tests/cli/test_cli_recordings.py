@@ -1,0 +1,147 @@
+"""``acquire ls | info | cut`` on recordings written by the real writer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from acquire.clock import ClockFit
+from acquire.codes import PrbsCode
+from acquire.lines import ARMS, LineFlag, TaggedBlock
+from acquire.store import RecordingSpec, RecordingWriter, RunCondition, open_recording
+
+Cli = Callable[..., Any]
+M, S, FIRST, LINES = 4, 2, 100, 64
+CODE = PrbsCode(15, 77)
+
+
+def spec() -> RecordingSpec:
+    camera = {"white_dn": 4095, "black_level_dn": 1.0, "responsivity_dn": 2.0}
+    return RecordingSpec(
+        run_id="run-1",
+        stages=M,
+        substeps=S,
+        pixels=M,
+        dtype="uint16",
+        first_line=FIRST,
+        clock=ClockFit(90_000_000, 1_700_000_000_000_000_000, 100),
+        code=CODE.to_attrs(),
+        substep_ticks=900,
+        trigger={"model": "test"},
+        cameras={"a": camera, "b": camera},
+        config={},
+        chunk_lines=16,
+    )
+
+
+def block(arm: str, lost: range) -> TaggedBlock:
+    line = np.arange(FIRST, FIRST + LINES, dtype=np.uint64)
+    bits = CODE.bits(S * FIRST, S * LINES).reshape(LINES, S)
+    flags = np.where(np.isin(line, lost), LineFlag.MISSING, 0).astype(np.uint16)
+    return TaggedBlock(
+        arm=arm,
+        first_line=FIRST,
+        pixels=np.full((LINES, M), 7 if arm == "a" else 9, np.uint16),
+        flags=flags,
+        code_index=S * line,
+        code=np.packbits(bits, axis=1, bitorder="little")[:, 0],
+        tick=900 * S * line,
+        time_ns=(20_000 * line).astype(np.int64),
+    )
+
+
+def write(path: Path, lost: range = range(0)) -> Path:
+    with RecordingWriter.create(path, spec()) as writer:
+        for arm in ARMS:
+            gone = lost if arm == "b" else range(0)
+            if gone:
+                writer.add_gap(arm, gone.start, len(gone), "ring_full")
+            writer.append(block(arm, gone))
+        condition = RunCondition.INCOMPLETE if lost else RunCondition.GOOD
+        writer.seal(condition, "stopped", {})
+    return path
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    return write(tmp_path / "one.zarr")
+
+
+def test_ls(cli: Cli, recording: Path) -> None:
+    (recording.parent / "broken.zarr").mkdir()
+    (recording.parent / "note.txt").write_text("x")
+    answer = cli("ls", recording.parent)
+    assert answer.code == 0
+    title, broken, good = answer.out.splitlines()
+    assert title.split()[:2] == ["recording", "lines"]
+    assert broken.startswith("broken.zarr")
+    assert "is not a recording" in broken
+    assert good.split()[:2] == ["one.zarr", "64"]
+    assert "GOOD" in good
+    listed = cli("ls", recording.parent, "--json").json
+    assert [Path(item["path"]).name for item in listed] == ["broken.zarr", "one.zarr"]
+    assert "error" in listed[0]
+    assert listed[1]["lines"] == 64
+
+
+def test_ls_of_nothing(cli: Cli, tmp_path: Path) -> None:
+    assert cli("ls", tmp_path).out == f"no recordings in {tmp_path}\n"
+    assert cli("ls", tmp_path, "--json").json == []
+    assert cli("ls", tmp_path / "absent").code == 2
+
+
+def test_info(cli: Cli, tmp_path: Path) -> None:
+    path = write(tmp_path / "gap.zarr", lost=range(110, 115))
+    answer = cli("info", path)
+    assert answer.code == 0
+    assert "64 (100 to 163)" in answer.out
+    assert "a 0, b 5" in answer.out
+    assert answer.out.splitlines()[-1].split() == ["b", "110", "5", "ring_full"]
+    facts = cli("info", path, "--json").json
+    assert facts["gap_list"] == [{"arm": "b", "first_line": 110, "count": 5, "cause": "ring_full"}]
+    assert facts["run_condition"] == "INCOMPLETE"
+
+
+@pytest.mark.parametrize("command", [("info",), ("cut", "--first-line", 1, "--lines", 1, "--out", "x.npz")])
+def test_not_a_recording_is_exit_6(
+    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, command: tuple[object, ...]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    answer = cli(command[0], tmp_path / "absent.zarr", *command[1:])
+    assert answer.code == 6
+    assert "absent.zarr" in answer.err
+    assert not (tmp_path / "x.npz").exists()
+
+
+def test_cut_is_the_segment(cli: Cli, recording: Path, tmp_path: Path) -> None:
+    out = tmp_path / "cut.npz"
+    answer = cli("cut", recording, "--first-line", 110, "--lines", 20, "--out", out, "--json")
+    assert answer.json == {"path": str(out), "first_line": 110, "lines": 20, "bytes": out.stat().st_size}
+    segment = open_recording(recording).cut(110, 20)
+    with np.load(out) as saved:
+        for name in ("lines", "mask", "code", "time_ns"):
+            assert np.array_equal(saved[name], getattr(segment, name))
+        assert (int(saved["stages"]), int(saved["substeps"]), int(saved["first_line"])) == (M, S, 110)
+        assert float(saved["substep_ns"]) == pytest.approx(10_000)
+        assert (float(saved["black_level_dn"]), float(saved["responsivity_dn"])) == (1.0, 2.0)
+    assert list(tmp_path.glob("*.part")) == []
+
+
+def test_cut_overwrites_nothing(cli: Cli, recording: Path, tmp_path: Path) -> None:
+    out = tmp_path / "cut.npz"
+    out.write_text("precious")
+    answer = cli("cut", recording, "--first-line", 110, "--lines", 20, "--out", out)
+    assert (answer.code, out.read_text()) == (2, "precious")
+    answer = cli("cut", recording, "--first-line", 110, "--lines", 20, "--out", tmp_path / "no" / "c.npz")
+    assert answer.code == 2
+
+
+def test_cut_outside_says_what_is_there(cli: Cli, recording: Path, tmp_path: Path) -> None:
+    answer = cli("cut", recording, "--first-line", 160, "--lines", 20, "--out", tmp_path / "c.npz")
+    assert answer.code == 2
+    assert "possible: lines 100 to 163" in answer.err
+    assert not (tmp_path / "c.npz").exists()

@@ -1,0 +1,118 @@
+"""What every command has in common: help with an example, errors in words, exit codes, quick start."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from acquire import __version__
+from acquire.cli import app, control
+from acquire.errors import EXIT_INTERRUPTED
+
+Cli = Callable[..., Any]
+HEAVY = {"numpy", "zarr", "numba", "scipy", "matplotlib", "httpx", "fastapi", "uvicorn"}
+
+
+def walk(command: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    if not hasattr(command, "commands"):
+        yield words
+        return
+    for name, below in command.commands.items():
+        yield from walk(below, (*words, name))
+
+
+COMMANDS = list(walk(typer.main.get_command(app)))
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_help_has_an_example(cli: Cli, words: tuple[str, ...]) -> None:
+    answer = cli(*words, "--help")
+    assert answer.code == 0
+    assert f"Example: acquire {' '.join(words)}" in answer.out
+
+
+def test_the_contract_s_commands_are_there() -> None:
+    names = {words[0] for words in COMMANDS}
+    assert {"serve", "arm", "start", "stop", "disarm", "status", "ls", "info", "cut", "config"} <= names
+
+
+def test_version(cli: Cli) -> None:
+    assert cli("--version").out.strip() == __version__
+
+
+@pytest.mark.parametrize(
+    "words", [("stauts",), ("start", "--line", "5"), ("cut",), ("start", "--lines", "x")]
+)
+def test_wrong_words_are_exit_2(cli: Cli, words: list[str]) -> None:
+    assert cli(*words).code == 2
+
+
+@pytest.mark.parametrize("command", ["status", "arm", "start", "stop", "disarm"])
+def test_no_daemon_in_words(cli: Cli, tmp_path: Path, command: str) -> None:
+    answer = cli(command, "--socket", tmp_path / "no.sock")
+    assert answer.code == 3
+    assert answer.out == ""
+    first, hint = answer.err.splitlines()
+    assert first.startswith(f"acquire: error: no daemon listens on {tmp_path / 'no.sock'}")
+    assert hint.startswith("  try: acquire serve")
+
+
+def test_error_as_json(cli: Cli, tmp_path: Path) -> None:
+    answer = cli("status", "--json", "--socket", tmp_path / "no.sock")
+    error = json.loads(answer.err)
+    assert (answer.code, error["exit_code"], error["error"]) == (3, 3, "NoDaemonError")
+
+
+def test_socket_from_the_environment(cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ACQUIRE_SOCKET", str(tmp_path / "env.sock"))
+    assert "env.sock" in cli("arm").err
+
+
+def test_unknown_state_to_wait_for(cli: Cli) -> None:
+    answer = cli("status", "--wait", "done")
+    assert answer.code == 2
+    assert "possible: idle, armed, recording, draining, faulted" in answer.err
+
+
+def test_interrupted(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(control, "_daemon", interrupted)
+    assert cli("status").code == EXIT_INTERRUPTED
+
+
+@pytest.mark.parametrize("words", [["--help"], ["status", "--help"], ["serve", "--help"]])
+def test_help_loads_nothing_heavy(words: list[str]) -> None:
+    code = (
+        "import sys\nfrom acquire.cli import app\n"
+        "try:\n    app(sys.argv[1:])\n"
+        f"finally:\n    print('loaded:', sorted({HEAVY!r} & set(sys.modules)))"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", code, *words], check=True, capture_output=True, text=True, timeout=60
+    )
+    assert ended.stdout.splitlines()[-1] == "loaded: []"
+
+
+def test_status_loads_no_recording_or_mathematics(tmp_path: Path) -> None:
+    code = (
+        "import sys\nfrom acquire.cli import main\n"
+        "assert main() == 3\n"
+        f"print(sorted({(HEAVY - {'numpy', 'httpx'})!r} & set(sys.modules)))"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", code, "status", "--socket", str(tmp_path / "no.sock")],
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert ended.stdout.strip() == "[]"

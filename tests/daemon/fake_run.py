@@ -1,0 +1,85 @@
+"""A capture path without processes: the test says what it sees."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+from acquire.config import load_rig
+from acquire.errors import AcquireError
+from acquire.lines import ARMS
+from acquire.store import RunCondition
+from acquire.stream import CaptureStatus
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from acquire.config import RigConfig
+
+CALM = CaptureStatus(
+    ring={arm: {"slots": 8, "fill": 1, "peak": 2, "drops": 0, "dropped_lines": 0} for arm in ARMS},
+    lines={
+        arm: {"delivered": 100, "preroll": 65, "lost": {"camera": 0}, "recorded": 0, "missing": 0}
+        for arm in ARMS
+    },
+)
+
+
+def rig_config(directory: Path) -> RigConfig:
+    return load_rig("rig-demo", {"recording.directory": str(directory)})
+
+
+class FakeRun:
+    """Records what it is told in ``calls``; ``refuse`` maps a call to the error it raises."""
+
+    run_id = "fake-run"
+
+    def __init__(self, **refuse: AcquireError) -> None:
+        self.calls: list[Any] = []
+        self.refuse = refuse
+        self.seen = CALM
+        self.may_arm = threading.Event()
+        self.may_arm.set()
+        self.seals_at_stop = True
+
+    def see(self, **changes: Any) -> None:
+        self.seen = replace(self.seen, **changes)
+
+    def seal(self, lines: int = 500, reason: str = "stopped") -> None:
+        self.see(
+            recording=False, done=True, recorded_lines=lines, condition=RunCondition.GOOD, end_reason=reason
+        )
+
+    def arm(self) -> None:
+        assert self.may_arm.wait(10)
+        self._call("arm")
+        self.seen = CALM
+
+    def start(self, path: Path, lines: int | None) -> None:
+        self._call("start", path, lines)
+        self.see(recording=True, first_line=40)
+
+    def stop(self, reason: str) -> None:
+        self._call("stop", reason)
+        if self.seals_at_stop:
+            self.seal(reason=reason)
+
+    def poll(self) -> CaptureStatus:
+        if "poll" in self.refuse and "close" not in self.names:
+            raise self.refuse["poll"]
+        return self.seen
+
+    def close(self) -> None:
+        self._call("close")
+        if self.seen.recording:
+            self.see(recording=False, condition=RunCondition.INTERRUPTED, end_reason="the capture was closed")
+
+    @property
+    def names(self) -> list[str]:
+        return [call[0] for call in self.calls]
+
+    def _call(self, *call: Any) -> None:
+        self.calls.append(call)
+        if call[0] in self.refuse:
+            raise self.refuse[call[0]]

@@ -1,0 +1,214 @@
+"""API and client over a real socket: what the service refuses arrives as the same error."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import httpx
+import pytest
+import uvicorn
+from fake_run import FakeRun, rig_config
+
+from acquire import errors
+from acquire.daemon import client as client_module
+from acquire.daemon.client import Client
+from acquire.daemon.control import build_app
+from acquire.daemon.endpoint import Endpoint
+from acquire.daemon.messages import ErrorMessage, http_status
+from acquire.daemon.service import Service
+from acquire.daemon.states import State
+from acquire.errors import AcquireError, CameraError, DeviceError, NoDaemonError, StateError, UsageError
+
+
+@contextlib.contextmanager
+def api(service: Service, endpoint: Endpoint) -> Iterator[None]:
+    """The API in a thread of its own, as the daemon serves it."""
+    with ThreadPoolExecutor(1) as devices:
+
+        async def run(work: Callable[[], None]) -> None:
+            await asyncio.get_running_loop().run_in_executor(devices, work)
+
+        config = uvicorn.Config(
+            build_app(service, run), log_config=None, lifespan="off", http="h11", ws="none"
+        )
+        server = uvicorn.Server(config)
+        thread = threading.Thread(target=server.run, args=([endpoint.socket],))
+        thread.start()
+        try:
+            yield
+        finally:
+            server.should_exit = True
+            thread.join(20)
+    assert not thread.is_alive()
+
+
+@pytest.fixture
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("s") / "c.sock"
+
+
+@pytest.fixture
+def run() -> FakeRun:
+    """What `arm` opens."""
+    return FakeRun()
+
+
+@pytest.fixture
+def daemon(path: Path, run: FakeRun) -> Iterator[Client]:
+    service = Service(rig_config(path.parent), lambda: run)
+    with contextlib.closing(Endpoint(path)) as endpoint, api(service, endpoint), Client(path) as client:
+        yield client
+
+
+def test_commands(daemon: Client, run: FakeRun, tmp_path: Path) -> None:
+    assert daemon.arm().state is State.ARMED
+    status = daemon.start(tmp_path / "x.zarr", lines=7)
+    assert (status.state, status.possible) == (State.RECORDING, ["stop"])
+    assert run.calls[-1] == ("start", tmp_path / "x.zarr", 7)
+    assert daemon.stop().state is State.IDLE
+
+
+def test_relative_paths_are_the_callers(
+    daemon: Client, run: FakeRun, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    daemon.arm()
+    daemon.start(Path("x.zarr"))
+    daemon.stop()
+    assert ("start", tmp_path / "x.zarr", None) in run.calls
+
+
+def test_refused_by_state(daemon: Client, run: FakeRun) -> None:
+    with pytest.raises(StateError) as caught:
+        daemon.start()
+    assert caught.value.possible == "arm"
+    assert run.calls == []
+
+
+def test_device_error_keeps_its_class_and_words(daemon: Client, run: FakeRun) -> None:
+    run.refuse["arm"] = CameraError("camera a is not there", possible="SIM-A", hint="plug it in")
+    with pytest.raises(CameraError) as caught:
+        daemon.arm()
+    assert str(caught.value) == "camera a is not there; possible: SIM-A; try: plug it in"
+
+
+def test_impossible_start_is_refused_before_it_is_sent(daemon: Client) -> None:
+    with pytest.raises(UsageError, match="lines"):
+        daemon.start(lines=0)
+    with pytest.raises(UsageError, match="two ways to say the same"):
+        daemon.start(lines=1, duration_s=1.0)
+
+
+def test_malformed_request_names_the_key(path: Path, daemon: Client) -> None:
+    with httpx.Client(transport=httpx.HTTPTransport(uds=str(path)), base_url="http://x") as raw:
+        answer = raw.post("/start", json={"line": 5})
+        assert answer.status_code == 422
+        message = ErrorMessage.model_validate_json(answer.content)
+        assert message.error == "UsageError"
+        assert message.message.startswith("line = 5")
+        described = raw.get("/openapi.json").json()
+    assert {"/status", "/arm", "/start", "/stop", "/disarm"} == set(described["paths"])
+    assert "Status" in described["components"]["schemas"]
+
+
+def test_status_is_answered_while_arming(daemon: Client, run: FakeRun) -> None:
+    run.may_arm.clear()
+    arming = threading.Thread(target=daemon.arm)
+    arming.start()
+    deadline = time.monotonic() + 10
+    while (status := daemon.status()).busy != "arm":
+        assert time.monotonic() < deadline
+    assert status.state is State.IDLE
+    run.may_arm.set()
+    arming.join(10)
+    assert daemon.status().state is State.ARMED
+
+
+def test_wait(daemon: Client, run: FakeRun) -> None:
+    assert daemon.wait({State.IDLE}, 0.0).state is State.IDLE
+    with pytest.raises(StateError, match=r"still idle after waiting 0\.2 s for recording"):
+        daemon.wait({State.RECORDING}, 0.2)
+
+
+def test_defect_in_the_daemon_is_told(daemon: Client, run: FakeRun, caplog: pytest.LogCaptureFixture) -> None:
+    run.refuse["arm"] = ZeroDivisionError("oops")  # type: ignore[assignment]
+    with pytest.raises(AcquireError, match=r"defect in the daemon.*oops"):
+        daemon.arm()
+    deadline = time.monotonic() + 10
+    while "ZeroDivisionError" not in caplog.text:  # the server logs after it has answered
+        assert time.monotonic() < deadline
+    assert daemon.status().busy is None
+
+
+def test_nobody_there(tmp_path: Path) -> None:
+    with Client(tmp_path / "none.sock") as client, pytest.raises(NoDaemonError, match=r"none\.sock"):
+        client.status()
+
+
+def test_socket_left_behind(path: Path) -> None:
+    dead = path.with_name("dead.sock")
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(dead))
+    with Client(dead) as client, pytest.raises(NoDaemonError, match="refused"):
+        client.status()
+
+
+def test_daemon_that_does_not_answer(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client_module, "STATUS_TIMEOUT_S", 0.2)
+    deaf = path.with_name("deaf.sock")
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(deaf))
+        listener.listen(1)
+        with Client(deaf) as client, pytest.raises(NoDaemonError, match=r"no answer to status within 0\.2 s"):
+            client.status()
+
+
+@pytest.mark.parametrize(
+    ("answer", "kind"),
+    [(b"", NoDaemonError), (b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\n{}", AcquireError)],
+)
+def test_daemon_that_answers_strangely(path: Path, answer: bytes, kind: type[AcquireError]) -> None:
+    odd = path.with_name("odd.sock")
+    odd.unlink(missing_ok=True)
+    with socket.socket(socket.AF_UNIX) as listener:
+        listener.bind(str(odd))
+        listener.listen(1)
+
+        def reply() -> None:
+            listener.accept()[0].close()  # somebody looked whether anybody listens
+            with listener.accept()[0] as connection:
+                connection.recv(4096)
+                connection.sendall(answer)
+
+        thread = threading.Thread(target=reply)
+        thread.start()
+        with Client(odd) as client, pytest.raises(kind):
+            client.status()
+        thread.join(10)
+
+
+TREE = [
+    kind for kind in vars(errors).values() if isinstance(kind, type) and issubclass(kind, errors.AcquireError)
+]
+
+
+@pytest.mark.parametrize("kind", TREE)
+def test_every_error_survives_the_wire(kind: type[AcquireError]) -> None:
+    error = kind("what", possible="this", hint="that")
+    again = ErrorMessage.model_validate_json(ErrorMessage.of(error).model_dump_json()).rebuild()
+    assert type(again) is kind
+    assert (again.message, again.possible, again.hint) == ("what", "this", "that")
+    assert http_status(error) in (409, 422, 500, 503)
+
+
+def test_unknown_error_of_another_version() -> None:
+    message = ErrorMessage(error="FutureError", message="m", exit_code=9)
+    assert type(message.rebuild()) is AcquireError
+    assert http_status(DeviceError("x")) == 503

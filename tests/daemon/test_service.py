@@ -1,0 +1,245 @@
+"""The service over a capture path that the test scripts: what each command and each failure leaves behind."""
+
+from __future__ import annotations
+
+import math
+import threading
+from pathlib import Path
+
+import pytest
+from fake_run import FakeRun, rig_config
+
+from acquire.daemon import service as service_module
+from acquire.daemon.messages import StartRequest
+from acquire.daemon.service import Service
+from acquire.daemon.states import State
+from acquire.errors import CameraError, DeviceError, StateError, UsageError
+from acquire.store import RunCondition
+
+
+class Bed:
+    """A service and the run that it will open."""
+
+    def __init__(self, directory: Path, run: FakeRun) -> None:
+        self.run = run
+        self.opened = 0
+        self.service = Service(rig_config(directory), self._open)
+
+    def _open(self) -> FakeRun:
+        self.opened += 1
+        return self.run
+
+    @property
+    def state(self) -> State:
+        return self.service.status().state
+
+    def record(self, **request: object) -> None:
+        self.service.arm()
+        self.service.start(StartRequest.model_validate(request))
+
+
+@pytest.fixture
+def bed(tmp_path: Path) -> Bed:
+    return Bed(tmp_path, FakeRun())
+
+
+def test_life(bed: Bed, tmp_path: Path) -> None:
+    path = tmp_path / "x.zarr"
+    bed.record(path=path, lines=500)
+    status = bed.service.status()
+    assert (status.state, status.run_id) == (State.RECORDING, "fake-run")
+    assert status.recording is not None
+    assert (status.recording.path, status.recording.budget_lines) == (path, 500)
+    bed.service.stop()
+    assert bed.run.names == ["arm", "start", "stop", "close"]
+    status = bed.service.status()
+    assert (status.state, status.run_id, status.recording) == (State.IDLE, None, None)
+    assert status.last is not None
+    assert (status.last.path, status.last.lines, status.last.condition) == (path, 500, "GOOD")
+
+
+def test_refused_command_touches_nothing(bed: Bed) -> None:
+    with pytest.raises(StateError, match="cannot start while idle"):
+        bed.service.start(StartRequest())
+    with pytest.raises(StateError, match="cannot stop while idle"):
+        bed.service.stop()
+    assert (bed.opened, bed.run.calls) == (0, [])
+    bed.service.arm()
+    with pytest.raises(StateError, match="cannot arm while armed"):
+        bed.service.arm()
+    assert bed.opened == 1
+
+
+def test_failing_arm_stays_idle(tmp_path: Path) -> None:
+    bed = Bed(tmp_path, FakeRun(arm=CameraError("camera a is not there")))
+    with pytest.raises(CameraError):
+        bed.service.arm()
+    status = bed.service.status()
+    assert (status.state, status.busy, status.run_id) == (State.IDLE, None, None)
+
+
+def test_refused_start_stays_armed(tmp_path: Path) -> None:
+    bed = Bed(tmp_path, FakeRun(start=UsageError("x.zarr exists")))
+    with pytest.raises(UsageError):
+        bed.record()
+    assert (bed.state, bed.service.status().recording) == (State.ARMED, None)
+    bed.run.refuse.clear()
+    bed.service.start(StartRequest())
+    assert bed.state is State.RECORDING
+
+
+def test_budget_drains_and_ends_by_itself(bed: Bed) -> None:
+    bed.record(lines=500)
+    bed.run.see(draining=True)
+    bed.service.supervise()
+    assert bed.state is State.DRAINING
+    assert "close" not in bed.run.names
+    bed.run.seal(reason="line budget reached")
+    bed.service.supervise()
+    assert bed.state is State.IDLE
+    assert bed.service.status().last is not None
+    assert "close" in bed.run.names
+
+
+def test_recording_sealed_between_two_looks(bed: Bed) -> None:
+    bed.record(lines=500)
+    bed.run.seal()
+    bed.service.supervise()
+    assert bed.state is State.IDLE
+
+
+def test_budget_in_seconds_rounds_up(bed: Bed) -> None:
+    bed.record(duration_s=0.0100001)
+    assert bed.run.calls[-1][2] == 334  # 33,333.3 lines per second
+
+
+def test_default_paths_are_free_and_in_the_configured_directory(bed: Bed, tmp_path: Path) -> None:
+    seen = set()
+    for _ in range(3):
+        bed.record()
+        path = bed.run.calls[-1][1]
+        assert path.parent == tmp_path
+        assert path.name.startswith("demo-2")
+        assert path.suffix == ".zarr"
+        path.mkdir()
+        seen.add(path)
+        bed.service.stop()
+    assert len(seen) == 3
+
+
+@pytest.mark.parametrize("recording", [False, True])
+def test_fault_releases_the_devices_and_waits_to_be_read(bed: Bed, recording: bool) -> None:
+    bed.service.arm()
+    if recording:
+        bed.service.start(StartRequest())
+    bed.run.see(fault="grabber a: killed by SIGKILL")
+    bed.service.supervise()
+    status = bed.service.status()
+    assert (status.state, status.fault) == (State.FAULTED, "grabber a: killed by SIGKILL")
+    assert bed.run.names[-1] == "close"
+    if recording:
+        assert status.last is not None
+        assert status.last.condition == RunCondition.INTERRUPTED
+    bed.service.disarm()
+    assert (bed.state, bed.service.status().fault) == (State.IDLE, None)
+    bed.service.arm()
+    assert bed.state is State.ARMED
+
+
+def test_a_look_that_fails_is_a_fault(tmp_path: Path) -> None:
+    bed = Bed(tmp_path, FakeRun(poll=CameraError("lost")))
+    with pytest.raises(DeviceError, match="lost"):
+        bed.service.arm()
+    assert (bed.state, bed.service.status().fault) == (State.FAULTED, "lost")
+
+
+def test_fault_tells_of_a_failing_end_too(tmp_path: Path) -> None:
+    bed = Bed(tmp_path, FakeRun(close=CameraError("does not let go")))
+    bed.service.arm()
+    bed.run.see(fault="first")
+    bed.service.supervise()
+    assert bed.service.status().fault == "first; then, while ending: does not let go"
+
+
+def test_failing_end_after_sealing_is_a_fault(tmp_path: Path) -> None:
+    bed = Bed(tmp_path, FakeRun(close=CameraError("does not let go")))
+    bed.record()
+    with pytest.raises(DeviceError, match="does not let go"):
+        bed.service.stop()
+    assert (bed.state, bed.service.status().fault) == (State.FAULTED, "does not let go")
+    assert bed.service.status().last is not None
+
+
+def test_draining_has_an_end(bed: Bed, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(service_module, "DRAIN_TIMEOUT_S", 0.1)
+    bed.run.seals_at_stop = False
+    bed.record()
+    with pytest.raises(DeviceError, match="not sealed"):
+        bed.service.stop()
+    status = bed.service.status()
+    assert status.state is State.FAULTED
+    assert "not sealed within 0.1 s" in str(status.fault)
+    assert bed.run.names[-1] == "close"
+
+
+def test_hurry_ends_the_wait(bed: Bed) -> None:
+    bed.run.seals_at_stop = False
+    bed.record()
+    stopping = threading.Thread(target=bed.service.stop)
+    stopping.start()
+    bed.service.hurry()
+    stopping.join(10)
+    assert not stopping.is_alive()
+    assert bed.state is State.IDLE
+    assert bed.service.status().last is not None
+    assert bed.service.status().last.condition == RunCondition.INTERRUPTED
+
+
+@pytest.mark.parametrize(
+    ("prepare", "calls"),
+    [
+        ([], []),
+        (["arm"], ["arm", "close"]),
+        (["arm", "start"], ["arm", "start", "stop", "close"]),
+    ],
+)
+def test_shutdown_ends_what_is_under_way(bed: Bed, prepare: list[str], calls: list[str]) -> None:
+    if prepare:
+        bed.service.arm()
+    if "start" in prepare:
+        bed.service.start(StartRequest())
+    bed.service.shutdown()
+    assert bed.run.names == calls
+    assert ("stop", "signal") in bed.run.calls or "stop" not in calls
+    assert bed.state is State.IDLE
+
+
+def test_status_has_the_numbers_of_each_arm(bed: Bed) -> None:
+    bed.service.arm()
+    bed.service.supervise()
+    arm = bed.service.status().arms["a"]
+    assert (arm.delivered, arm.preroll, arm.lost, arm.rate_hz) == (100, 65, {"camera": 0}, 0.0)
+    assert (arm.ring.slots, arm.ring.fill, arm.ring.peak, arm.ring.drops) == (8, 1, 2, 0)
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        {"lines": 0},
+        {"duration_s": -1},
+        {"duration_s": math.inf},
+        {"lines": 5, "duration_s": 1},
+        {"path": "relative.zarr"},
+    ],
+)
+def test_impossible_requests(request_: dict[str, object]) -> None:
+    with pytest.raises(ValueError, match="validation error"):
+        StartRequest.model_validate(request_)
+
+
+def test_shutdown_closes_the_run_whatever_fails(tmp_path: Path) -> None:
+    bed = Bed(tmp_path, FakeRun(stop=CameraError("does not stop")))
+    bed.record()
+    bed.service.shutdown()
+    assert bed.run.names[-1] == "close"
+    assert bed.service.status().last is not None

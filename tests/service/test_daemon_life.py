@@ -1,0 +1,141 @@
+"""One daemon, driven by commands: each test finds it idle and leaves it idle."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from live_daemon import LINE_RATE_HZ, SUBSTEPS, Daemon, acquire
+
+from acquire.config import load_rig
+from acquire.daemon.states import State
+from acquire.store import open_recording
+
+
+@pytest.fixture(scope="module")
+def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Daemon]:
+    daemon = Daemon(tmp_path_factory.mktemp("d"))
+    with daemon.client() as client:  # the first run starts a helper process that stays with the daemon
+        client.arm()
+        client.disarm()
+    yield daemon
+    daemon.close()
+
+
+@pytest.fixture
+def daemon(running: Daemon) -> Iterator[Daemon]:
+    with running.client() as client:
+        assert client.status().state is State.IDLE
+    yield running
+    with running.client() as client:
+        if client.status().state is State.RECORDING:
+            client.stop()
+        if client.status().state is not State.IDLE:
+            client.disarm()
+
+
+def test_whole_life(daemon: Daemon) -> None:
+    """A recording until stopped: what commands and log say, and that the file is what was recorded."""
+    logged = len(daemon.log.read_text().splitlines())
+    assert daemon("arm", "--json").json["state"] == "armed"
+    assert "armed" in daemon("status").out
+    begun = daemon("start", "life.zarr", "--json").json
+    assert begun["state"] == "recording"
+    assert begun["recording"]["path"] == str(daemon.home / "life.zarr")
+    stopped = daemon("stop", "--json")
+    assert stopped.code == 0, stopped.err
+    last = stopped.json["last"]
+    assert (last["condition"], last["end_reason"]) == ("GOOD", "stopped")
+    recording = open_recording(daemon.home / "life.zarr")
+    assert (recording.state, recording.lines) == ("sealed", last["lines"])
+    assert recording.first_line == begun["recording"]["first_line"]
+    assert recording.attrs["run_id"] == begun["run_id"]
+    assert recording.attrs["config"] == load_rig(daemon.config).model_dump(mode="json")
+    changes = [line.split("INFO ")[1].split(" (")[0] for line in daemon.log.read_text().splitlines()[logged:]]
+    assert changes == ["idle → armed", "armed → recording", "recording → draining", "draining → idle"]
+
+
+def test_line_budget(daemon: Daemon) -> None:
+    """The daemon goes idle by itself; both arms hold exactly the budget, contiguous, with the run's code."""
+    with daemon.client() as client:
+        client.arm()
+    assert daemon("start", "budget.zarr", "--lines", 700).code == 0
+    status = daemon("status", "--wait", "idle", "--timeout", 30, "--json").json
+    assert status["last"] == {
+        "path": str(daemon.home / "budget.zarr"),
+        "lines": 700,
+        "condition": "GOOD",
+        "end_reason": "line budget reached",
+    }
+    recording = open_recording(daemon.home / "budget.zarr")
+    for arm in ("a", "b"):
+        camera = recording.camera(arm)
+        assert camera.lines.shape == (700, 8)
+        assert np.array_equal(camera.code_index[:], SUBSTEPS * camera.line_number)
+        assert not np.any(camera.flags[:] & 1)
+    code = load_rig(daemon.config).code.build().bits(SUBSTEPS * recording.first_line, SUBSTEPS * 700)
+    packed = np.packbits(code.reshape(700, SUBSTEPS), axis=1, bitorder="little")[:, 0]
+    assert np.array_equal(recording.camera("a").code[:], packed)
+
+
+def test_refusals_leave_the_daemon_armed(daemon: Daemon) -> None:
+    """Wrong state, existing and unwritable places: named, nothing touched, and the next start works."""
+    precious, closed, absent = (daemon.home / name for name in ("precious.zarr", "closed", "absent"))
+    precious.mkdir()
+    (precious / "data").write_text("precious")
+    before = precious.stat().st_mtime_ns
+    closed.mkdir(mode=0o500)
+    with daemon.client() as client:
+        client.arm()
+        refused = {path: daemon("start", path) for path in (precious, closed / "x.zarr", absent / "x.zarr")}
+        again = daemon("arm")
+        assert client.status().state is State.ARMED
+    assert (again.code, "possible: start, disarm" in again.err) == (4, True)
+    assert {path: answer.code for path, answer in refused.items()} == dict.fromkeys(refused, 2)
+    assert "exists" in refused[precious].err
+    assert str(closed) in refused[closed / "x.zarr"].err
+    assert str(absent) in refused[absent / "x.zarr"].err
+    assert (precious / "data").read_text() == "precious"
+    assert precious.stat().st_mtime_ns == before
+    assert not list(closed.iterdir())
+    assert not absent.exists()
+    begun = daemon("start", "--duration", 0.05, "--json").json
+    path = Path(begun["recording"]["path"])
+    assert path.parent == daemon.home
+    assert path.name.startswith("small-2")
+    with daemon.client() as client:
+        client.wait({State.IDLE}, 30)
+    assert open_recording(path).lines == 0.05 * LINE_RATE_HZ
+
+
+def test_commands_while_idle(daemon: Daemon) -> None:
+    for command in ("start", "stop", "disarm"):
+        answer = daemon(command)
+        assert answer.code == 4
+        assert f"cannot {command} while idle" in answer.err
+        assert "possible: arm" in answer.err
+
+
+def test_second_daemon_is_refused(daemon: Daemon) -> None:
+    socket_inode = daemon.socket.stat().st_ino
+    answer = acquire("serve", "--config", daemon.config)
+    assert answer.code == 4
+    assert f"process {daemon.process.pid}" in answer.err
+    assert daemon.socket.stat().st_ino == socket_inode
+    with daemon.client() as client:
+        assert client.status().pid == daemon.process.pid
+
+
+def test_socket_is_private(daemon: Daemon) -> None:
+    assert stat.S_IMODE(daemon.socket.stat().st_mode) == 0o600
+    assert daemon.socket.stat().st_uid == os.geteuid()
+
+
+def test_wait_has_an_end(daemon: Daemon) -> None:
+    answer = daemon("status", "--wait", "recording", "--timeout", 0.1)
+    assert answer.code == 4
+    assert "still idle" in answer.err
