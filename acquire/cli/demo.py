@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -32,9 +33,10 @@ def register(app: typer.Typer) -> None:
 
 
 def demo(
-    out: Annotated[Path, typer.Option(metavar="DIR", help="New directory for everything.")] = Path(
-        "acquire-demo"
-    ),
+    out: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="New directory for everything; else acquire-demo, -2, …"),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Another exposure code.")] = 1,
     lines: Annotated[int, typer.Option(help="Lines to record.")] = 33_334,
     budget: Annotated[float | None, typer.Option(metavar="SECONDS", help="For the default solver.")] = None,
@@ -54,6 +56,7 @@ def demo(
     from acquire.evaluate.report import write_report
 
     rig = load_rig(config, {"code.seed": seed})
+    out = out or _free(Path("acquire-demo"))
     _check(out, lines, rig)
     out.mkdir(parents=True)
     journal = Journal()
@@ -87,6 +90,12 @@ class Journal:
         self.stages.append(Stage(name, seconds, note.get("detail", "")))
         detail = f"  {note['detail']}" if "detail" in note else ""
         typer.echo(f"{name:<34} {seconds:6.1f} s{detail}", err=True)
+
+
+def _free(path: Path) -> Path:
+    """``path``, or with the first number behind it that is free."""
+    names = (path if n == 1 else path.with_name(f"{path.name}-{n}") for n in itertools.count(1))
+    return next(name for name in names if not name.exists())
 
 
 def _check(out: Path, lines: int, rig: RigConfig) -> None:
