@@ -33,7 +33,7 @@ def test_any_stretch_equals_the_register(degree: int, number: int, start: int, l
     )
 
 
-@pytest.mark.parametrize("degree", [7, 9, 11, 15])
+@pytest.mark.parametrize("degree", range(3, 17))
 def test_period_is_maximal(degree: int) -> None:
     period = 2**degree - 1
     bits = prbs(degree, 1, 0, 2 * period)
@@ -43,7 +43,7 @@ def test_period_is_maximal(degree: int) -> None:
     assert len(np.unique(windows @ (1 << np.arange(degree)))) == period
 
 
-@pytest.mark.parametrize("degree", [23, 31, 48, 64])
+@pytest.mark.parametrize("degree", [d for d in TAPS if d > 16])
 def test_jump_lands_where_a_full_period_ends(degree: int) -> None:
     seed, period = mix_seed(5, degree), 2**degree - 1
     np.testing.assert_array_equal(prbs(degree, seed, period, 200), prbs(degree, seed, 0, 200))
@@ -74,8 +74,8 @@ def test_attributes_regenerate_the_code(code: PrbsCode | ConstantCode) -> None:
 
 
 def test_refusals() -> None:
-    with pytest.raises(UsageError, match="degree 8"):
-        prbs(8, 1, 0, 10)
+    with pytest.raises(UsageError, match="degree 40"):
+        prbs(40, 1, 0, 10)
     with pytest.raises(UsageError, match="seed"):
         prbs(7, 128, 0, 10)
     with pytest.raises(UsageError, match="seed"):

@@ -11,7 +11,7 @@ import numpy as np
 from acquire.errors import UsageError
 from acquire.forward import DualArm
 from acquire.recon.admm import Admm, AdmmParameters
-from acquire.recon.band import BandOperator, InBasis
+from acquire.recon.band import InBasis, band_operator
 from acquire.recon.basis import TemporalBasis
 from acquire.recon.problem import pose
 from acquire.recon.twist import Twist, TwistParameters
@@ -179,7 +179,7 @@ def _admm(segment: Segment, problem: Problem, request: Request) -> _Work:
     frames, side, _ = segment.geometry.video_shape(request.spatial_merge, request.temporal_merge)
     count = min(frames, max(FEWEST_COEFFICIENTS, round(request.bandwidth * frames)))
     basis = TemporalBasis(frames, count)
-    operator = BandOperator(
+    operator = band_operator(
         segment.geometry, segment.code, basis, request.spatial_merge, request.temporal_merge
     )
     parameters = AdmmParameters()

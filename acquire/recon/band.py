@@ -12,19 +12,36 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.forward import block_bounds
+from acquire.forward import DualArm, block_bounds
 from acquire.forward.kernels import blocks_to_pixels, pixels_to_blocks
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from acquire.forward import DualArm
     from acquire.geometry import Geometry
     from acquire.recon.basis import TemporalBasis
 
 
+LARGEST_FACTORS_BYTES = 1 << 30
+
+
+def band_operator(
+    geometry: Geometry,
+    code: NDArray[np.uint8],
+    basis: TemporalBasis,
+    spatial_merge: int = 1,
+    temporal_merge: int = 1,
+) -> BandOperator | InBasis:
+    """B = Λ′·Dᵀ, by the dense factors where these take at most 1 GiB, else by way of the video."""
+    side = geometry.video_shape(spatial_merge, temporal_merge)[1]
+    if 2 * geometry.lines * side * basis.count * basis.dtype.itemsize <= LARGEST_FACTORS_BYTES:
+        return BandOperator(geometry, code, basis, spatial_merge, temporal_merge)
+    whole = DualArm(geometry, code, spatial_merge, temporal_merge, basis.dtype.type)
+    return InBasis(whole, basis)
+
+
 class BandOperator:
-    """B = Λ′·Dᵀ and its transpose, for any N_m and T_m."""
+    """B = Λ′·Dᵀ and its transpose, for any N_m and T_m, by one dense factor per arm."""
 
     def __init__(
         self,

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from acquire.errors import UsageError
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
-from acquire.recon.band import BandOperator, InBasis
+from acquire.recon import band
+from acquire.recon.band import BandOperator, InBasis, band_operator
 from acquire.recon.basis import TemporalBasis
 
 
@@ -39,6 +40,14 @@ def test_basis_refuses_more_cosines_than_instants() -> None:
         TemporalBasis(5, 6)
     with pytest.raises(UsageError, match="3 instants for 4"):
         TemporalBasis(5, 4).matrix(3)
+
+
+def test_long_segments_do_without_the_dense_factors(monkeypatch: pytest.MonkeyPatch) -> None:
+    g = Geometry(2, 2, 10)
+    code, basis = np.ones(g.span, np.uint8), TemporalBasis(g.span, 4)
+    assert isinstance(band_operator(g, code, basis), BandOperator)
+    monkeypatch.setattr(band, "LARGEST_FACTORS_BYTES", 100)
+    assert isinstance(band_operator(g, code, basis), InBasis)
 
 
 @st.composite
