@@ -18,6 +18,8 @@ A message states what was asked; ``possible`` and ``hint`` add what can be had a
 
 from __future__ import annotations
 
+from typing import Any
+
 EXIT_INTERRUPTED = 130
 
 
@@ -39,6 +41,16 @@ class AcquireError(Exception):
         if self.hint:
             parts.append(f"try: {self.hint}")
         return "; ".join(parts)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The error for programs: on the control socket, and as ``--json``."""
+        return {
+            "error": type(self).__name__,
+            "message": self.message,
+            "possible": self.possible,
+            "hint": self.hint,
+            "exit_code": self.exit_code,
+        }
 
     def __reduce__(self) -> tuple[object, ...]:
         return _rebuild, (type(self), self.message, self.possible, self.hint)

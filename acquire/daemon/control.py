@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
 
 from acquire import __version__
 from acquire.daemon.messages import (
@@ -25,6 +26,11 @@ from acquire.errors import AcquireError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
+
+    from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+MAX_BODY_BYTES = 2**16
+"""No request is longer than a path and a number."""
 
 
 class Commands(Protocol):
@@ -47,6 +53,7 @@ def build_app(service: Commands, run: Callable[[Callable[[], None]], Awaitable[N
         docs_url=None,  # the pages would load scripts from elsewhere
         redoc_url=None,
     )
+    app.add_middleware(BoundedBody)
     _add_errors(app)
 
     @app.get("/status", summary="What the daemon is doing, and how well")
@@ -76,6 +83,26 @@ def build_app(service: Commands, run: Callable[[Callable[[], None]], Awaitable[N
     return app
 
 
+class BoundedBody:
+    """Middleware that reads no more than `MAX_BODY_BYTES` of a request, whatever its header says."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        left = MAX_BODY_BYTES
+
+        async def bounded() -> Message:
+            nonlocal left
+            message = await receive()
+            left -= len(message.get("body", b""))
+            if left < 0:
+                raise HTTPException(413, f"more than {MAX_BODY_BYTES} bytes")
+            return message
+
+        await self._app(scope, bounded, send)
+
+
 def _add_errors(app: FastAPI) -> None:
     @app.exception_handler(AcquireError)
     async def refused(_: Request, error: AcquireError) -> JSONResponse:
@@ -84,6 +111,11 @@ def _add_errors(app: FastAPI) -> None:
     @app.exception_handler(RequestValidationError)
     async def malformed(_: Request, error: RequestValidationError) -> JSONResponse:
         return _answer(UsageError("; ".join(map(_explain, error.errors()))))
+
+    @app.exception_handler(HTTPException)
+    async def unknown(request: Request, error: HTTPException) -> JSONResponse:
+        told = UsageError(f"{request.method} {request.url.path}: {error.detail}", possible="/openapi.json")
+        return JSONResponse(error_body(told), error.status_code, error.headers)
 
     @app.exception_handler(Exception)
     async def defect(_: Request, error: Exception) -> JSONResponse:

@@ -9,7 +9,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from acquire import errors
 from acquire.daemon.states import State
@@ -41,6 +41,14 @@ class StartRequest(_Message):
             raise ValueError(f"path {str(self.path)!r} is not absolute: the daemon has another directory")
         return self
 
+    @field_validator("path")
+    @classmethod
+    def _can_be_a_name(cls, path: Path | None) -> Path | None:
+        text = str(path)
+        if "\0" in text or text != text.encode(errors="replace").decode():
+            raise ValueError(f"path {text!r} is not UTF-8, or has a NUL")
+        return path
+
 
 class RingStatus(_Message):
     """Fill of the ring between a camera and the recorder, in slots."""
@@ -56,6 +64,11 @@ class ArmStatus(_Message):
 
     delivered: int = Field(description="by the camera, the preroll included")
     preroll: int = Field(description="exposed before the run's start, discarded")
+    discarded: int = Field(
+        default=0,
+        description="taken while nothing was recorded, or outside the recording; once idle, delivered = "
+        "preroll + discarded + lost.ring_full + recorded - missing",
+    )
     lost: dict[str, int] = Field(description="cause → lines")
     recorded: int = Field(description="rows of the latest recording")
     missing: int = Field(description="those of them that hold no line")
@@ -111,13 +124,7 @@ class ErrorMessage(_Message):
 
     @classmethod
     def of(cls, error: AcquireError) -> ErrorMessage:
-        return cls(
-            error=type(error).__name__,
-            message=error.message,
-            possible=error.possible,
-            hint=error.hint,
-            exit_code=error.exit_code,
-        )
+        return cls(**error.to_dict())
 
     def rebuild(self) -> AcquireError:
         """The error again, of its own class where this version knows it."""

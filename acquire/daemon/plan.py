@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import secrets
 from dataclasses import asdict
 from datetime import UTC, datetime
@@ -112,7 +113,7 @@ def default_path(config: RigConfig) -> Path:
     directory = config.recording.directory.absolute()
     path = directory / f"{config.name}-{_stamp()}.zarr"
     number = 2
-    while path.exists():
+    while os.path.lexists(path):
         path = directory / f"{config.name}-{_stamp()}-{number}.zarr"
         number += 1
     return path

@@ -45,6 +45,7 @@ def arm_statuses(seen: CaptureStatus, rates: Rates) -> dict[str, ArmStatus]:
         arm: ArmStatus(
             delivered=counts["delivered"],
             preroll=counts["preroll"],
+            discarded=counts["discarded"],
             lost={str(cause): lines for cause, lines in counts["lost"].items()},
             recorded=counts["recorded"],
             missing=counts["missing"],

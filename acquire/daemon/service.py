@@ -21,6 +21,7 @@ from acquire.daemon.plan import default_path
 from acquire.daemon.report import Rates, arm_statuses, delivered_lines
 from acquire.daemon.states import Event, State, after, commands
 from acquire.errors import AcquireError, DeviceError
+from acquire.store import RunCondition
 from acquire.stream import CaptureStatus
 
 if TYPE_CHECKING:
@@ -123,8 +124,8 @@ class Service:
             return
         try:
             self._look()
-        except AcquireError as error:
-            self._fail(str(error))
+        except (AcquireError, OSError) as error:
+            self._fail(self._with_cause(str(error)))
         self._publish()
 
     def shutdown(self) -> None:
@@ -136,7 +137,7 @@ class Service:
                 self._drain_on()
             if self._state is State.ARMED:
                 self.disarm()
-        except AcquireError as error:
+        except (AcquireError, OSError) as error:
             log.error("while ending: %s", error)  # noqa: TRY400 - users get no traceback
         finally:
             self._release()
@@ -176,7 +177,16 @@ class Service:
 
     def _finish(self) -> None:
         self._release()
-        self._go(Event.SEALED, self._last_words())
+        if self._seen.condition is RunCondition.ABORTED:
+            self._fail(f"the recording was aborted: {self._seen.end_reason}")
+        else:
+            self._go(Event.SEALED, self._last_words())
+
+    def _with_cause(self, trouble: str) -> str:
+        """What went wrong while ending often follows from what ended it: that comes first."""
+        seen = self._seen
+        cause = seen.fault or (seen.end_reason if seen.condition is not RunCondition.GOOD else None)
+        return f"{cause}; then, while ending: {trouble}" if cause else trouble
 
     def _fail(self, text: str) -> None:
         """Tell the fault at once, release the devices, then wait to be read."""
@@ -189,12 +199,14 @@ class Service:
         self._go(Event.FAULT, self._fault)
 
     def _release(self) -> None:
-        """Close the run and remember its recording. Idempotent."""
+        """Close the run and remember its recording. Raises what closing raises, OSError as DeviceError."""
         if self._run is None:
             return
         run, self._run = self._run, None
         try:
             run.close()
+        except OSError as error:
+            raise DeviceError(f"the devices could not be released in order: {error}") from error
         finally:
             self._seen, self._rates = run.poll(), Rates()
             self._remember()
@@ -206,7 +218,7 @@ class Service:
         (path, _), self._target = self._target, None
         self._last = LastRecording(
             path=path,
-            lines=self._seen.recorded_lines,
+            lines=self._seen.committed_lines,
             condition=None if self._seen.condition is None else str(self._seen.condition),
             end_reason=self._seen.end_reason,
         )

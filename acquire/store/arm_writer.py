@@ -21,9 +21,7 @@ class ArmWriter:
 
     def __init__(self, directory: Path, spec: RecordingSpec) -> None:
         self.directory = directory
-        self._attributes = {"arm": directory.name, "first_line": spec.first_line}
         self._first_line = spec.first_line
-        self._row_shape = (spec.pixels,)
         durable = spec.fsync == "commit"
         self._arrays = {
             column: ArrayWriter(directory / column.name, layout.column_shape(column, spec), durable=durable)
@@ -46,6 +44,10 @@ class ArmWriter:
     def create(self) -> None:
         for array in self._arrays.values():
             array.directory.mkdir(parents=True)
+
+    def begin(self, first_line: int) -> None:
+        """Row 0 is line ``first_line``; before the first `append`."""
+        self._first_line = first_line
 
     def append(self, block: TaggedBlock) -> None:
         self._check(block)
@@ -72,9 +74,9 @@ class ArmWriter:
         }
         for name, document in documents.items():
             publisher.replace(self.directory / name / "zarr.json", layout.to_json(document))
-        group = layout.group_document(self._attributes, documents)
-        publisher.replace(self.directory / "zarr.json", layout.to_json(group))
         arm = self.directory.name
+        group = layout.group_document({"arm": arm, "first_line": self._first_line}, documents)
+        publisher.replace(self.directory / "zarr.json", layout.to_json(group))
         return {arm: group} | {f"{arm}/{name}": document for name, document in documents.items()}
 
     def _check(self, block: TaggedBlock) -> None:

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-DAMAGE = (OSError, ValueError, RuntimeError, LookupError, TypeError, AttributeError)
-"""What zarr raises for metadata or chunks that are not what they should be."""
+DAMAGE = (OSError, ValueError, RuntimeError, LookupError, TypeError, AttributeError, ArithmeticError)
+"""What zarr and arithmetic raise for metadata or chunks that are not what they should be."""
 
 READ_ATTEMPTS = 3
 """A chunk's index may be met in the instant of its replacement; its checksum tells, and it is read again."""

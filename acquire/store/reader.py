@@ -7,6 +7,7 @@ open it again to see more. Nothing is read before it is asked for.
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -98,14 +99,14 @@ class Recording:
     @cached_property
     def gaps(self) -> tuple[Gap, ...]:
         """Lost lines in the order in which they were noticed."""
-        table = child_group(self._group, "gaps")
+        table = _table(self._group, "gaps")
         first, count = _numbers(table, "first_line"), _numbers(table, "count")
         return tuple(map(Gap, _words(table, "arm"), first, count, _words(table, "cause")))
 
     @cached_property
     def events(self) -> tuple[Event, ...]:
         """What happened, in the order in which it was noted."""
-        table = child_group(self._group, "events")
+        table = _table(self._group, "events")
         texts = [str(text) for text in _column(table, "text")]
         ticks, lines = _numbers(table, "tick"), _numbers(table, "line")
         return tuple(map(Event, _words(table, "kind"), ticks, lines, texts))
@@ -209,17 +210,24 @@ class Recording:
 
 def open_recording(path: Path) -> Recording:
     """Open a recording, growing or sealed. Raises DataError when ``path`` is not one, or is damaged."""
-    _check_format(path, _root_attributes(path))
+    _check_format(path, format_of(path))
     try:
         group = zarr.open_group(path, mode="r", zarr_format=3)
         recording = Recording(path, group)
         _check_complete(recording)
-    except DAMAGE as error:
+    except (*DAMAGE, UsageError) as error:
         raise DataError(
             f"{path}: the metadata of the recording is damaged: {type(error).__name__}: {error}",
             hint="a copy of the recording",
         ) from error
     return recording
+
+
+def format_of(path: Path) -> str | None:
+    """The format that a Zarr group names, if any; DataError where there is no group to ask."""
+    attributes = _root_attributes(path)
+    name = attributes.get("format") if isinstance(attributes, dict) else None
+    return name if isinstance(name, str) else None
 
 
 def _root_attributes(path: Path) -> object:
@@ -237,11 +245,10 @@ def _root_attributes(path: Path) -> object:
     return attributes
 
 
-def _check_format(path: Path, attributes: object) -> None:
-    name = attributes.get("format") if isinstance(attributes, dict) else None
+def _check_format(path: Path, name: str | None) -> None:
     if name == FORMAT:
         return
-    if isinstance(name, str) and name.startswith(FORMAT.split("/")[0] + "/"):
+    if name is not None and name.startswith(FORMAT.split("/")[0] + "/"):
         raise DataError(
             f"{path} is a recording of format {name!r}",
             possible=f"{FORMAT!r}",
@@ -251,19 +258,38 @@ def _check_format(path: Path, attributes: object) -> None:
 
 
 def _check_complete(recording: Recording) -> None:
-    """Touch everything that a recording needs; what is absent raises LookupError, TypeError or ValueError."""
+    """Touch everything that a recording needs; what is absent or impossible raises DAMAGE or UsageError."""
     attributes = recording.attrs
-    for key in ("state", "run_condition", "ledger", "versions", "layout", "run_id", "end_reason"):
+    for key in ("state", "run_condition", "ledger", "layout", "run_id", "end_reason"):
         attributes[key]
-    for arm, stream in recording.arms.items():
-        for column in line_columns("any"):
-            if len(stream.array(column.name).shape) != (2 if column.name == "lines" else 1):
-                raise ValueError(f"{arm}/{column.name} has the wrong number of axes")
-        for key in CAMERA_KEYS:
-            float(attributes["cameras"][arm][key])
+    attributes["versions"]["acquire"]
+    code_from_attrs(attributes["code"])
     recording.geometry_for(1)
-    if recording.line_period_ns <= 0 or "kind" not in attributes["code"]:
-        raise ValueError("timing or code")
+    _check_number("pixels", int(attributes["geometry"]["pixels"]), above=0)
+    _check_number("clock_hz", recording.clock.clock_hz, above=0)
+    _check_number("line period", recording.line_period_ns, above=0)
+    for arm, stream in recording.arms.items():
+        _check_arm(stream, attributes["cameras"][arm])
+
+
+def _check_arm(stream: CameraStream, camera: dict[str, Any]) -> None:
+    for column in line_columns("any"):
+        if len(stream.array(column.name).shape) != (2 if column.name == "lines" else 1):
+            raise ValueError(f"{stream.path.name}/{column.name} has the wrong number of axes")
+    for key in CAMERA_KEYS:
+        _check_number(key, float(camera[key]), above=-math.inf if key == "black_level_dn" else 0)
+
+
+def _check_number(name: str, value: float, *, above: float) -> None:
+    if not (math.isfinite(value) and value > above):
+        raise ValueError(f"{name} is {value}")
+
+
+def _table(group: zarr.Group, name: str) -> zarr.Group:
+    try:
+        return child_group(group, name)
+    except DAMAGE as error:
+        raise DataError(f"table {name} cannot be read: {error}") from error
 
 
 def _column(table: zarr.Group, name: str) -> NDArray[Any]:
@@ -279,8 +305,10 @@ def _numbers(table: zarr.Group, name: str) -> list[int]:
 
 def _words(table: zarr.Group, name: str) -> list[str]:
     """A column of CF flag values as their meanings."""
-    attributes = table[name].attrs
-    meanings = str(attributes["flag_meanings"]).split()
-    values: Any = attributes["flag_values"]
-    by_value = dict(zip(values, meanings, strict=True))
-    return [by_value[value] for value in _numbers(table, name)]
+    try:
+        attributes = child_array(table, name).attrs
+        values: Any = attributes["flag_values"]
+        by_value = dict(zip(values, str(attributes["flag_meanings"]).split(), strict=True))
+        return [by_value[value] for value in _numbers(table, name)]
+    except DAMAGE as error:
+        raise DataError(f"table {table.path}/{name} cannot be read: {error!r}") from error

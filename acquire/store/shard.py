@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 PAGE = 4096
 MAX_SHARD_CHUNKS = 255
 """Chunks whose index (16 bytes each, and a checksum) fits one page."""
-MAX_CHUNK_BYTES = 2**31 - PAGE
-"""What blosc takes at once."""
+MAX_CHUNK_BYTES = 2**26
+"""Each array holds one chunk in memory while it fills, lost if the process is killed; blosc takes 2 GiB."""
 
 ABSENT = np.uint64(2**64 - 1)
 

@@ -15,6 +15,7 @@ import errno
 import json
 import shutil
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
 
 from acquire.errors import DataError, UsageError
@@ -31,6 +32,18 @@ if TYPE_CHECKING:
 
     from acquire.lines import TaggedBlock
     from acquire.store.spec import RecordingSpec
+
+NOT_A_PLACE = (
+    errno.EACCES,
+    errno.EINVAL,
+    errno.ELOOP,
+    errno.ENAMETOOLONG,
+    errno.ENOENT,
+    errno.ENOTDIR,
+    errno.EPERM,
+    errno.EROFS,
+)
+"""Why a directory cannot be made where it was asked for; all other reasons are the disk's."""
 
 RESERVE_BYTES = 2**20
 """Kept free for the metadata of the end: more than the tables and the root take."""
@@ -70,7 +83,14 @@ class RecordingWriter:
 
     @classmethod
     def create(cls, path: Path, spec: RecordingSpec) -> RecordingWriter:
-        """A new, empty recording at ``path``.
+        """A new, empty recording at ``path``, from line ``spec.first_line`` on: `prepare`, then `begin`."""
+        writer = cls.prepare(path, spec)
+        writer.begin(spec.first_line)
+        return writer
+
+    @classmethod
+    def prepare(cls, path: Path, spec: RecordingSpec) -> RecordingWriter:
+        """Do all that takes time; ``path`` becomes a recording, and takes lines, once `begin` was called.
 
         Raises UsageError when ``path`` exists or cannot be created, before anything is touched, and
         DataError when the disk refuses; then nothing is left behind.
@@ -81,27 +101,43 @@ class RecordingWriter:
         except FileExistsError as error:  # somebody was faster
             raise UsageError(f"{path} exists already", hint="another name") from error
         except OSError as error:
-            raise DataError(f"{path} cannot be created: {error.strerror}") from error
+            kind = UsageError if error.errno in NOT_A_PLACE else DataError
+            raise kind(f"{path} cannot be created: {error.strerror}") from error
         try:
-            return cls._create_inside(path, spec)
-        except (DataError, UsageError):
+            writer = cls(path, spec)
+            writer._create_parts()
+        except (DataError, UsageError, MemoryError):
             shutil.rmtree(path, ignore_errors=True)
             raise
-
-    @classmethod
-    def _create_inside(cls, path: Path, spec: RecordingSpec) -> RecordingWriter:
-        writer = cls(path, spec)
-        with writer._disk("creating the recording"):
-            for arm in writer._arms.values():
-                arm.create()
-            for table in writer._tables:
-                table.create()
-            reserve(writer._reserve, RESERVE_BYTES)
-            writer._publish_root(0, writer._publish_parts(0), durable=False)
-            if spec.fsync == "commit":
-                sync_tree(path)
-                sync_directory(path.parent)
         return writer
+
+    def begin(self, first_line: int) -> None:
+        """Make it a recording whose row 0 is line ``first_line``; takes as long as a commit.
+
+        Raises DataError when the disk refuses; then nothing is left behind.
+        """
+        self.spec = replace(self.spec, first_line=first_line)
+        for arm in self._arms.values():
+            arm.begin(first_line)
+        try:
+            with self._disk("creating the recording"):
+                durable = self.spec.fsync == "commit"
+                self._publish_root(0, self._publish_parts(0), durable=durable)
+        except DataError:
+            self.close()
+            shutil.rmtree(self.path, ignore_errors=True)
+            raise
+
+    def _create_parts(self) -> None:
+        with self._disk("creating the recording"):
+            for arm in self._arms.values():
+                arm.create()
+            for table in self._tables:
+                table.create()
+            reserve(self._reserve, RESERVE_BYTES)
+            if self.spec.fsync == "commit":
+                sync_tree(self.path)
+                sync_directory(self.path.parent)
 
     def __enter__(self) -> Self:
         return self

@@ -63,6 +63,7 @@ class Capture:
         self._rings: dict[str, Ring] = {}
         self._tags: Ring | None = None
         self._counters: dict[str, Counters] = {}
+        self._left_over = dict.fromkeys(ARMS, 0)
         self._workers: dict[str, Worker] = {}
         self._supervisor: Supervisor | None = None
         self._memory = threading.Lock()
@@ -137,6 +138,7 @@ class Capture:
             self._end_tags,
             self._end_trigger,
             lambda: self._end_workers(deadline),
+            self._empty_rings,
             self._end_memory,
         )
 
@@ -152,7 +154,9 @@ class Capture:
         self.clock = self._trigger.start()
         self._workers[RECORDER].post(RunStarted(self.clock))
         assert self._tags is not None
-        self._supervisor = Supervisor(self._trigger, self._workers, self._tags)
+        self._supervisor = Supervisor(
+            self._trigger, self._workers, self._tags, self._counters, self._plan.stall_timeout_s
+        )
         self._supervisor.start()
 
     def _make_memory(self) -> None:
@@ -171,7 +175,9 @@ class Capture:
             RECORDER, recorder.record, what, self._rings, self._tags, self._counters[RECORDER]
         )
         for arm, ring in self._rings.items():
-            task = grabber.GrabberPlan(arm, plan.openers[arm], plan.depth_lines, plan.white_dn)
+            task = grabber.GrabberPlan(
+                arm, plan.openers[arm], plan.depth_lines, plan.white_dn, plan.max_skew_lines
+            )
             self._workers[arm] = Worker(f"grabber {arm}", grabber.grab, task, ring, self._counters[arm])
 
     def _running(self, command: str) -> Supervisor:
@@ -217,6 +223,7 @@ class Capture:
         return {
             "delivered": grabbed["delivered"],
             "preroll": grabbed["preroll"],
+            "discarded": recorded[f"discarded_{arm}"] + self._left_over[arm],
             "lost": lost,
             "recorded": recorded[f"rows_{arm}"] if began else 0,
             "missing": recorded[f"missing_{arm}"] if began else 0,
@@ -246,6 +253,11 @@ class Capture:
         for worker in order:
             worker.post(Quit())
         _run_all(*(partial(worker.end, deadline) for worker in order))
+
+    def _empty_rings(self) -> None:
+        """Nobody will take what the last of the grabbers left."""
+        for arm, ring in self._rings.items():
+            self._left_over[arm] = ring.empty()
 
     def _end_memory(self) -> None:
         with self._memory:

@@ -29,21 +29,22 @@ if TYPE_CHECKING:
 COUNTERS = ("delivered", "preroll", "camera_lost")
 """Lines since arm: delivered by the camera (preroll included), discarded as preroll, jumped over."""
 
-MAX_JUMP_LINES = 1 << 24
-"""A larger jump of the camera's count is a broken count, not a loss."""
-
 _BLOCK_WAIT_S = 0.05
 _MAIL_INTERVAL_S = 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class GrabberPlan:
-    """What one grabber needs to know. Picklable."""
+    """What one grabber needs to know. Picklable.
+
+    A jump of the camera's count by more than ``max_jump_lines`` is a broken count, not a loss.
+    """
 
     arm: str
     opener: CameraOpener
     depth_lines: int
     white_dn: int
+    max_jump_lines: int
 
 
 def grab(mailbox: Mailbox, plan: GrabberPlan, ring: Ring, counters: Counters) -> None:
@@ -117,11 +118,11 @@ class Intake:
 
     def _note_jump(self, first: int) -> None:
         jump = first - self._next
-        if not 0 <= jump <= MAX_JUMP_LINES:
+        if not 0 <= jump <= self._plan.max_jump_lines:
             raise CameraError(
                 f"camera {self._plan.arm}: its count of lines went from "
                 f"{self._next + self._plan.depth_lines} to {first + self._plan.depth_lines}",
-                possible=f"the next line, or up to {MAX_JUMP_LINES} lost ones",
+                possible=f"the next line, or up to {self._plan.max_jump_lines} lost ones",
             )
         lost = first - max(self._next, 0)
         if lost > 0:

@@ -33,7 +33,8 @@ class CapturePlan:
     block_lines, ring_slots : lines per ring slot; slots per arm
     white_dn : a pixel that has this value is saturated
     openers : arm → how its camera is opened, in the grabber's process
-    stall_timeout_s : an arm that delivers nothing for so long ends the recording
+    stall_timeout_s : an arm that delivers nothing for so long ends the recording; while nothing is
+        recorded it is a fault, as is a recorder that shows no life for so long
     tag_wait_s : how long lines wait for the tag that confirms them before they are flagged
     """
 
@@ -75,7 +76,9 @@ class CapturePlan:
 
     @property
     def max_skew_lines(self) -> int:
-        """Lines by which one arm may be ahead of the other."""
+        """Lines by which one arm may be ahead of the other, and by which a camera's count may jump: after
+        a larger jump the other arm would be taken for stalled, and its rows would be written in one go.
+        """
         return SKEW_RINGS * self.ring_slots * self.block_lines
 
 
@@ -91,8 +94,9 @@ class CaptureStatus:
     first_line : the trigger's number of its row 0, or None before the first recording
     recorded_lines, committed_lines : rows that both arms have; rows that a reader finds
     ring : arm → slots, fill, peak, drops (blocks), dropped_lines, all since arm
-    lines : arm → delivered, preroll, and lost by cause, since arm; and of the latest recording
-        ``recorded`` rows, of which ``missing``
+    lines : arm → delivered, preroll, discarded (taken from the ring, but in no recording), and lost by
+        cause, since arm; and of the latest recording ``recorded`` rows, of which ``missing``. After
+        `close`: delivered = preroll + lost["ring_full"] + discarded + recorded − missing
     fault : what failed first, or None
     """
 

@@ -4,6 +4,7 @@
 
     discarding ──Begin──▶ opening ──▶ recording ──last line──▶ closing ──▶ discarding
 
+Lines are discarded while a recording is opened as well: its first line is chosen when it can take lines.
 A block waits in its ring until a tag of the trigger confirms its lines, but not longer than ``tag_wait_s``
 and not once the ring is half full; then its lines are written flagged. Creating and sealing a recording
 wait for the disk: a second thread does them, so that the rings are emptied meanwhile. What is counted is
@@ -16,12 +17,12 @@ from __future__ import annotations
 import select
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from acquire.errors import AcquireError, StateError
+from acquire.errors import AcquireError, DataError, StateError
 from acquire.lines import ARMS
 from acquire.store import RecordingWriter, RunCondition
 from acquire.stream.losses import Cause
@@ -38,12 +39,13 @@ if TYPE_CHECKING:
     from acquire.stream.shared import Counters
     from acquire.trigger.base import TriggerRun
 
-COUNTERS = ("recorded", "committed", "draining", "rows_a", "rows_b", "missing_a", "missing_b")
+COUNTERS = (
+    *("recorded", "committed", "draining", "rows_a", "rows_b", "missing_a", "missing_b"),
+    *("discarded_a", "discarded_b", "turns"),
+)
 """Of the latest recording: rows in both arms, rows that a reader finds, whether its last line is known; per
-arm the rows written and those of them that are missing."""
-
-OPENING_S = {"seal": 0.1, "commit": 0.5}
-"""What creating a recording takes, by when its bytes are forced to the medium; generously."""
+arm the rows written and those of them that are missing. Since armed: per arm the lines taken from its ring
+that no recording holds; turns of the loop, which stand still when it hangs."""
 
 _WAIT_S = 0.02
 _COMMIT_INTERVAL_S = 0.1
@@ -65,9 +67,8 @@ class RecorderPlan:
 
 @dataclass(frozen=True, slots=True)
 class Opening:
-    """A recording that is being created, for lines from ``first_line`` on."""
+    """A recording that is being created, for ``lines`` lines."""
 
-    first_line: int
     lines: int | None
     writer: Future[RecordingWriter]
 
@@ -119,6 +120,7 @@ class Recorder:
 
     def turn(self) -> bool:
         """One round over messages, disk, tags and rings; False when nothing is left to live for."""
+        self._counters.add("turns", 1)
         try:
             self._listen()
             self._look_at_disk()
@@ -164,20 +166,13 @@ class Recorder:
                 self._interrupt(reason, dict.fromkeys(lost, cause))
 
     def _begin(self, begin: Begin) -> None:
-        """At the next line that both arms can still deliver whole when the recording exists."""
+        """Lines go on being discarded until the recording can take them."""
         if self._tagger is None or self._opening or self._session or self._closing:
             self._mailbox.post(Refused(StateError("start: the recorder is not armed, or is recording")))
             return
-        first_line = self._newest_line() + self._lead_lines(OPENING_S[begin.spec.fsync])
-        spec = replace(begin.spec, first_line=first_line)
-        writer = self._disk.submit(RecordingWriter.create, begin.path, spec)
-        self._opening = Opening(first_line, begin.lines, writer)
-
-    def _lead_lines(self, opening_s: float) -> int:
-        """Lines that will come while a recording is created, and that half a ring cannot hold."""
-        half = min(arm.ring.shape.slots * arm.ring.shape.rows // 2 for arm in self._arms.values())
-        rate_hz = max(arm.rate_hz(time.monotonic()) for arm in self._arms.values())
-        return max(0, int(rate_hz * opening_s) - half)
+        self._opening = Opening(
+            begin.lines, self._disk.submit(RecordingWriter.prepare, begin.path, begin.spec)
+        )
 
     def _interrupt(self, reason: str, lost: dict[str, Cause]) -> None:
         """What is lost stays lost: a recording that is only being created will know."""
@@ -207,17 +202,22 @@ class Recorder:
             self._mailbox.post(sealed.result())
 
     def _opened(self, opening: Opening) -> None:
+        """From the newest line on: both arms have still to deliver what comes after it."""
         assert self._tagger is not None
         try:
             writer = opening.writer.result()
+            writer.begin(first_line := self._newest_line())
         except AcquireError as error:
             self._mailbox.post(Refused(error))
             return
-        self._session = Session(writer, self._tagger, self._blank, opening.first_line, opening.lines)
+        except (OSError, ValueError, MemoryError) as error:
+            self._mailbox.post(Refused(DataError(f"the recording cannot be created: {error!r}")))
+            return
+        self._session = Session(writer, self._tagger, self._blank, first_line, opening.lines)
         for arm in self._arms.values():
             arm.revive(time.monotonic())
         self._publish(self._session)
-        self._mailbox.post(Began(opening.first_line))
+        self._mailbox.post(Began(first_line))
         if self._trouble is not None:
             self._interrupt(*self._trouble)
 
@@ -242,15 +242,13 @@ class Recorder:
             block = arm.ring.acquire()
             if block is None or not self._may_go(arm.ring, block):
                 return taken > 0
-            if self._session is not None:
-                self._session.take(name, block)
+            written = self._session.take(name, block) if self._session is not None else 0
+            self._counters.add(f"discarded_{name}", len(block.flags) - written)
             arm.ring.release()
         return True
 
     def _may_go(self, ring: Ring, block: RingBlock) -> bool:
-        """Nothing is gained by letting the block wait any longer: for its recording, or for its tag."""
-        if self._opening is not None:
-            return block.end_line <= self._opening.first_line
+        """Nothing is gained by letting the block wait any longer for its tag."""
         if self._session is None or self._tagger is None or block.end_line <= self._tagger.confirmed_end:
             return True
         return self._tags_overdue(self._tagger.confirmed_end, ring, block) or not self._owner

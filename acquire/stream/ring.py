@@ -187,6 +187,14 @@ class Ring:
         self._check(self._headers[tail % self.shape.slots], tail)
         self._control[_TAIL] = tail + 1
 
+    def empty(self) -> int:
+        """Release everything that waits, unread; returns the number of lines."""
+        lines = 0
+        while (block := self.acquire()) is not None:
+            lines += len(block.flags)
+            self.release()
+        return lines
+
     def fileno(self) -> int:
         """The doorbell: readable when something was committed since `hush`."""
         return self._bell

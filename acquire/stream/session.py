@@ -136,17 +136,20 @@ class Session:
         """The arm has all its rows."""
         return self.books[arm].next_line >= self.end_line
 
-    def take(self, arm: str, block: RingBlock) -> None:
-        """Write what was lost before the block, and what of the block is in range."""
+    def take(self, arm: str, block: RingBlock) -> int:
+        """Write what was lost before the block, and what of the block is in range: so many lines."""
         book = self.books[arm]
         if block.end_line <= book.next_line:
-            return
+            return 0
         for loss in block.losses:
             self._miss_until(arm, loss.end_line, loss.cause)
         self._miss_until(arm, block.first_line, Cause.MIXED)
         part = slice(book.next_line - block.first_line, self.end_line - block.first_line)
-        if part.stop > part.start:
-            self._append(LineBlock(arm, book.next_line, block.pixels[part], block.flags[part]))
+        if part.stop <= part.start:
+            return 0
+        taken = LineBlock(arm, book.next_line, block.pixels[part], block.flags[part])
+        self._append(taken)
+        return len(taken)
 
     def give_up(self, arm: str) -> None:
         """Fill the remaining rows of a lost arm."""
@@ -180,12 +183,12 @@ class Session:
                 return self._seal(self._condition(), self.end_reason)
             except (AcquireError, OSError) as found:
                 error = found
-        reason = f"write error: {error}"
+        reason = f"write error: {_words(error)}"
         try:
             return self._seal(RunCondition.ABORTED, reason)
         except (AcquireError, OSError) as second:
             self._writer.close()
-            return Sealed(RunCondition.ABORTED, f"{reason}; not sealed: {second}", self._ledger())
+            return Sealed(RunCondition.ABORTED, f"{reason}; not sealed: {_words(second)}", self._ledger())
 
     def _seal(self, condition: RunCondition, reason: str) -> Sealed:
         ledger = self._ledger()
@@ -213,11 +216,12 @@ class Session:
     def _condition(self) -> RunCondition:
         books = self.books.values()
         lines = self.end_line - self.first_line
-        found = RunCondition.GOOD
+        # A recording without a line was stopped before it held anything.
+        found = RunCondition.GOOD if lines else RunCondition.INTERRUPTED
         if self._mismatches or any(book.unverified or book.incomplete for book in books):
-            found = RunCondition.TAINTED
+            found = _worse(found, RunCondition.TAINTED)
         if any(book.missing or not book.balances(lines) for book in books):
-            found = RunCondition.INCOMPLETE
+            found = _worse(found, RunCondition.INCOMPLETE)
         return _worse(found, self._floor)
 
     def _ledger(self) -> dict[str, Any]:
@@ -228,6 +232,11 @@ class Session:
 
     def _note(self, kind: str, line: int, text: str) -> None:
         self._writer.add_event(kind, int(self._tagger.table(line, 1).tick[0]), line, text)
+
+
+def _words(error: Exception) -> str:
+    """What happened; what an error says to do about it is out of date once it is read in a recording."""
+    return error.message if isinstance(error, AcquireError) else str(error)
 
 
 def _worse(one: RunCondition, other: RunCondition) -> RunCondition:

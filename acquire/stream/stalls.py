@@ -1,4 +1,9 @@
-"""When an arm counts as stalled: it is silent for too long, or has fallen too far behind the other."""
+"""Silence: when an arm counts as stalled, and when a process shows no life.
+
+The recorder judges the arms of its recording: silent for too long, or too far behind the other. The
+supervisor judges by counters that must not stand still: the recorder always, the arms while nothing is
+recorded.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +17,9 @@ from acquire.store import RunCondition
 if TYPE_CHECKING:
     from acquire.stream.ring import Ring
     from acquire.stream.session import Session
+    from acquire.stream.shared import Counters
+
+_LONGEST_LOOK_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,13 +32,12 @@ class Stall:
 
 
 class Arm:
-    """A ring as the recorder sees it: when it last showed life, and how fast it lives."""
+    """A ring as the recorder sees it: when it last showed life."""
 
     def __init__(self, ring: Ring) -> None:
         self.ring = ring
         self.alive_s = time.monotonic()
         self._newest = ring.newest_line
-        self._since: tuple[float, int] | None = None
 
     def watch(self, now_s: float) -> None:
         """Note life: something new, or something that still waits to be taken."""
@@ -38,17 +45,34 @@ class Arm:
         if newest != self._newest or self.ring.fill:
             self._newest = newest
             self.alive_s = now_s
-            self._since = self._since or (now_s, newest)
 
     def revive(self, now_s: float) -> None:
         """Count silence from now."""
         self.alive_s = now_s
 
-    def rate_hz(self, now_s: float) -> float:
-        """Lines per second since the first one; 0 while that is not known."""
-        if self._since is None or now_s <= self._since[0]:
-            return 0.0
-        return (self.ring.newest_line - self._since[1]) / (now_s - self._since[0])
+
+class Heartbeat:
+    """A counter of another process, for how long it has stood still."""
+
+    def __init__(self, counters: Counters, name: str) -> None:
+        self._counters = counters
+        self._name = name
+        self._count = counters[name]
+        self._looked_s = time.monotonic()
+        self.still_s = 0.0
+
+    def look(self, now_s: float) -> float:
+        """Seconds without a beat; of a time between two looks, only so much as a look can take counts."""
+        self.still_s += min(now_s - self._looked_s, _LONGEST_LOOK_S)
+        self._looked_s = now_s
+        if (count := self._counters[self._name]) != self._count:
+            self._count = count
+            self.still_s = 0.0
+        return self.still_s
+
+    def revive(self) -> None:
+        """Count silence from now."""
+        self.still_s = 0.0
 
 
 def find_stall(session: Session, arms: dict[str, Arm], limit_s: float, max_skew_lines: int) -> Stall | None:

@@ -1,4 +1,6 @@
-"""The thread of an armed run: it moves tags to the recorder and hears what the processes say."""
+"""The thread of an armed run: it moves tags to the recorder, hears what the processes say, and notices when
+they are silent.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +11,14 @@ from typing import TYPE_CHECKING
 from acquire.errors import AcquireError, DeviceError, TriggerError
 from acquire.lines import ARMS
 from acquire.stream.messages import Began, Failed, Interrupt, Refused, Sealed
+from acquire.stream.stalls import Heartbeat
 from acquire.stream.tagger import tag_rows
 
 if TYPE_CHECKING:
     from acquire.stream.messages import Begin
     from acquire.stream.process import Worker
     from acquire.stream.ring import Ring
+    from acquire.stream.shared import Counters
     from acquire.trigger.base import LineTag, Trigger
 
 RECORDER = "recorder"
@@ -35,13 +39,23 @@ class Supervisor:
     fault : what failed first
     """
 
-    def __init__(self, trigger: Trigger, workers: dict[str, Worker], tags: Ring) -> None:
+    def __init__(
+        self,
+        trigger: Trigger,
+        workers: dict[str, Worker],
+        tags: Ring,
+        counters: dict[str, Counters],
+        stall_timeout_s: float,
+    ) -> None:
         self.began: Began | None = None
         self.sealed: Sealed | None = None
         self.fault: str | None = None
         self._trigger = trigger
         self._workers = workers
         self._tags = tags
+        self._stall_timeout_s = stall_timeout_s
+        self._loop = Heartbeat(counters[RECORDER], "turns")
+        self._cameras = {arm: Heartbeat(counters[arm], "delivered") for arm in ARMS}
         self._refused: Refused | None = None
         self._trigger_lost = False
         self._dead: set[str] = set()
@@ -73,12 +87,12 @@ class Supervisor:
         with self._news:
             self.began = self.sealed = self._refused = None
             self._workers[RECORDER].post(message)
-            self._news.wait_for(lambda: self.began or self._refused or RECORDER in self._dead, _ANSWER_S)
+            self._news.wait_for(lambda: self.began or self._refused or self.fault, _ANSWER_S)
             if self.began is not None:
                 return
             if self._refused is not None:
                 raise self._refused.error
-        if RECORDER not in self._dead:
+        if self.fault is None:
             self._fail(f"recorder: no answer within {_ANSWER_S:g} s")
         raise DeviceError(f"start: {self.fault}")
 
@@ -100,6 +114,8 @@ class Supervisor:
         tags = self._take_tags()
         for name, worker in self._workers.items():
             self._hear(name, worker)
+        if self.fault is None:
+            self._watch(time.monotonic())
         if not tags:  # a trigger that does not wait by itself must not make this loop spin
             self._ending.wait(max(0.0, begun + _TAG_WAIT_S - time.monotonic()))
 
@@ -127,6 +143,20 @@ class Supervisor:
         slot.pixels[: len(tags)] = tag_rows(tags)
         self._tags.commit(0, len(tags))
 
+    def _watch(self, now_s: float) -> None:
+        """A recorder that hangs is a fault. So is a silent arm; in a recording, the recorder judges it."""
+        limit_s = self._stall_timeout_s
+        if self._loop.look(now_s) > limit_s:
+            self._fail(f"{self._workers[RECORDER].name}: no sign of life for {limit_s:g} s")
+        if self.recording:
+            for camera in self._cameras.values():
+                camera.revive()
+        silent_s = {arm: camera.look(now_s) for arm, camera in self._cameras.items()}
+        if max(silent_s.values()) > limit_s:
+            # Arms that fall silent together do so to within a block: half the limit tells both from one.
+            arms = " and ".join(arm for arm in ARMS if silent_s[arm] > limit_s / 2)
+            self._fail(f"arm {arms}: no line for {limit_s:g} s")
+
     def _hear(self, name: str, worker: Worker) -> None:
         death = worker.death  # looked at before the messages: what a process said last counts
         while (message := worker.message()) is not None:
@@ -145,7 +175,8 @@ class Supervisor:
                 case Sealed():
                     self.sealed = message
                 case Failed(error):
-                    self._last_words[name] = str(error)
+                    # Those of a defect begin with the process's name already.
+                    self._last_words[name] = str(error).removeprefix(f"{self._workers[name].name}: ")
             self._news.notify_all()
 
     def _fail(self, text: str, name: str | None = None) -> None:

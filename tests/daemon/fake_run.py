@@ -7,7 +7,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from acquire.config import load_rig
-from acquire.errors import AcquireError
 from acquire.lines import ARMS
 from acquire.store import RunCondition
 from acquire.stream import CaptureStatus
@@ -20,7 +19,14 @@ if TYPE_CHECKING:
 CALM = CaptureStatus(
     ring={arm: {"slots": 8, "fill": 1, "peak": 2, "drops": 0, "dropped_lines": 0} for arm in ARMS},
     lines={
-        arm: {"delivered": 100, "preroll": 65, "lost": {"camera": 0}, "recorded": 0, "missing": 0}
+        arm: {
+            "delivered": 100,
+            "preroll": 65,
+            "discarded": 35,
+            "lost": {"camera": 0},
+            "recorded": 0,
+            "missing": 0,
+        }
         for arm in ARMS
     },
 )
@@ -35,7 +41,7 @@ class FakeRun:
 
     run_id = "fake-run"
 
-    def __init__(self, **refuse: AcquireError) -> None:
+    def __init__(self, **refuse: Exception) -> None:
         self.calls: list[Any] = []
         self.refuse = refuse
         self.seen = CALM
@@ -46,9 +52,16 @@ class FakeRun:
     def see(self, **changes: Any) -> None:
         self.seen = replace(self.seen, **changes)
 
-    def seal(self, lines: int = 500, reason: str = "stopped") -> None:
+    def seal(
+        self, lines: int = 500, reason: str = "stopped", condition: RunCondition = RunCondition.GOOD
+    ) -> None:
         self.see(
-            recording=False, done=True, recorded_lines=lines, condition=RunCondition.GOOD, end_reason=reason
+            recording=False,
+            done=True,
+            recorded_lines=lines,
+            committed_lines=lines,
+            condition=condition,
+            end_reason=reason,
         )
 
     def arm(self) -> None:

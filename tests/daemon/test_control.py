@@ -118,6 +118,42 @@ def test_malformed_request_names_the_key(path: Path, daemon: Client) -> None:
     assert "Status" in described["components"]["schemas"]
 
 
+@pytest.mark.parametrize(
+    ("method", "url", "code"), [("GET", "/nothing", 404), ("GET", "/arm", 405), ("POST", "/start", 400)]
+)
+def test_requests_that_no_route_takes_are_answered_alike(
+    path: Path, daemon: Client, method: str, url: str, code: int
+) -> None:
+    with httpx.Client(transport=httpx.HTTPTransport(uds=str(path)), base_url="http://x") as raw:
+        answer = raw.request(method, url, content=b"\xff", headers={"content-type": "application/json"})
+    assert answer.status_code == code
+    message = ErrorMessage.model_validate_json(answer.content)
+    assert (message.error, message.message.split(":")[0]) == ("UsageError", f"{method} {url}")
+
+
+def test_long_requests_are_not_read(path: Path, daemon: Client, run: FakeRun) -> None:
+    def body() -> Iterator[bytes]:  # of a length that no header tells
+        for _ in range(70):
+            yield b" " * 1000
+
+    daemon.arm()
+    with httpx.Client(transport=httpx.HTTPTransport(uds=str(path)), base_url="http://x") as raw:
+        for content in (b" " * 70_000, body()):
+            answer = raw.post("/start", content=content, headers={"content-type": "application/json"})
+            assert answer.status_code == 413
+            assert "more than 65536 bytes" in ErrorMessage.model_validate_json(answer.content).message
+    assert run.names == ["arm"]
+
+
+@pytest.mark.parametrize("name", ["nul\0.zarr", "not-utf8-\udcff.zarr"])
+def test_paths_that_cannot_be_are_refused_before_they_are_sent(
+    daemon: Client, tmp_path: Path, name: str
+) -> None:
+    with pytest.raises(UsageError, match="is not UTF-8, or has a NUL") as caught:
+        daemon.start(tmp_path / name)
+    assert str(caught.value).encode()  # can be printed
+
+
 def test_status_is_answered_while_arming(daemon: Client, run: FakeRun) -> None:
     run.may_arm.clear()
     arming = threading.Thread(target=daemon.arm)

@@ -146,19 +146,51 @@ def test_fault_releases_the_devices_and_waits_to_be_read(bed: Bed, recording: bo
     assert bed.state is State.ARMED
 
 
-def test_a_look_that_fails_is_a_fault(tmp_path: Path) -> None:
-    bed = Bed(tmp_path, FakeRun(poll=CameraError("lost")))
+@pytest.mark.parametrize("error", [CameraError("lost"), OSError("lost")])
+def test_a_look_that_fails_is_a_fault(tmp_path: Path, error: Exception) -> None:
+    bed = Bed(tmp_path, FakeRun(poll=error))
     with pytest.raises(DeviceError, match="lost"):
         bed.service.arm()
     assert (bed.state, bed.service.status().fault) == (State.FAULTED, "lost")
 
 
-def test_fault_tells_of_a_failing_end_too(tmp_path: Path) -> None:
-    bed = Bed(tmp_path, FakeRun(close=CameraError("does not let go")))
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (CameraError("does not let go"), "does not let go"),
+        (OSError("no memory"), "the devices could not be released in order: no memory"),
+    ],
+)
+def test_fault_tells_of_a_failing_end_too(tmp_path: Path, error: Exception, told: str) -> None:
+    bed = Bed(tmp_path, FakeRun(close=error))
     bed.service.arm()
     bed.run.see(fault="first")
     bed.service.supervise()
-    assert bed.service.status().fault == "first; then, while ending: does not let go"
+    assert bed.service.status().fault == f"first; then, while ending: {told}"
+
+
+def test_what_ended_the_recording_is_told_before_what_went_wrong_after_it(tmp_path: Path) -> None:
+    bed = Bed(tmp_path, FakeRun(close=DeviceError("grabber b: the process did not end when told to")))
+    bed.record()
+    bed.run.seal(reason="arm b stalled: no line for 3 s", condition=RunCondition.INCOMPLETE)
+    bed.service.supervise()
+    assert bed.service.status().fault == (
+        "arm b stalled: no line for 3 s; then, while ending: grabber b: the process did not end when told to"
+    )
+
+
+def test_a_recording_that_the_disk_ended_is_a_fault(bed: Bed) -> None:
+    bed.record()
+    bed.run.seal(lines=200, reason="write error: no space left", condition=RunCondition.ABORTED)
+    bed.run.see(recorded_lines=300)
+    bed.service.supervise()
+    status = bed.service.status()
+    assert (status.state, status.possible) == (State.FAULTED, ["disarm"])
+    assert status.fault == "the recording was aborted: write error: no space left"
+    assert status.last is not None
+    assert (status.last.lines, status.last.condition) == (200, "ABORTED")  # as many as the file holds
+    bed.service.disarm()
+    assert (bed.state, bed.service.status().fault) == (State.IDLE, None)
 
 
 def test_failing_end_after_sealing_is_a_fault(tmp_path: Path) -> None:
@@ -218,7 +250,8 @@ def test_status_has_the_numbers_of_each_arm(bed: Bed) -> None:
     bed.service.arm()
     bed.service.supervise()
     arm = bed.service.status().arms["a"]
-    assert (arm.delivered, arm.preroll, arm.lost, arm.rate_hz) == (100, 65, {"camera": 0}, 0.0)
+    assert (arm.delivered, arm.preroll, arm.discarded) == (100, 65, 35)
+    assert (arm.lost, arm.rate_hz) == ({"camera": 0}, 0.0)
     assert (arm.ring.slots, arm.ring.fill, arm.ring.peak, arm.ring.drops) == (8, 1, 2, 0)
 
 
@@ -230,6 +263,8 @@ def test_status_has_the_numbers_of_each_arm(bed: Bed) -> None:
         {"duration_s": math.inf},
         {"lines": 5, "duration_s": 1},
         {"path": "relative.zarr"},
+        {"path": "/tmp/nul\0.zarr"},
+        {"path": "/tmp/\udcff.zarr"},
     ],
 )
 def test_impossible_requests(request_: dict[str, object]) -> None:

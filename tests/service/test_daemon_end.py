@@ -123,6 +123,42 @@ def test_killed_grabber_is_a_fault(start: Start) -> None:
     assert recording.attrs["run_condition"] != "GOOD"
 
 
+@pytest.mark.parametrize("recording", [False, True])
+def test_a_process_that_hangs_is_a_fault(start: Start, recording: bool) -> None:
+    """A camera while armed, the recorder while recording: told, ended by force, and the daemon goes on."""
+    daemon = start()
+    if recording:
+        path = record(daemon)
+    with daemon.client() as client:
+        if not recording:
+            client.arm()
+        workers = daemon.workers()
+        (workers[0] if recording else workers[-1]).suspend()
+        status = client.wait({State.FAULTED}, 60)
+        told = "recorder: no sign of life for 3 s" if recording else "arm b: no line for 3 s"
+        assert str(status.fault).startswith(told)
+        until_gone(workers)
+        client.disarm()
+        client.arm()
+        client.disarm()
+    if recording:
+        assert open_recording(path).lines >= 300
+
+
+def test_a_disk_that_ends_the_recording_is_a_fault(start: Start) -> None:
+    daemon = start()
+    path = record(daemon)
+    (path / "a" / "zarr.json").unlink()
+    (path / "a").rename(path / "away")
+    with daemon.client() as client:
+        status = client.wait({State.FAULTED}, 30)
+        assert str(status.fault).startswith("the recording was aborted: write error: ")
+        assert "possible" not in str(status.fault)
+        assert status.last is not None
+        assert status.last.condition == "ABORTED"
+        assert client.disarm().state is State.IDLE
+
+
 def test_systemd_is_told(start: Start, tmp_path_factory: pytest.TempPathFactory) -> None:
     name = tmp_path_factory.mktemp("n") / "n"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:

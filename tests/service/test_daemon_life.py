@@ -82,6 +82,18 @@ def test_line_budget(daemon: Daemon) -> None:
     assert np.array_equal(recording.camera("a").code[:], packed)
 
 
+def test_every_line_is_accounted_for_once_idle(daemon: Daemon) -> None:
+    with daemon.client() as client:
+        client.arm()
+        client.start(daemon.home / "account.zarr", lines=700)
+        arms = client.wait({State.IDLE}, 30).arms
+    for arm in arms.values():
+        stored = arm.recorded - arm.missing
+        assert arm.delivered == arm.preroll + arm.discarded + arm.lost["ring_full"] + stored
+        assert stored == 700
+        assert arm.ring.fill == 0
+
+
 def test_refusals_leave_the_daemon_armed(daemon: Daemon) -> None:
     """Wrong state, existing and unwritable places: named, nothing touched, and the next start works."""
     precious, closed, absent = (daemon.home / name for name in ("precious.zarr", "closed", "absent"))
@@ -103,6 +115,11 @@ def test_refusals_leave_the_daemon_armed(daemon: Daemon) -> None:
     assert precious.stat().st_mtime_ns == before
     assert not list(closed.iterdir())
     assert not absent.exists()
+    for odd in ("x" * 300, "\udcff.zarr"):
+        answer = daemon("start", odd)
+        assert (answer.code, "path" in answer.err) == (2, True)
+        with daemon.client() as client:
+            assert client.status().state is State.ARMED
     begun = daemon("start", "--duration", 0.05, "--json").json
     path = Path(begun["recording"]["path"])
     assert path.parent == daemon.home

@@ -117,6 +117,49 @@ def test_arms_with_cameras_of_their_own(tmp_path):
     np.testing.assert_allclose(segment.samples(np.float64)[1], b)
 
 
+@pytest.mark.parametrize(
+    ("keys", "value"),
+    [
+        (("geometry", "stages"), -1),
+        (("geometry", "substeps"), 0),
+        (("geometry", "pixels"), None),
+        (("clock", "clock_hz"), 0),
+        (("clock", "clock_hz"), -5),
+        (("trigger", "line_period_ticks"), 0),
+        (("code",), {"kind": "prbs"}),
+        (("code",), {"kind": "morse"}),
+        (("code",), 7),
+        (("versions",), {}),
+        (("cameras", "b", "responsivity_dn"), 0),
+        (("cameras", "b", "responsivity_dn"), "much"),
+        (("cameras", "a", "black_level_dn"), float("nan")),
+        (("cameras", "a", "white_dn"), None),
+        (("cameras",), []),
+    ],
+)
+def test_damaged_metadata_is_told_when_the_recording_is_opened(tmp_path, keys, value):
+    path = write(tmp_path / "r.zarr", make_spec(), lambda block: block).path
+    document = json.loads((path / "zarr.json").read_text())
+    table = document["attributes"]
+    for key in keys[:-1]:
+        table = table[key]
+    table[keys[-1]] = value
+    (path / "zarr.json").write_text(json.dumps(document))
+    with pytest.raises(DataError, match=r"r\.zarr: the metadata of the recording is damaged"):
+        open_recording(path)
+
+
+@pytest.mark.parametrize("attribute", ["flag_values", "flag_meanings"])
+def test_a_damaged_table_is_told_when_it_is_read_and_the_lines_stay(tmp_path, attribute):
+    recording = write(tmp_path / "r.zarr", make_spec(), lambda block: block)
+    for file in (recording.path / "zarr.json", recording.path / "gaps" / "arm" / "zarr.json"):
+        file.write_text(file.read_text().replace(attribute, "gone"))
+    again = open_recording(recording.path)
+    with pytest.raises(DataError, match="gaps/arm cannot be read"):
+        again.info()
+    assert again.cut(1000, 64).mask.all()
+
+
 @pytest.mark.parametrize("array", ["code", "code_index"])
 def test_a_code_that_disagrees_names_the_first_line(tmp_path, array):
     def change(block):

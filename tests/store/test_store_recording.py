@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import shutil
 from dataclasses import replace
 
@@ -267,6 +269,54 @@ def test_nothing_is_overwritten_or_half_created(path, tmp_path):
         RecordingWriter.create(tmp_path / "file" / "r.zarr", spec)
 
 
+@pytest.mark.parametrize("name", ["x" * 300, "nul\0.zarr", "\ud800.zarr"])
+def test_what_cannot_be_a_path_is_refused(tmp_path, name):
+    with pytest.raises(UsageError, match="cannot be a path") as caught:
+        RecordingWriter.create(tmp_path / name, make_spec())
+    assert str(caught.value).encode()  # can be printed
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("number", "kind"),
+    [
+        (errno.EROFS, UsageError),
+        (errno.EPERM, UsageError),
+        (errno.ENOENT, UsageError),
+        (errno.ENOSPC, DataError),
+    ],
+)
+def test_a_place_that_takes_no_directory_is_not_a_disk_that_fails(path, monkeypatch, number, kind):
+    def refuse(*_):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(type(path), "mkdir", refuse)
+    with pytest.raises(kind, match="cannot be created"):
+        RecordingWriter.create(path, make_spec())
+
+
+def test_the_first_line_may_be_chosen_when_all_else_is_ready(path):
+    writer = RecordingWriter.prepare(path, make_spec())
+    assert not (path / "zarr.json").exists()
+    writer.begin(777)
+    assert open_recording(path).first_line == 777
+    fill(writer, 40)
+    writer.seal(RunCondition.GOOD, "stopped", {})
+    recording = open_recording(path)
+    assert (recording.first_line, recording.lines) == (777, 40)
+    root = zarr.open_group(path, mode="r")
+    assert root["b"].attrs["first_line"] == 777
+    check_rows(root, make_spec(first_line=777), 40)
+
+
+def test_a_disk_that_refuses_the_beginning_leaves_nothing_behind(path):
+    writer = RecordingWriter.prepare(path, make_spec())
+    shutil.rmtree(path / "a")
+    with pytest.raises(DataError, match="creating the recording"):
+        writer.begin(5)
+    assert not path.exists()
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -276,6 +326,7 @@ def test_nothing_is_overwritten_or_half_created(path, tmp_path):
         {"shard_chunks": 256},
         {"chunk_lines": 0},
         {"chunk_lines": 2**29},
+        {"chunk_lines": 2**26 // 16 + 1},  # a little more than a chunk may take of the memory
         {"substeps": 9},
         {"first_line": -1},
         {"extra": {"format": "mine"}},

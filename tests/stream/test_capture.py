@@ -27,6 +27,7 @@ from wired_devices import (
     SUBSTEP_TICKS,
     SUBSTEPS,
     Bench,
+    issued,
     make_bench,
     make_spec,
     pixels_of,
@@ -114,6 +115,16 @@ def check_tags(stored: dict[str, np.ndarray], line: np.ndarray) -> None:
     assert np.array_equal(stored["time"], 1_700_000_000_000_000_000 + tick * 10**9 // CLOCK_HZ)
 
 
+def check_balance(status: CaptureStatus) -> None:
+    """Of a closed capture: what each camera delivered is accounted for to the line."""
+    for arm in ARMS:
+        lines = status.lines[arm]
+        stored = lines["recorded"] - lines["missing"]
+        known = lines["preroll"] + lines["discarded"] + lines["lost"]["ring_full"] + stored
+        assert lines["delivered"] == known > 0
+        assert status.ring[arm]["fill"] == 0
+
+
 def causes(recording: Recording) -> set[tuple[str, str]]:
     return {(gap.arm, gap.cause) for gap in recording.gaps}
 
@@ -131,6 +142,9 @@ def test_records_every_line_of_both_arms_as_it_was(tmp_path: Path) -> None:
             capture.start(tmp_path / "no" / "r.zarr", make_spec())
         with pytest.raises(UsageError, match="budget of 0"):
             capture.start(tmp_path / "r.zarr", make_spec(), 0)
+        for name in ("x" * 300, "nul\0.zarr"):
+            with pytest.raises(UsageError, match="cannot be a path"):
+                capture.start(tmp_path / name, make_spec())
         assert not any(tmp_path.iterdir())
 
         capture.start(tmp_path / "budget.zarr", make_spec(), 5000)
@@ -146,6 +160,12 @@ def test_records_every_line_of_both_arms_as_it_was(tmp_path: Path) -> None:
         stopped = sealed(capture)
     after = capture.poll()
     assert after.lines["a"]["preroll"] == after.lines["b"]["preroll"] == STAGES + 1
+    discarded = {arm: after.lines[arm]["discarded"] for arm in ARMS}
+    assert min(discarded.values()) > 1900
+    # What the first recording holds is neither discarded nor in the books of the second.
+    for arm in ARMS:
+        after.lines[arm]["recorded"] += 5000
+    check_balance(after)
     assert after.ring["a"]["dropped_lines"] == 0
     assert after.ring["a"]["peak"] <= after.ring["a"]["slots"] == 64
     assert bench.trigger.stops == 1
@@ -167,7 +187,7 @@ def test_records_every_line_of_both_arms_as_it_was(tmp_path: Path) -> None:
 
 def test_losses_are_located_to_the_line(tmp_path: Path) -> None:
     """A camera loses a block, and the recorder is held up until both rings overflow."""
-    bench = make_bench()
+    bench = make_bench(stall_timeout_s=20.0)
     with armed(bench) as capture:
         record_until(capture, tmp_path / "r.zarr", 1000)
         bench.wire["drop_b"] = 1
@@ -183,6 +203,7 @@ def test_losses_are_located_to_the_line(tmp_path: Path) -> None:
         capture.stop()
         status = sealed(capture)
         dropped = {arm: status.ring[arm]["dropped_lines"] for arm in ARMS}
+    check_balance(capture.poll())
     recording, missing = check_rows(tmp_path / "r.zarr")
     assert status.condition is RunCondition.INCOMPLETE
     assert causes(recording) == {("a", "ring_full"), ("b", "ring_full"), ("b", "camera")}
@@ -223,7 +244,11 @@ def test_a_stopped_trigger_ends_the_recording_without_missing_lines_in_doubt(tmp
 
 @pytest.mark.parametrize(
     ("fault", "text"),
-    [("die", "grabber b: killed by SIGKILL"), ("raise", "grabber b: the link is down")],
+    [
+        ("die", "grabber b: killed by SIGKILL"),
+        ("raise", "grabber b: the link is down"),
+        ("bug", "grabber b: ZeroDivisionError: a bug"),
+    ],
 )
 def test_a_dead_grabber_is_a_fault_and_what_was_written_is_sealed(
     tmp_path: Path, fault: str, text: str
@@ -242,6 +267,53 @@ def test_a_dead_grabber_is_a_fault_and_what_was_written_is_sealed(
     assert recording.attrs["run_condition"] == "INTERRUPTED"
     assert not missing["a"].any()
     assert causes(recording) <= {("b", "arm_lost")}
+
+
+def test_recording_begins_now_however_fast_the_lines_before_it_came(tmp_path: Path) -> None:
+    """Cameras that were held up deliver what they have at once; that says nothing of the lines to come."""
+    bench = make_bench(stall_timeout_s=20.0)
+    for arm in ARMS:
+        bench.wire[f"stall_{arm}"] = 1
+    with armed(bench) as capture:
+        until(lambda: issued(bench.wire, bench.trigger.rate_hz) > 12_000, "lines in the cameras")
+        for arm in ARMS:
+            bench.wire[f"stall_{arm}"] = 0
+        until(lambda: capture.poll().lines["a"]["delivered"] > 256, "lines")
+        capture.start(tmp_path / "r.zarr", make_spec(), 1000)
+        assert capture.poll().first_line <= issued(bench.wire, bench.trigger.rate_hz)
+        assert sealed(capture).condition is RunCondition.GOOD
+    check_rows(tmp_path / "r.zarr")
+
+
+def test_a_recorder_that_hangs_is_a_fault(tmp_path: Path) -> None:
+    with armed(make_bench(stall_timeout_s=1.0)) as capture:
+        record_until(capture, tmp_path / "r.zarr", 1000)
+        recorder = capture.pids["recorder"]
+        assert recorder is not None
+        os.kill(recorder, signal.SIGSTOP)
+        until(lambda: capture.poll().fault, "the fault")
+        with pytest.raises(StateError, match="being written"):
+            capture.start(tmp_path / "next.zarr", make_spec())
+        os.kill(recorder, signal.SIGCONT)
+        status = sealed(capture)
+    assert status.fault == status.end_reason == "recorder: no sign of life for 1 s"
+    assert status.condition is RunCondition.INTERRUPTED
+    check_rows(tmp_path / "r.zarr")
+
+
+@pytest.mark.parametrize(
+    ("stalled", "fault"), [("stall_b", "arm b: no line for 1 s"), ("stop_ns", "arm a and b: no line for 1 s")]
+)
+def test_silence_while_armed_is_a_fault(tmp_path: Path, stalled: str, fault: str) -> None:
+    bench = make_bench(stall_timeout_s=1.0)
+    with armed(bench) as capture:
+        until(lambda: capture.poll().lines["b"]["delivered"] > 1000, "lines")
+        bench.wire[stalled] = time.monotonic_ns()
+        until(lambda: capture.poll().fault, "the fault")
+        assert capture.poll().fault == fault
+        with pytest.raises(StateError, match="no line for 1 s"):
+            capture.start(tmp_path / "r.zarr", make_spec())
+    assert not any(tmp_path.iterdir())
 
 
 def test_a_killed_recorder_leaves_what_was_committed(tmp_path: Path) -> None:
@@ -304,6 +376,7 @@ def test_a_write_error_aborts_and_the_rings_are_emptied_all_the_same(tmp_path: P
         assert status.condition is RunCondition.ABORTED
         assert status.end_reason is not None
         assert status.end_reason.startswith("write error: ")
+        assert "possible" not in status.end_reason  # what was possible then
         capture.start(tmp_path / "next.zarr", make_spec(), 1000)
         assert sealed(capture).condition is RunCondition.GOOD
     check_rows(tmp_path / "next.zarr")

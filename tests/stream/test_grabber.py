@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from acquire.camera.base import CameraBlock
 from acquire.errors import CameraError
 from acquire.lines import LineFlag
-from acquire.stream.grabber import COUNTERS, MAX_JUMP_LINES, GrabberPlan, Intake
+from acquire.stream.grabber import COUNTERS, GrabberPlan, Intake
 from acquire.stream.losses import Cause, Loss
 from acquire.stream.ring import Ring, RingBlock, RingShape
 from acquire.stream.shared import Counters
 
-DEPTH, WHITE = 9, 4000
+DEPTH, WHITE, MOST_LOST = 9, 4000, 100_000
 SHAPE = RingShape(slots=4, rows=16, width=3, dtype="uint16")
 
 
@@ -27,7 +27,9 @@ class Path:
     def __init__(self) -> None:
         self.ring = Ring("test", SHAPE)
         self.counters = Counters(COUNTERS)
-        self.intake = Intake(GrabberPlan("a", lambda: None, DEPTH, WHITE), self.ring, self.counters)
+        self.intake = Intake(
+            GrabberPlan("a", lambda: None, DEPTH, WHITE, MOST_LOST), self.ring, self.counters
+        )
 
     def give(self, first: int, count: int, width: int = 3, dtype: str = "uint16") -> None:
         line = np.arange(first, first + count)[:, None] - DEPTH
@@ -108,7 +110,7 @@ def test_white_pixels_flag_their_lines(path: Path) -> None:
     assert (flags == LineFlag.INCOMPLETE).all()
 
 
-@pytest.mark.parametrize("first", [19, MAX_JUMP_LINES + 21])
+@pytest.mark.parametrize("first", [19, 20 + MOST_LOST + 1])
 def test_a_count_that_cannot_be_is_refused(path: Path, first: int) -> None:
     path.give(0, 20)
     with pytest.raises(CameraError, match=f"went from 20 to {first}"):

@@ -66,7 +66,7 @@ class MemoryWriter:
 
     def _refuse(self, name: str) -> None:
         if name in self.broken:
-            raise DataError(f"{name}: no space left")
+            raise DataError(f"{name}: no space left", possible="0 lines can be read", hint="free space")
 
 
 def rest_of(block: TaggedBlock) -> tuple[np.ndarray, ...]:
@@ -233,6 +233,20 @@ def test_a_mismatch_of_tags_taints_and_is_listed_to_a_bound() -> None:
     assert sum(kind == "tag_mismatch" for kind, _, _ in writer.events) == 100
 
 
+def test_a_recording_without_a_line_is_not_good() -> None:
+    session = make_session(MemoryWriter(), first_line=40)
+    session.end(40, "stopped")
+    sealed = session.close()
+    assert (sealed.condition, sealed.ledger["pulses"]) == (RunCondition.INTERRUPTED, 0)
+
+
+def test_take_says_how_many_lines_of_a_block_it_wrote() -> None:
+    session = make_session(MemoryWriter(), first_line=10, lines=20)
+    taken = [session.take("a", ring_block("a", first, count)) for first, count in ((0, 8), (8, 7), (20, 15))]
+    assert taken == [0, 5, 10]
+    assert session.take("a", ring_block("a", 35, 5)) == 0
+
+
 def test_a_full_disk_aborts_and_seals_what_there_is() -> None:
     writer = MemoryWriter()
     session = make_session(writer, lines=50)
@@ -242,7 +256,7 @@ def test_a_full_disk_aborts_and_seals_what_there_is() -> None:
         session.take("a", ring_block("a", 20, 20))
     sealed = session.close(failure.value)
     assert sealed.condition is RunCondition.ABORTED
-    assert "no space left" in sealed.end_reason
+    assert sealed.end_reason == "write error: append: no space left"
     assert sealed.ledger["a"] == sealed.ledger["b"] | {}
     assert sealed.ledger["a"]["stored"] == 20
     assert writer.ending[0] is RunCondition.ABORTED
@@ -254,6 +268,6 @@ def test_a_disk_that_does_not_even_seal_leaves_the_recording_as_committed() -> N
     feed(session, 50, 50)
     sealed = session.close()
     assert sealed.condition is RunCondition.ABORTED
-    assert "not sealed" in sealed.end_reason
+    assert sealed.end_reason == "write error: seal: no space left; not sealed: seal: no space left"
     assert writer.closed
     assert writer.ending is None

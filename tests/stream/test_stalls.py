@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 
-import numpy as np
 import pytest
 from test_session import MemoryWriter, feed, make_session, ring_block
 
@@ -13,7 +12,8 @@ from acquire.store import RunCondition
 from acquire.stream.losses import Cause
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.session import Session
-from acquire.stream.stalls import Arm, find_stall
+from acquire.stream.shared import Counters
+from acquire.stream.stalls import Arm, Heartbeat, find_stall
 
 LIMIT_S, SKEW = 10.0, 1000
 
@@ -94,12 +94,26 @@ def test_what_waits_in_the_ring_is_life(arms: dict[str, Arm]) -> None:
     assert arm.alive_s == now_s + 3
 
 
-def test_rate_is_measured_from_the_first_lines_on(arms: dict[str, Arm]) -> None:
-    arm = arms["a"]
-    assert arm.rate_hz(time.monotonic()) == 0
-    begun = time.monotonic()
-    for k in range(4):
-        arm.ring.claim()
-        arm.ring.commit(16 * k, 16)
-        arm.watch(begun + k)
-    assert arm.rate_hz(begun + 4) == pytest.approx(np.divide(48, 4))
+@pytest.fixture
+def counters() -> Iterator[Counters]:
+    made = Counters(("beats",))
+    yield made
+    made.close()
+
+
+def test_a_counter_that_stands_still_shows_no_life(counters: Counters) -> None:
+    now_s = time.monotonic()
+    heart = Heartbeat(counters, "beats")
+    for k in range(1, 6):
+        still_s = heart.look(now_s + 0.3 * k)
+    assert still_s == pytest.approx(1.5, abs=0.01)
+    counters.add("beats", 1)
+    assert heart.look(now_s + 1.6) == 0
+    assert heart.look(now_s + 1.8) == pytest.approx(0.2)
+    heart.revive()
+    assert heart.look(now_s + 1.9) == pytest.approx(0.1)
+
+
+def test_the_watchers_own_absence_is_not_held_against_the_watched(counters: Counters) -> None:
+    heart = Heartbeat(counters, "beats")
+    assert heart.look(time.monotonic() + 1000) < 1

@@ -26,7 +26,7 @@ STAGES, SUBSTEPS, PIXELS, WHITE = 8, 3, 8, 4095
 DEPTH = STAGES + 1
 CLOCK_HZ = 90_000_000
 SUBSTEP_TICKS = 900
-FAULTS = ("stall", "drop", "raise", "die")
+FAULTS = ("stall", "drop", "raise", "die", "bug")
 SATURATED_EVERY = 1000
 
 CODE = PrbsCode(64, 0xACE1)
@@ -101,6 +101,8 @@ class CountingCamera:
             time.sleep(0.001)
         if self._fault("raise"):
             raise CameraError("the link is down")
+        if self._fault("bug"):
+            raise ZeroDivisionError("a bug")
         if self._fault("die"):
             os.kill(os.getpid(), signal.SIGKILL)
         if self._fault("drop"):
