@@ -10,7 +10,7 @@ import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from acquire.codes import TAPS, Code, ConstantCode, PrbsCode, mix_seed
 from acquire.errors import ConfigError
@@ -23,6 +23,9 @@ PIXEL_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16}
 """SFNC PixelFormat → significant bits of an (unpacked) pixel."""
 
 
+MAX_RING_BYTES = 4 * 2**30
+"""Pixels that may wait in the ring of one arm."""
+
 M = TypeVar("M", bound=BaseModel)
 
 
@@ -33,7 +36,7 @@ def default_socket() -> Path:
 
 
 class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class GeometryConfig(_Model):
@@ -155,18 +158,42 @@ class SimulationConfig(_Model):
     speed: float = Field(default=1.0, gt=0, le=1000, description="simulated seconds per second")
 
 
+def _prbs_unless_said(value: Any) -> Any:
+    """``[code]`` without a ``kind`` is pseudo-random, as the rig without ``[code]`` is."""
+    return {"kind": "prbs", **value} if isinstance(value, dict) else value
+
+
 class RigConfig(_Model):
     """A whole instrument: everything the daemon needs to know."""
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
     geometry: GeometryConfig
-    code: Annotated[PrbsConfig | ConstantCodeConfig, Field(discriminator="kind")] = PrbsConfig()
+    code: Annotated[
+        PrbsConfig | ConstantCodeConfig, Field(discriminator="kind"), BeforeValidator(_prbs_unless_said)
+    ] = PrbsConfig()
     trigger: TriggerConfig = TriggerConfig()
     cameras: CamerasConfig
     stream: StreamConfig = StreamConfig()
     recording: RecordingConfig = RecordingConfig()
     control: ControlConfig = Field(default_factory=ControlConfig)
     simulation: SimulationConfig
+
+    @model_validator(mode="after")
+    def _ring_fits(self) -> RigConfig:
+        """Lines wait for their tag in the ring, of which half must stay free for the cameras."""
+        lines = self.stream.ring_slots * self.stream.block_lines
+        pixel_bytes = 1 if self.cameras.a.dtype == "uint8" else 2
+        if (size := lines * self.geometry.stages * pixel_bytes) > MAX_RING_BYTES:
+            raise ValueError(
+                f"stream.ring_slots x stream.block_lines = {lines} lines of {self.geometry.stages} pixels "
+                f"are {size} bytes of memory per arm; possible: up to {MAX_RING_BYTES}"
+            )
+        if self.trigger.tag_every_lines > lines // 2:
+            raise ValueError(
+                f"trigger.tag_every_lines = {self.trigger.tag_every_lines}; possible: 1 to {lines // 2}, "
+                "half of what a ring holds (stream.ring_slots x stream.block_lines)"
+            )
+        return self
 
     @property
     def line_period_ticks(self) -> int:
@@ -244,9 +271,8 @@ def find(name: str | Path, beside: Path | None = None) -> Path:
         if path.is_file():
             return path
     have = ", ".join(sorted(p.name for p in builtin_directory().glob("*.toml")))
-    raise ConfigError(
-        f"configuration file {str(name)!r} does not exist", possible=f"a path, or one of {have}"
-    )
+    why = "is a directory" if Path(name).is_dir() else "does not exist"
+    raise ConfigError(f"configuration file {str(name)!r} {why}", possible=f"a path, or one of {have}")
 
 
 def load_rig(name: str | Path, overrides: Mapping[str, Any] | None = None) -> RigConfig:
@@ -261,6 +287,13 @@ def load_rig(name: str | Path, overrides: Mapping[str, Any] | None = None) -> Ri
     rig = _validate(RigConfig, table, path)
     scene = find(rig.simulation.scene, beside=path).resolve()
     return rig.model_copy(update={"simulation": rig.simulation.model_copy(update={"scene": str(scene)})})
+
+
+def check_directory(rig: RigConfig) -> None:
+    """Raise ConfigError unless the directory for recordings is there."""
+    directory = rig.recording.directory
+    if not directory.is_dir():
+        raise ConfigError(f"recording.directory: there is no directory {directory}", hint="create it first")
 
 
 def parse_settings(settings: Sequence[str]) -> dict[str, Any]:
@@ -297,6 +330,8 @@ def _set(table: dict[str, Any], dotted: str, value: Any) -> None:
     *parents, last = dotted.split(".")
     for key in parents:
         table = table.setdefault(key, {})
+        if not isinstance(table, dict):
+            raise ConfigError(f"setting {dotted!r}: {key!r} is a value, nothing is below it")
     table[last] = value
 
 
@@ -311,13 +346,15 @@ def _explain(error: ValidationError, model: type[BaseModel], path: Path) -> str:
     lines = [f"{path}: {error.error_count()} thing(s) to mend"]
     for item in error.errors():
         keys, allowed = _locate(model, item["loc"])
-        key = ".".join(keys) or "(file)"
+        key, why = ".".join(keys) or "(file)", item["msg"].removeprefix("Value error, ")
         if item["type"] == "extra_forbidden":
             lines.append(f"  {key}: unknown key; allowed here: {', '.join(allowed)}")
         elif item["type"] == "missing":
             lines.append(f"  {key}: missing")
+        elif isinstance(item["input"], dict):
+            lines.append(f"  {key}: {why}")
         else:
-            lines.append(f"  {key} = {item['input']!r}: {item['msg']}")
+            lines.append(f"  {key} = {item['input']!r}: {why}")
     return "\n".join(lines)
 
 

@@ -12,6 +12,9 @@ from dataclasses import dataclass
 
 from acquire.errors import UsageError
 
+MAX_TEMPORAL_MERGE = 2**31 - 1
+"""What the kernels can count; far beyond any recording."""
+
 
 @dataclass(frozen=True, slots=True)
 class Geometry:
@@ -31,7 +34,7 @@ class Geometry:
     def __post_init__(self) -> None:
         for name in ("stages", "substeps", "lines"):
             value = getattr(self, name)
-            if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+            if not is_integer(value) or value < 1:
                 raise UsageError(f"geometry: {name} = {value!r}", possible="an integer of at least 1")
 
     @property
@@ -104,10 +107,18 @@ class Geometry:
         return samples / (self.size**2 * self.span)
 
     def check_merge(self, spatial_merge: int, temporal_merge: int) -> None:
-        """Raise UsageError unless 1 ≤ N_m ≤ n and T_m ≥ 1."""
-        if not 1 <= spatial_merge <= self.size:
+        """Raise UsageError unless they are integers with 1 ≤ N_m ≤ n and 1 ≤ T_m ≤ 2³¹ − 1."""
+        if not is_integer(spatial_merge) or not 1 <= spatial_merge <= self.size:
             raise UsageError(
-                f"spatial merge N_m = {spatial_merge}", possible=f"1 to {self.size} (n = M·S of this segment)"
+                f"spatial merge N_m = {spatial_merge!r}",
+                possible=f"an integer, 1 to {self.size} (n = M·S of this segment)",
             )
-        if temporal_merge < 1:
-            raise UsageError(f"temporal merge T_m = {temporal_merge}", possible="1 or more")
+        if not is_integer(temporal_merge) or not 1 <= temporal_merge <= MAX_TEMPORAL_MERGE:
+            raise UsageError(
+                f"temporal merge T_m = {temporal_merge!r}", possible=f"an integer, 1 to {MAX_TEMPORAL_MERGE}"
+            )
+
+
+def is_integer(value: object) -> bool:
+    """A whole number by type: neither 3.0 nor True."""
+    return isinstance(value, int) and not isinstance(value, bool)

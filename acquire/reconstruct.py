@@ -44,6 +44,7 @@ def describe(result: Reconstruction, recording: Recording, segment: Segment) -> 
         "lines": segment.geometry.lines,
         "solver": result.solver,
         "iterations": result.iterations,
+        "iterations_asked": result.iterations_asked,
         "seconds": round(result.seconds, 3),
         "parameters": result.parameters,
         "quality": quality,

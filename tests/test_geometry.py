@@ -61,6 +61,19 @@ def test_sampling_rate_tends_to_its_limit() -> None:
     assert g.sampling_rate(3, 4) == pytest.approx(2 * 9 * 4 / (64 * 27), rel=1e-4)
 
 
+@pytest.mark.parametrize(("N_m", "T_m"), [(13, 1), (0, 1), (3.0, 1), ("3", 1), (True, 1)])
+def test_impossible_spatial_merges_are_refused(N_m: int, T_m: int) -> None:
+    with pytest.raises(UsageError, match=r"N_m = .*1 to 12"):
+        Geometry(4, 3, 7).check_merge(N_m, T_m)
+
+
+@pytest.mark.parametrize("T_m", [0, 2**31, 10**24, 2.0, "4", True])
+def test_impossible_temporal_merges_are_refused(T_m: int) -> None:
+    with pytest.raises(UsageError, match=r"T_m = .*1 to 2147483647"):
+        Geometry(4, 3, 7).check_merge(3, T_m)
+    assert Geometry(4, 3, 7).video_shape(3, 2**31 - 1) == (1, 4, 4)
+
+
 @pytest.mark.parametrize("bad", [(0, 3, 5), (4, -1, 5), (4, 3, 2.5), (4, 3, True)])
 def test_impossible_sizes_are_refused(bad: tuple[int, int, int]) -> None:
     with pytest.raises(UsageError, match="at least 1"):

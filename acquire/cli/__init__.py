@@ -3,17 +3,21 @@
 A command prints facts to stdout (``--json`` for programs) and raises what goes wrong; only `main` turns an
 AcquireError into words on stderr and an exit code. Heavy libraries are imported inside the commands that
 need them, so that help and status come at once.
+
+What the system refuses (a name too long, a full disk under stdout) becomes words there too; a reader that
+goes away ends a command without any.
 """
 
 from __future__ import annotations
 
+import os
 import sys
 
 import typer
 
 from acquire.cli import config, control, demo, reconstruct, recordings, serve
 from acquire.cli.output import print_error
-from acquire.errors import EXIT_INTERRUPTED, AcquireError
+from acquire.errors import EXIT_INTERRUPTED, AcquireError, UsageError
 
 MODULES = (demo, serve, control, recordings, reconstruct, config)
 """Modules of commands, in the order of the help; each has ``register(app)``. New groups are added here."""
@@ -41,9 +45,23 @@ def main() -> int:
     except AcquireError as error:
         print_error(error, as_json="--json" in sys.argv)
         return error.exit_code
+    except OSError as error:
+        _give_up_stdout()
+        where = f"{error.filename}: " if error.filename else ""
+        refused = UsageError(f"{where}{error.strerror or error}")
+        print_error(refused, as_json="--json" in sys.argv)
+        return refused.exit_code
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
     return 0
+
+
+def _give_up_stdout() -> None:
+    """What stdout could not take is not tried again, with a traceback, when the interpreter ends."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 @app.callback(invoke_without_command=True)

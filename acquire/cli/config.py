@@ -25,14 +25,15 @@ def register(app: typer.Typer) -> None:
 
 
 def check(file: FileArgument, json: JsonFlag = False) -> None:
-    """Validate a rig file and the scene it names; say what it amounts to.
+    """Validate a rig file, its scene and its directory; say what it amounts to.
 
     Example: [bold]acquire config check rig-demo[/]
     """
-    from acquire.config import load_rig, load_scene
+    from acquire.config import check_directory, load_rig, load_scene
 
     rig = load_rig(file)
     load_scene(rig.simulation.scene)
+    check_directory(rig)
     facts = _facts(rig)
     if json:
         print_json({"file": file, "valid": True, **facts})

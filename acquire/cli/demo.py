@@ -3,29 +3,14 @@
 from __future__ import annotations
 
 import itertools
-import time
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+from acquire.cli.demo_plan import LINES, RIG, SEED, TWIST_BUDGET_S, DemoPlan, check
+from acquire.cli.journal import Journal
 from acquire.cli.output import JsonFlag, print_facts, print_json
-from acquire.errors import UsageError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from acquire.config import RigConfig
-    from acquire.evaluate.report import Stage
-
-SEGMENT_LINES = 263
-"""L_R of Fig. 9: 598 trusted frames."""
-
-SEGMENT_START_S = 0.052
-"""Where Fig. 9 cuts, from the start of the recording."""
 
 
 def register(app: typer.Typer) -> None:
@@ -37,11 +22,13 @@ def demo(
         Path | None,
         typer.Option(metavar="DIR", help="New directory for everything; else acquire-demo, -2, …"),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Another exposure code.")] = 1,
-    lines: Annotated[int, typer.Option(help="Lines to record.")] = 33_334,
+    seed: Annotated[int, typer.Option(min=0, help="Another exposure code.")] = SEED,
+    lines: Annotated[int, typer.Option(help="Lines to record.")] = LINES,
     budget: Annotated[float | None, typer.Option(metavar="SECONDS", help="For the default solver.")] = None,
-    twist_budget: Annotated[float, typer.Option(metavar="SECONDS", help="For the paper's solver.")] = 30.0,
-    config: Annotated[str, typer.Option("--config", "-c", metavar="FILE", help="Rig file.")] = "rig-demo",
+    twist_budget: Annotated[
+        float, typer.Option(metavar="SECONDS", help="For the paper's solver.")
+    ] = TWIST_BUDGET_S,
+    config: Annotated[str, typer.Option("--config", "-c", metavar="FILE", help="Rig file.")] = RIG,
     json: JsonFlag = False,
 ) -> None:
     """Record Scene #1 of the paper with a simulated rig, reconstruct it, and write a report.
@@ -50,64 +37,31 @@ def demo(
 
     Example: [bold]acquire demo --out /tmp/demo --seed 7[/]
     """
+    from acquire.config import load_rig
+
+    plan = DemoPlan(out or _free(Path("acquire-demo")), config, seed, lines, budget, twist_budget)
+    rig = load_rig(config)
+    check(plan, rig)
+
     from acquire.cli.demo_analysis import analyse
     from acquire.cli.demo_capture import record
-    from acquire.config import load_rig
     from acquire.evaluate.report import write_report
 
-    rig = load_rig(config, {"code.seed": seed})
-    out = out or _free(Path("acquire-demo"))
-    _check(out, lines, rig)
-    out.mkdir(parents=True)
+    plan.out.mkdir()
     journal = Journal()
-    capture = record(out, config, seed, lines, journal)
-    command = f"acquire demo --seed {seed} --lines {lines}"
-    result = analyse(out, capture, rig, journal, seed, command, (budget, twist_budget))
+    result = analyse(plan, record(plan, journal), rig, journal)
     with journal.stage("Write the report"):
-        page = write_report(result, out)
+        page = write_report(result, plan.out)
     if json:
         print_json({"report": str(page), **result.summary()})
         return
     print_facts(_headline(page, result.summary()))
 
 
-@dataclass
-class Journal:
-    """The stages of the run: told on stderr as they happen, kept for the report."""
-
-    stages: list[Stage] = field(default_factory=list)
-    when: datetime = field(default_factory=lambda: datetime.now(UTC))
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[dict[str, str]]:
-        """Times a stage; ``detail`` may be set in the dictionary given."""
-        from acquire.evaluate.report import Stage
-
-        note: dict[str, str] = {}
-        started = time.perf_counter()
-        yield note
-        seconds = time.perf_counter() - started
-        self.stages.append(Stage(name, seconds, note.get("detail", "")))
-        detail = f"  {note['detail']}" if "detail" in note else ""
-        typer.echo(f"{name:<34} {seconds:6.1f} s{detail}", err=True)
-
-
 def _free(path: Path) -> Path:
     """``path``, or with the first number behind it that is free."""
     names = (path if n == 1 else path.with_name(f"{path.name}-{n}") for n in itertools.count(1))
     return next(name for name in names if not name.exists())
-
-
-def _check(out: Path, lines: int, rig: RigConfig) -> None:
-    if out.exists():
-        raise UsageError(f"demo to {out}: it exists and stays untouched", hint="--out with a new directory")
-    if not out.absolute().parent.is_dir():
-        raise UsageError(f"demo to {out}: there is no directory {out.absolute().parent}")
-    least = round(SEGMENT_START_S * rig.line_rate_hz) + SEGMENT_LINES
-    if lines < least:
-        raise UsageError(
-            f"demo of {lines} lines", possible=f"{least} or more: it cuts {SEGMENT_LINES} at 52 ms"
-        )
 
 
 def _headline(page: Path, summary: dict[str, Any]) -> dict[str, Any]:
@@ -118,12 +72,19 @@ def _headline(page: Path, summary: dict[str, Any]) -> dict[str, Any]:
             f"{arm} {facts['recorded']} recorded, {facts['missing']} missing" for arm, facts in arms.items()
         ),
         "recording": f"{capture['recording']}, {capture['size_mb']} MB, {capture['condition']}",
-        **{
-            solver["label"]: f"{solver['psnr_db']} dB, SSIM {solver['ssim']}, {solver['seconds']} s"
-            for solver in summary["solvers"]
-        },
+        **{solver["label"]: _solver(solver) for solver in summary["solvers"]},
         "frequencies": ", ".join(
             f"{curve['name']} {curve['measured_hz']} Hz" for curve in best["curves"] if curve["measured_hz"]
         ),
         "report": page,
     }
+
+
+def _solver(facts: dict[str, Any]) -> str:
+    text = f"{facts['psnr_db']} dB, SSIM {facts['ssim']}, {facts['seconds']} s"
+    if facts["stopped_by_budget_s"] is None:
+        return text
+    return (
+        f"{text}, {facts['iterations']} of {facts['requested_iterations']} iterations "
+        f"(stopped by its budget of {facts['stopped_by_budget_s']:g} s)"
+    )

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from acquire.cli.demo_plan import N_M, SEGMENT_LINES, T_M, segment_row
 from acquire.cli.progress import stage_progress
 from acquire.config import LedSceneConfig, SineDrive
 from acquire.evaluate.report import (
@@ -28,62 +31,57 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from acquire.cli.demo import Journal
     from acquire.cli.demo_capture import Captured
+    from acquire.cli.demo_plan import DemoPlan
+    from acquire.cli.journal import Journal
     from acquire.config import RigConfig
     from acquire.daemon.messages import ArmStatus
     from acquire.lines import Segment
-
-N_M, T_M = 3, 1
-"""Fig. 9: 64 × 64 voxels at the sub-step rate."""
 
 INNER = 0.9
 """Regions hold the voxels that a shape covers at least so far: edges mix light and dark."""
 
 
-def analyse(
-    out: Path,
-    captured: Captured,
-    rig: RigConfig,
-    journal: Journal,
-    seed: int,
-    command: str,
-    budgets: tuple[float | None, float],
-) -> DemoResult:
-    """Everything that the report shows; leaves truth and videos in ``out``."""
-    from acquire.cli.demo import SEGMENT_LINES, SEGMENT_START_S
+@dataclass(frozen=True, slots=True)
+class Method:
+    """A solver of the demo: its name for people, its video's, and its time."""
 
+    solver: Literal["admm", "twist"]
+    label: str
+    file: str
+    budget_s: float | None
+
+
+def analyse(plan: DemoPlan, captured: Captured, rig: RigConfig, journal: Journal) -> DemoResult:
+    """Everything that the report shows; leaves truth and videos in ``plan.out``."""
     recording = open_recording(captured.path)
-    with journal.stage("Cut both arms") as note:
-        first = recording.first_line + round(SEGMENT_START_S * rig.line_rate_hz)
-        segment = recording.cut(first, SEGMENT_LINES)
-        note["detail"] = f"lines {first} to {first + SEGMENT_LINES - 1}"
+    segment = _cut(recording, segment_row(rig), journal)
+    scene = _scene(recording, segment)
     with journal.stage("Save the truth at full resolution"):
-        scene = _scene(recording, segment)
-        _save_truth(out / "truth.zarr", scene, segment)
-    default = _solve("admm", "Reconstruct: ADMM (default)", segment, budgets[0], journal)
-    paper = _solve("twist", "Reconstruct: TwIST (the paper's)", segment, budgets[1], journal)
-    for name, result in (("video", default), ("video-twist", paper)):
-        save_reconstruction(out / f"{name}.zarr", result, recording, segment, N_M)
-    trusted = default.trusted
-    voxels = truth(scene, _first_substep(segment), segment.geometry.span, N_M, T_M)[trusted]
-    regions = _regions(scene, segment, trusted)
+        _save_truth(plan.out / "truth.zarr", scene, segment)
+    methods = (
+        Method("admm", "ADMM (default)", "video.zarr", plan.budget_s),
+        Method("twist", "TwIST (the paper's)", "video-twist.zarr", plan.twist_budget_s),
+    )
+    videos = [_solve(method, segment, journal) for method in methods]
+    for method, video in zip(methods, videos, strict=True):
+        save_reconstruction(plan.out / method.file, video, recording, segment, N_M)
+    trusted = videos[0].trusted
     with journal.stage("Compare with the truth"):
+        voxels = truth(scene, _first_substep(segment), segment.geometry.span, N_M, T_M)[trusted]
+        regions = _regions(scene, segment, trusted)
         interval_s = segment.substep_ns * T_M * 1e-9
-        solvers = tuple(
-            _judge(label, result, voxels, regions, interval_s)
-            for label, result in (("ADMM (default)", default), ("TwIST (the paper's)", paper))
-        )
+        solvers = tuple(map(partial(_judge, voxels, regions, interval_s), methods, videos))
     return DemoResult(
         title=str(recording.attrs["scene"]["title"]),
         when=journal.when,
-        command=command,
-        seed=seed,
+        command=plan.command,
+        seed=plan.seed,
         rig=_rig_facts(recording),
         capture=_capture_facts(recording, captured),
         segment=segment,
         start_ns=int(np.asarray(recording.camera("a").time_ns[:1])[0]),
-        frame_time_ns=default.time_ns[trusted],
+        frame_time_ns=videos[0].time_ns[trusted],
         truth=voxels,
         solvers=solvers,
         regions=regions,
@@ -91,32 +89,45 @@ def analyse(
     )
 
 
-def _solve(
-    solver: Literal["admm", "twist"], name: str, segment: Segment, budget_s: float | None, journal: Journal
-) -> Reconstruction:
+def _cut(recording: Recording, row: int, journal: Journal) -> Segment:
+    with journal.stage("Cut both arms") as note:
+        first = recording.first_line + row
+        note["detail"] = f"lines {first} to {first + SEGMENT_LINES - 1}"
+        return recording.cut(first, SEGMENT_LINES)
+
+
+def _solve(method: Method, segment: Segment, journal: Journal) -> Reconstruction:
+    name = f"Reconstruct: {method.label}"
     with journal.stage(name) as note, stage_progress(name) as advance:
         result = reconstruct(
             segment,
             N_M,
             T_M,
-            budget_s=budget_s,
+            budget_s=method.budget_s,
             progress=lambda step: advance(step.iteration, step.iterations),
-            solver=solver,
+            solver=method.solver,
         )
-        note["detail"] = f"{result.iterations} iterations"
+        note["detail"] = f"{result.iterations} of {result.iterations_asked} iterations"
     return result
 
 
 def _judge(
-    label: str,
-    result: Reconstruction,
     voxels: NDArray[np.float32],
     regions: tuple[Region, ...],
     interval_s: float,
+    method: Method,
+    result: Reconstruction,
 ) -> SolverResult:
-    video = result.video[result.trusted]
     return evaluate_solver(
-        label, video, voxels, regions, interval_s, seconds=result.seconds, iterations=result.iterations
+        method.label,
+        result.video[result.trusted],
+        voxels,
+        regions,
+        interval_s,
+        seconds=result.seconds,
+        iterations=result.iterations,
+        requested_iterations=result.iterations_asked,
+        budget_s=method.budget_s,
     )
 
 
@@ -140,7 +151,7 @@ def _save_truth(path: Path, scene: LedScene, segment: Segment) -> None:
 
 
 def _regions(scene: LedScene, segment: Segment, trusted: slice) -> tuple[Region, ...]:
-    """One region per LED; theory is its light in the voxels wholly behind its mask."""
+    """One region per LED that fills a voxel; theory is its light in the voxels wholly behind its mask."""
     first = _first_substep(segment) + trusted.start
     light = scene.intensity(first, trusted.stop - trusted.start)
     side = scene.size // N_M
@@ -148,6 +159,8 @@ def _regions(scene: LedScene, segment: Segment, trusted: slice) -> tuple[Region,
     regions = []
     for led, mask, curve in zip(scene.leds, covered, light, strict=True):
         inner = mask >= INNER
+        if not inner.any():
+            continue
         set_hz = led.drive.frequency_hz if isinstance(led.drive, SineDrive) else None
         regions.append(Region(led.name, inner, curve * float(mask[inner].mean()), set_hz))
     return tuple(regions)
@@ -180,6 +193,7 @@ def _ledger(arm: ArmStatus) -> ArmLedger:
     return ArmLedger(
         delivered=arm.delivered,
         preroll=arm.preroll,
+        discarded=arm.discarded,
         recorded=arm.recorded,
         missing=arm.missing,
         ring_peak=arm.ring.peak,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import subprocess
 import sys
 import tempfile
@@ -20,9 +19,11 @@ from acquire.errors import AcquireError, DataError, NoDaemonError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from acquire.cli.demo import Journal
+    from acquire.cli.demo_plan import DemoPlan
+    from acquire.cli.journal import Journal
     from acquire.daemon.messages import Status
 
+LOG = "daemon.log"
 START_TIMEOUT_S = 60.0
 END_TIMEOUT_S = 30.0
 STALL_TIMEOUT_S = 30.0
@@ -39,42 +40,33 @@ class Captured:
     seconds: float
 
 
-def record(out: Path, config: str, seed: int, lines: int, journal: Journal) -> Captured:
-    """Start a daemon, arm, record ``lines`` lines, and end the daemon again; its log goes to daemon.log."""
+def record(plan: DemoPlan, journal: Journal) -> Captured:
+    """Start a daemon, arm, record, and end the daemon again; its log goes to daemon.log."""
+    log = plan.out / LOG
     with tempfile.TemporaryDirectory(prefix="acquire-") as directory:  # socket paths must be short
         socket = Path(directory) / "acquire.sock"
-        overrides = [f"--set=code.seed={seed}", f"--set=recording.directory='{out.absolute()}'"]
-        with _daemon(config, socket, overrides, out / "daemon.log") as process, Client(socket) as client:
+        with daemon(plan, socket) as process, Client(socket) as client:
             with journal.stage("Start the daemon") as note:
-                _await_daemon(client, process, out / "daemon.log")
+                await_daemon(client, process, log)
                 note["detail"] = f"process {process.pid}"
             with journal.stage("Arm trigger and cameras"):
                 client.arm()
             with journal.stage("Record") as note:
-                captured = _record(client, out / "recording.zarr", lines)
-                note["detail"] = f"{lines} lines of both arms"
+                captured = _record(client, plan.out / "recording.zarr", plan.lines)
+                note["detail"] = f"{plan.lines} lines of both arms"
             with journal.stage("End the daemon"):
-                process.send_signal(signal.SIGTERM)
-                process.wait(END_TIMEOUT_S)
+                if not end(process):
+                    raise AcquireError(f"the daemon was killed after {END_TIMEOUT_S:g} s", hint=str(log))
     return captured
 
 
 @contextmanager
-def _daemon(config: str, socket: Path, overrides: list[str], log: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """``acquire serve`` as a process of its own; killed if it is still there at the end."""
-    command = [
-        sys.executable,
-        "-m",
-        "acquire",
-        "serve",
-        "--config",
-        config,
-        "--socket",
-        str(socket),
-        *overrides,
-    ]
+def daemon(plan: DemoPlan, socket: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """``acquire serve`` as a process of its own, which ends with the block, however that ends."""
+    options = [f"--config={plan.config}", f"--socket={socket}", f"--set=code.seed={plan.seed}"]
+    command = [sys.executable, "-m", "acquire", "serve", *options]
     with (
-        log.open("wb") as file,
+        (plan.out / LOG).open("wb") as file,
         subprocess.Popen(  # noqa: S603  # ourselves
             command, stderr=file, stdout=file
         ) as process,
@@ -82,11 +74,23 @@ def _daemon(config: str, socket: Path, overrides: list[str], log: Path) -> Itera
         try:
             yield process
         finally:
-            if process.poll() is None:
-                process.kill()
+            end(process)
 
 
-def _await_daemon(client: Client, process: subprocess.Popen[bytes], log: Path) -> None:
+def end(process: subprocess.Popen[bytes], timeout_s: float = END_TIMEOUT_S) -> bool:
+    """Let the daemon seal what it records, but not for ever; False when it had to be killed."""
+    process.terminate()
+    try:
+        process.wait(timeout_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+        return False
+    return True
+
+
+def await_daemon(client: Client, process: subprocess.Popen[bytes], log: Path) -> None:
+    """Return once the daemon answers; AcquireError with its last words when it ended instead."""
     deadline = time.monotonic() + START_TIMEOUT_S
     while True:
         try:

@@ -45,19 +45,17 @@ def print_table(columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
 def print_error(error: AcquireError, *, as_json: bool) -> None:
     """What was asked, what is possible, what to try; on stderr."""
     if as_json:
-        facts = {
-            "error": type(error).__name__,
-            "message": error.message,
-            "possible": error.possible,
-            "hint": error.hint,
-            "exit_code": error.exit_code,
-        }
-        typer.echo(json.dumps(facts, ensure_ascii=False), err=True)
+        typer.echo(json.dumps(error.to_dict(), ensure_ascii=False), err=True)
         return
     typer.echo(f"acquire: error: {error.message}", err=True)
     for word, text in (("possible", error.possible), ("try", error.hint)):
         if text:
             typer.echo(f"  {word}: {text}", err=True)
+
+
+def print_warning(text: str) -> None:
+    """What a user should know although the command did what was asked; on stderr."""
+    typer.echo(f"acquire: warning: {text}", err=True)
 
 
 def quantity(value: float, unit: str) -> str:

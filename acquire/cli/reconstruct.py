@@ -7,13 +7,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from acquire.cli.output import JsonFlag, print_facts, print_json
+from acquire.cli.output import JsonFlag, print_facts, print_json, print_warning
 from acquire.cli.progress import stage_progress
 from acquire.cli.recordings import RecordingArgument
-from acquire.errors import UsageError
 
 if TYPE_CHECKING:
     from typing import Any
+
+
+DOUBTFUL_PREDICTION = 0.3
+"""Good reconstructions predict within a tenth; a wrong code or swapped arms come to half and more."""
 
 
 def register(app: typer.Typer) -> None:
@@ -45,9 +48,9 @@ def reconstruct(
     from acquire.recon import reconstruct as solve
     from acquire.reconstruct import save_reconstruction
     from acquire.store import open_recording
+    from acquire.store.files import check_new_path
 
-    if out.exists():
-        raise UsageError(f"reconstruct to {out}: it exists and stays untouched", hint="another --out")
+    check_new_path(out)
     opened = open_recording(recording)
     segment = opened.cut(opened.first_line if first_line is None else first_line, lines)
     with stage_progress(f"reconstructing {out.name}") as advance:
@@ -63,8 +66,18 @@ def reconstruct(
     provenance = save_reconstruction(out, result, opened, segment, spatial_merge)
     if json:
         print_json({"path": str(out), "shape": result.video.shape, **provenance})
-    else:
-        print_facts(_readable(out, provenance, result.video.shape))
+        return
+    print_facts(_readable(out, provenance, result.video.shape))
+    if result.quality.prediction > DOUBTFUL_PREDICTION:
+        print_warning(
+            f"samples kept from the solver are predicted with an error of {result.quality.prediction:.0%}: "
+            "do not trust the video before code, arms and losses are checked"
+        )
+
+
+def _iterations(facts: dict[str, Any]) -> str:
+    done, asked = facts["iterations"], facts["iterations_asked"]
+    return f"{done} iterations" if done == asked else f"{done} of {asked} iterations (stopped by the budget)"
 
 
 def _readable(out: Path, facts: dict[str, Any], shape: tuple[int, ...]) -> dict[str, Any]:
@@ -74,7 +87,7 @@ def _readable(out: Path, facts: dict[str, Any], shape: tuple[int, ...]) -> dict[
     return {
         "video": f"{out}, {' × '.join(map(str, shape))} (time, row, column)",
         "trusted": f"frames {first} to {end - 1}" if end > first else "none: fewer lines than stages",
-        "solver": f"{facts['solver']}, {facts['iterations']} iterations, {facts['seconds']:.1f} s",
+        "solver": f"{facts['solver']}, {_iterations(facts)}, {facts['seconds']:.1f} s",
         "misfit": f"{quality['misfit']:.2%} of the samples' RMS",
         "prediction": None if prediction is None else f"{prediction:.2%} at samples kept from the solver",
         "coverage": f"{quality['coverage']:.2%} of the samples usable",

@@ -10,14 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, quantity
-from acquire.errors import DataError, UsageError
+from acquire.errors import AcquireError, DataError, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from acquire.lines import Segment
 
 RecordingArgument = Annotated[Path, typer.Argument(metavar="RECORDING", help="A directory NAME.zarr.")]
+
+CELL_CHARACTERS = 72
+"""What a table shows of an error; --json has all of it."""
 
 
 def register(app: typer.Typer) -> None:
@@ -30,13 +31,13 @@ def list_recordings(
     directory: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where to look.")] = Path(),
     json: JsonFlag = False,
 ) -> None:
-    """List the recordings of a directory; damaged ones are listed as such.
+    """List the recordings of a directory; damaged ones are listed as such, videos are not.
 
     Example: [bold]acquire ls /data[/]
     """
     if not directory.is_dir():
         raise UsageError(f"ls {directory}: no such directory")
-    found = [_summary(path) for path in _candidates(directory)]
+    found = [_summary(path) for path in sorted(directory.glob("*.zarr")) if _may_be_one(path)]
     if json:
         print_json(found)
     elif not found:
@@ -80,8 +81,9 @@ def cut(
     Example: [bold]acquire cut run.zarr --first-line 2000 --lines 256 --out segment.npz[/]
     """
     from acquire.store import open_recording
+    from acquire.store.files import check_new_path
 
-    _check_new(out)
+    check_new_path(out)
     segment = open_recording(recording).cut(first_line, lines)
     size = _save(segment, out)
     facts = {"path": str(out), "first_line": first_line, "lines": lines, "bytes": size}
@@ -91,11 +93,14 @@ def cut(
         typer.echo(f"{out}: lines {first_line} to {first_line + lines - 1}, {quantity(size, 'B')}")
 
 
-def _candidates(directory: Path) -> Iterator[Path]:
-    """Zarr groups that say they are recordings, and those that cannot say what they are."""
-    for path in sorted(directory.glob("*.zarr")):
-        if path.is_dir():
-            yield path
+def _may_be_one(path: Path) -> bool:
+    """A directory that is a recording, or cannot say what it is; a video says so."""
+    from acquire.store import format_of
+
+    try:
+        return path.is_dir() and not (format_of(path) or "").startswith("acquire-video/")
+    except DataError:
+        return True
 
 
 def _summary(path: Path) -> dict[str, Any]:
@@ -103,8 +108,10 @@ def _summary(path: Path) -> dict[str, Any]:
 
     try:
         facts = open_recording(path).info()
-    except DataError as error:
+    except AcquireError as error:
         return {"path": str(path), "error": error.message}
+    except OSError as error:  # a file of a recording that is being written was replaced meanwhile
+        return {"path": str(path), "error": f"{path} cannot be read: {error.strerror}"}
     keys = ("path", "run_id", "state", "run_condition", "lines", "duration_s", "bytes", "start_ns")
     return {key: facts[key] for key in keys}
 
@@ -112,10 +119,16 @@ def _summary(path: Path) -> dict[str, Any]:
 def _row(facts: dict[str, Any]) -> tuple[str, ...]:
     name = Path(facts["path"]).name
     if "error" in facts:
-        return (name, "-", "-", "-", facts["error"], "-")
+        return (name, "-", "-", "-", _short(facts["error"].removeprefix(facts["path"]).lstrip(": ")), "-")
     state = facts["run_condition"] or facts["state"]
     size = quantity(facts["bytes"], "B")
     return (name, str(facts["lines"]), f"{facts['duration_s']:.3f} s", size, state, _utc(facts["start_ns"]))
+
+
+def _short(text: str) -> str:
+    """One line of bounded length, for a cell of a table."""
+    line = " ".join(text.split())
+    return line if len(line) <= CELL_CHARACTERS else line[: CELL_CHARACTERS - 1] + "…"
 
 
 def _readable(facts: dict[str, Any]) -> dict[str, Any]:
@@ -146,20 +159,14 @@ def _utc(time_ns: int | None) -> str:
     return datetime.fromtimestamp(time_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S.%f")
 
 
-def _check_new(out: Path) -> None:
-    if out.exists():
-        raise UsageError(f"cut to {out}: it exists and stays untouched", hint="another --out")
-    if not out.parent.is_dir() or not os.access(out.parent, os.W_OK):
-        raise UsageError(f"cut to {out}: its directory does not exist or cannot be written")
-
-
 def _save(segment: Segment, out: Path) -> int:
     """Write the segment; a file that is there is whole. The file's size."""
     import numpy as np
 
-    part = out.with_name(out.name + ".part")
+    part = out.with_name(f".{out.name}.{os.getpid()}.partial")
+    file = part.open("xb")
     try:
-        with part.open("xb") as file:
+        with file:
             np.savez(
                 file,
                 lines=segment.lines,
@@ -173,8 +180,11 @@ def _save(segment: Segment, out: Path) -> int:
                 black_level_dn=segment.black_level_dn,
                 responsivity_dn=segment.responsivity_dn,
             )
-        part.rename(out)
+        os.link(part, out)  # refuses where a rename would replace
+    except FileExistsError as error:
+        raise UsageError(f"cut to {out}: it came into being meanwhile", hint="another --out") from error
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise DataError(f"cut to {out}: {error.strerror}") from error
+    finally:
+        part.unlink(missing_ok=True)
     return out.stat().st_size

@@ -33,13 +33,14 @@ def serve(
     """
     import logging
 
-    from acquire.config import load_rig, parse_settings
+    from acquire.config import check_directory, load_rig, parse_settings
     from acquire.daemon.server import serve as run_daemon
 
     overrides = parse_settings(settings or [])
     if socket is not None:
         overrides["control.socket"] = str(socket.absolute())
     rig = load_rig(config, overrides)
+    check_directory(rig)
     logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO)
     logging.getLogger("uvicorn").setLevel(logging.WARNING)
     raise typer.Exit(run_daemon(rig))

@@ -41,13 +41,14 @@ class RigFacts:
 class ArmLedger:
     """What became of one arm's lines since it was armed.
 
-    ``delivered`` by the camera, of which ``preroll`` were exposed before the start and discarded;
-    ``lost`` by cause. The recording has ``recorded`` rows, of which ``missing`` hold no line.
-    ``ring_peak`` of ``ring_slots`` blocks were waiting at the worst moment.
+    ``delivered`` by the camera, of which ``preroll`` were exposed before the start and ``discarded`` came
+    while nothing was recorded; ``lost`` by cause. The recording has ``recorded`` rows, of which ``missing``
+    hold no line. ``ring_peak`` of ``ring_slots`` blocks were waiting at the worst moment.
     """
 
     delivered: int
     preroll: int
+    discarded: int
     recorded: int
     missing: int
     ring_peak: int
@@ -98,13 +99,16 @@ class SolverResult:
     """One reconstruction of the segment against the truth; :func:`evaluate_solver` makes it.
 
     ``video`` (t, row, column) and ``psnr_per_frame`` (t,) cover the trusted frames only;
-    ``curves`` has one entry per region.
+    ``curves`` has one entry per region. With fewer ``iterations`` than ``requested_iterations`` it was
+    stopped by ``budget_s``, and is not what the solver can do.
     """
 
     label: str
     video: NDArray[Any]
     seconds: float
     iterations: int
+    requested_iterations: int
+    budget_s: float | None
     psnr_db: float
     ssim: float
     psnr_per_frame: NDArray[np.float64]
@@ -120,6 +124,8 @@ def evaluate_solver(
     *,
     seconds: float,
     iterations: int,
+    requested_iterations: int,
+    budget_s: float | None = None,
 ) -> SolverResult:
     """Compare the trusted frames of a reconstruction with the truth; raises as the metrics and fits do."""
     return SolverResult(
@@ -127,6 +133,8 @@ def evaluate_solver(
         video=video,
         seconds=seconds,
         iterations=iterations,
+        requested_iterations=requested_iterations,
+        budget_s=budget_s,
         psnr_db=metrics.psnr(video, truth),
         ssim=metrics.ssim(video, truth),
         psnr_per_frame=metrics.psnr_per_frame(video, truth),
@@ -142,7 +150,7 @@ class DemoResult:
     """Everything that the report shows.
 
     ``frame_time_ns`` (t,) are the UTC times of the trusted frames, which ``truth`` and every solver's
-    video hold; ``start_ns`` is the start of the trigger's run, from which the figures count.
+    video hold; ``start_ns`` is the time of the recording's first line, from which the figures count.
     ``solvers[0]`` is the default one, which the headline quotes. Raises UsageError when the arrays do not
     fit together.
     """
@@ -184,12 +192,12 @@ class DemoResult:
 
     @property
     def frame_ms(self) -> NDArray[np.float64]:
-        """Time of each frame since the start of the run."""
+        """Time of each frame since the recording's first line."""
         return (self.frame_time_ns - self.start_ns) / 1e6
 
     @property
     def line_ms(self) -> NDArray[np.float64]:
-        """Time at which each line's read-out began, since the start of the run."""
+        """Time at which each line's read-out began, since the recording's first line."""
         return (self.segment.time_ns - self.start_ns) / 1e6
 
     @property

@@ -71,6 +71,7 @@ def ledger_summary(ledger: ArmLedger) -> dict[str, Any]:
     return {
         "delivered": ledger.delivered,
         "preroll": ledger.preroll,
+        "discarded": ledger.discarded,
         "recorded": ledger.recorded,
         "missing": ledger.missing,
         "lost": {str(cause): lines for cause, lines in ledger.lost.items()},
@@ -106,6 +107,8 @@ def solver_summary(solver: SolverResult, set_hz: list[float | None]) -> dict[str
         "label": solver.label,
         "seconds": rounded(solver.seconds, 2),
         "iterations": solver.iterations,
+        "requested_iterations": solver.requested_iterations,
+        "stopped_by_budget_s": solver.budget_s if solver.iterations < solver.requested_iterations else None,
         "psnr_db": rounded(solver.psnr_db, 2),
         "worst_frame_psnr_db": rounded(solver.psnr_per_frame.min(), 2),
         "ssim": rounded(solver.ssim, 3),

@@ -48,7 +48,10 @@ class AdmmParameters:
 
 
 class Admm:
-    """Holds the iterates; `step` is one iteration, `theta` the current estimate (K, n′, n′)."""
+    """Holds the iterates; `step` is one iteration, `theta` the current estimate (K, n′, n′).
+
+    ``samples`` are 0 where the operator's weight is.
+    """
 
     name = "admm"
 
@@ -60,11 +63,7 @@ class Admm:
         basis: TemporalBasis,
         parameters: AdmmParameters,
     ) -> None:
-        self._operator, self._samples, self._parameters = (
-            operator,
-            samples * (operator.weight > 0),
-            parameters,
-        )
+        self._operator, self._samples, self._parameters = operator, samples, parameters
         self._tv = FrameTv(theta_shape, parameters.tv_iterations, samples.dtype)
         grid = min(basis.frames, parameters.grid_per_coefficient * basis.count)
         self._grid = basis.matrix(grid)

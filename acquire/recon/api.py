@@ -10,6 +10,7 @@ import numpy as np
 
 from acquire.errors import UsageError
 from acquire.forward import DualArm
+from acquire.geometry import is_integer
 from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import InBasis, band_operator
 from acquire.recon.basis import TemporalBasis
@@ -68,7 +69,9 @@ class Reconstruction:
     """A reconstructed video and how it came about.
 
     ``video`` is (time, row, column) float32 in scene units, over the whole span; only the frames in
-    ``trusted`` were sampled in full (Fig. 5). ``time_ns`` is the begin of each frame.
+    ``trusted`` were sampled in full (Fig. 5). That interval is nominal: it follows from the geometry alone,
+    whatever lines were lost, samples masked, or the code does; ``quality`` says how well it went.
+    ``time_ns`` is the begin of each frame. Fewer ``iterations`` than ``iterations_asked``: the budget ended.
     """
 
     video: NDArray[np.float32]
@@ -76,6 +79,7 @@ class Reconstruction:
     trusted: slice
     seconds: float
     iterations: int
+    iterations_asked: int
     solver: str
     quality: Quality
     parameters: dict[str, Any] = field(default_factory=dict)
@@ -100,8 +104,8 @@ class Request:
             raise UsageError(f"TV weight {self.tv_weight}", possible="a finite number of at least 0")
         if self.budget_s is not None and not self.budget_s > 0:
             raise UsageError(f"budget of {self.budget_s} s", possible="more than 0")
-        if self.iterations < 1:
-            raise UsageError(f"{self.iterations} iterations", possible="1 or more")
+        if not is_integer(self.iterations) or self.iterations < 1:
+            raise UsageError(f"{self.iterations!r} iterations", possible="an integer of at least 1")
 
 
 def reconstruct(
@@ -148,6 +152,7 @@ def reconstruct(
         trusted=segment.geometry.trusted_frames(temporal_merge),
         seconds=time.perf_counter() - started,
         iterations=done,
+        iterations_asked=request.iterations,
         solver=solver,
         quality=Quality(problem.misfit(predicted), problem.prediction_error(predicted), problem.coverage),
         parameters={
@@ -185,7 +190,7 @@ def _admm(segment: Segment, problem: Problem, request: Request) -> _Work:
     parameters = AdmmParameters()
     if request.tv_weight is not None:
         parameters = replace(parameters, tv_weight=request.tv_weight)
-    iterate = Admm(problem.masked(operator), problem.samples, (count, side, side), basis, parameters)
+    iterate = Admm(problem.masked(operator), problem.used_samples, (count, side, side), basis, parameters)
     return _Work(iterate, operator, basis, parameters, floor=0.0)
 
 
@@ -196,7 +201,7 @@ def _twist(segment: Segment, problem: Problem, request: Request) -> _Work:
     parameters = TwistParameters()
     if request.tv_weight is not None:
         parameters = replace(parameters, tv_weight=request.tv_weight)
-    iterate = Twist(problem.masked(operator), problem.samples, dual_arm.video_shape, parameters)
+    iterate = Twist(problem.masked(operator), problem.used_samples, dual_arm.video_shape, parameters)
     return _Work(iterate, operator, basis, parameters, floor=-np.inf)
 
 

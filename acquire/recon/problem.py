@@ -50,6 +50,12 @@ class Problem:
     scale: float
     coverage: float
 
+    @property
+    def used_samples(self) -> NDArray[Any]:
+        """``weight·samples``: what the solvers are given."""
+        used: NDArray[Any] = self.samples * self.weight
+        return used
+
     def masked(self, operator: Operator) -> MaskedOperator:
         """The solvers' operator: weighted, of norm at most 1."""
         return MaskedOperator(operator, self.weight / self.samples.dtype.type(self.norm))

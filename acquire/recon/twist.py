@@ -44,7 +44,10 @@ class TwistParameters:
 
 
 class Twist:
-    """Holds the iterates; `step` is one iteration, `theta` the current estimate (T/T_m, n′, n′)."""
+    """Holds the iterates; `step` is one iteration, `theta` the current estimate (T/T_m, n′, n′).
+
+    ``samples`` are 0 where the operator's weight is.
+    """
 
     name = "twist"
 
@@ -55,7 +58,7 @@ class Twist:
         theta_shape: tuple[int, int, int],
         parameters: TwistParameters,
     ) -> None:
-        self._operator, self._samples = operator, samples * (operator.weight > 0)
+        self._operator, self._samples = operator, samples
         self._lambda = parameters.tv_weight
         self._tv = FrameTv(theta_shape, parameters.tv_iterations, samples.dtype)
         root = np.sqrt(parameters.smallest_eigenvalue)

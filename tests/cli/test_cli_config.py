@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from acquire.config import RigConfig, builtin_directory, load_rig
+from acquire.errors import ConfigError
 
 Cli = Callable[..., Any]
 
@@ -41,6 +42,9 @@ def test_check(cli: Cli, rig_file: Path) -> None:
         ('codec = "lz4"', 'codec = "zip"', "recording.codec"),
         ('scene = "scene-leds.toml"', 'scene = "none.toml"', "none.toml"),
         ("[geometry]", "[geometry", "not TOML"),
+        ("speed = 1.0", "speed = inf", "simulation.speed"),
+        ("tag_every_lines = 256", "tag_every_lines = 32768", "trigger.tag_every_lines"),
+        ("= 256\nring_slots = 64", "= 65536\nring_slots = 4096", "stream.ring_slots x stream.block_lines"),
     ],
 )
 def test_bad_files_name_the_key(cli: Cli, rig_file: Path, before: str, after: str, key: str) -> None:
@@ -71,3 +75,27 @@ def test_show_is_a_file_that_means_the_same(cli: Cli, rig_file: Path, tmp_path: 
 def test_schema_describes_every_key(cli: Cli) -> None:
     schema = cli("config", "schema").json
     assert set(RigConfig.model_fields) == set(schema["properties"])
+
+
+def test_code_without_a_kind_is_pseudo_random(rig_file: Path) -> None:
+    text = rig_file.read_text().replace('kind = "prbs"\n', "")
+    assert text != rig_file.read_text()
+    expected = load_rig(rig_file).code
+    rig_file.write_text(text)
+    assert load_rig(rig_file).code == expected
+
+
+def test_directory_of_recordings_must_be_there(cli: Cli, rig_file: Path) -> None:
+    rig_file.write_text(rig_file.read_text().replace("[recording]", '[recording]\ndirectory = "/nowhere"'))
+    answer = cli("config", "check", rig_file)
+    assert answer.code == 2
+    assert "/nowhere" in answer.err
+
+
+def test_a_directory_is_not_a_file(cli: Cli, tmp_path: Path) -> None:
+    assert "is a directory" in cli("config", "check", tmp_path).err
+
+
+def test_setting_below_a_value_is_refused(rig_file: Path) -> None:
+    with pytest.raises(ConfigError, match="'name' is a value"):
+        load_rig(rig_file, {"name.first": 1})

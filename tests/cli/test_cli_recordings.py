@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,10 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from acquire.cli.recordings import CELL_CHARACTERS
 from acquire.clock import ClockFit
 from acquire.codes import PrbsCode
 from acquire.lines import ARMS, LineFlag, TaggedBlock
-from acquire.store import RecordingSpec, RecordingWriter, RunCondition, open_recording
+from acquire.store import RecordingSpec, RecordingWriter, RunCondition, open_recording, write_video
 
 Cli = Callable[..., Any]
 M, S, FIRST, LINES = 4, 2, 100, 64
@@ -88,6 +92,37 @@ def test_ls(cli: Cli, recording: Path) -> None:
     assert listed[1]["lines"] == 64
 
 
+def test_ls_survives_recordings_that_cannot_be_described(cli: Cli, recording: Path) -> None:
+    for name, before, after in (
+        ("stages", f'"stages":{M}', '"stages":-1'),
+        ("clock", '"clock_hz":90000000', '"clock_hz":0'),
+        ("code", '"degree":15', '"grade":15'),
+        ("versions", '"acquire":', '"acquired":'),
+        ("text", '"run_id"', "\n" * 50 + '"run_id'),
+    ):
+        damaged = write(recording.parent / f"{name}.zarr") / "zarr.json"
+        text = json.dumps(json.loads(damaged.read_text()), separators=(",", ":"))
+        assert before in text
+        damaged.write_text(text.replace(before, after))
+    answer = cli("ls", recording.parent)
+    assert answer.code == 0
+    title, *rows = answer.out.splitlines()
+    assert [row.split()[0] for row in rows] == [
+        "clock.zarr", "code.zarr", "one.zarr", "stages.zarr", "text.zarr", "versions.zarr"
+    ]  # fmt: skip
+    assert max(map(len, (title, *rows))) < 160
+    assert sum("damaged" in row for row in rows) == 5
+    listed = cli("ls", recording.parent, "--json").json
+    assert sum("error" in item for item in listed) == 5
+    assert max(len(item.get("error", "")) for item in listed) > CELL_CHARACTERS
+
+
+def test_ls_leaves_videos_out(cli: Cli, recording: Path) -> None:
+    video, times = np.zeros((2, 4, 4), np.float32), np.arange(2, dtype=np.int64)
+    write_video(recording.parent / "a-video.zarr", video, times, 1.0, 1e4, {})
+    assert [Path(item["path"]).name for item in cli("ls", recording.parent, "--json").json] == ["one.zarr"]
+
+
 def test_ls_of_nothing(cli: Cli, tmp_path: Path) -> None:
     assert cli("ls", tmp_path).out == f"no recordings in {tmp_path}\n"
     assert cli("ls", tmp_path, "--json").json == []
@@ -128,7 +163,43 @@ def test_cut_is_the_segment(cli: Cli, recording: Path, tmp_path: Path) -> None:
         assert (int(saved["stages"]), int(saved["substeps"]), int(saved["first_line"])) == (M, S, 110)
         assert float(saved["substep_ns"]) == pytest.approx(10_000)
         assert (float(saved["black_level_dn"]), float(saved["responsivity_dn"])) == (1.0, 2.0)
-    assert list(tmp_path.glob("*.part")) == []
+    assert {path.name for path in tmp_path.iterdir()} == {"cut.npz", "one.zarr"}
+
+
+@pytest.mark.parametrize("name", ["cut.npz.part", ".cut.npz.{pid}.partial"])
+def test_cut_leaves_files_that_are_not_its_own(cli: Cli, recording: Path, tmp_path: Path, name: str) -> None:
+    other = tmp_path / name.format(pid=os.getpid())
+    other.write_text("precious")
+    cli("cut", recording, "--first-line", 110, "--lines", 20, "--out", tmp_path / "cut.npz")
+    assert other.read_text() == "precious"
+
+
+def test_cut_replaces_nothing_that_came_into_being_meanwhile(
+    cli: Cli, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, savez = tmp_path / "cut.npz", np.savez
+
+    def meanwhile(*words: Any, **arrays: Any) -> None:
+        savez(*words, **arrays)
+        out.write_text("precious")
+
+    monkeypatch.setattr(np, "savez", meanwhile)
+    answer = cli("cut", recording, "--first-line", 110, "--lines", 20, "--out", out)
+    assert (answer.code, out.read_text()) == (2, "precious")
+    assert {path.name for path in tmp_path.iterdir()} == {"cut.npz", "one.zarr"}
+
+
+def test_cut_that_the_disk_refuses_leaves_nothing(
+    cli: Cli, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(np, "savez", full)
+    answer = cli("cut", recording, "--first-line", 110, "--lines", 20, "--out", tmp_path / "cut.npz")
+    assert answer.code == 6
+    assert "No space left" in answer.err
+    assert {path.name for path in tmp_path.iterdir()} == {"one.zarr"}
 
 
 def test_cut_overwrites_nothing(cli: Cli, recording: Path, tmp_path: Path) -> None:

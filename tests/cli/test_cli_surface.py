@@ -116,3 +116,24 @@ def test_status_loads_no_recording_or_mathematics(tmp_path: Path) -> None:
         timeout=60,
     )
     assert ended.stdout.strip() == "[]"
+
+
+def test_what_the_system_refuses_is_told_in_words(cli: Cli, tmp_path: Path) -> None:
+    answer = cli("info", tmp_path / ("long" * 100))
+    assert answer.code in {2, 6}
+    assert "File name too long" in answer.err
+    assert "Traceback" not in answer.err
+
+
+def test_a_full_disk_behind_stdout_ends_in_words() -> None:
+    with Path("/dev/full").open("w") as full:
+        ended = subprocess.run(
+            [sys.executable, "-m", "acquire", "config", "schema"],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=60,
+            check=False,
+        )
+    assert ended.returncode == 2
+    assert ended.stderr == "acquire: error: No space left on device\n"

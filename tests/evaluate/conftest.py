@@ -67,8 +67,8 @@ def result() -> DemoResult:
     damped = truth.mean(axis=0) + 0.8 * (truth - truth.mean(axis=0))
     noise = rng.normal(0, 1, truth.shape).astype(np.float32)
     solvers = [
-        ("ADMM (default)", truth + 0.011 * noise, 7.62, 118),
-        ("TwIST", damped + 0.13 * noise, 31.44, 207),
+        ("ADMM (default)", truth + 0.011 * noise, 7.62, 118, 118),
+        ("TwIST", damped + 0.13 * noise, 31.44, 207, 451),
     ]
     return DemoResult(
         title="Scene #1: <four> LEDs",
@@ -83,8 +83,8 @@ def result() -> DemoResult:
             seconds=0.617,
             size_bytes=5_312_204,
             arms={
-                "a": ArmLedger(20_065, 65, 20_003, 0, 9, 64),
-                "b": ArmLedger(20_049, 65, 20_003, 16, 11, 64, {"camera": 2, "ring_full": 14}),
+                "a": ArmLedger(20_075, 65, 7, 20_003, 0, 9, 64),
+                "b": ArmLedger(20_077, 65, 11, 20_003, 16, 11, 64, {"camera": 2, "ring_full": 14}),
             },
         ),
         segment=segment,
@@ -93,9 +93,17 @@ def result() -> DemoResult:
         truth=truth,
         solvers=tuple(
             evaluate_solver(
-                label, video, truth, regions, SUBSTEP_NS * 1e-9, seconds=seconds, iterations=iterations
+                label,
+                video,
+                truth,
+                regions,
+                SUBSTEP_NS * 1e-9,
+                seconds=seconds,
+                iterations=iterations,
+                requested_iterations=asked,
+                budget_s=31.5,
             )
-            for label, video, seconds, iterations in solvers
+            for label, video, seconds, iterations, asked in solvers
         ),
         regions=regions,
         stages=(

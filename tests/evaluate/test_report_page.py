@@ -104,6 +104,13 @@ def test_every_text_of_the_summary_is_on_the_page(result: DemoResult, page: Page
 
 def test_losses_stand_with_their_causes(page: Page) -> None:
     assert "lost: camera 0 2 lost: ring full 0 14" in page.text
+    assert "discarded while armed 7 11" in page.text
+
+
+def test_a_solver_that_its_budget_stopped_is_not_shown_as_if_it_had_finished(page: Page) -> None:
+    assert "207 of 451 (stopped by its budget of 31.5 s)" in page.text
+    assert re.search(r"TwIST [\d.]+ dB, stopped by its budget", page.text)
+    assert "118 of" not in page.text
 
 
 def test_the_page_refers_to_nothing_outside_itself(source: str, page: Page) -> None:
@@ -154,7 +161,9 @@ def test_masked_samples_stand_out(directory) -> None:
 
 
 def test_extremes_one_perfect_solver_nothing_to_follow_no_stage_time(result: DemoResult, tmp_path) -> None:
-    perfect = evaluate_solver("exact", result.truth, result.truth, (), 1e-5, seconds=0.0, iterations=0)
+    perfect = evaluate_solver(
+        "exact", result.truth, result.truth, (), 1e-5, seconds=0.0, iterations=0, requested_iterations=0
+    )
     bare = replace(result, solvers=(perfect,), regions=(), stages=())
     (tmp_path / "index.html").write_text("of an earlier run")
     page = Page(write_report(bare, tmp_path).read_text(encoding="utf-8"))

@@ -32,6 +32,8 @@ def test_summary_survives_json_and_holds_what_was_measured(result: DemoResult) -
     best, other = summary["solvers"]
     # the noise and the damping that the fixture put in
     assert best["psnr_db"] == pytest.approx(20 * np.log10(result.peak / 0.011), abs=0.1)
+    assert [solver["stopped_by_budget_s"] for solver in (best, other)] == [None, 31.5]
+    assert [solver["requested_iterations"] for solver in (best, other)] == [118, 451]
     assert other["psnr_db"] < 18 < best["worst_frame_psnr_db"] < best["psnr_db"]
     assert [curve["amplitude_ratio"] for curve in other["curves"]] == [
         pytest.approx(0.8, abs=0.03),
@@ -57,7 +59,14 @@ def test_rounding_gives_no_negative_zero() -> None:
 
 def test_the_evaluation_of_the_truth_itself_is_perfect(result: DemoResult) -> None:
     perfect = evaluate_solver(
-        "truth", result.truth, result.truth, result.regions, 1e-5, seconds=0.0, iterations=0
+        "truth",
+        result.truth,
+        result.truth,
+        result.regions,
+        1e-5,
+        seconds=0.0,
+        iterations=0,
+        requested_iterations=0,
     )
     assert perfect.psnr_db == np.inf
     assert perfect.ssim == pytest.approx(1)

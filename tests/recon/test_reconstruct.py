@@ -119,7 +119,7 @@ def test_a_budget_is_kept_and_progress_is_told() -> None:
     steps: list[Progress] = []
     result = reconstruct(segment(), 3, 1, budget_s=1e-6, progress=steps.append)
     assert result.iterations == len(steps) == 1
-    assert steps[0].iterations == 80
+    assert steps[0].iterations == result.iterations_asked == 80
 
 
 @pytest.mark.parametrize(("N_m", "T_m"), [(1, 419), (3, 4), (2, 5), (7, 1), (60, 1000)])
@@ -163,6 +163,7 @@ def test_what_cannot_be_is_refused_with_what_can() -> None:
         (UsageError, "TV weight nan", {"tv_weight": float("nan")}),
         (UsageError, "budget of -1", {"budget_s": -1.0}),
         (UsageError, "0 iterations", {"iterations": 0}),
+        (UsageError, "2.5 iterations", {"iterations": 2.5}),
     ):
         with pytest.raises(error, match=match):
             reconstruct(good, 3, 1, **call)

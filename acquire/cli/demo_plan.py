@@ -1,0 +1,109 @@
+"""What a demonstration is to do, and whether it can: everything is refused before anything is touched."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from acquire.config import RigConfig
+
+RIG = "rig-demo"
+SEED = 1
+LINES = 33_334
+TWIST_BUDGET_S = 30.0
+
+SEGMENT_LINES = 263
+"""L_R of Fig. 9: 598 trusted frames."""
+
+SEGMENT_START_S = 0.052
+"""Where Fig. 9 cuts, from the start of the recording."""
+
+N_M, T_M = 3, 1
+"""Fig. 9: 64 × 64 voxels at the sub-step rate."""
+
+LEAST_SIDE = 11
+"""Voxels: the window of SSIM."""
+
+LEAST_FRAMES = 8
+"""What the fit of a sinusoid with its harmonics takes."""
+
+
+@dataclass(frozen=True, slots=True)
+class DemoPlan:
+    """One run: a new directory for everything, the rig, its code's seed, lines, seconds for the solvers."""
+
+    out: Path
+    config: str = RIG
+    seed: int = SEED
+    lines: int = LINES
+    budget_s: float | None = None
+    twist_budget_s: float = TWIST_BUDGET_S
+
+    @property
+    def command(self) -> str:
+        """The words that do the same again, somewhere else."""
+        words = ["acquire", "demo", "--seed", str(self.seed), "--lines", str(self.lines)]
+        if self.config != RIG:
+            words += ["--config", self.config]
+        if self.budget_s is not None:
+            words += ["--budget", f"{self.budget_s:g}"]
+        if self.twist_budget_s != TWIST_BUDGET_S:
+            words += ["--twist-budget", f"{self.twist_budget_s:g}"]
+        return shlex.join(words)
+
+
+def check(plan: DemoPlan, rig: RigConfig) -> None:
+    """Raise UsageError for what could not be carried out to the end."""
+    from acquire.config import check_directory
+
+    _check_out(plan.out)
+    _check_budgets(plan)
+    _check_rig(plan, rig)
+    check_directory(rig)
+    least = segment_row(rig) + SEGMENT_LINES
+    if plan.lines < least:
+        raise UsageError(
+            f"demo of {plan.lines} lines", possible=f"{least} or more: it cuts {SEGMENT_LINES} at 52 ms"
+        )
+
+
+def segment_row(rig: RigConfig) -> int:
+    """Row of the recording at which the segment begins."""
+    return round(SEGMENT_START_S * rig.line_rate_hz)
+
+
+def _check_out(out: Path) -> None:
+    if out.exists():
+        raise UsageError(f"demo to {out}: it exists and stays untouched", hint="--out with a new directory")
+    if not out.absolute().parent.is_dir():
+        raise UsageError(f"demo to {out}: there is no directory {out.absolute().parent}")
+
+
+def _check_budgets(plan: DemoPlan) -> None:
+    for budget_s in (plan.budget_s, plan.twist_budget_s):
+        if budget_s is not None and not budget_s > 0:
+            raise UsageError(f"demo with a budget of {budget_s} s", possible="more than 0")
+
+
+def _check_rig(plan: DemoPlan, rig: RigConfig) -> None:
+    if rig.trigger.driver != "simulated":
+        raise UsageError(f"demo with trigger driver {rig.trigger.driver!r}", possible="'simulated'")
+    if rig.code.kind != "prbs":
+        raise UsageError(f"demo of {plan.config} with code.kind = {rig.code.kind!r}", possible="'prbs'")
+    geometry = rig.geometry.segment(SEGMENT_LINES)
+    if geometry.size % N_M or geometry.size < N_M * LEAST_SIDE:
+        raise UsageError(
+            f"demo of {plan.config} with n = M·S = {geometry.size}",
+            possible=f"a multiple of {N_M}, {N_M * LEAST_SIDE} or more",
+        )
+    if (frames := geometry.trusted.stop - geometry.trusted.start) < LEAST_FRAMES:
+        raise UsageError(
+            f"demo of {plan.config}: of {SEGMENT_LINES} lines with M = {geometry.stages} stages, "
+            f"{frames} frames can be trusted",
+            possible=f"fewer stages: {LEAST_FRAMES} trusted frames or more",
+        )

@@ -1,0 +1,37 @@
+"""Stages of a long command: told on stderr as they end, kept for its report."""
+
+from __future__ import annotations
+
+import time
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+import typer
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from acquire.evaluate.report import Stage
+
+
+@dataclass
+class Journal:
+    """The stages since ``when``."""
+
+    stages: list[Stage] = field(default_factory=list)
+    when: datetime = field(default_factory=lambda: datetime.now(UTC))
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[dict[str, str]]:
+        """Times a stage; ``detail`` may be set in the dictionary given."""
+        from acquire.evaluate.report import Stage
+
+        note: dict[str, str] = {}
+        started = time.perf_counter()
+        yield note
+        seconds = time.perf_counter() - started
+        self.stages.append(Stage(name, seconds, note.get("detail", "")))
+        detail = f"  {note['detail']}" if "detail" in note else ""
+        typer.echo(f"{name:<34} {seconds:6.1f} s{detail}", err=True)

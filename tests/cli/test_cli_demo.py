@@ -1,0 +1,78 @@
+"""``acquire demo``: what cannot be carried out to the end is refused before anything is touched."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from acquire.cli.demo_capture import end
+from acquire.cli.demo_plan import DemoPlan
+from acquire.config import builtin_directory
+
+Cli = Callable[..., Any]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--lines", 1000), "1996 or more"),
+        (("--budget", 0), "more than 0"),
+        (("--twist-budget", "nan"), "more than 0"),
+        (("--config", "none.toml"), "does not exist"),
+    ],
+)
+def test_impossible_options(cli: Cli, tmp_path: Path, options: tuple[object, ...], words: str) -> None:
+    answer = cli("demo", "--out", tmp_path / "new", *options)
+    assert answer.code == 2
+    assert words in answer.err
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "words"),
+    [
+        ("substeps = 3", "substeps = 2", "a multiple of 3"),
+        ("stages = 64", "stages = 261", "fewer stages"),
+        ('kind = "prbs"\ndegree = 64\nseed = 1', 'kind = "constant"\nvalue = 1', "code.kind"),
+    ],
+)
+def test_rigs_that_show_too_little(cli: Cli, tmp_path: Path, before: str, after: str, words: str) -> None:
+    rig = tmp_path / "rig.toml"
+    text = (builtin_directory() / "rig-demo.toml").read_text(encoding="utf-8")
+    assert before in text
+    rig.write_text(text.replace(before, after))
+    answer = cli("demo", "--out", tmp_path / "new", "--config", rig)
+    assert answer.code == 2
+    assert words in answer.err
+    assert not (tmp_path / "new").exists()
+
+
+def test_no_directory_to_make_one_in(cli: Cli, tmp_path: Path) -> None:
+    answer = cli("demo", "--out", tmp_path / "none" / "new")
+    assert answer.code == 2
+    assert f"no directory {tmp_path / 'none'}" in answer.err
+
+
+def test_the_report_tells_the_command_that_does_the_same() -> None:
+    plain = DemoPlan(Path("out"))
+    assert plain.command == "acquire demo --seed 1 --lines 33334"
+    other = DemoPlan(Path("out"), "my rig.toml", 3, 5000, 2.0, 1.5)
+    assert other.command == (
+        "acquire demo --seed 3 --lines 5000 --config 'my rig.toml' --budget 2 --twist-budget 1.5"
+    )
+
+
+def test_a_daemon_that_does_not_end_is_killed() -> None:
+    deaf = "import signal, sys; signal.signal(signal.SIGTERM, signal.SIG_IGN); print(flush=True); input()"
+    with subprocess.Popen(
+        [sys.executable, "-c", deaf], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        assert not end(process, timeout_s=0.2)
+        assert process.returncode is not None
