@@ -46,6 +46,7 @@ def demo(
     from acquire.cli.demo_analysis import analyse
     from acquire.cli.demo_capture import record
     from acquire.evaluate.report import write_report
+    from acquire.evaluate.summary import summarise
 
     plan.out.mkdir()
     journal = Journal()
@@ -53,9 +54,9 @@ def demo(
     with journal.stage("Write the report"):
         page = write_report(result, plan.out)
     if json:
-        print_json({"report": str(page), **result.summary()})
+        print_json({"report": str(page), **summarise(result)})
         return
-    print_facts(_headline(page, result.summary()))
+    print_facts(_headline(page, summarise(result)))
 
 
 def _free(path: Path) -> Path:

@@ -25,6 +25,7 @@ from acquire.evaluate.result import (
     Stage,
     evaluate_solver,
 )
+from acquire.evaluate.summary import summarise
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -64,7 +65,7 @@ def write_report(result: DemoResult, directory: Path) -> Path:
     pictures = figures.save_figures(result, directory)
     pictures["animation"] = directory / ANIMATION
     step = animation.save_animation(result, pictures["animation"])
-    summary = result.summary()
+    summary = summarise(result)
     summary["animation"] = _animation_facts(result, step)
     (directory / SUMMARY).write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     page = directory / PAGE

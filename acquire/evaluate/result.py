@@ -14,7 +14,6 @@ import numpy as np
 from acquire.errors import UsageError
 from acquire.evaluate import metrics
 from acquire.evaluate.curves import CurveComparison, compare_curve, region_mean
-from acquire.evaluate.summary import summarise
 from acquire.lines import ARMS
 
 if TYPE_CHECKING:
@@ -208,7 +207,3 @@ class DemoResult:
     def peak(self) -> float:
         """White of the figures: the brightest value of the truth."""
         return metrics.checked_peak(self.truth)
-
-    def summary(self) -> dict[str, Any]:
-        """All numbers of the report as JSON-able values; see :func:`acquire.evaluate.summary.summarise`."""
-        return summarise(self)
