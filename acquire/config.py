@@ -108,6 +108,9 @@ class TriggerConfig(_Model):
     driver: Literal["simulated", "rtl", "serial", "usb"] = "simulated"
     url: str = Field(default="", description="driver 'serial': /dev/tty…, socket://host:port")
     baud: int = Field(default=3_000_000, ge=9600, description="driver 'serial'")
+    flow_control: Literal["none", "rts-cts"] = Field(
+        default="none", description="driver 'serial'; 'rts-cts' where the board wires both lines"
+    )
     serial: str = Field(default="", description="driver 'usb': serial number; absent: any")
     clock_hz: int = Field(default=90_000_000, ge=1_000_000, le=1_000_000_000)
     substep_ticks: int = Field(default=900, ge=5, lt=2**24, description="duration of a sub-step in ticks")

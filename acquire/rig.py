@@ -20,7 +20,6 @@ from acquire.sim.pins import PinPage, PinWire
 from acquire.sim.scenes import build_scene
 from acquire.sim.trigger_model import TriggerModel
 from acquire.sim.trigger_registers import INPUTS as SIMULATED_INPUTS
-from acquire.sim.trigger_registers import LEAD_MARGIN
 from acquire.sim.twin_links import TwinTransport
 from acquire.trigger.base import TriggerRun
 from acquire.trigger.driver import TriggerDriver
@@ -103,7 +102,7 @@ def check_rig(config: RigConfig) -> None:
     )
     possible = replace(GATEWARE, clock_hz=trigger.clock_hz)
     if trigger.driver == "simulated":
-        possible = replace(possible, inputs=SIMULATED_INPUTS, lead_margin_ticks=LEAD_MARGIN)
+        possible = replace(possible, inputs=SIMULATED_INPUTS)
     try:
         register_values(run, trigger, possible, _link_bytes_per_s(trigger))
     except TriggerError as error:
@@ -155,7 +154,9 @@ def _trigger_way(config: RigConfig, wire: Wire, pins: PinPage | None) -> Callabl
         case "rtl":
             return partial(rtl.RtlTransport, trigger.clock_hz, pins)
         case "serial":
-            return partial(SerialTransport, trigger.url, trigger.baud)
+            return partial(
+                SerialTransport, trigger.url, trigger.baud, rts_cts=trigger.flow_control == "rts-cts"
+            )
         case "usb":
             return partial(UsbTransport, serial=trigger.serial)
 

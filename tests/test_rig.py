@@ -109,3 +109,14 @@ def test_a_trigger_can_be_opened_on_its_own(config):
     trigger.start()
     assert trigger.stop() >= 1
     trigger.close()
+
+
+def test_on_the_gateware_each_camera_follows_its_own_trigger_pin(config):
+    """Nothing is started until the trigger is used."""
+    before = open_descriptors()
+    rtl = config.model_copy(update={"trigger": config.trigger.model_copy(update={"driver": "rtl"})})
+    with Rig(rtl) as rig:
+        wires = [opener.wire for opener in rig.openers().values()]
+        assert [wire.arm for wire in wires] == ["a", "b"]
+        assert all(wire.look().train is None for wire in wires)
+    assert open_descriptors() == before

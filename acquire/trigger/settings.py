@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 _DEFAULT_WIDTH = 90
 _TAG_FRAME_BYTES = r.TAG_BYTES + 10
 """On the wire: header, CRC, COBS and delimiter."""
+_TAGS_SHARE = 0.5
+"""Of the link; answers need the rest, and it lets a FIFO that has filled empty again."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -169,7 +171,7 @@ def _check_tags(run: TriggerRun, device: Capabilities, bytes_per_s: float) -> No
     if run.tag_every_lines < 1:
         raise TriggerError(f"a tag every {run.tag_every_lines} lines", possible="1 or more")
     line_rate = device.clock_hz / run.line_period_ticks
-    fewest = int(line_rate * _TAG_FRAME_BYTES / bytes_per_s) + 1
+    fewest = int(line_rate * _TAG_FRAME_BYTES / (bytes_per_s * _TAGS_SHARE)) + 1
     if run.tag_every_lines < fewest and bytes_per_s != float("inf"):
         raise TriggerError(
             f"a tag every {run.tag_every_lines} lines at {line_rate:g} lines/s",

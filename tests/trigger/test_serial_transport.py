@@ -84,7 +84,7 @@ def test_a_port_has_one_user_and_the_second_hears_who_the_first_is(tmp_path) -> 
 def test_two_drivers_on_one_port() -> None:
     with wired_model() as model:
         twin = PtyTwin(model)
-        first = SerialTransport(twin.path, 3_000_000)
+        first = SerialTransport(twin.path, 3_000_000, rts_cts=True)
         with pytest.raises(TriggerError, match="is in use by process"):
             SerialTransport(twin.path, 3_000_000)
         first.close()

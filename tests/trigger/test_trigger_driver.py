@@ -132,9 +132,9 @@ def test_tags_faster_than_the_link_are_refused() -> None:
         driver = driver_of(model)
         device = driver.device().capabilities
         config = TriggerConfig()
-        with pytest.raises(TriggerError, match="possible: every 5 lines over a link of 300000 bytes/s"):
-            register_values(run(tag_every_lines=4), config, device, 300_000)
-        values = register_values(run(tag_every_lines=5), config, device, 300_000)
+        with pytest.raises(TriggerError, match="possible: every 9 lines over a link of 300000 bytes/s"):
+            register_values(run(tag_every_lines=8), config, device, 300_000)
+        values = register_values(run(tag_every_lines=9), config, device, 300_000)
         assert values.keys() == set(r.CONFIGURATION)
         asked = TriggerConfig.model_validate({"light": {"scene_gate": True}})
         with pytest.raises(TriggerError, match="scene gate"):

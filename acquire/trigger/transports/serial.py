@@ -21,18 +21,18 @@ _READ_BYTES = 4096
 class SerialTransport:
     """An open serial port, locked against a second user.
 
-    Modem lines are not used, since pseudo-terminals have none. Raises TriggerError when the port is not
-    there or in use.
+    Modem lines are used for ``rts_cts`` only: pseudo-terminals and many boards have none. Raises
+    TriggerError when the port is not there or in use.
     """
 
-    def __init__(self, url: str, baud: int) -> None:
+    def __init__(self, url: str, baud: int, *, rts_cts: bool = False) -> None:
         self.name = url
         self._local = local = "://" not in url
         self.bytes_per_s = baud / BITS_PER_BYTE if local else float("inf")
         self._lock = PortLock(str(Path(url).resolve()) if local else url)
         try:
             self._port = serial.serial_for_url(
-                url, baudrate=baud, timeout=READ_WAIT_S, write_timeout=_WRITE_S
+                url, baudrate=baud, timeout=READ_WAIT_S, write_timeout=_WRITE_S, rtscts=rts_cts
             )
             self._port.reset_input_buffer()
         except (OSError, ValueError) as error:  # SerialException is an OSError

@@ -13,7 +13,6 @@ from random_runs import random_run
 
 from acquire.sim.clock import Wire
 from acquire.sim.trigger_model import TriggerModel
-from acquire.sim.trigger_registers import LEAD_MARGIN
 from acquire.trigger import registers as r
 from acquire.trigger.frames import Decoder, Frame, encode, parse_write, read_payload, write_payload
 from acquire.trigger.registers import Command, FrameType, LineMode, Source, TagFlag
@@ -100,8 +99,6 @@ def test_the_model_says_and_does_what_the_gateware_does(pair: Pair, seed: int) -
         config[r.EXTERNAL_ARM] = r.EXTERNAL_ARM.pack(enable=choose.getrandbits(1))
         if choose.random() < 0.6:
             spoil(choose, config)
-        if r.LED.lead.of(config[r.LED]) + LEAD_MARGIN > config[r.SUBSTEP_CLOCKS]:
-            config[r.LED] &= ~r.LED.lead.put(r.LED.lead.limit)  # the model asks for more margin
         load(choose, pair, config, code)
         for register, value in config.items():
             pair.write(register.address, list(register.to_words(value)))

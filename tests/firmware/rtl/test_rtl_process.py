@@ -14,11 +14,13 @@ import pytest
 
 import acquire.sim.rtl
 from acquire.cli.demo_capture import record
-from acquire.cli.demo_plan import DemoPlan
+from acquire.cli.demo_plan import DemoPlan, trigger_settings
 from acquire.cli.journal import Journal
 from acquire.codes import PrbsCode, mix_seed
-from acquire.config import TriggerConfig
+from acquire.config import TriggerConfig, load_rig
 from acquire.errors import DeviceError, TriggerError, UsageError
+from acquire.rig import Rig
+from acquire.sim.lines import StreamingArm
 from acquire.sim.pins import PinPage, PinRun, PinWire
 from acquire.sim.rtl import RtlTransport
 from acquire.store import open_recording
@@ -145,6 +147,7 @@ def test_without_a_compiler_the_rig_says_what_to_install(
 
 
 def test_the_demo_records_from_the_gateware(tmp_path: Path) -> None:
+    """Every pixel is Eq. (1) with the code that was asked for; the light came from the LED's pin."""
     out = tmp_path / "out"
     out.mkdir()
     captured = record(DemoPlan(out, lines=700, trigger="rtl"), Journal())
@@ -154,11 +157,18 @@ def test_the_demo_records_from_the_gateware(tmp_path: Path) -> None:
     assert recording.lines == 700
     assert recording.attrs["trigger"]["model"] == "sync trigger (none)"
     assert recording.attrs["config"]["trigger"]["driver"] == "rtl"
-    camera = recording.camera("a")
-    index = np.asarray(camera.code_index[:])
-    assert (np.diff(index) == 3).all()
-    lines = np.asarray(camera.lines[:], np.float64)
-    assert lines.std() > 1  # the light was on
+    plan = DemoPlan(out, trigger="rtl")
+    config = load_rig(plan.config, {"code.seed": plan.seed, **trigger_settings(plan)})
+    with Rig(config) as rig:
+        scene = rig.scene()
+    for arm in "ab":
+        camera, asked = recording.camera(arm), config.cameras.arm(arm)
+        first = int(camera.line_number[0])
+        np.testing.assert_array_equal(camera.code_index[:], 3 * np.arange(first, first + 700))
+        light = StreamingArm(scene, config.code.build(), 64, 3, arm).lines(first, 700)
+        assert light.std() > 1
+        dn = np.clip(np.rint(light * np.float32(asked.responsivity_dn)), 0, asked.white_dn)
+        np.testing.assert_array_equal(camera.lines[:], dn)
 
 
 def test_a_killed_demo_leaves_nothing_behind(tmp_path: Path) -> None:
