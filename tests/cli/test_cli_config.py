@@ -66,7 +66,7 @@ def test_bad_files_name_the_key(cli: Cli, rig_file: Path, before: str, after: st
         ("a.delay_ticks = 2650", "pulse A 90 ticks wide, 2650 late; possible: delay + width below the 2700"),
         ("b.width_ticks = 2700", "pulse B 2700 ticks wide, 0 late"),
         ("light.open_ticks = 901", "light from tick 901 to 900 of a sub-step; possible: within 0 to 900"),
-        ("substep_ticks = 200\nlight.lead_ticks = 200", "light 200 ticks ahead; possible: at most 196"),
+        ("substep_ticks = 200\nlight.lead_ticks = 200", "light 200 ticks ahead; possible: at most 199"),
         (
             "light.scene_gate = true",
             "light behind the scene gate; possible: trigger.light.scene_gate = false",
@@ -80,7 +80,7 @@ def test_bad_files_name_the_key(cli: Cli, rig_file: Path, before: str, after: st
         ("driver = 'serial'", "driver 'serial' needs a url"),
         (
             "driver = 'serial'\nurl = 'x'\nbaud = 9600",
-            "possible: every 1251 lines over a link of 960 bytes/s",
+            "possible: every 2501 lines over a link of 960 bytes/s",
         ),
     ],
 )
