@@ -18,6 +18,9 @@ from amaranth.lib.wiring import In, Out
 
 from acquire.trigger.registers import CODE_LENGTH, COMMAND, Command, EndReason, ErrorCode, State, TagFlag
 
+SETTLE_CLOCKS = 4
+"""After ARM, before an edge starts: the code memory's first bit takes as long. A START comes later anyway."""
+
 
 class Commands(wiring.Component):
     execute: In(1)
@@ -76,7 +79,9 @@ class Commands(wiring.Component):
             self.address.eq(COMMAND.address),
             begun.eq(self.running),
         ]
-        self._follow(m, armed, runs, over)
+        settling = Signal(range(SETTLE_CLOCKS + 1))
+        m.d.sync += settling.eq(Mux(self.arm, SETTLE_CLOCKS, Mux(settling == 0, 0, settling - 1)))
+        self._follow(m, self.edge & (settling == 0), armed, runs, over)
         asked = {command: Signal(name=f"{command.name.lower()}_asked") for command in Command}
         m.d.sync += [signal.eq(self.command == command) for command, signal in asked.items()]
         with m.If(pending):
@@ -146,9 +151,9 @@ class Commands(wiring.Component):
         with m.Else():
             m.d.sync += self.error.eq(ErrorCode.BUSY)
 
-    def _follow(self, m: Module, armed: Value, runs: Value, over: Value) -> None:
+    def _follow(self, m: Module, edge: Value, armed: Value, runs: Value, over: Value) -> None:
         """What happens without the host. A command of the same clock comes later and wins."""
-        with m.If(armed & self.edge):
+        with m.If(armed & edge):
             m.d.comb += self.start.eq(1)
             m.d.sync += [self.state.eq(State.RUNNING), self.external.eq(1)]
         with m.If((armed | runs) & ~self.clock_locked):

@@ -219,7 +219,7 @@ class SyncTrigger(wiring.Component):
         host, code, commands = self.host, self.code, self.commands
         m.d.comb += [
             code.host_address.eq(host.code_address),
-            code.host_read.eq(host.code_read & commands.idle),
+            code.host_read.eq(host.code_read & host.idle),
             host.code_data.eq(code.host_data),
             code.host_write.eq(host.code_write),
             code.host_word.eq(host.write_data),
