@@ -58,8 +58,9 @@ One WRITE of three words from RUN_ID on: run id, command. Asking again changes n
 
 | command | what is done | asked again | refused |
 |---|---|---|---|
-| ARM | configuration checked, counters cleared, state ARMED | ACK while the same run is armed or running | \
-BUSY: another run; RUN_OVER: this run has ended; 32 and more: the configuration, see REJECT |
+| ARM | configuration checked, counters cleared, state ARMED; an external edge of the next 4 clocks is \
+ignored | ACK while the same run is armed or running | BUSY: another run, or the last tag of the run before \
+waits for room; RUN_OVER: this run has ended; 32 and more: the configuration, see REJECT |
 | START | line 0 begins start_latency + LED.lead clocks later | ACK while the same run runs or has ended | \
 NOT_ARMED, WRONG_RUN |
 | STOP | the run ends after the line that runs; no line if none has begun | ACK | WRONG_RUN |
