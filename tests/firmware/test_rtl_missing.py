@@ -29,15 +29,16 @@ def test_without_yosys_the_reason_is_given(monkeypatch: pytest.MonkeyPatch, tmp_
     assert firmware.cxxrtl.missing() == "Amaranth (pip install 'tdi-acquire[firmware]')"
 
 
-def test_the_summary_names_what_was_left_out(pytester_free_reporter: list[str]) -> None:
-    assert pytester_free_reporter == ["tests/firmware/rtl was left out: there is no g++"]
+def test_the_summary_names_what_was_left_out(summary: list[str]) -> None:
+    assert summary[:1] == ["tests/firmware/rtl was left out: there is no g++"]
 
 
 @pytest.fixture
-def pytester_free_reporter(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """What the run's summary says on a machine without a compiler."""
-    import conftest
-
+def summary(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What this folder's conftest says at the end of a run on a machine without a compiler."""
+    here = str(Path(__file__).with_name("conftest.py"))
+    plugins = request.config.pluginmanager.get_plugins()
+    conftest: Any = next(plugin for plugin in plugins if getattr(plugin, "__file__", None) == here)
     said: list[str] = []
 
     class Reporter:
