@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from types import TracebackType
 
     from acquire.camera.base import CameraOpener
-    from acquire.config import RigConfig, SceneConfig
+    from acquire.config import RigConfig
+    from acquire.scene_config import SceneConfig
     from acquire.sim.scenes import Scene
     from acquire.trigger.base import Trigger
 

@@ -8,10 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquire.config import LedSceneConfig, load_rig
+from acquire.config import load_rig
 from acquire.errors import ConfigError
 from acquire.geometry import Geometry
 from acquire.rig import Rig, open_trigger
+from acquire.scene_config import LedSceneConfig
 from acquire.sim import build_scene, truth
 from acquire.trigger.base import TriggerRun
 

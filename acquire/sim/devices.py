@@ -29,7 +29,8 @@ from acquire.trigger.base import LineTag, TriggerIdentity
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from acquire.config import CameraConfig, GeometryConfig, SceneConfig
+    from acquire.config import CameraConfig, GeometryConfig
+    from acquire.scene_config import SceneConfig
     from acquire.sim.clock import PulseTrain, Reading, Wire
     from acquire.trigger.base import TriggerRun
 
