@@ -12,6 +12,7 @@ from acquire.config import load_scene
 from acquire.lines import ARMS
 from acquire.sim.clock import Wire
 from acquire.sim.devices import SimulatedCameraOpener, SimulatedOptics, SimulatedTrigger
+from acquire.sim.effects import in_order
 from acquire.sim.scenes import build_scene
 
 if TYPE_CHECKING:
@@ -43,7 +44,12 @@ class Rig:
 
     def describe(self) -> dict[str, Any]:
         """What a recording must say about where its lines come from (JSON)."""
-        return {"simulated": True, "scene": self._scene.model_dump(mode="json"), "effects": []}
+        return describe(self._scene)
+
+    @property
+    def layout(self) -> str:
+        """How the instrument is laid out: ``dual``, ``compact``, ``emulated``, ``interline``."""
+        return self._scene.optics.layout
 
     def scene(self) -> Scene:
         """What the simulated cameras see, in camera A's rows and columns; sub-step 0 is the run's first."""
@@ -66,6 +72,12 @@ class Rig:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def describe(scene: SceneConfig) -> dict[str, Any]:
+    """What a recording of a simulated scene says of it: effects in the order in which they acted (JSON)."""
+    effects = [effect.model_dump(mode="json") for effect in in_order(scene.effects)]
+    return {"simulated": True, "scene": scene.model_dump(mode="json"), "effects": effects}
 
 
 def open_trigger(config: RigConfig, wire: Wire | None = None) -> Trigger:

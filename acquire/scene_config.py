@@ -160,6 +160,9 @@ class OpticsConfig(FrozenModel):
     sensor_pixels: int = Field(default=256, ge=2, le=65536, description="compact: columns of the camera")
     column_a: int = Field(default=0, ge=0, description="compact: first column of arm A")
     column_b: int | None = Field(default=None, ge=0, description="compact: absent: half-way")
+    raw_bits: int = Field(
+        default=12, ge=1, le=16, description="emulated: of the lines before they are merged"
+    )
     baseline_factor: int = Field(default=3, ge=1, le=16, description="interline: fine sub-steps per step")
 
 

@@ -35,7 +35,8 @@ def mean_drive(drive: Drive, first: int, count: int, substep_s: float) -> NDArra
             mean = mean_over(lambda x: _pulse_area(x, drive.duty), cycles, step)
         case TriangleDrive():
             mean = mean_over(_triangle_area, cycles, step)
-    return drive.low + (drive.high - drive.low) * mean
+    light: Phase = drive.low + (drive.high - drive.low) * mean
+    return light
 
 
 def phase(first: int, count: int, cycles_per_substep: float, phase_deg: float) -> Phase:
@@ -59,9 +60,11 @@ def triangle_within(x: Phase) -> Phase:
 
 def _triangle_area(x: Phase) -> Phase:
     whole = np.floor(x)
-    return whole / 2 + triangle_within(x - whole)
+    area: Phase = whole / 2 + triangle_within(x - whole)
+    return area
 
 
 def _pulse_area(x: Phase, duty: float) -> Phase:
     whole = np.floor(x)
-    return whole * duty + np.minimum(x - whole, duty)
+    area: Phase = whole * duty + np.minimum(x - whole, duty)
+    return area
