@@ -12,7 +12,7 @@ from acquire.config import load_scene
 from acquire.lines import ARMS
 from acquire.sim.clock import Wire
 from acquire.sim.devices import SimulatedCameraOpener, SimulatedOptics, SimulatedTrigger
-from acquire.sim.effects import in_order
+from acquire.sim.pipeline import describe
 from acquire.sim.scenes import build_scene
 
 if TYPE_CHECKING:
@@ -72,12 +72,6 @@ class Rig:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
-
-
-def describe(scene: SceneConfig) -> dict[str, Any]:
-    """What a recording of a simulated scene says of it: effects in the order in which they acted (JSON)."""
-    effects = [effect.model_dump(mode="json") for effect in in_order(scene.effects)]
-    return {"simulated": True, "scene": scene.model_dump(mode="json"), "effects": effects}
 
 
 def open_trigger(config: RigConfig, wire: Wire | None = None) -> Trigger:

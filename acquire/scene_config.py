@@ -171,6 +171,7 @@ class SceneBase(FrozenModel):
 
     title: str = ""
     rig: str = Field(default="rig-demo", description="the rig that `acquire simulate` takes for it")
+    lines: int = Field(default=33_334, ge=1, description="that `acquire simulate` writes")
     shutters: tuple[ShutterConfig, ...] = ()
     optics: OpticsConfig = OpticsConfig()
     seed: int = Field(default=0, ge=0, description="of the effects' random streams")

@@ -21,6 +21,7 @@ import numpy as np
 
 from acquire.errors import UsageError
 from acquire.lines import ARMS, LineFlag
+from acquire.sim.effects import in_order
 from acquire.sim.effects.base import TILE_LINES, Setting, Stage
 from acquire.sim.light import Illumination
 from acquire.sim.lines import StreamingArm
@@ -254,6 +255,12 @@ class _Image:
         return lines.astype(np.float64)
 
 
+def describe(scene: SceneConfig) -> dict[str, Any]:
+    """What a recording of a simulated scene says of it: effects in the order in which they acted (JSON)."""
+    effects = [effect.model_dump(mode="json") for effect in in_order(scene.effects)]
+    return {"simulated": True, "scene": scene.model_dump(mode="json"), "effects": effects}
+
+
 def _sensor(
     bench: Bench,
     name: str,
@@ -329,7 +336,7 @@ def _compact(bench: Bench, arm: str, code: Code, converter: Converter) -> Cut:
             f"compact layout with images of {M} columns at {columns['a']} and {columns['b']}",
             possible=f"two ranges beside each other on {optics.sensor_pixels} columns",
         )
-    if bench.cameras["a"] != bench.cameras["b"]:
+    if converter != Converter.of(bench.cameras["b"]) or converter != Converter.of(bench.cameras["a"]):
         raise UsageError(
             "compact layout with two different cameras", possible="cameras.a and .b alike: it has one"
         )

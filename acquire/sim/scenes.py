@@ -86,10 +86,15 @@ class MaskScene:
 
     def frames(self, first: int, count: int) -> NDArray[np.float32]:
         """(count, row, column) float32."""
-        intensity = self.intensity(first, count).astype(np.float32)
-        frames = np.zeros((count, self.size, self.size), np.float32)
-        for mask, light in zip(self.masks, intensity, strict=True):
-            frames += light[:, None, None] * mask
+        return self.frames_at(np.arange(first, first + count))
+
+    def frames_at(self, substeps: NDArray[np.int64]) -> NDArray[np.float32]:
+        """(count, row, column) float32."""
+        first, last = (int(substeps[0]), int(substeps[-1])) if len(substeps) else (0, -1)
+        light = self.intensity(first, last + 1 - first)[:, substeps - first].astype(np.float32)
+        frames: NDArray[np.float32] = np.multiply.outer(light[0], self.masks[0])
+        for mask, of_time in zip(self.masks[1:], light[1:], strict=True):
+            frames += of_time[:, None, None] * mask
         return frames
 
 
