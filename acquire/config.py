@@ -56,6 +56,11 @@ class PrbsConfig(_Model):
     kind: Literal["prbs"] = "prbs"
     degree: int = Field(default=64, description="degree of the register: " + ", ".join(map(str, TAPS)))
     seed: int = Field(default=1, ge=0, description="any number; the register's first state is mixed from it")
+    state: str | None = Field(
+        default=None,
+        pattern="^0x[0-9a-f]+$",
+        description="the register's first state itself, instead of a seed",
+    )
 
     @model_validator(mode="after")
     def _degree_known(self) -> PrbsConfig:
@@ -64,7 +69,8 @@ class PrbsConfig(_Model):
         return self
 
     def build(self) -> Code:
-        return PrbsCode(self.degree, mix_seed(self.seed, self.degree))
+        state = mix_seed(self.seed, self.degree) if self.state is None else int(self.state, 16)
+        return PrbsCode(self.degree, state)
 
 
 class ConstantCodeConfig(_Model):
@@ -157,6 +163,9 @@ class SimulationConfig(_Model):
 
     scene: str = Field(description="a scene file, beside this file or one of the built-in ones")
     speed: float = Field(default=1.0, gt=0, le=1000, description="simulated seconds per second")
+    replay: Path | None = Field(default=None, description="a recording whose lines the cameras give instead")
+    replay_loop: bool = Field(default=False, description="over and over")
+    replay_hold_s: float = Field(default=0.0, ge=0, le=2.5, description="by which replayed lines come late")
 
 
 def _prbs_unless_said(value: Any) -> Any:

@@ -13,7 +13,9 @@ from acquire.lines import ARMS
 from acquire.sim.clock import Wire
 from acquire.sim.devices import SimulatedCameraOpener, SimulatedOptics, SimulatedTrigger
 from acquire.sim.pipeline import describe
+from acquire.sim.replay import ReplayCameraOpener, describe_replay
 from acquire.sim.scenes import build_scene
+from acquire.store import open_recording
 
 if TYPE_CHECKING:
     from types import TracebackType
@@ -40,16 +42,20 @@ class Rig:
 
     def openers(self) -> dict[str, CameraOpener]:
         """Arm → what opens its camera, here or in a process being spawned."""
+        if self.config.simulation.replay is not None:
+            return {arm: _replay_opener(self.config, self._wire, arm) for arm in ARMS}
         return {arm: _camera_opener(self.config, self._scene, self._wire, arm) for arm in ARMS}
 
     def describe(self) -> dict[str, Any]:
         """What a recording must say about where its lines come from (JSON)."""
-        return describe(self._scene)
+        replay = self.config.simulation.replay
+        return describe(self._scene) if replay is None else describe_replay(replay)
 
     @property
     def layout(self) -> str:
         """How the instrument is laid out: ``dual``, ``compact``, ``emulated``, ``interline``."""
-        return self._scene.optics.layout
+        replay = self.config.simulation.replay
+        return self._scene.optics.layout if replay is None else str(open_recording(replay).attrs["layout"])
 
     def scene(self) -> Scene:
         """What the simulated cameras see, in camera A's rows and columns; sub-step 0 is the run's first."""
@@ -85,4 +91,17 @@ def _camera_opener(config: RigConfig, scene: SceneConfig, wire: Wire, arm: str) 
     optics = SimulatedOptics(arm, config.geometry, scene)
     return SimulatedCameraOpener(
         wire, optics, config.cameras.arm(arm), config.stream.block_lines, config.line_rate_hz
+    )
+
+
+def _replay_opener(config: RigConfig, wire: Wire, arm: str) -> CameraOpener:
+    simulation = config.simulation
+    assert simulation.replay is not None
+    return ReplayCameraOpener(
+        wire,
+        simulation.replay,
+        arm,
+        config.stream.block_lines,
+        simulation.replay_loop,
+        simulation.replay_hold_s,
     )

@@ -62,11 +62,18 @@ def record(plan: DemoPlan, journal: Journal) -> Captured:
 
 @contextmanager
 def daemon(plan: DemoPlan, socket: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """``acquire serve`` as a process of its own, which ends with the block, however that ends."""
+    """``acquire serve`` for the demonstration."""
     options = [f"--config={plan.config}", f"--socket={socket}", f"--set=code.seed={plan.seed}"]
+    with daemon_process(options, plan.out / LOG) as process:
+        yield process
+
+
+@contextmanager
+def daemon_process(options: list[str], log: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """``acquire serve`` as a process of its own, which ends with the block, however that ends."""
     command = [sys.executable, "-m", "acquire", "serve", *options]
     with (
-        (plan.out / LOG).open("wb") as file,
+        log.open("wb") as file,
         subprocess.Popen(  # noqa: S603  # ourselves
             command, stderr=file, stdout=file
         ) as process,
@@ -110,14 +117,14 @@ def _record(client: Client, path: Path, lines: int) -> Captured:
     started = time.perf_counter()
     client.start(path, lines=lines)
     with stage_progress("recording") as advance:
-        status = _follow(client, lines, advance)
+        status = follow(client, lines, advance)
     if status.last is None or status.last.condition != "GOOD":
         reason = status.fault or (status.last and f"{status.last.condition}: {status.last.end_reason}")
         raise DataError(f"the recording {path} is not whole: {reason}", hint=f"acquire info {path}")
     return Captured(path, status, time.perf_counter() - started)
 
 
-def _follow(client: Client, lines: int, advance: Callable[[int, int], None]) -> Status:
+def follow(client: Client, lines: int, advance: Callable[[int, int], None]) -> Status:
     """Poll until the daemon is idle again; give up when nothing moves."""
     seen, moved = -1, time.monotonic()
     while (status := client.status()).state not in {State.IDLE, State.FAULTED}:
