@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,6 +37,8 @@ _PAGE_LINES = 4096
 _KEPT_FLAGS = np.uint16(LineFlag.INCOMPLETE)
 """What was seen of a line by its camera; all else is found again."""
 _NAP_S = 0.001
+_CATCH_UP = Fraction(5, 4)
+"""Lines per pulse of a camera that is behind."""
 
 
 def replay_code(recording: Recording) -> Code:
@@ -89,6 +92,7 @@ class ReplayCamera:
         self._rows = self._recording.lines
         self._run: int | None = None
         self._delivered = self._lost = 0
+        self._not_before_ns = 0
         self._ready: deque[CameraBlock] = deque()
         self._page: tuple[int, NDArray[Any], NDArray[np.uint16]] | None = None
 
@@ -106,6 +110,7 @@ class ReplayCamera:
             raise CameraError("a replay was armed while the trigger runs", hint="arm it before the start")
         self._run = reading.run + 1
         self._delivered = self._lost = 0
+        self._not_before_ns = 0
         self._ready.clear()
 
     def next_block(self, timeout_s: float) -> CameraBlock | None:
@@ -115,13 +120,11 @@ class ReplayCamera:
         if self._ready:
             return self._ready.popleft()
         deadline_ns = self._wire.clock.monotonic_ns() + int(timeout_s * 1e9)
-        while (count := self._due()) < self._opener.block_lines:
-            if self._ended() and count:
-                break
+        while not (count := self._deliverable()):
             if self._wire.clock.monotonic_ns() >= deadline_ns:
                 return None
             self._wire.clock.sleep(min(_NAP_S, timeout_s))
-        self._ready.extend(self._blocks(min(count, self._opener.block_lines)))
+        self._ready.extend(self._blocks(count))
         return self._ready.popleft() if self._ready else None
 
     def release(self, block: CameraBlock) -> None:
@@ -135,6 +138,21 @@ class ReplayCamera:
 
     def close(self) -> None:
         self.disarm()
+
+    def _deliverable(self) -> int:
+        """Lines of the next block, 0 before its time.
+
+        A camera that fell behind catches up, but no faster than a recorder can take: reading is so much
+        faster than the pulses come that the ring would overflow.
+        """
+        now_ns, count = self._wire.clock.monotonic_ns(), self._due()
+        if now_ns < self._not_before_ns or (count < self._opener.block_lines and not self._ended()):
+            return 0
+        count = min(count, self._opener.block_lines)
+        train = self._wire.look().train
+        if train is not None:
+            self._not_before_ns = now_ns + int(count * train.line_period_ns / train.speed / _CATCH_UP)
+        return count
 
     def _due(self) -> int:
         """Lines whose pulses came ``hold_s`` ago or earlier, and which are not delivered."""

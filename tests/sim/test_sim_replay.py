@@ -48,7 +48,7 @@ def play(stored, pulses, **changes):
         if not changes.get("hold_s"):
             wire.stop()
         blocks: list[CameraBlock] = [held] if held else []
-        while (block := camera.next_block(0.0)) is not None:
+        while (block := camera.next_block(0.1)) is not None:
             blocks.append(block)
         return blocks, camera.statistics(), held
     finally:
