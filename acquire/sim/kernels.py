@@ -34,14 +34,18 @@ def add_along_columns(
 ) -> None:
     """out[r, oldest[i] + c] += light[i]·frames[i, r, c]: charge that moves from the last column to the first.
 
-    ``out`` is (row of the scene, packet of charge), so that both are walked in their order.
+    ``out`` is (row of the scene, packet of charge), so that both are walked in their order; a few frames at a
+    time, as many as the cache holds beside a row of packets. (Slices, because numba would otherwise ask of
+    every element whether its index is negative.)
     """
-    for i in range(frames.shape[0]):
-        begin = max(0, -oldest[i])
-        end = min(frames.shape[2], out.shape[1] - oldest[i])
+    for chunk in range(0, frames.shape[0], 8):
         for r in range(frames.shape[1]):
-            for c in range(begin, end):
-                out[r, oldest[i] + c] += light[i] * frames[i, r, c]
+            for i in range(chunk, min(chunk + 8, frames.shape[0])):
+                begin = max(0, -oldest[i])
+                end = min(frames.shape[2], out.shape[1] - oldest[i])
+                to, source = out[r, oldest[i] + begin : oldest[i] + end], frames[i, r, begin:end]
+                for c in range(end - begin):
+                    to[c] += light[i] * source[c]
 
 
 @numba.njit(cache=True, nogil=True)

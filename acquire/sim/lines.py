@@ -180,8 +180,10 @@ class FrameLines:
             self._gather(packets, S * first_line, first, min(self._block, end - first))
         self._unfinished = gathered[S * count :].copy()
         self._next_line = first_line + count
-        whole = gathered[: S * count, np.argsort(self._columns)]
-        merged: NDArray[Any] = whole.reshape(count, S, n // S, S).sum(axis=3).sum(axis=1)
+        whole = gathered[: S * count, :: 1 if self._columns[0] <= self._columns[-1] else -1]
+        merged = np.zeros((count, n // S))
+        for u, c in np.ndindex(S, S):
+            merged += whole[u::S, c::S]
         return merged.astype(np.float32)
 
     def _gather(self, packets: NDArray[np.float64], first_packet: int, first: int, count: int) -> None:
