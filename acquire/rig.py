@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Self
 
+from acquire.codes import ConstantCode
 from acquire.config import load_scene
 from acquire.lines import ARMS
 from acquire.sim.clock import Wire
 from acquire.sim.devices import SimulatedCameraOpener, SimulatedOptics, SimulatedTrigger
-from acquire.sim.pipeline import describe
+from acquire.sim.pipeline import Bench, describe
 from acquire.sim.replay import ReplayCameraOpener, describe_replay
 from acquire.sim.scenes import build_scene
 from acquire.store import open_recording
@@ -30,12 +31,15 @@ if TYPE_CHECKING:
 class Rig:
     """The devices of one instrument; a context manager that lets go of them.
 
-    Building one reads the scene's file and touches no device: ConfigError is all it raises.
+    Building one reads the scene and touches no device. Raises ConfigError for files and values, UsageError
+    for a scene that cannot be shown to these cameras.
     """
 
     def __init__(self, config: RigConfig) -> None:
         self.config = config
         self._scene = load_scene(config.simulation.scene)
+        if config.simulation.replay is None:
+            _check_scene(config, self._scene)
         self._wire = Wire()
         self._closed = False
         self.trigger: Trigger = open_trigger(config, self._wire)
@@ -78,6 +82,15 @@ class Rig:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _check_scene(config: RigConfig, scene: SceneConfig) -> None:
+    """Raise UsageError here rather than in a camera's process."""
+    code = ConstantCode(0)
+    substep_s = config.trigger.substep_ticks / config.trigger.clock_hz
+    bench = Bench(scene, config.geometry, {arm: config.cameras.arm(arm) for arm in ARMS}, substep_s)
+    for arm in ARMS:
+        bench.camera(arm, code)
 
 
 def open_trigger(config: RigConfig, wire: Wire | None = None) -> Trigger:

@@ -65,6 +65,8 @@ def chop(
     for i in range(frames.shape[0]):
         for r in range(frames.shape[1]):
             for c in range(frames.shape[2]):
+                if frames[i, r, c] == 0:
+                    continue
                 x = (angle[r, c] - turned[i]) * blades
                 x -= np.floor(x)
                 inside = min(x, open_part - x) if x < open_part else -min(x - open_part, 1 - x)
@@ -74,14 +76,19 @@ def chop(
 
 @numba.njit(cache=True, nogil=True)
 def paste(
-    frames: NDArray[Any], picture: NDArray[Any], alpha: NDArray[Any], place: NDArray[Any], scale: float
+    frames: NDArray[Any],
+    picture: NDArray[Any],
+    alpha: NDArray[Any],
+    place: NDArray[Any],
+    scale: float,
+    reach: float,
 ) -> None:
     """Draw a turned picture over frames, bilinear; ``place`` is (frame: row, column, cosine, sine) in pixels.
 
-    ``scale`` is texels per pixel. frame ← frame·(1 − alpha) + picture, which is multiplied by its alpha.
+    ``scale`` is texels per pixel, ``reach`` how far the picture goes from its middle, in pixels.
+    frame ← frame·(1 − alpha) + picture, which is multiplied by its alpha.
     """
     n, side = frames.shape[1], picture.shape[0]
-    reach = side / scale * 0.7072
     for i in range(frames.shape[0]):
         row, column, cosine, sine = place[i, 0], place[i, 1], place[i, 2], place[i, 3]
         for r in range(max(0, int(row - reach)), min(n, int(row + reach) + 2)):

@@ -27,7 +27,6 @@ from numpy.lib.stride_tricks import sliding_window_view
 from acquire.errors import UsageError
 from acquire.lines import ARMS
 from acquire.scene_config import ArmOptics, OpticsConfig
-from acquire.sim.kernels import add_along_columns, add_along_rows
 from acquire.sim.light import Illumination
 from acquire.sim.scenes import SeparableScene, frames_at
 
@@ -144,6 +143,9 @@ class FrameLines:
     """Lines of any scene; what unfinished packets have gathered is kept for the call that continues."""
 
     def __init__(self, scene: Scene, light: Illumination, substeps: int, optics: ArmOptics) -> None:
+        from acquire.sim import kernels  # a compiler, which separable scenes do without
+
+        self._kernels = kernels
         self._scene, self._source, self._substeps = scene, light, substeps
         n = scene.size
         self._block = max(1, _BLOCK_BYTES // (4 * n**2))
@@ -195,11 +197,11 @@ class FrameLines:
         frames = frames_at(self._scene, first + lit)
         newest = first + lit - first_packet
         if self._along_rows:
-            add_along_rows(frames, light[lit], newest, self._rows, packets)
+            self._kernels.add_along_rows(frames, light[lit], newest, self._rows, packets)
         else:
             if self._rows[0] < self._rows[-1]:
                 frames = frames[:, :, ::-1]
-            add_along_columns(frames, light[lit], newest - (self._scene.size - 1), packets)
+            self._kernels.add_along_columns(frames, light[lit], newest - (self._scene.size - 1), packets)
 
 
 def seen(video: NDArray[Any], optics: ArmOptics) -> NDArray[Any]:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from acquire.errors import UsageError
+from acquire.errors import DataError, UsageError
 from acquire.sim.functions import checked_light
 
 if TYPE_CHECKING:
@@ -208,6 +208,12 @@ class _PictureFile:
         self.frame_rate_hz = 1000 / duration_ms if duration_ms > 0 else None
 
     def frame(self, index: int) -> Light:
+        try:
+            return self._read(index)
+        except (OSError, SyntaxError, ValueError, EOFError) as error:
+            raise DataError(f"{self._path}: frame {index} cannot be read: {error}") from error
+
+    def _read(self, index: int) -> Light:
         from PIL import Image
 
         with Image.open(self._path) as image:
@@ -271,13 +277,21 @@ class _Container:
         if index < self._next - 1 or self._latest is None:
             self._next, self._decoded = 0, self._decode()
         while self._next <= index:
-            latest = next(self._decoded, None)
+            latest = self._decode_next()
             if latest is None and self._latest is None:
                 raise UsageError(f"{self._path}: no frame can be decoded")
             self._latest = self._latest if latest is None else latest
             self._next += 1
         assert self._latest is not None
         return self._latest
+
+    def _decode_next(self) -> Light | None:
+        import av
+
+        try:
+            return next(self._decoded, None)
+        except av.FFmpegError as error:
+            raise DataError(f"{self._path}: frame {self._next} cannot be decoded: {error}") from error
 
     def _decode(self) -> Iterator[Light]:
         import av

@@ -54,10 +54,12 @@ class _Sprite:
         picture, alpha = _picture(config.picture)
         self._picture = (picture * config.level).astype(np.float32)
         self._alpha = alpha.astype(np.float32)
+        covered = np.argwhere(alpha > 0) - (len(alpha) - 1) / 2
+        self._reach_texels = float(np.hypot(*covered.T).max(initial=0)) + 1
 
     def draw(self, frames: NDArray[np.float32], substeps: NDArray[np.int64]) -> None:
         scale = len(self._picture) / (self._config.size * self._size)
-        paste(frames, self._picture, self._alpha, self._places(substeps), scale)
+        paste(frames, self._picture, self._alpha, self._places(substeps), scale, self._reach_texels / scale)
 
     def _places(self, substeps: NDArray[np.int64]) -> Grid:
         """(frame, 4): row and column in pixels, cosine and sine of the heading."""

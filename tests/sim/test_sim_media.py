@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from acquire.config import load_scene
-from acquire.errors import UsageError
+from acquire.errors import DataError, UsageError
 from acquire.scene_config import SpriteConfig, SpritesSceneConfig, VideoSceneConfig
 from acquire.sim.media import _KEPT_FRAMES, VideoScene, resample
 from acquire.sim.scenes import build_scene
@@ -156,3 +156,24 @@ def test_a_picture_of_the_user_swims(tmp_path):
     frame = scene.frames(0, 1)[0]
     assert frame.sum() == pytest.approx(400, rel=0.05)
     np.testing.assert_allclose(np.argwhere(frame > 0.5).mean(axis=0) + 0.5, (25, 12.5), atol=0.6)
+
+
+def test_a_container_that_breaks_off_ends_with_its_last_frame(tmp_path):
+    noise = RNG.integers(0, 255, (40, 64, 64)).astype(np.uint8)
+    write_container(tmp_path / "late.mkv", noise, 25, "ffv1")
+    whole = (tmp_path / "late.mkv").read_bytes()
+    (tmp_path / "late.mkv").write_bytes(whole[: int(len(whole) * 0.7)])
+    scene = shown(tmp_path / "late.mkv", size=8, substep_s=0.04, between="hold", end="last")
+    assert 20 < scene._source.count < 35
+    expected = resample(noise[10].astype(np.float32) / 255, 8)
+    np.testing.assert_allclose(scene.frames(10, 1)[0], expected, atol=0.02)
+    np.testing.assert_array_equal(*scene.frames(60, 2))
+
+
+def test_a_frame_that_cannot_be_read_is_named(tmp_path, monkeypatch):
+    frames = [Image.fromarray(np.full((9, 9), grey, np.uint8)) for grey in (1, 200, 90)]
+    frames[0].save(tmp_path / "v.gif", save_all=True, append_images=frames[1:], duration=40)
+    scene = shown(tmp_path / "v.gif", size=8, substep_s=0.04, between="hold")
+    (tmp_path / "v.gif").write_bytes((tmp_path / "v.gif").read_bytes()[:40])
+    with pytest.raises(DataError, match=r"v\.gif: frame 2 cannot be read"):
+        scene.frames(2, 1)
