@@ -109,6 +109,13 @@ def setting(**changes):
     return Setting(**(facts | camera | {"scene": scene} | changes))
 
 
+def through(camera, value, *more):
+    """Through every stage of a camera, in order."""
+    for stage in camera.stages:
+        value = stage.run(value, *more)
+    return value
+
+
 # What holds for all of them
 
 
@@ -213,8 +220,7 @@ def test_prnu_and_dsnu_are_fixed_patterns_of_their_size():
     dark, bright = 0.0, 1.0
     for kind, level, sigma in (("dsnu", dark, 40.0), ("prnu", bright, 0.02 * FLAT / K)):
         sensor = bench(flat(level, effects(kind), **wide)).camera("a", LIT)._sensor
-        stage = next(stage for stage in sensor.stages if stage.effect == kind)
-        change = stage.run(np.full((2, 4000), level * FLAT / K), 0) - level * FLAT / K
+        change = through(sensor, np.full((2, 4000), level * FLAT / K), 0) - level * FLAT / K
         np.testing.assert_array_equal(change[0], change[1])
         assert change[0].std() == pytest.approx(sigma, rel=0.05)
         assert abs(change[0].mean()) < 4 * sigma / np.sqrt(4000)
@@ -252,10 +258,10 @@ def test_an_adc_of_fewer_bits_has_fewer_levels_and_an_end():
 
 def test_wrong_bits_come_at_their_rate_and_late_light_is_late():
     scene = build_scene(flat(), N, DT)
-    stage = bench(flat(listed=effects("code_errors", late_substeps=0))).camera("a", CODE).stages[0]
-    wrong = stage.run(Illumination.of(scene, CODE)).bits(0, 100_000) != CODE.bits(0, 100_000)
+    camera = bench(flat(listed=effects("code_errors", late_substeps=0))).camera("a", CODE)
+    wrong = through(camera, Illumination.of(scene, CODE)).bits(0, 100_000) != CODE.bits(0, 100_000)
     assert wrong.mean() == pytest.approx(0.02, rel=0.1)
-    assert not stage.run(Illumination.of(scene, CODE)).bits(-900, 900).any()
+    assert not through(camera, Illumination.of(scene, CODE)).bits(-900, 900).any()
     late = read(blinking(effects("code_errors", flip_rate=0.0, late_substeps=3)), 64, CODE)
 
     class Late:
@@ -268,9 +274,9 @@ def test_wrong_bits_come_at_their_rate_and_late_light_is_late():
 @pytest.mark.parametrize(("carrier_hz", "bits"), [(1e6, 4), (400e3, 8), (37e3, 6), (3e3, 8)])
 def test_pwm_switches_full_light_for_the_duty_cycle(carrier_hz, bits):
     config = blinking(effects("pwm", carrier_hz=carrier_hz, bits=bits))
-    stage = bench(config).camera("a", LIT).stages[0]
+    camera = bench(config).camera("a", LIT)
     scene = build_scene(config, N, DT)
-    drives = stage.run(Illumination.of(scene, LIT)).drives(-700, 3000)[0]
+    drives = through(camera, Illumination.of(scene, LIT)).drives(-700, 3000)[0]
     duty = np.rint(scene.intensity(-40_000, 80_000, 1 / carrier_hz)[0] * 2**bits) / 2**bits
     fine = (np.arange(200 * 1000) + 0.5) / 1000
     cycle = fine * DT * carrier_hz
@@ -295,8 +301,8 @@ def test_led_rise_and_fall_follow_the_exponentials():
             return ((t >= 0) & (t < 5)).astype(np.uint8)
 
     listed = effects("led_rise_fall", rise_s=rise * DT, fall_s=fall * DT)
-    stage = bench(flat(listed=listed)).camera("a", LIT).stages[0]
-    light = stage.run(Illumination.of(build_scene(flat(), N, DT), Pulse())).light(-3, 20)[0]
+    camera = bench(flat(listed=listed)).camera("a", LIT)
+    light = through(camera, Illumination.of(build_scene(flat(), N, DT), Pulse())).light(-3, 20)[0]
     fine = (np.arange(20 * 2000) + 0.5) / 2000 - 3
     peak = 1 - np.exp(-5 / rise)
     exact = np.where(fine < 5, 1 - np.exp(-np.maximum(fine, 0) / rise), peak * np.exp(-(fine - 5) / fall))
@@ -311,9 +317,9 @@ def test_jitter_has_its_histogram_and_moves_light_between_neighbours():
     assert steps.mean() == pytest.approx(0, abs=0.001)
     assert (np.abs(steps) < 0.1).mean() == pytest.approx(0.683, abs=0.005)
     assert abs(np.corrcoef(steps[:-1], steps[1:])[0, 1]) < 0.01
-    stage = bench(flat(listed=effects("trigger_jitter"))).camera("a", CODE).stages[0]
+    camera = bench(flat(listed=effects("trigger_jitter"))).camera("a", CODE)
     ideal = Illumination.of(build_scene(flat(), N, DT), CODE)
-    moved = stage.run(ideal).light(100, 20_000)[0] - ideal.light(100, 20_000)[0]
+    moved = through(camera, ideal).light(100, 20_000)[0] - ideal.light(100, 20_000)[0]
     # Light until x is piecewise linear; a step gathers what falls between its late beginning and late end.
     until = np.concatenate([[0], np.cumsum(CODE.bits(99, 20_002), dtype=float)])
     edges = np.arange(1, 20_002) + delay(100, 20_001)
