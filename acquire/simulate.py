@@ -18,6 +18,7 @@ from acquire.clock import ClockFit
 from acquire.errors import AcquireError, UsageError
 from acquire.lines import ARMS, LineBlock, LineFlag
 from acquire.sim.pipeline import Bench, describe
+from acquire.sim.stopwatch import Stopwatch
 from acquire.store import RecordingSpec, RecordingWriter, RunCondition
 from acquire.stream.losses import Cause
 from acquire.stream.tagger import Tagger
@@ -38,6 +39,8 @@ _BLOCK_LINES = 1024
 _QUANTISATION = 1 / 12
 """Variance of rounding to whole DN."""
 STUDIED_LINES = 512
+BARE = "Eq. (1)"
+LOSS = "dropped_lines"
 TEMPORAL_NOISE = ("shot_noise", "dark_current", "read_noise")
 
 
@@ -62,13 +65,14 @@ class Worth:
     """What one effect does to the lines of both arms.
 
     ``change_dn`` is the RMS change when it alone is left out, ``noises`` the same in units of the lines'
-    temporal noise, ``us_per_line`` the time that it takes.
+    temporal noise (None for lines that are lost: they do not change, and are known), ``us_per_line`` the time
+    that it takes.
     """
 
     effect: str
     place: str
     change_dn: float
-    noises: float
+    noises: float | None
     us_per_line: float
 
 
@@ -124,23 +128,21 @@ def simulate(
 
 def study(bench: Bench, code: Code, lines: int = STUDIED_LINES) -> Study:
     """Leave out one effect after the other, over ``lines`` lines of both arms that are exposed throughout."""
-    full, full_s = _sample(bench, code, lines)
-    again, _ = _sample(replace(bench, realisation=bench.realisation + 1), code, lines)
-    _, bare_s = _sample(bench.without(*(effect.kind for effect in bench.scene.effects)), code, lines)
+    us_per_line, places = _times(bench, code, lines), _places(bench, code)
+    bench = bench.without(LOSS)
+    full = _sample(bench, code, lines)
+    again = _sample(replace(bench, realisation=bench.realisation + 1), code, lines)
+    quiet = _sample(bench.without(*TEMPORAL_NOISE), code, lines)
     noise_dn = float(np.sqrt(np.mean((full - again) ** 2) / 2 + _QUANTISATION))
     worths = []
-    quiet, _ = _sample(bench.without(*TEMPORAL_NOISE), code, lines)
-    for effect, place in _places(bench, code):
-        without, seconds = _sample(bench.without(effect), code, lines)
+    for effect, place in places:
         if effect in TEMPORAL_NOISE:
-            change = float(np.sqrt(np.mean((full - without) ** 2)))
+            change = _rms(full - _sample(bench.without(effect), code, lines))
         else:  # noise that is drawn anew for other lines is not the effect's doing
-            expected, _ = _sample(bench.without(effect, *TEMPORAL_NOISE), code, lines)
-            change = float(np.sqrt(np.mean((quiet - expected) ** 2)))
-        saved_us = (full_s - seconds) / (2 * lines) * 1e6
-        worths.append(Worth(effect, place, change, change / noise_dn, saved_us))
-    per_line_us = 1e6 / (2 * lines)
-    return Study(noise_dn, float(full.std()), bare_s * per_line_us, full_s * per_line_us, tuple(worths))
+            change = _rms(quiet - _sample(bench.without(effect, *TEMPORAL_NOISE), code, lines))
+        noises = None if effect == LOSS else change / noise_dn
+        worths.append(Worth(effect, place, change, noises, us_per_line.get(effect, 0.0)))
+    return Study(noise_dn, float(full.std()), us_per_line[BARE], sum(us_per_line.values()), tuple(worths))
 
 
 def _write(
@@ -224,15 +226,25 @@ def _places(bench: Bench, code: Code) -> Sequence[tuple[str, str]]:
     return sorted(found.items(), key=lambda item: ORDER.index(item[0]))
 
 
-def _sample(bench: Bench, code: Code, lines: int) -> tuple[NDArray[np.float64], float]:
-    """Lines of both arms (2·lines, M), none of them lost, and the better of two times for them."""
-    kept = bench.without("dropped_lines")
-    cameras = [kept.camera(arm, code) for arm in ARMS]
+def _sample(bench: Bench, code: Code, lines: int) -> NDArray[np.float64]:
+    """Lines of both arms, one after the other: (2·lines, M)."""
     first = bench.geometry.stages + 1
-    times = []
-    for _ in range(2):
-        began = time.perf_counter()
-        parts = [camera.read(first, lines).pixels for camera in cameras]
-        times.append(time.perf_counter() - began)
-        first += lines
-    return np.concatenate(parts).astype(np.float64), min(times)
+    return np.concatenate([bench.camera(arm, code).read(first, lines).pixels for arm in ARMS]).astype(
+        np.float64
+    )
+
+
+def _rms(change: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(change**2)))
+
+
+def _times(bench: Bench, code: Code, lines: int) -> dict[str, float]:
+    """Microseconds per line and arm, by effect and of the bare model: what each does by itself."""
+    stopwatch = Stopwatch()
+    cameras = [replace(bench, stopwatch=stopwatch).camera(arm, code) for arm in ARMS]
+    for camera in cameras:
+        camera.read(0, 1)
+    stopwatch.seconds.clear()
+    for camera in cameras:
+        stopwatch.timed(BARE, camera.read)(bench.geometry.stages + 1, lines)
+    return {name: seconds / (2 * lines) * 1e6 for name, seconds in stopwatch.seconds.items()}

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, quantity
+from acquire.cli.output import JsonFlag, print_facts, print_json, print_table
 from acquire.cli.progress import stage_progress
 from acquire.errors import UsageError
 
@@ -96,7 +96,7 @@ def _print_study(found: Study, *, explain: bool) -> None:
     typer.echo()
     if explain:
         rows = [("Eq. (1)", "forward", f"{found.bare_us_per_line:.2f}")]
-        rows += [(worth.effect, worth.place, f"{worth.us_per_line:+.2f}") for worth in found.effects]
+        rows += [(worth.effect, worth.place, f"{worth.us_per_line:.2f}") for worth in found.effects]
         rows.append(("all", "", f"{found.all_us_per_line:.2f}"))
         print_table(("stage", "acts on", "us per line and arm"), rows)
         typer.echo()
@@ -104,14 +104,15 @@ def _print_study(found: Study, *, explain: bool) -> None:
         f"signal {found.signal_dn:.3g} DN RMS, temporal noise {found.noise_dn:.3g} DN RMS (rounding included)"
     )
     if found.effects:
-        by_size = sorted(found.effects, key=lambda worth: -worth.noises)
-        changes = [(w.effect, f"{w.change_dn:.3g}", f"{w.noises:.3g}", verdict(w)) for w in by_size]
+        by_size = sorted(found.effects, key=lambda worth: -(worth.noises or 0))
+        changes = [(w.effect, f"{w.change_dn:.3g}", f"{w.noises or 0:.3g}", verdict(w)) for w in by_size]
         print_table(("left out", "lines change by DN", "noises", "so"), changes)
 
 
 def verdict(worth: Worth) -> str:
     """What an effect's size means for the scene."""
+    if worth.noises is None:
+        return "lines are lost, and known to be"
     if worth.noises < 0.05:
-        gain = f", saves {quantity(worth.us_per_line * 1e-6, 's')} a line" if worth.us_per_line > 1 else ""
-        return f"can be left out{gain}"
+        return f"can be left out, saves {worth.us_per_line:.2f} us a line"
     return "small beside the noise" if worth.noises < 0.5 else "matters"

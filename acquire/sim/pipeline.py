@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from acquire.config import CameraConfig, GeometryConfig
     from acquire.scene_config import OpticsConfig, SceneConfig
     from acquire.sim.scenes import Scene
+    from acquire.sim.stopwatch import Stopwatch
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +84,7 @@ class Bench:
     cameras: dict[str, CameraConfig]
     substep_s: float
     realisation: int = 0
+    stopwatch: Stopwatch | None = None
 
     def without(self, *effects: str) -> Bench:
         """The same bench, some effects not listed."""
@@ -300,7 +302,8 @@ def _stages(bench: Bench, setting: Setting) -> list[Stage]:
         return []
     from acquire.sim.effects import build_stages
 
-    return build_stages(bench.scene.effects, setting)
+    stages = build_stages(bench.scene.effects, setting)
+    return stages if bench.stopwatch is None else [bench.stopwatch.stage(stage) for stage in stages]
 
 
 def _image(
