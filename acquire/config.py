@@ -83,13 +83,68 @@ class ConstantCodeConfig(_Model):
         return ConstantCode(self.value)
 
 
+class LineOutputConfig(_Model):
+    """The line trigger of one camera, in ticks of the trigger's clock."""
+
+    enable: bool = True
+    delay_ticks: int = Field(default=0, ge=0, lt=2**24, description="from the line's start to the pulse")
+    width_ticks: int | None = Field(
+        default=None, ge=1, lt=2**24, description="absent: a third of the distance of pulses, at most 90"
+    )
+    active: Literal["high", "low"] = "high"
+    direction: Literal["forward", "reverse"] = "forward"
+    strobe: bool = Field(default=False, description="the camera answers every pulse: count those it misses")
+
+
+class LightOutputConfig(_Model):
+    """The LED output: code bit AND window AND scene gate."""
+
+    enable: bool = True
+    lead_ticks: int = Field(default=0, ge=0, le=255, description="by which light precedes its sub-step")
+    open_ticks: int = Field(default=0, ge=0, lt=2**24, description="of a sub-step, from which light may be")
+    close_ticks: int | None = Field(
+        default=None, ge=1, lt=2**24, description="from which it may not; absent: the sub-step's end"
+    )
+    scene_gate: bool = Field(default=False, description="only while the scene gate input allows it")
+    active: Literal["high", "low"] = "high"
+
+
 class TriggerConfig(_Model):
     """The sync trigger and its timing."""
 
-    driver: Literal["simulated"] = "simulated"
+    driver: Literal["simulated", "rtl", "serial", "usb"] = "simulated"
+    url: str = Field(default="", description="driver 'serial': /dev/tty…, socket://host:port")
+    baud: int = Field(default=3_000_000, ge=9600, description="driver 'serial'")
+    flow_control: Literal["none", "rts-cts"] = Field(
+        default="none", description="driver 'serial'; 'rts-cts' where the board wires both lines"
+    )
+    serial: str = Field(default="", description="driver 'usb': serial number; absent: any")
     clock_hz: int = Field(default=90_000_000, ge=1_000_000, le=1_000_000_000)
-    substep_ticks: int = Field(default=900, ge=5, le=2**24, description="duration of a sub-step in ticks")
+    substep_ticks: int = Field(default=900, ge=5, lt=2**24, description="duration of a sub-step in ticks")
     tag_every_lines: int = Field(default=256, ge=1, le=65536)
+    line_start: Literal["per-line", "per-substep"] = Field(
+        default="per-line", description="when the cameras are triggered"
+    )
+    camera_min_period_ticks: int = Field(
+        default=0, ge=0, lt=2**32, description="closest pulses that the cameras stand; 0: any"
+    )
+    line_budget: int = Field(
+        default=0, ge=0, lt=2**48, description="lines after which a run ends; 0: endless"
+    )
+    watchdog_ticks: int = Field(
+        default=0, ge=0, lt=2**32, description="of silence of the host after which a run ends; 0: never"
+    )
+    external_start: Literal["off", "rising", "falling"] = "off"
+    external_timeout_s: float = Field(default=10.0, gt=0, description="wait for the external start")
+    light: LightOutputConfig = LightOutputConfig()
+    a: LineOutputConfig = LineOutputConfig()
+    b: LineOutputConfig = LineOutputConfig()
+
+    @model_validator(mode="after")
+    def _port_known(self) -> TriggerConfig:
+        if self.driver == "serial" and not self.url:
+            raise ValueError("driver 'serial' needs a url: /dev/ttyUSB0, socket://host:port")
+        return self
 
 
 class CameraConfig(_Model):

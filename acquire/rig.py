@@ -6,26 +6,41 @@ through the wire that the rig lays between simulated ones.
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
 from acquire.codes import ConstantCode
-from acquire.config import load_scene
+from acquire.config import LightOutputConfig, load_scene
+from acquire.errors import ConfigError, TriggerError
 from acquire.lines import ARMS
+from acquire.sim import rtl
 from acquire.sim.clock import Wire
-from acquire.sim.devices import SimulatedCameraOpener, SimulatedOptics, SimulatedTrigger
+from acquire.sim.devices import SimulatedCameraOpener, SimulatedOptics
+from acquire.sim.pins import PinPage, PinWire
 from acquire.sim.pipeline import Bench, describe
 from acquire.sim.replay import ReplayCameraOpener, describe_replay
 from acquire.sim.scenes import build_scene
+from acquire.sim.trigger_model import TriggerModel
+from acquire.sim.trigger_registers import INPUTS as SIMULATED_INPUTS
+from acquire.sim.twin_links import TwinTransport
 from acquire.store import open_recording
+from acquire.trigger.base import TriggerRun
+from acquire.trigger.driver import TriggerDriver
+from acquire.trigger.settings import GATEWARE, register_values
+from acquire.trigger.transports.serial import BITS_PER_BYTE, SerialTransport
+from acquire.trigger.transports.usb import UsbTransport
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from types import TracebackType
 
     from acquire.camera.base import CameraOpener
-    from acquire.config import RigConfig
+    from acquire.config import RigConfig, TriggerConfig
     from acquire.scene_config import SceneConfig
     from acquire.sim.scenes import Scene
     from acquire.trigger.base import Trigger
+    from acquire.trigger.transports import Transport
 
 
 class Rig:
@@ -36,19 +51,21 @@ class Rig:
     """
 
     def __init__(self, config: RigConfig) -> None:
+        check_rig(config)
         self.config = config
         self._scene = load_scene(config.simulation.scene)
         if config.simulation.replay is None:
             _check_scene(config, self._scene)
         self._wire = Wire()
+        self._pins = PinPage() if config.trigger.driver == "rtl" else None
         self._closed = False
-        self.trigger: Trigger = open_trigger(config, self._wire)
+        self.trigger: Trigger = open_trigger(config, self._wire, self._pins)
 
     def openers(self) -> dict[str, CameraOpener]:
         """Arm → what opens its camera, here or in a process being spawned."""
         if self.config.simulation.replay is not None:
             return {arm: _replay_opener(self.config, self._wire, arm) for arm in ARMS}
-        return {arm: _camera_opener(self.config, self._scene, self._wire, arm) for arm in ARMS}
+        return {arm: _camera_opener(self.config, self._scene, self._pulses(arm), arm) for arm in ARMS}
 
     def describe(self) -> dict[str, Any]:
         """What a recording must say about where its lines come from (JSON)."""
@@ -74,6 +91,12 @@ class Rig:
             self._closed = True
             self.trigger.close()
             self._wire.close()
+            if self._pins is not None:
+                self._pins.close()
+
+    def _pulses(self, arm: str) -> Wire | PinWire:
+        """Where an arm's camera sees its trigger's pulses."""
+        return self._wire if self._pins is None else PinWire(self._pins, arm)
 
     def __enter__(self) -> Self:
         return self
@@ -93,14 +116,82 @@ def _check_scene(config: RigConfig, scene: SceneConfig) -> None:
         bench.camera(arm, code)
 
 
-def open_trigger(config: RigConfig, wire: Wire | None = None) -> Trigger:
-    """The rig's trigger; without a ``wire`` it pulses for nobody."""
-    return SimulatedTrigger(
-        wire or Wire(), config.trigger.clock_hz, config.geometry.substeps, config.simulation.speed
+def check_rig(config: RigConfig) -> None:
+    """Raise ConfigError for what no trigger, or not the rig's simulated cameras, can honour."""
+    trigger = config.trigger
+    if config.simulation.replay is not None and trigger.driver != "simulated":
+        raise ConfigError(
+            f"trigger.driver = {trigger.driver!r} with simulation.replay", possible="'simulated'"
+        )
+    run = TriggerRun(
+        "check",
+        config.code.build(),
+        config.geometry.substeps,
+        trigger.substep_ticks,
+        trigger.tag_every_lines,
     )
+    possible = replace(GATEWARE, clock_hz=trigger.clock_hz)
+    if trigger.driver == "simulated":
+        possible = replace(possible, inputs=SIMULATED_INPUTS)
+    try:
+        register_values(run, trigger, possible, _link_bytes_per_s(trigger))
+    except TriggerError as error:
+        raise ConfigError(error.message, possible=error.possible, hint=error.hint) from error
+    _check_simulated_cameras(trigger)
 
 
-def _camera_opener(config: RigConfig, scene: SceneConfig, wire: Wire, arm: str) -> CameraOpener:
+def _link_bytes_per_s(trigger: TriggerConfig) -> float:
+    match trigger.driver:
+        case "serial":
+            return trigger.baud / BITS_PER_BYTE
+        case "rtl":
+            return rtl.baud(trigger.clock_hz) / BITS_PER_BYTE
+        case "simulated" | "usb":
+            return float("inf")
+
+
+def _check_simulated_cameras(trigger: TriggerConfig) -> None:
+    """They see when lines begin and which code the light follows; a simulated trigger has no inputs."""
+    light, plain = trigger.light, LightOutputConfig()
+    same = (light.open_ticks, light.close_ticks) == (plain.open_ticks, plain.close_ticks)
+    for ignored, key, possible in (
+        (trigger.driver in ("serial", "usb"), f"driver = {trigger.driver!r}", "'simulated'"),
+        (trigger.external_start != "off", f"external_start = {trigger.external_start!r}", "'off'"),
+        (trigger.line_start != "per-line", f"line_start = {trigger.line_start!r}", "'per-line'"),
+        (not trigger.a.enable, "a.enable = false", "true"),
+        (not trigger.b.enable, "b.enable = false", "true"),
+        (trigger.a.direction != "forward", f"a.direction = {trigger.a.direction!r}", "'forward'"),
+        (trigger.b.direction != "forward", f"b.direction = {trigger.b.direction!r}", "'forward'"),
+        (not same, "light.open_ticks, light.close_ticks", "absent: the whole sub-step"),
+    ):
+        if ignored:
+            raise ConfigError(f"trigger.{key}: cannot be simulated", possible=possible)
+
+
+def open_trigger(config: RigConfig, wire: Wire | None = None, pins: PinPage | None = None) -> Trigger:
+    """The rig's trigger; connected when first used. A simulated one without a ``wire``, or the gateware
+    without ``pins``, pulses for nobody."""
+    return TriggerDriver(_trigger_way(config, wire or Wire(), pins), config.trigger)
+
+
+def _trigger_way(config: RigConfig, wire: Wire, pins: PinPage | None) -> Callable[[], Transport]:
+    """What opens the way to the trigger's device."""
+    trigger = config.trigger
+    match trigger.driver:
+        case "simulated":
+            model = TriggerModel(wire, trigger.clock_hz, config.simulation.speed)
+            return partial(TwinTransport, model)
+        case "rtl":
+            return partial(rtl.RtlTransport, trigger.clock_hz, pins)
+        case "serial":
+            return partial(
+                SerialTransport, trigger.url, trigger.baud, rts_cts=trigger.flow_control == "rts-cts"
+            )
+        case "usb":
+            return partial(UsbTransport, serial=trigger.serial)
+
+
+def _camera_opener(config: RigConfig, scene: SceneConfig, wire: Wire | PinWire, arm: str) -> CameraOpener:
     optics = SimulatedOptics(arm, config.geometry, scene)
     return SimulatedCameraOpener(
         wire, optics, config.cameras.arm(arm), config.stream.block_lines, config.line_rate_hz

@@ -152,3 +152,14 @@ def test_devices_deliver_what_simulate_writes_effects_layout_losses_and_all(conf
             assert len(seen) < 200
             assert camera.statistics()["lost"] >= 200 - len(seen)
     assert rig.layout == "compact"
+
+
+def test_on_the_gateware_each_camera_follows_its_own_trigger_pin(config):
+    """Nothing is started until the trigger is used."""
+    before = open_descriptors()
+    rtl = config.model_copy(update={"trigger": config.trigger.model_copy(update={"driver": "rtl"})})
+    with Rig(rtl) as rig:
+        wires = [opener.wire for opener in rig.openers().values()]
+        assert [wire.arm for wire in wires] == ["a", "b"]
+        assert all(wire.look().train is None for wire in wires)
+    assert open_descriptors() == before

@@ -30,8 +30,10 @@ def check(file: FileArgument, json: JsonFlag = False) -> None:
     Example: [bold]acquire config check rig-demo[/]
     """
     from acquire.config import check_directory, load_rig, load_scene
+    from acquire.rig import check_rig
 
     rig = load_rig(file)
+    check_rig(rig)
     load_scene(rig.simulation.scene)
     check_directory(rig)
     facts = _facts(rig)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
-from acquire.cli.demo_plan import LINES, RIG, SEED, TWIST_BUDGET_S, DemoPlan, check
+from acquire.cli.demo_plan import LINES, RIG, SEED, TWIST_BUDGET_S, DemoPlan, check, trigger_settings
 from acquire.cli.journal import Journal
 from acquire.cli.output import JsonFlag, print_facts, print_json
 
@@ -29,6 +29,10 @@ def demo(
         float, typer.Option(metavar="SECONDS", help="For the paper's solver.")
     ] = TWIST_BUDGET_S,
     config: Annotated[str, typer.Option("--config", "-c", metavar="FILE", help="Rig file.")] = RIG,
+    trigger: Annotated[
+        Literal["simulated", "rtl"],
+        typer.Option(help="A model of the sync trigger, or its gateware itself, clock by clock."),
+    ] = "simulated",
     json: JsonFlag = False,
 ) -> None:
     """Record Scene #1 of the paper with a simulated rig, reconstruct it, and write a report.
@@ -39,17 +43,19 @@ def demo(
     """
     from acquire.config import load_rig
 
-    plan = DemoPlan(out or _free(Path("acquire-demo")), config, seed, lines, budget, twist_budget)
-    rig = load_rig(config)
+    plan = DemoPlan(out or _free(Path("acquire-demo")), config, seed, lines, budget, twist_budget, trigger)
+    rig = load_rig(config, trigger_settings(plan))
     check(plan, rig)
 
     from acquire.cli.demo_analysis import analyse
-    from acquire.cli.demo_capture import record
+    from acquire.cli.demo_capture import compile_gateware, record
     from acquire.evaluate.report import write_report
     from acquire.evaluate.summary import summarise
 
     plan.out.mkdir()
     journal = Journal()
+    if rig.trigger.driver == "rtl":
+        compile_gateware(rig, journal)
     result = analyse(plan, record(plan, journal), rig, journal)
     with journal.stage("Write the report"):
         page = write_report(result, plan.out)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from acquire.cli.demo_plan import trigger_settings
 from acquire.cli.progress import stage_progress
 from acquire.daemon.client import Client
 from acquire.daemon.states import State
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
     from acquire.cli.demo_plan import DemoPlan
     from acquire.cli.journal import Journal
+    from acquire.config import RigConfig
     from acquire.daemon.messages import Status
 
 LOG = "daemon.log"
@@ -60,10 +62,26 @@ def record(plan: DemoPlan, journal: Journal) -> Captured:
     return captured
 
 
+def compile_gateware(rig: RigConfig, journal: Journal) -> None:
+    """So that arming need not wait for it; says how time will pass."""
+    from acquire.sim import rtl
+
+    timing = rig.trigger
+    with journal.stage("Compile the trigger's gateware") as note:
+        rtl.build(timing.clock_hz)
+        substep_us = 1e6 * timing.substep_ticks / timing.clock_hz
+        note["detail"] = (
+            f"{timing.substep_ticks} clocks per sub-step of {substep_us:g} us; "
+            "it records as fast as they can be computed"
+        )
+
+
 @contextmanager
 def daemon(plan: DemoPlan, socket: Path) -> Iterator[subprocess.Popen[bytes]]:
     """``acquire serve`` for the demonstration."""
-    options = [f"--config={plan.config}", f"--socket={socket}", f"--set=code.seed={plan.seed}"]
+    settings = {"code.seed": plan.seed, **trigger_settings(plan)}
+    options = [f"--config={plan.config}", f"--socket={socket}"]
+    options += [f"--set={key}={value!r}" for key, value in settings.items()]
     with daemon_process(options, plan.out / LOG) as process:
         yield process
 
@@ -71,11 +89,11 @@ def daemon(plan: DemoPlan, socket: Path) -> Iterator[subprocess.Popen[bytes]]:
 @contextmanager
 def daemon_process(options: list[str], log: Path) -> Iterator[subprocess.Popen[bytes]]:
     """``acquire serve`` as a process of its own, which ends with the block, however that ends."""
-    command = [sys.executable, "-m", "acquire", "serve", *options]
+    command = [sys.executable, "-m", "acquire", "serve", "--owned", *options]
     with (
         log.open("wb") as file,
         subprocess.Popen(  # noqa: S603  # ourselves
-            command, stderr=file, stdout=file
+            command, stdin=subprocess.PIPE, stderr=file, stdout=file
         ) as process,
     ):
         try:

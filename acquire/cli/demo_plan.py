@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from acquire.errors import UsageError
 
@@ -32,6 +32,11 @@ LEAST_SIDE = 11
 LEAST_FRAMES = 8
 """What the fit of a sinusoid with its harmonics takes."""
 
+RTL_TICKS = 60
+"""Clocks of a sub-step where the trigger is its gateware; and the lowest clock that a rig can have."""
+
+RTL_LEAST_HZ = 1_000_000
+
 
 @dataclass(frozen=True, slots=True)
 class DemoPlan:
@@ -43,6 +48,7 @@ class DemoPlan:
     lines: int = LINES
     budget_s: float | None = None
     twist_budget_s: float = TWIST_BUDGET_S
+    trigger: Literal["simulated", "rtl"] = "simulated"
 
     @property
     def command(self) -> str:
@@ -54,7 +60,25 @@ class DemoPlan:
             words += ["--budget", f"{self.budget_s:g}"]
         if self.twist_budget_s != TWIST_BUDGET_S:
             words += ["--twist-budget", f"{self.twist_budget_s:g}"]
+        if self.trigger != "simulated":
+            words += ["--trigger", self.trigger]
         return shlex.join(words)
+
+
+def trigger_settings(plan: DemoPlan) -> dict[str, str | int]:
+    """What the demonstration changes in its rig file, as `load_rig` takes it.
+
+    The gateware is computed clock by clock: it gets a slower clock, with few clocks in the same sub-step.
+    """
+    if plan.trigger == "simulated":
+        return {}
+    from acquire.config import load_rig
+
+    timing = load_rig(plan.config).trigger
+    ticks, clock_hz = timing.substep_ticks, timing.clock_hz
+    if ticks % RTL_TICKS == 0 and clock_hz * RTL_TICKS // ticks >= RTL_LEAST_HZ:
+        ticks, clock_hz = RTL_TICKS, clock_hz * RTL_TICKS // ticks
+    return {"trigger.driver": "rtl", "trigger.clock_hz": clock_hz, "trigger.substep_ticks": ticks}
 
 
 def check(plan: DemoPlan, rig: RigConfig) -> None:
@@ -65,6 +89,10 @@ def check(plan: DemoPlan, rig: RigConfig) -> None:
     _check_budgets(plan)
     _check_rig(plan, rig)
     check_directory(rig)
+    if rig.trigger.driver == "rtl":
+        from acquire.sim.rtl import demand
+
+        demand()
     least = segment_row(rig) + SEGMENT_LINES
     if plan.lines < least:
         raise UsageError(
@@ -91,8 +119,8 @@ def _check_budgets(plan: DemoPlan) -> None:
 
 
 def _check_rig(plan: DemoPlan, rig: RigConfig) -> None:
-    if rig.trigger.driver != "simulated":
-        raise UsageError(f"demo with trigger driver {rig.trigger.driver!r}", possible="'simulated'")
+    if rig.trigger.driver not in ("simulated", "rtl"):
+        raise UsageError(f"demo with trigger driver {rig.trigger.driver!r}", possible="'simulated', 'rtl'")
     if rig.code.kind != "prbs":
         raise UsageError(f"demo of {plan.config} with code.kind = {rig.code.kind!r}", possible="'prbs'")
     geometry = rig.geometry.segment(SEGMENT_LINES)

@@ -21,11 +21,19 @@ def print_json(value: Any) -> None:
 
 
 def print_facts(facts: Mapping[str, Any]) -> None:
-    """``name  value`` per line, aligned; None is left out."""
+    """``name  value`` per line, aligned; None is left out, several values stand side by side."""
     shown = {name: value for name, value in facts.items() if value is not None}
     width = max(map(len, shown), default=0)
     for name, value in shown.items():
-        typer.echo(f"{name:<{width}}  {value}")
+        typer.echo(f"{name:<{width}}  {_words(value)}")
+
+
+def _words(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{name} {_words(below)}" for name, below in value.items())
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return ", ".join(map(_words, value)) if isinstance(value, tuple) else str(value)
 
 
 def print_table(columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:

@@ -24,6 +24,9 @@ def serve(
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Change one value of the file, e.g. code.seed=7."),
     ] = None,
+    owned: Annotated[
+        bool, typer.Option("--owned", hidden=True, help="End as on SIGTERM when standard input is closed.")
+    ] = False,
 ) -> None:
     """Own the rig's devices and take commands, until SIGTERM or Ctrl-C.
 
@@ -32,6 +35,7 @@ def serve(
     Example: [bold]acquire serve --config rig-demo[/]
     """
     import logging
+    import threading
 
     from acquire.config import check_directory, load_rig, parse_settings
     from acquire.daemon.server import serve as run_daemon
@@ -43,4 +47,16 @@ def serve(
     check_directory(rig)
     logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO)
     logging.getLogger("uvicorn").setLevel(logging.WARNING)
+    if owned:
+        threading.Thread(target=_end_with_owner, name="acquire-owner", daemon=True).start()
     raise typer.Exit(run_daemon(rig))
+
+
+def _end_with_owner() -> None:
+    """The other end of standard input is closed by its owner's end, also by a kill."""
+    import os
+    import signal
+
+    while os.read(0, 1024):
+        pass
+    os.kill(os.getpid(), signal.SIGTERM)

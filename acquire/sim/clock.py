@@ -32,10 +32,13 @@ from multiprocessing.context import assert_spawning
 from multiprocessing.reduction import DupFd
 from typing import TYPE_CHECKING, Any, Protocol
 
+from acquire.codes import code_from_attrs
 from acquire.errors import DeviceError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+
+    from acquire.codes import Code
 
 _PAGE = 4096
 _SEQUENCE = struct.Struct("@Q")  # native: one 8-byte store
@@ -81,7 +84,8 @@ class PulseTrain:
 
     ``run`` counts the trains of a wire from 1; ``start_ns`` is CLOCK_MONOTONIC; ``line_period_ns`` is
     simulated time; ``code`` is what `acquire.codes.code_from_attrs` reads; ``stopped_after`` is the
-    number of pulses after which the train ended, None while it lasts.
+    number of pulses after which the train ended, None while it lasts; ``budget`` is the number that it
+    never exceeds, None where only a stop ends it.
     """
 
     run: int
@@ -90,13 +94,15 @@ class PulseTrain:
     speed: Fraction
     code: Mapping[str, Any]
     stopped_after: int | None = None
+    budget: int | None = None
 
     def issued(self, now_ns: int) -> int:
         """Pulses issued by ``now_ns``, pulse 0 at the start included; 0 before the start."""
         spacing = self.line_period_ns / self.speed
         elapsed_ns = now_ns - self.start_ns
         pulses = elapsed_ns * spacing.denominator // spacing.numerator + 1 if elapsed_ns >= 0 else 0
-        return pulses if self.stopped_after is None else min(pulses, self.stopped_after)
+        limits = [limit for limit in (self.stopped_after, self.budget) if limit is not None]
+        return min(pulses, *limits) if limits else pulses
 
     def due_ns(self, pulse: int) -> int:
         """The first whole ns (CLOCK_MONOTONIC) at which ``pulse`` has been issued."""
@@ -155,13 +161,14 @@ class Wire:
         speed: Fraction,
         code: Mapping[str, Any],
         start_ns: int | None = None,
+        budget: int | None = None,
     ) -> PulseTrain:
         """Begin a train now, or at ``start_ns``; DeviceError while another one lasts."""
         with self._writing:
             sequence, latest = self._observe()
             if latest.running:
                 raise DeviceError(f"pulse train {latest.run} still runs", hint="stop it first")
-            train = PulseTrain(latest.run + 1, 0, line_period_ns, speed, dict(code))
+            train = PulseTrain(latest.run + 1, 0, line_period_ns, speed, dict(code), budget=budget)
             if len(_encode(train)) > _ROOM:
                 raise UsageError(f"code of {len(_encode(train))} bytes", possible=f"{_ROOM} on the wire")
             return self._write(
@@ -181,6 +188,10 @@ class Wire:
     def look(self) -> Reading:
         """The latest train and the pulses it has issued at this moment."""
         return self._observe()[1]
+
+    def code(self, train: PulseTrain) -> Code:
+        """The light's code during a train."""
+        return code_from_attrs(train.code)
 
     def wait(self, run: int, pulses: int, timeout_s: float) -> Reading:
         """Look until train ``run`` has issued ``pulses`` pulses or has ended, at most for ``timeout_s``.
@@ -239,12 +250,12 @@ class Wire:
 
 def _encode(train: PulseTrain) -> bytes:
     fields = (train.run, train.start_ns, str(train.line_period_ns), str(train.speed))
-    return json.dumps([*fields, dict(train.code), train.stopped_after]).encode()
+    return json.dumps([*fields, dict(train.code), train.stopped_after, train.budget]).encode()
 
 
 def _decode(payload: bytes) -> PulseTrain:
-    run, start_ns, line_period_ns, speed, code, stopped_after = json.loads(payload)
-    return PulseTrain(run, start_ns, Fraction(line_period_ns), Fraction(speed), code, stopped_after)
+    run, start_ns, line_period_ns, speed, code, stopped_after, budget = json.loads(payload)
+    return PulseTrain(run, start_ns, Fraction(line_period_ns), Fraction(speed), code, stopped_after, budget)
 
 
 def _receive(duplicate: Any) -> Wire:

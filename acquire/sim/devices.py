@@ -1,18 +1,16 @@
-"""Simulated trigger and cameras: the same protocols as the real ones, joined by a wire.
+"""Simulated cameras: the same protocol as the real ones, at the end of a simulated trigger's wire.
 
-The trigger only writes its pulse train on the wire. A camera reads the train, waits until the pulses of its
-next block have been issued and computes those lines from scene and code; the light's code comes with the
-pulses, as it does on the bench. A camera that computes more slowly than the pulses come is no camera that
-loses lines: the queue behind it has no end, it is merely late (``behind_lines``).
+The trigger (`acquire.sim.trigger_model`) only writes its pulse train there. A camera reads it, waits until
+the pulses of its next block have been issued and computes those lines from scene and code; the light's code
+comes with the pulses, as it does on the bench. A camera that computes more slowly than the pulses come is no
+camera that loses lines: the queue behind it has no end, it is merely late (``behind_lines``).
 """
 
 from __future__ import annotations
 
 import multiprocessing
-import threading
 from collections import deque
 from dataclasses import dataclass
-from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,123 +18,20 @@ import numpy as np
 from acquire import __version__
 from acquire.camera import base
 from acquire.camera.base import CameraBlock, CameraIdentity
-from acquire.clock import NS_PER_S, ClockFit
-from acquire.codes import code_from_attrs
-from acquire.errors import CameraError, TriggerError, UsageError
+from acquire.clock import NS_PER_S
+from acquire.errors import CameraError
 from acquire.lines import ARMS
 from acquire.sim.blas import limit_blas_threads
 from acquire.sim.pipeline import Bench, Camera, Readout
-from acquire.trigger.base import LineTag, TriggerIdentity
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from acquire.codes import Code
     from acquire.config import CameraConfig, GeometryConfig
     from acquire.scene_config import SceneConfig
     from acquire.sim.clock import PulseTrain, Reading, Wire
-    from acquire.trigger.base import TriggerRun
-
-_SUBSTEP_TICKS = range(5, 2**24 + 1)
-"""What the gateware's counter can do."""
-_TAGS_PER_CALL = 4096
-
-
-class SimulatedTrigger:
-    """A trigger whose pulses are worked out instead of sent.
-
-    Parameters
-    ----------
-    wire : the pulses' way to the cameras; the trigger is its only writer
-    clock_hz : frequency of its clock, in simulated time
-    substeps : S of the cameras that hang on the wire
-    speed : simulated seconds per second, taken as the decimal number it is written as
-
-    The clock fit holds at the start of a run; when ``speed`` is not 1, simulated time leaves UTC from there.
-    """
-
-    def __init__(self, wire: Wire, clock_hz: int, substeps: int, speed: float = 1.0) -> None:
-        self._wire = wire
-        self._clock_hz = clock_hz
-        self._substeps = substeps
-        self._speed = Fraction(str(speed))
-        self._lock = threading.Lock()
-        self._prepared: TriggerRun | None = None
-        self._run: TriggerRun | None = None
-        self._tags = 0
-
-    def identify(self) -> TriggerIdentity:
-        return TriggerIdentity("simulated trigger", "simulated", __version__, self._clock_hz)
-
-    def prepare(self, run: TriggerRun) -> None:
-        """Check and keep the run. Preparing the same run again changes nothing, even while it runs."""
-        with self._lock:
-            if self._wire.look().running:
-                if run == self._run:
-                    return
-                raise TriggerError(
-                    f"run {run.run_id!r} prepared while another one runs", hint="stop it first"
-                )
-            self._check(run)
-            self._prepared = run
-
-    def start(self) -> ClockFit:
-        with self._lock:
-            run = self._prepared
-            if run is None:
-                raise TriggerError("start of a trigger without a run", hint="prepare one")
-            utc_ns, monotonic_ns, uncertainty_ns = self._compare_clocks()
-            line_period_ns = Fraction(run.line_period_ticks * NS_PER_S, self._clock_hz)
-            train = self._wire.start(line_period_ns, self._speed, run.code.to_attrs())
-            self._run, self._prepared, self._tags = run, None, 0
-            return ClockFit(self._clock_hz, utc_ns + train.start_ns - monotonic_ns, uncertainty_ns)
-
-    def tags(self, timeout_s: float) -> list[LineTag]:
-        """At most 4096 tags at a time; a stop ends the wait."""
-        run = self._run
-        reading = self._wire.look()
-        if run is None or (reading.stopped and reading.issued <= self._tags * run.tag_every_lines):
-            self._wire.clock.sleep(timeout_s)
-            return []
-        line = self._tags * run.tag_every_lines
-        reading = self._wire.wait(reading.run, line + 1, timeout_s)
-        ready = range(line, reading.issued, run.tag_every_lines)[:_TAGS_PER_CALL]
-        self._tags += len(ready)
-        return [LineTag(k, k * run.substeps, k * run.line_period_ticks) for k in ready]
-
-    def stop(self) -> int:
-        with self._lock:
-            self._prepared = None
-            return self._wire.stop()
-
-    def statistics(self) -> dict[str, Any]:
-        return {"pulses": self._wire.look().issued, "tags": self._tags}
-
-    def close(self) -> None:
-        self.stop()
-
-    def _check(self, run: TriggerRun) -> None:
-        if run.substep_ticks not in _SUBSTEP_TICKS:
-            raise TriggerError(
-                f"sub-step of {run.substep_ticks} ticks",
-                possible=f"{_SUBSTEP_TICKS.start} to {_SUBSTEP_TICKS.stop - 1}",
-            )
-        if run.substeps != self._substeps:
-            raise TriggerError(
-                f"{run.substeps} sub-steps per line", possible=f"{self._substeps}, as the cameras have"
-            )
-        if run.tag_every_lines < 1:
-            raise TriggerError(f"a tag every {run.tag_every_lines} lines", possible="1 or more")
-        try:
-            code_from_attrs(run.code.to_attrs())
-        except UsageError as error:
-            raise TriggerError(f"the trigger cannot generate the code: {error}") from error
-
-    def _compare_clocks(self) -> tuple[int, int, int]:
-        """UTC, the monotonic clock at the same moment, and how far the two may be apart (ns)."""
-        clock = self._wire.clock
-        readings = [(clock.monotonic_ns(), clock.utc_ns(), clock.monotonic_ns()) for _ in range(5)]
-        before_ns, utc_ns, after_ns = min(readings, key=lambda reading: reading[2] - reading[0])
-        return utc_ns, (before_ns + after_ns) // 2, (after_ns - before_ns) // 2 + 1
+    from acquire.sim.pins import PinWire
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,11 +42,11 @@ class SimulatedOptics:
     geometry: GeometryConfig
     scene: SceneConfig
 
-    def expose(self, train: PulseTrain, config: CameraConfig) -> Camera:
-        """The lines that the arm's camera gives under a train's timing and code."""
+    def expose(self, train: PulseTrain, code: Code, config: CameraConfig) -> Camera:
+        """The lines that the arm's camera gives under a train's timing and the light's code."""
         substep_s = float(train.line_period_ns / (self.geometry.substeps * NS_PER_S))
         bench = Bench(self.scene, self.geometry, dict.fromkeys(ARMS, config), substep_s)
-        return bench.camera(self.arm, code_from_attrs(train.code))
+        return bench.camera(self.arm, code)
 
 
 class SimulatedCamera:
@@ -163,7 +58,12 @@ class SimulatedCamera:
     """
 
     def __init__(
-        self, wire: Wire, optics: SimulatedOptics, config: CameraConfig, block_lines: int, line_rate_hz: float
+        self,
+        wire: Wire | PinWire,
+        optics: SimulatedOptics,
+        config: CameraConfig,
+        block_lines: int,
+        line_rate_hz: float,
     ) -> None:
         self._wire, self._optics, self._config, self._block_lines = wire, optics, config, block_lines
         self._line_rate_hz = line_rate_hz
@@ -251,7 +151,8 @@ class SimulatedCamera:
     def _read_out(self, reading: Reading, count: int) -> CameraBlock | None:
         if self._light is None:
             assert reading.train is not None
-            self._light = self._optics.expose(reading.train, self._config)
+            code = self._wire.code(reading.train)
+            self._light = self._optics.expose(reading.train, code, self._config)
         first_line = self._first_pulse + self._delivered - self._depth_lines
         lines = self._light.read(first_line, count)
         if not lines.missing.any():
@@ -275,7 +176,7 @@ def _whole_runs(first: int, lines: Readout) -> Iterator[CameraBlock]:
 class SimulatedCameraOpener:
     """Opens one simulated camera in the process that calls it; can be given to a process being spawned."""
 
-    wire: Wire
+    wire: Wire | PinWire
     optics: SimulatedOptics
     config: CameraConfig
     block_lines: int

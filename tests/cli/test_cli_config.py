@@ -56,6 +56,51 @@ def test_bad_files_name_the_key(cli: Cli, rig_file: Path, before: str, after: st
         assert answer.out == ""
 
 
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        (
+            "substep_ticks = 9000\ncamera_min_period_ticks = 30_000",
+            "27000 ticks apart; possible: 30000 or more",
+        ),
+        ("a.delay_ticks = 2650", "pulse A 90 ticks wide, 2650 late; possible: delay + width below the 2700"),
+        ("b.width_ticks = 2700", "pulse B 2700 ticks wide, 0 late"),
+        ("light.open_ticks = 901", "light from tick 901 to 900 of a sub-step; possible: within 0 to 900"),
+        ("substep_ticks = 200\nlight.lead_ticks = 200", "light 200 ticks ahead; possible: at most 199"),
+        (
+            "light.scene_gate = true",
+            "light behind the scene gate; possible: trigger.light.scene_gate = false",
+        ),
+        ("b.strobe = true", "strobes of camera B"),
+        ("line_start = 'per-substep'", "trigger.line_start = 'per-substep': cannot be simulated"),
+        ("external_start = 'rising'", "trigger.external_start = 'rising': cannot be simulated"),
+        ("b.direction = 'reverse'", "trigger.b.direction = 'reverse': cannot be simulated"),
+        ("light.close_ticks = 450", "trigger.light.open_ticks, light.close_ticks: cannot be simulated"),
+        ("driver = 'serial'\nurl = '/dev/ttyUSB0'", "trigger.driver = 'serial': cannot be simulated"),
+        ("driver = 'serial'", "driver 'serial' needs a url"),
+        (
+            "driver = 'serial'\nurl = 'x'\nbaud = 9600",
+            "possible: every 2501 lines over a link of 960 bytes/s",
+        ),
+    ],
+)
+def test_what_no_trigger_can_honour_is_refused(cli: Cli, rig_file: Path, line: str, words: str) -> None:
+    text = rig_file.read_text(encoding="utf-8")
+    keys = [new.partition(" =")[0] for new in line.splitlines()]
+    kept = "\n".join(old for old in text.splitlines() if old.partition(" =")[0] not in keys)
+    rig_file.write_text(kept.replace("[trigger]", f"[trigger]\n{line}"), encoding="utf-8")
+    answer = cli("config", "check", rig_file)
+    assert answer.code == 2
+    assert words in " ".join(answer.err.split()).replace(" possible:", "; possible:")
+
+
+def test_sub_steps_that_no_trigger_has_are_found_by_check(cli: Cli, rig_file: Path) -> None:
+    rig_file.write_text(rig_file.read_text().replace("substeps = 3", "substeps = 4"))
+    answer = cli("config", "check", rig_file)
+    assert answer.code == 2
+    assert "4 sub-steps per line\n  possible: 1, 2, 3, 6\n  try: change geometry.substeps" in answer.err
+
+
 def test_bad_scene_is_found_by_check(cli: Cli, rig_file: Path) -> None:
     scene = (builtin_directory() / "scene-leds.toml").read_text(encoding="utf-8")
     (rig_file.parent / "scene-leds.toml").write_text(scene.replace("size = 0.36", "size = 3.6", 1))

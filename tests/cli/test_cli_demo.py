@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from acquire.cli.demo_capture import end
-from acquire.cli.demo_plan import DemoPlan
+from acquire.cli.demo_plan import DemoPlan, trigger_settings
 from acquire.config import builtin_directory
 
 Cli = Callable[..., Any]
@@ -65,6 +65,27 @@ def test_the_report_tells_the_command_that_does_the_same() -> None:
     assert other.command == (
         "acquire demo --seed 3 --lines 5000 --config 'my rig.toml' --budget 2 --twist-budget 1.5"
     )
+
+
+def test_the_gateware_gets_few_clocks_in_the_same_substep() -> None:
+    assert trigger_settings(DemoPlan(Path("out"))) == {}
+    rtl = DemoPlan(Path("out"), trigger="rtl")
+    assert trigger_settings(rtl) == {
+        "trigger.driver": "rtl",
+        "trigger.clock_hz": 6_000_000,
+        "trigger.substep_ticks": 60,
+    }
+    assert rtl.command == "acquire demo --seed 1 --lines 33334 --trigger rtl"
+
+
+def test_without_a_compiler_there_is_no_demo_on_the_gateware(
+    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    answer = cli("demo", "--trigger", "rtl", "--out", tmp_path / "new")
+    assert answer.code == 2
+    assert "apt install g++" in answer.err
+    assert not (tmp_path / "new").exists()
 
 
 def test_a_daemon_that_does_not_end_is_killed() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field
+from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -68,6 +69,21 @@ class ManualClock:
     def sleep(self, duration_s: float) -> None:
         self.now_ns += max(1, round(duration_s * 1e9))
         self.on_sleep()
+
+
+class Pulses:
+    """All that cameras see of a trigger."""
+
+    def __init__(self, wire: Wire) -> None:
+        self.wire = wire
+
+    def start(self, **changes: Any) -> None:
+        run = trigger_run(**changes)
+        period_ns = Fraction(run.line_period_ticks * 100, 9)
+        self.wire.start(period_ns, Fraction(1), run.code.to_attrs())
+
+    def stop(self) -> int:
+        return self.wire.stop()
 
 
 def trigger_run(**changes: Any) -> TriggerRun:

@@ -1,4 +1,4 @@
-"""Simulated trigger and cameras: on a clock that is told to move, and in processes of their own."""
+"""Simulated cameras at the end of a wire: on a clock that is told to move, and in processes of their own."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from sim_helpers import (
     CODE,
     LEDS,
     ManualClock,
+    Pulses,
     blas_child,
     camera_child,
     camera_config,
@@ -23,10 +24,14 @@ from sim_helpers import (
 )
 
 from acquire.codes import ConstantCode
-from acquire.errors import CameraError, TriggerError
+from acquire.config import TriggerConfig
+from acquire.errors import CameraError
 from acquire.sim.clock import Wire
-from acquire.sim.devices import SimulatedCamera, SimulatedCameraOpener, SimulatedTrigger
+from acquire.sim.devices import SimulatedCamera, SimulatedCameraOpener
 from acquire.sim.scenes import build_scene
+from acquire.sim.trigger_model import TriggerModel
+from acquire.sim.twin_links import TwinTransport
+from acquire.trigger.driver import TriggerDriver
 
 LINE_NS = 30_000
 LINE_RATE_HZ = 1e9 / LINE_NS
@@ -47,140 +52,17 @@ def wire(clock):
 
 @pytest.fixture
 def trigger(wire):
-    return SimulatedTrigger(wire, 90_000_000, S)
+    return Pulses(wire)
 
 
 def camera(wire, arm="a", block_lines=8, **config):
     return SimulatedCamera(wire, optics(arm), camera_config(**config), block_lines, LINE_RATE_HZ)
 
 
-def start(trigger, **changes):
-    trigger.prepare(trigger_run(**changes))
-    return trigger.start()
-
-
 def expected_dn(arm, pulses, code=CODE, substep_s=1e-5, first_pulse=0):
     scene = build_scene(LEDS, M * S, substep_s)
     Y = naive_lines(scene, code, M, S, arm, range(first_pulse - DEPTH, pulses - DEPTH))
     return np.clip(np.rint(5.0 + 40.0 * Y), 0, 4095)
-
-
-# the trigger
-
-
-def test_the_trigger_says_who_it_is(trigger):
-    identity = trigger.identify()
-    assert (identity.model, identity.clock_hz) == ("simulated trigger", 90_000_000)
-    assert trigger.statistics() == {"pulses": 0, "tags": 0}
-
-
-@pytest.mark.parametrize(
-    ("change", "word"),
-    [
-        ({"substep_ticks": 4}, "sub-step of 4 ticks; possible: 5 to 16777216"),
-        ({"substep_ticks": 2**24 + 1}, "sub-step of"),
-        ({"substeps": 4}, "4 sub-steps per line; possible: 3"),
-        ({"tag_every_lines": 0}, "a tag every 0 lines"),
-    ],
-)
-def test_a_run_that_cannot_be_honoured_is_refused(trigger, change, word):
-    with pytest.raises(TriggerError, match=word):
-        trigger.prepare(trigger_run(**change))
-    with pytest.raises(TriggerError, match="without a run"):
-        trigger.start()
-
-
-def test_a_code_that_a_trigger_cannot_generate_is_refused(trigger):
-    class Whim:
-        def bits(self, start, length):
-            return np.zeros(length, np.uint8)
-
-        def to_attrs(self):
-            return {"kind": "whim"}
-
-    with pytest.raises(TriggerError, match="'whim'"):
-        trigger.prepare(trigger_run(code=Whim()))
-
-
-def test_preparing_a_run_again_changes_nothing_another_one_needs_a_stop(trigger):
-    trigger.prepare(trigger_run())
-    start(trigger)
-    trigger.prepare(trigger_run())
-    assert trigger.statistics()["pulses"] == 1
-    with pytest.raises(TriggerError, match="'other' prepared while another one runs"):
-        trigger.prepare(trigger_run(run_id="other"))
-    with pytest.raises(TriggerError, match="without a run"):
-        trigger.start()
-    trigger.stop()
-    start(trigger, run_id="other")
-
-
-@pytest.mark.parametrize("speed", [0.5, 1.0, 50.0])
-def test_pulses_follow_the_clock_at_the_configured_speed(wire, clock, speed):
-    trigger = SimulatedTrigger(wire, 90_000_000, S, speed)
-    start(trigger)
-    for _ in range(5):
-        clock.now_ns += 7 * LINE_NS
-    assert trigger.stop() == int(35 * speed) + 1
-    clock.now_ns += 10 * LINE_NS
-    assert trigger.stop() == int(35 * speed) + 1
-
-
-@pytest.mark.parametrize("step_ns", [0, 1, 90, 12_345])
-def test_the_clock_fit_holds_within_its_uncertainty(clock, wire, trigger, step_ns):
-    clock.step_ns = step_ns
-    fit = start(trigger)
-    true_utc_ns = wire.look().train.start_ns + clock.utc_offset_ns
-    assert abs(fit.utc_ns_at_tick_0 - true_utc_ns) <= fit.uncertainty_ns
-    assert fit.uncertainty_ns <= step_ns + 1
-    assert fit.clock_hz == 90_000_000
-
-
-def test_tags_tell_line_code_index_and_tick(clock, trigger):
-    start(trigger)
-    (first,) = trigger.tags(0.1)
-    assert (first.line, first.code_index, first.tick) == (0, 0, 0)
-    clock.now_ns += 40 * LINE_NS
-    tags = trigger.tags(0.1)
-    assert [tag.line for tag in tags] == [16, 32]
-    assert all((tag.code_index, tag.tick) == (3 * tag.line, 2700 * tag.line) for tag in tags)
-    assert [tag.line for tag in trigger.tags(10.0)] == [48], "waits for the first to come"
-
-
-def test_tags_wait_no_longer_than_asked_and_end_with_a_stop(clock, trigger):
-    begin_ns = clock.now_ns
-    assert trigger.tags(0.05) == []
-    assert clock.now_ns - begin_ns == pytest.approx(0.05e9, rel=1e-3)
-    start(trigger, tag_every_lines=65536)
-    trigger.tags(0)
-    clock.on_sleep = trigger.stop
-    begin_ns = clock.now_ns
-    assert trigger.tags(1.0) == []
-    assert clock.now_ns - begin_ns < 0.01e9, "a stop ends the wait"
-    clock.on_sleep = lambda: None
-    begin_ns = clock.now_ns
-    assert trigger.tags(0.5) == []
-    assert clock.now_ns - begin_ns == pytest.approx(0.5e9, rel=1e-3), "and nothing spins afterwards"
-
-
-def test_many_tags_come_in_bounded_portions_up_to_the_stop(clock, trigger):
-    start(trigger, tag_every_lines=1)
-    clock.now_ns += 9_999 * LINE_NS
-    assert trigger.stop() == 10_000
-    portions = [trigger.tags(0), trigger.tags(0), trigger.tags(0), trigger.tags(0)]
-    assert [len(portion) for portion in portions] == [4096, 4096, 1808, 0]
-    assert [tag.line for portion in portions for tag in portion] == list(range(10_000))
-
-
-def test_a_new_run_begins_its_tags_anew(clock, trigger):
-    start(trigger)
-    clock.now_ns += 100 * LINE_NS
-    trigger.tags(0)
-    trigger.close()
-    trigger.close()
-    start(trigger, run_id="second")
-    assert [tag.line for tag in trigger.tags(0)] == [0]
-    assert trigger.statistics() == {"pulses": 1, "tags": 1}
 
 
 # a camera
@@ -204,7 +86,7 @@ def test_blocks_come_whole_and_only_when_their_pulses_were_issued(wire, clock, t
     eye = camera(wire)
     eye.arm()
     assert eye.next_block(0.01) is None, "no trigger, no lines"
-    start(trigger)
+    trigger.start()
     begin_ns = clock.now_ns
     block = eye.next_block(1.0)
     assert (block.first_line, len(block.pixels), block.pixels.dtype) == (0, 8, np.uint16)
@@ -225,9 +107,9 @@ def test_blocks_come_whole_and_only_when_their_pulses_were_issued(wire, clock, t
 def test_a_stop_leaves_exactly_the_issued_lines_however_they_are_blocked(block_lines, pulses, arm, looks):
     clock = ManualClock()
     wire = Wire(clock)
-    trigger, eye = SimulatedTrigger(wire, 90_000_000, S), camera(wire, arm, block_lines)
+    trigger, eye = Pulses(wire), camera(wire, arm, block_lines)
     eye.arm()
-    start(trigger)
+    trigger.start()
     blocks = []
     for lines in looks:
         clock.now_ns = min(clock.now_ns + lines * LINE_NS, wire.look().train.due_ns(pulses - 1))
@@ -245,7 +127,7 @@ def test_a_stop_leaves_exactly_the_issued_lines_however_they_are_blocked(block_l
 def test_nothing_spins_after_the_last_line(wire, clock, trigger):
     eye = camera(wire)
     eye.arm()
-    start(trigger)
+    trigger.start()
     trigger.stop()
     assert len(read_lines(eye, 1)) == 1
     begin_ns = clock.now_ns
@@ -256,7 +138,7 @@ def test_nothing_spins_after_the_last_line(wire, clock, trigger):
 def test_code_and_timing_come_with_the_pulses(wire, clock, trigger):
     eye = camera(wire)
     eye.arm()
-    start(trigger, code=ConstantCode(1), substep_ticks=4500)
+    trigger.start(code=ConstantCode(1), substep_ticks=4500)
     clock.now_ns += 39 * 5 * LINE_NS
     trigger.stop()
     dn = np.concatenate(read_lines(eye, 40))
@@ -266,7 +148,7 @@ def test_code_and_timing_come_with_the_pulses(wire, clock, trigger):
 def test_a_late_camera_delivers_everything_and_says_how_late_it_is(wire, clock, trigger):
     eye = camera(wire)
     eye.arm()
-    start(trigger)
+    trigger.start()
     clock.now_ns += 999 * LINE_NS
     assert eye.statistics() == {"lines": 0, "lost": 0, "behind_lines": 1000}
     eye.next_block(0)
@@ -277,7 +159,7 @@ def test_a_late_camera_delivers_everything_and_says_how_late_it_is(wire, clock, 
 def test_the_converter_rounds_and_clips(wire, clock, trigger, pixel_format, white, dtype):
     eye = camera(wire, pixel_format=pixel_format, responsivity_dn=200.0)
     eye.arm()
-    start(trigger, code=ConstantCode(1))
+    trigger.start(code=ConstantCode(1))
     clock.now_ns += 39 * LINE_NS
     dn = np.concatenate(read_lines(eye, 40))
     assert dn.dtype == dtype
@@ -285,7 +167,7 @@ def test_the_converter_rounds_and_clips(wire, clock, trigger, pixel_format, whit
 
 
 def test_a_camera_armed_while_pulses_come_counts_from_there(wire, clock, trigger):
-    start(trigger)
+    trigger.start()
     clock.now_ns += 20 * LINE_NS
     eye = camera(wire)
     eye.arm()
@@ -298,9 +180,9 @@ def test_a_camera_armed_while_pulses_come_counts_from_there(wire, clock, trigger
 def test_a_second_start_under_an_armed_camera_is_an_error_not_a_mixture(wire, clock, trigger):
     eye = camera(wire)
     eye.arm()
-    start(trigger)
+    trigger.start()
     trigger.stop()
-    start(trigger, run_id="second")
+    trigger.start(run_id="second")
     with pytest.raises(CameraError, match="started train 2 with a camera armed for train 1"):
         eye.next_block(0.1)
     eye.disarm()
@@ -309,13 +191,13 @@ def test_a_second_start_under_an_armed_camera_is_an_error_not_a_mixture(wire, cl
 
 
 def test_a_camera_armed_after_a_run_waits_for_the_next(wire, clock, trigger):
-    start(trigger)
+    trigger.start()
     clock.now_ns += 100 * LINE_NS
     trigger.stop()
     eye = camera(wire)
     eye.arm()
     assert eye.next_block(0.1) is None
-    start(trigger, run_id="second")
+    trigger.start(run_id="second")
     assert eye.next_block(0.1).first_line == 0
 
 
@@ -351,15 +233,17 @@ def received(link):
 
 def test_two_cameras_in_processes_of_their_own_follow_one_trigger():
     wire = Wire()
-    trigger = SimulatedTrigger(wire, 90_000_000, S)
+    trigger = TriggerDriver(lambda: TwinTransport(TriggerModel(wire, 90_000_000)), TriggerConfig())
     openers = [SimulatedCameraOpener(wire, optics(arm), camera_config(), 64, LINE_RATE_HZ) for arm in "ab"]
     with spawned(camera_child, *openers) as links:
         assert [received(link) for link in links] == ["armed", "armed"]
-        start(trigger)
+        trigger.prepare(trigger_run())
+        trigger.start()
         tags = trigger.tags(5.0)
         while tags[-1].line < 4000:
             tags += trigger.tags(5.0)
         pulses = trigger.stop()
+        trigger.close()
         for link in links:
             link.send(pulses)
         results = [received(link) for link in links]

@@ -281,7 +281,9 @@ def test_recording_begins_now_however_fast_the_lines_before_it_came(tmp_path: Pa
         until(lambda: capture.poll().lines["a"]["delivered"] > 256, "lines")
         capture.start(tmp_path / "r.zarr", make_spec(), 1000)
         assert capture.poll().first_line <= issued(bench.wire, bench.trigger.rate_hz)
-        assert sealed(capture).condition is RunCondition.GOOD
+        status = sealed(capture)
+    # A machine with other work may let a ring run over, which is told; it may not wait for lines to come.
+    assert (status.recorded_lines, status.end_reason) == (1000, "line budget reached")
     check_rows(tmp_path / "r.zarr")
 
 

@@ -1,0 +1,266 @@
+"""``acquire trigger info | load | arm | stop | selftest | monitor``: the sync trigger by itself.
+
+These commands talk to the device, not to the daemon: while a daemon has the port, they are told so.
+"""
+
+from __future__ import annotations
+
+import json as json_text
+import time
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from acquire.cli.output import JsonFlag, print_facts, print_json
+from acquire.errors import TriggerError, UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from acquire.config import RigConfig
+    from acquire.trigger.device import Device
+    from acquire.trigger.driver import TriggerDriver
+    from acquire.trigger.registers import TagRecord
+
+_LOOK_S = 0.2
+
+ConfigOption = Annotated[
+    str, typer.Option("--config", "-c", metavar="FILE", help="Rig file, or the name of a built-in one.")
+]
+UrlOption = Annotated[
+    str | None,
+    typer.Option(
+        "--url", "--port", metavar="URL", help="Serial port or socket://host:port, not the rig file's."
+    ),
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Change one value of the file, e.g. code.seed=7."),
+]
+
+
+def register(app: typer.Typer) -> None:
+    group = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
+    for command in (info, load, arm, stop, selftest, monitor):
+        group.command()(command)
+    app.add_typer(group, name="trigger", help="The sync trigger by itself.", rich_help_panel="Rig")
+
+
+def info(
+    config: ConfigOption = "rig-demo",
+    url: UrlOption = None,
+    settings: SetOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Who answers, what it can do and what it does now.
+
+    Example: [bold]acquire trigger info --url /dev/ttyUSB0[/]
+    """
+    from acquire.trigger.device import facts_of
+
+    with _device(config, url, settings) as (driver, _):
+        facts = {"model": driver.identify().model, **facts_of(driver.device().capabilities)}
+        facts |= {**facts_of(driver.device().status()), **driver.statistics()}
+    if json:
+        print_json(facts)
+        return
+    print_facts(facts)
+
+
+def load(
+    file: Annotated[Path, typer.Argument(help="Code: text of 0 and 1 (white space is ignored), or .npy.")],
+    config: ConfigOption = "rig-demo",
+    url: UrlOption = None,
+    settings: SetOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Load the code memory, have the device check it, read it back.
+
+    Example: [bold]acquire trigger load code.txt --url /dev/ttyUSB0[/]
+    """
+    bits = _read_code(file)
+    with _device(config, url, settings) as (driver, _):
+        device = driver.device()
+        begun_s = time.monotonic()
+        crc = device.load_code(bits)
+        facts = {"bits": len(bits), "ones": int(bits.sum()), "crc": f"{crc:#010x}"}
+        facts["load_ms"] = round((time.monotonic() - begun_s) * 1000, 1)
+        if (device.read_code(len(bits)) != bits).any():
+            raise TriggerError("the code memory reads back as something else")
+    if json:
+        print_json(facts)
+        return
+    print_facts(facts)
+
+
+def arm(
+    config: ConfigOption = "rig-demo",
+    url: UrlOption = None,
+    settings: SetOption = None,
+    run_id: Annotated[str | None, typer.Option(help="Name of the run; absent: a new one.")] = None,
+    start: Annotated[bool, typer.Option("--start", help="Start it as well.")] = False,
+    memory: Annotated[bool, typer.Option("--memory", help="Use the code that was loaded.")] = False,
+    json: JsonFlag = False,
+) -> None:
+    """Configure the device as the rig file says and arm it; it stays so when the command ends.
+
+    Example: [bold]acquire trigger arm --url /dev/ttyUSB0 --set trigger.substep_ticks=50 --start[/]
+    """
+    from dataclasses import replace
+
+    from acquire.daemon.plan import new_run_id
+    from acquire.trigger.base import TriggerRun
+    from acquire.trigger.device import facts_of
+    from acquire.trigger.settings import LoadedCode
+
+    with _device(config, url, settings) as (driver, rig):
+        run = TriggerRun(
+            run_id=run_id or new_run_id(rig.name),
+            code=rig.code.build(),
+            substeps=rig.geometry.substeps,
+            substep_ticks=rig.trigger.substep_ticks,
+            tag_every_lines=rig.trigger.tag_every_lines,
+        )
+        if memory:
+            run = replace(run, code=LoadedCode(driver.device().read_code(driver.device().code_length())))
+        driver.prepare(run)
+        fit = driver.start() if start else None
+        facts = {"run_id": run.run_id, **facts_of(driver.device().status())}
+        facts["utc_ns_at_tick_0"] = fit and fit.utc_ns_at_tick_0
+    if json:
+        print_json(facts)
+        return
+    print_facts(facts)
+
+
+def stop(
+    config: ConfigOption = "rig-demo",
+    url: UrlOption = None,
+    settings: SetOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """End the device's run after a whole line; light off.
+
+    Example: [bold]acquire trigger stop --url /dev/ttyUSB0[/]
+    """
+    with _device(config, url, settings) as (driver, _):
+        driver.device()
+        lines = driver.stop()
+    if json:
+        print_json({"lines": lines})
+        return
+    typer.echo(f"stopped; {lines} lines")
+
+
+def selftest(
+    config: ConfigOption = "rig-demo",
+    url: UrlOption = None,
+    settings: SetOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Have the device test its memory, its code generator and its checksum unit.
+
+    Example: [bold]acquire trigger selftest --url /dev/ttyUSB0[/]
+    """
+    with _device(config, url, settings) as (driver, _):
+        result = driver.device().self_test()
+    failed = [name.removesuffix("_failed") for name, bit in result.items() if name != "done" and bit]
+    if failed or not result["done"]:
+        raise TriggerError(f"self test failed: {', '.join(failed) or 'it was not made'}")
+    if json:
+        print_json({"passed": True})
+        return
+    typer.echo("self test passed")
+
+
+def monitor(
+    config: ConfigOption = "rig-demo",
+    url: UrlOption = None,
+    settings: SetOption = None,
+    tags: Annotated[int | None, typer.Option(min=1, help="End after so many tags.")] = None,
+    seconds: Annotated[float | None, typer.Option(min=0.0, help="End after this time.")] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Print tags as they come, until the run ends or Ctrl-C. With --json, one object per line.
+
+    Example: [bold]acquire trigger monitor --url /dev/ttyUSB0 --seconds 5[/]
+    """
+    from itertools import islice
+
+    with _device(config, url, settings) as (driver, _):
+        for tag in islice(_watch(driver.device(), seconds), tags):
+            facts = _tag_facts(tag)
+            text = json_text.dumps(facts) if json else "  ".join(f"{k} {v}" for k, v in facts.items())
+            typer.echo(text)
+
+
+def _watch(device: Device, seconds: float | None) -> Iterator[TagRecord]:
+    """Tags of the run under way. Asks for the status now and then, which keeps a watchdog quiet."""
+    from acquire.trigger.registers import TagFlag
+
+    if device.status().at_rest:
+        raise TriggerError(
+            "nothing to monitor: no run is armed or running", hint="acquire trigger arm --start"
+        )
+    end_s = time.monotonic() + seconds if seconds is not None else float("inf")
+    while time.monotonic() < end_s:
+        for _, tag in device.link.tags(min(_LOOK_S, max(0.0, end_s - time.monotonic()))):
+            yield tag
+            if tag.flags & TagFlag.LAST:
+                return
+        device.status()
+
+
+def _tag_facts(tag: TagRecord) -> dict[str, object]:
+    from acquire.trigger.registers import TagFlag
+
+    flags = [flag.name for flag in TagFlag if tag.flags & flag]
+    return {
+        "line": tag.line,
+        "code_index": tag.code_index,
+        "time": tag.timestamp,
+        "flags": "+".join(map(str, flags)),
+    }
+
+
+@contextmanager
+def _device(
+    config: str, url: str | None, settings: list[str] | None
+) -> Iterator[tuple[TriggerDriver, RigConfig]]:
+    """The rig's trigger; left as it is at the end."""
+    from acquire.config import load_rig, parse_settings
+    from acquire.rig import open_trigger
+    from acquire.trigger.driver import TriggerDriver
+
+    overrides = parse_settings(settings or [])
+    if url is not None:
+        overrides |= {"trigger.driver": "serial", "trigger.url": url}
+    rig = load_rig(config, overrides)
+    driver = open_trigger(rig)
+    assert isinstance(driver, TriggerDriver)
+    try:
+        yield driver, rig
+    finally:
+        driver.release()
+
+
+def _read_code(file: Path) -> NDArray[np.uint8]:
+    """Bits, 0 or 1 each. Raises UsageError for what is no code."""
+    import numpy as np
+
+    try:
+        if file.suffix == ".npy":
+            bits = np.asarray(np.load(file, allow_pickle=False))
+        else:
+            text = "".join(file.read_text(encoding="ascii").split())
+            bits = np.frombuffer(text.encode(), np.uint8) - ord("0")
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{file} cannot be read as a code: {error}") from error
+    if bits.ndim != 1 or not len(bits) or not np.isin(bits, (0, 1)).all():
+        raise UsageError(f"{file} is no code", possible="one row of 0 and 1")
+    return bits.astype(np.uint8)

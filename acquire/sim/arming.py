@@ -1,0 +1,80 @@
+"""What the trigger's device checks when a run is armed, in the order in which it names the first fault."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from acquire.trigger import registers as r
+from acquire.trigger.registers import ErrorCode, LineMode, Source
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+
+class Refusal(Exception):  # noqa: N818 - a NAK on its way to the host, not an error of this program
+    """The device says no: ``code`` is an ErrorCode, ``address`` the word that it is about."""
+
+    def __init__(self, code: int, address: int) -> None:
+        super().__init__(code, address)
+        self.code, self.address = code, address
+
+
+def check_configuration(get: Callable[[r.Register], int], locked: bool, code_checked: bool) -> None:
+    """Raises Refusal for the first thing that cannot be honoured. ``get`` reads a register."""
+    if not locked:
+        raise Refusal(ErrorCode.CLOCK_UNLOCKED, r.STATUS.address)
+    for faults in (_timing(get), _code(get, code_checked), _light(get), _outputs(get)):
+        for wrong, code, register in faults:
+            if wrong:
+                raise Refusal(code, register.address)
+
+
+_Fault = tuple[bool, ErrorCode, r.Register]
+
+
+def _timing(get: Callable[[r.Register], int]) -> Iterator[_Fault]:
+    limits, clocks, substeps = get(r.LIMITS), get(r.SUBSTEP_CLOCKS), r.LINE.substeps.of(get(r.LINE))
+    longest = (1 << r.LIMITS.substep_max_log2.of(limits)) - 1
+    yield not r.LIMITS.substep_min.of(limits) <= clocks <= longest, ErrorCode.BAD_SUBSTEP, r.SUBSTEP_CLOCKS
+    possible = r.CAPABILITIES.substeps.of(get(r.CAPABILITIES))
+    yield not possible >> substeps & 1, ErrorCode.BAD_SUBSTEPS, r.LINE
+    yield 6 // substeps * get(r.PHASE_CLOCKS) > clocks, ErrorCode.BAD_PHASES, r.PHASE_CLOCKS
+    yield get(r.TAG_INTERVAL) == 0, ErrorCode.BAD_TAG_INTERVAL, r.TAG_INTERVAL
+
+
+def _code(get: Callable[[r.Register], int], checked: bool) -> Iterator[_Fault]:
+    kind = r.CODE_SOURCE.kind.of(get(r.CODE_SOURCE))
+    yield kind not in tuple(Source), ErrorCode.BAD_SOURCE, r.CODE_SOURCE
+    if kind == Source.PRBS:
+        yield get(r.PRBS_MASK) == 0, ErrorCode.BAD_SEED, r.PRBS_MASK
+        yield get(r.PRBS_SEED) == 0, ErrorCode.BAD_SEED, r.PRBS_SEED
+    if kind == Source.MEMORY:
+        length = get(r.CODE_LENGTH)
+        yield not 0 < length <= get(r.CODE_BITS), ErrorCode.BAD_CODE_LENGTH, r.CODE_LENGTH
+        yield not checked, ErrorCode.CODE_UNCHECKED, r.CODE_LENGTH
+
+
+def _light(get: Callable[[r.Register], int]) -> Iterator[_Fault]:
+    clocks, opens, closes = get(r.SUBSTEP_CLOCKS), get(r.WINDOW_OPEN), get(r.WINDOW_CLOSE)
+    yield not opens < closes <= clocks, ErrorCode.BAD_WINDOW, r.WINDOW_CLOSE
+    margin = r.LIMITS.lead_margin.of(get(r.LIMITS))
+    yield r.LED.lead.of(get(r.LED)) + margin > clocks, ErrorCode.BAD_LEAD, r.LED
+
+
+def _outputs(get: Callable[[r.Register], int]) -> Iterator[_Fault]:
+    distance = pulse_distance(get)
+    for enable, delay, width, code in (
+        (r.TRIGGER_A, r.TRIGGER_A_DELAY, r.TRIGGER_A_WIDTH, ErrorCode.BAD_TRIGGER_A),
+        (r.TRIGGER_B, r.TRIGGER_B_DELAY, r.TRIGGER_B_WIDTH, ErrorCode.BAD_TRIGGER_B),
+    ):
+        on = bool(enable.enable.of(get(enable)))
+        yield on and get(width) == 0, code, width
+        yield on and get(delay) + get(width) >= distance, code, delay
+    yield distance < get(r.CAMERA_MIN_PERIOD), ErrorCode.BAD_MIN_PERIOD, r.CAMERA_MIN_PERIOD
+
+
+def pulse_distance(get: Callable[[r.Register], int]) -> int:
+    """Clocks between pulses of an output."""
+    line = get(r.LINE)
+    per_substep = r.LINE.mode.of(line) == LineMode.PER_SUBSTEP
+    return get(r.SUBSTEP_CLOCKS) * (1 if per_substep else r.LINE.substeps.of(line))

@@ -1,0 +1,186 @@
+"""The pins of a trigger that runs as a program of its own, as simulated cameras see them.
+
+Where the wire of `acquire.sim.clock` says when pulses are due, this page says which ones have come, and
+what the light was in every sub-step that is over::
+
+    gateware's process                      memfd                              camera processes
+    publish  ──▶ [ sequence | run | pulses a, b | sub-steps | light ... ] ◀── look, wait, light
+
+Reading is optimistic, as with the wire: the sequence is odd while the writer writes, and a reading counts
+only if it was the same even number before and after. Light is kept for ROOM sub-steps, a byte each.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import time
+import weakref
+from dataclasses import dataclass, field
+from fractions import Fraction
+from multiprocessing.context import assert_spawning
+from multiprocessing.reduction import DupFd
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.clock import NS_PER_S
+from acquire.errors import DeviceError
+from acquire.lines import ARMS
+from acquire.sim.clock import HostClock, PulseTrain, Reading
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+ROOM = 1 << 23
+"""Sub-steps whose light is kept: a minute and more."""
+_HEADER_BYTES = 4096
+_SEQUENCE, _RUN, _RUNNING, _PULSES, _SUBSTEPS, _PERIOD_CLOCKS, _CLOCK_HZ, _FIELDS = 0, 1, 2, 3, 5, 6, 7, 8
+_POLL_S = 0.001
+_TORN_S = 1.0
+_LIGHT_S = 10.0
+"""A camera waits for light at most so long; it needs it some hundred lines ahead."""
+
+
+@dataclass(frozen=True, slots=True)
+class PinRun:
+    """What the pins have shown of one run: ``number`` from 1; 0 line clocks: not known yet."""
+
+    number: int
+    running: bool
+    pulses: tuple[int, int]
+    """Rising edges of trigger A and B."""
+    line_clocks: int
+
+
+class PinPage:
+    """The page. One process publishes, any number look; it can be given to a child being spawned."""
+
+    def __init__(self, descriptor: int | None = None) -> None:
+        """A new page, or the one behind an inherited descriptor, which is taken over."""
+        if descriptor is None:
+            descriptor = os.memfd_create("acquire-pins", os.MFD_CLOEXEC)
+            os.ftruncate(descriptor, _HEADER_BYTES + ROOM)
+        self.descriptor = descriptor
+        self._page = mmap.mmap(descriptor, _HEADER_BYTES + ROOM)
+        self._header = np.frombuffer(self._page, np.uint64, _FIELDS)
+        self._light = np.frombuffer(self._page, np.uint8, ROOM, _HEADER_BYTES)
+        self._close_descriptor = weakref.finalize(self, os.close, descriptor)
+
+    def close(self) -> None:
+        """Idempotent; nobody may look any more. A forgotten page closes itself."""
+        self._header, self._light = np.empty(0, np.uint64), np.empty(0, np.uint8)
+        self._page.close()
+        self._close_descriptor()
+
+    def __reduce__(self) -> tuple[object, ...]:
+        assert_spawning(self)
+        return _receive, (DupFd(self.descriptor),)
+
+    def publish(self, run: PinRun, light: bytes, clock_hz: int) -> None:
+        """What has come of a run up to now; ``light`` has a byte per sub-step that has ended since."""
+        header = self._header
+        header[_SEQUENCE] += np.uint64(1)
+        done = 0 if run.number != header[_RUN] else int(header[_SUBSTEPS])
+        places = (done + np.arange(len(light))) % ROOM
+        self._light[places] = np.frombuffer(light, np.uint8)
+        header[_RUN:_FIELDS] = (
+            run.number,
+            run.running,
+            *run.pulses,
+            done + len(light),
+            run.line_clocks,
+            clock_hz,
+        )
+        header[_SEQUENCE] += np.uint64(1)
+
+    def read(self) -> NDArray[np.uint64]:
+        """The header's fields, all of one moment."""
+        deadline_s = time.monotonic() + _TORN_S
+        while time.monotonic() < deadline_s:
+            before = int(self._header[_SEQUENCE])
+            fields = self._header.copy()
+            if not before & 1 and before == int(self._header[_SEQUENCE]):
+                return fields
+            time.sleep(0)
+        raise DeviceError("the gateware's process died while it wrote down its pins")
+
+    @property
+    def latest_run(self) -> int:
+        """Number of the latest run, 0 before the first."""
+        return int(self.read()[_RUN])
+
+    def light(self, run: int, start: int, length: int) -> NDArray[np.uint8]:
+        """Light (0 or 1) of sub-steps ``start`` on, once they are over; dark outside of the run.
+
+        Raises DeviceError when it does not come, or is forgotten.
+        """
+        fields = self._await_light(run, start + length)
+        index = np.arange(start, start + length)
+        lit = self._light[index % ROOM] * ((index >= 0) & (index < int(fields[_SUBSTEPS])))
+        if int(self.read()[_SUBSTEPS]) - max(start, 0) > ROOM:
+            raise DeviceError(f"a camera asked for the light of sub-step {start} too late")
+        return lit.astype(np.uint8)
+
+    def _await_light(self, run: int, end: int) -> NDArray[np.uint64]:
+        deadline_s = time.monotonic() + _LIGHT_S
+        while time.monotonic() < deadline_s:
+            fields = self.read()
+            if fields[_RUN] != run:
+                raise DeviceError(f"run {run} of the trigger is over and its light forgotten")
+            if fields[_SUBSTEPS] >= end or not fields[_RUNNING]:
+                return fields
+            time.sleep(_POLL_S)
+        raise DeviceError(f"sub-step {end} of the trigger did not end within {_LIGHT_S:g} s")
+
+
+@dataclass(frozen=True, slots=True)
+class PinWire:
+    """One camera's end of the page, in place of a `Wire`: its own trigger's pulses."""
+
+    page: PinPage
+    arm: str
+    clock: HostClock = field(default_factory=HostClock)
+
+    def look(self) -> Reading:
+        """The run that the pins show, as a pulse train, and this arm's pulses so far."""
+        fields = [int(value) for value in self.page.read()]
+        issued = fields[_PULSES + ARMS.index(self.arm)]
+        if fields[_RUN] == 0:
+            return Reading(None, 0)
+        period_ns = Fraction(fields[_PERIOD_CLOCKS] * NS_PER_S, fields[_CLOCK_HZ])
+        stopped = None if fields[_RUNNING] else issued
+        code = {"kind": "pins", "run": fields[_RUN]}
+        return Reading(PulseTrain(fields[_RUN], 0, period_ns, Fraction(1), code, stopped), issued)
+
+    def wait(self, run: int, pulses: int, timeout_s: float) -> Reading:
+        """As `Wire.wait`."""
+        deadline_s = time.monotonic() + timeout_s
+        while True:
+            reading = self.look()
+            come = reading.run == run and (reading.stopped or reading.issued >= pulses)
+            if come or reading.run > run or time.monotonic() >= deadline_s:
+                return reading
+            time.sleep(_POLL_S)
+
+    def code(self, train: PulseTrain) -> PinCode:
+        """What the light of a train did."""
+        return PinCode(self.page, train.run)
+
+
+@dataclass(frozen=True, slots=True)
+class PinCode:
+    """The light that was really emitted, as a run's code."""
+
+    page: PinPage
+    run: int
+
+    def bits(self, start: int, length: int) -> NDArray[np.uint8]:
+        return self.page.light(self.run, start, length)
+
+    def to_attrs(self) -> dict[str, Any]:
+        return {"kind": "pins", "run": self.run}
+
+
+def _receive(duplicate: Any) -> PinPage:
+    return PinPage(duplicate.detach())

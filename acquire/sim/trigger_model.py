@@ -1,0 +1,342 @@
+"""The behavioural model of the trigger's device: the same bytes, registers and refusals as the gateware.
+
+::
+
+    bytes ──▶ feed ──▶ [ registers · run ] ──▶ take ──▶ bytes: answers, then the tags that are due
+                              │
+                              └──▶ Wire ──▶ simulated cameras
+
+Nothing runs between calls: lines, tags and the end of a run are worked out from the time of the call, in
+exact integers. Simulated time runs ``speed`` times as fast as the host's while a run lasts, and as fast as
+the host's otherwise. A run's code must fit the wire's page, so cameras follow pseudo-random and constant
+codes; with a code memory the wire carries the pulses of a dark run.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from fractions import Fraction
+from typing import TYPE_CHECKING
+
+from acquire.clock import NS_PER_S
+from acquire.sim.arming import Refusal, check_configuration
+from acquire.sim.trigger_code import light_attrs, prbs_state
+from acquire.sim.trigger_registers import START_LATENCY, TAG_ROOM, RegisterBank, constants
+from acquire.sim.trigger_run import Run
+from acquire.trigger import registers as r
+from acquire.trigger.frames import (
+    Decoder,
+    Frame,
+    FrameLengthError,
+    encode,
+    nak_payload,
+    parse_read,
+    parse_write,
+    write_payload,
+)
+from acquire.trigger.registers import Command, EndReason, ErrorCode, FrameType, State, TagFlag, TagRecord
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from acquire.sim.clock import Wire
+
+_WORD = 0xFFFFFFFF
+_ENDS = {
+    EndReason.LINE_BUDGET: TagFlag.BUDGET,
+    EndReason.WATCHDOG: TagFlag.WATCHDOG,
+    EndReason.CLOCK_LOST: TagFlag.CLOCK_LOST,
+}
+
+
+class TriggerModel:
+    """One device. Thread-safe; never waits.
+
+    Parameters
+    ----------
+    wire : carries the pulses to the simulated cameras; its clock is the device's
+    clock_hz : frequency of the device's clock
+    speed : simulated seconds per second while a run lasts
+    """
+
+    def __init__(self, wire: Wire, clock_hz: int, speed: float = 1.0, serial: int = 0) -> None:
+        self._wire = wire
+        self._clock_hz = clock_hz
+        self._speed = Fraction(str(speed))
+        self._lock = threading.RLock()
+        self._decoder = Decoder()
+        self._out: deque[bytes] = deque()
+        self._tags: deque[bytes] = deque()
+        self._run = Run()
+        self._zero = (wire.clock.monotonic_ns(), 0, Fraction(1))
+        self._heard_tick = 0
+        self._pps: tuple[int, int] = (0, 0)
+        self._clock_losses = 0
+        self._locked = True
+        self.registers = RegisterBank(
+            constants(clock_hz, serial), self._status_values(), self._command, self._demand_rest
+        )
+
+    def _status_values(self) -> dict[r.Register, Callable[[], int]]:
+        return {
+            r.STATUS: self._status,
+            r.CURRENT_RUN: lambda: self._run.number,
+            r.TIME: lambda: self._tick() & (1 << r.TIME_BITS) - 1,
+            r.START_TIME: lambda: self._run.start_tick if self._run.lines else 0,
+            r.LINES: lambda: self._run.lines,
+            r.CODE_STATE: self._code_state,
+            r.TAG_COUNT: lambda: self._run.made & _WORD,
+            r.TAG_LOST: lambda: self._run.lost & _WORD,
+            r.TAG_FIFO: lambda: r.TAG_FIFO.pack(fill=len(self._tags), peak=self._run.peak),
+            r.RX_ERRORS: lambda: self._decoder.faults.total() & _WORD,
+            r.PPS_TIME: lambda: self._pps[0],
+            r.PPS_COUNT: lambda: self._pps[1],
+        }
+
+    # The link's side.
+
+    @property
+    def busy(self) -> bool:
+        """Its time is the host's and passes anyway."""
+        return False
+
+    def feed(self, data: bytes) -> None:
+        """Bytes from the host."""
+        with self._lock:
+            for frame in self._decoder.feed(data):
+                self._advance()
+                self._out.append(encode(self._answer(frame)))
+
+    def take(self) -> bytes:
+        """Bytes for the host: all that is due."""
+        with self._lock:
+            self._advance()
+            data = b"".join((*self._out, *self._tags))
+            self._out.clear()
+            self._tags.clear()
+            return data
+
+    @property
+    def frames_heard(self) -> int:
+        """Requests so far."""
+        return self._decoder.frames
+
+    # The inputs.
+
+    def external_edge(self) -> None:
+        """The external arm input goes to its active level."""
+        with self._lock:
+            self._advance()
+            if self.registers.field(r.EXTERNAL_ARM, "enable") and self._run.state == State.ARMED:
+                self._begin(external=True)
+
+    def pps_edge(self) -> None:
+        """A second of the reference begins."""
+        with self._lock:
+            self._advance()
+            self._pps = (self._tick(), self._pps[1] + 1)
+            self._event(TagFlag.PPS)
+
+    def lose_clock(self, lost: bool = True) -> None:
+        """The reference clock goes away, or comes back. A run under way ends."""
+        with self._lock:
+            self._advance()
+            self._locked = not lost
+            self._clock_losses += lost
+            if lost:
+                self._end_after_this_line(EndReason.CLOCK_LOST)
+
+    # Requests.
+
+    def _answer(self, frame: Frame) -> Frame:
+        try:
+            kind, payload = self._obey(frame)
+        except FrameLengthError:
+            kind, payload = FrameType.NAK, nak_payload(ErrorCode.BAD_LENGTH, 0)
+        except Refusal as refusal:
+            kind, payload = FrameType.NAK, nak_payload(refusal.code, refusal.address)
+        return Frame(kind, frame.sequence, payload)
+
+    def _obey(self, frame: Frame) -> tuple[FrameType, bytes]:
+        if frame.version != r.PROTOCOL_VERSION:
+            raise Refusal(ErrorCode.BAD_VERSION, 0)
+        if frame.type == FrameType.READ:
+            address, count = parse_read(frame.payload)
+            self._heard_tick = self._tick()
+            return FrameType.DATA, write_payload(address, self.registers.read(address, count))
+        if frame.type == FrameType.WRITE:
+            address, words = parse_write(frame.payload)
+            self._heard_tick = self._tick()
+            for i, word in enumerate(words):
+                self.registers.write(address + i, word)
+            return FrameType.ACK, frame.payload[:2] + bytes([len(words)])
+        raise Refusal(ErrorCode.BAD_TYPE, 0)
+
+    def _command(self, word: int) -> None:
+        number = self.registers.get(r.RUN_ID)
+        commands: dict[int, Callable[[int], None]] = {
+            Command.ARM: self._arm,
+            Command.START: self._start,
+            Command.STOP: self._stop,
+            Command.CHECK_CODE: self._check_code,
+            Command.SELF_TEST: self._self_test,
+        }
+        if word not in commands:
+            raise Refusal(ErrorCode.BAD_COMMAND, r.COMMAND.address)
+        commands[word](number)
+
+    def _arm(self, number: int) -> None:
+        run, at = self._run, r.COMMAND.address
+        if number == 0:
+            raise Refusal(ErrorCode.BAD_RUN_ID, at)
+        if number == run.number and run.state != State.IDLE:
+            if run.state == State.ENDED:
+                raise Refusal(ErrorCode.RUN_OVER, at)
+            return
+        self._demand_rest(at)
+        try:
+            check_configuration(self.registers.get, self._locked, self.registers.code_checked)
+        except Refusal as refusal:
+            self.registers.put(r.REJECT, r.REJECT.pack(error=refusal.code, address=refusal.address))
+            raise
+        self.registers.put(r.REJECT, 0)
+        self._tags.clear()
+        line_clocks = self.registers.field(r.LINE, "substeps") * self.registers.get(r.SUBSTEP_CLOCKS)
+        budget = self.registers.get(r.LINE_BUDGET) or None
+        self._run = Run(number, State.ARMED, line_clocks=line_clocks, limit=budget)
+
+    def _start(self, number: int) -> None:
+        run = self._run
+        if run.state == State.IDLE:
+            raise Refusal(ErrorCode.NOT_ARMED, r.COMMAND.address)
+        if number != run.number:
+            raise Refusal(ErrorCode.WRONG_RUN, r.COMMAND.address)
+        if run.state == State.ARMED:
+            self._begin(external=False)
+
+    def _stop(self, number: int) -> None:
+        if number not in (0, self._run.number):
+            raise Refusal(ErrorCode.WRONG_RUN, r.COMMAND.address)
+        if self._run.state == State.ARMED:
+            self._run.limit = 0
+            self._finish(EndReason.STOPPED, self._tick())
+        else:
+            self._end_after_this_line(EndReason.STOPPED)
+
+    def _check_code(self, number: int) -> None:
+        del number
+        self._demand_rest(r.COMMAND.address)
+        self.registers.check_code()
+
+    def _self_test(self, number: int) -> None:
+        del number
+        self._demand_rest(r.COMMAND.address)
+        self.registers.clear_code()
+        self.registers.put(r.SELF_TEST, r.SELF_TEST.pack(done=1))
+
+    def _demand_rest(self, address: int) -> None:
+        if self._run.state not in (State.IDLE, State.ENDED):
+            raise Refusal(ErrorCode.BUSY, address)
+
+    # The run in time.
+
+    def _begin(self, external: bool) -> None:
+        run, clock = self._run, self._wire.clock
+        now_ns, now_tick = clock.monotonic_ns(), self._tick()
+        latency = START_LATENCY + self.registers.field(r.LED, "lead")
+        run.start_tick, run.state, run.external = now_tick + latency, State.RUNNING, external
+        rate = self._clock_hz * self._speed / NS_PER_S
+        start_ns = now_ns + -(-latency * rate.denominator // rate.numerator)
+        self._zero = (start_ns, run.start_tick, self._speed)
+        period_ns = Fraction(run.line_clocks * NS_PER_S, self._clock_hz)
+        self._wire.start(period_ns, self._speed, light_attrs(self.registers.get), start_ns, run.limit)
+        self._heard_tick = now_tick
+
+    def _advance(self) -> None:
+        """Let everything happen that is due by now."""
+        run = self._run
+        if run.state not in (State.RUNNING, State.STOPPING):
+            return
+        self._bark()
+        lines = self._wire.look().issued
+        tick = self._tick()
+        self._tell_lines(run.lines, lines)
+        run.lines = lines
+        if run.limit is not None and tick >= (end := run.start_tick + run.limit * run.line_clocks):
+            self._finish(EndReason.LINE_BUDGET if run.reason == EndReason.NONE else run.reason, end)
+
+    def _bark(self) -> None:
+        """The watchdog; it bites at the first look after its time."""
+        patience = self.registers.get(r.WATCHDOG)
+        if patience and self._tick() >= self._heard_tick + patience:
+            self._end_after_this_line(EndReason.WATCHDOG)
+
+    def _end_after_this_line(self, reason: EndReason) -> None:
+        """What the wire has issued is the truth: cameras may have seen it."""
+        if self._run.state == State.RUNNING:
+            self._run.state, self._run.reason = State.STOPPING, reason
+            self._run.limit = self._wire.stop()
+
+    def _finish(self, reason: EndReason, tick: int) -> None:
+        run = self._run
+        if run.state != State.ARMED:
+            self._wire.stop()
+        run.state, run.reason = State.ENDED, reason
+        flags = TagFlag.LAST | _ENDS.get(reason, TagFlag(0))
+        self._tell(self._record(run.lines, tick, flags if run.lines else flags | TagFlag.NO_LINES))
+        now_ns = self._wire.clock.monotonic_ns()
+        self._zero = (now_ns, self._tick_at(now_ns), Fraction(1))
+
+    def _tell_lines(self, told: int, lines: int) -> None:
+        run, every = self._run, self.registers.get(r.TAG_INTERVAL)
+        for line in range(-(-told // every) * every, lines, every):
+            flags = TagFlag.LINE
+            if line == 0:
+                flags |= TagFlag.FIRST | (TagFlag.EXTERNAL if run.external else TagFlag(0))
+            self._tell(self._record(line + 1, run.start_tick + line * run.line_clocks, flags))
+
+    def _event(self, flags: TagFlag) -> None:
+        if self._run.state in (State.RUNNING, State.STOPPING):
+            self._tell(self._record(self._run.lines, self._tick(), flags))
+
+    def _record(self, lines: int, tick: int, flags: int) -> TagRecord:
+        run, line = self._run, max(0, lines - 1)
+        substeps = self.registers.field(r.LINE, "substeps")
+        time = tick & (1 << r.TIME_BITS) - 1
+        return TagRecord(run.number & _WORD, line, line * substeps, time, int(flags))
+
+    def _tell(self, record: TagRecord) -> None:
+        run = self._run
+        number, run.made = run.made, run.made + 1
+        if len(self._tags) >= TAG_ROOM:
+            run.lost, run.gap = run.lost + 1, True
+            return
+        if run.gap:
+            record, run.gap = record._replace(flags=record.flags | TagFlag.TAGS_LOST), False
+        self._tags.append(encode(Frame(FrameType.TAG, number & 0xFFFF, r.pack_tag(record))))
+        run.peak = max(run.peak, len(self._tags))
+
+    def _tick(self) -> int:
+        return self._tick_at(self._wire.clock.monotonic_ns())
+
+    def _tick_at(self, now_ns: int) -> int:
+        zero_ns, zero_tick, speed = self._zero
+        rate = self._clock_hz * speed
+        return zero_tick + (now_ns - zero_ns) * rate.numerator // (NS_PER_S * rate.denominator)
+
+    def _status(self) -> int:
+        return r.STATUS.pack(
+            state=self._run.state,
+            code_checked=self.registers.code_checked,
+            clock_locked=self._locked,
+            pps_seen=self._pps[1] > 0,
+            end_reason=self._run.reason if self._run.state == State.ENDED else EndReason.NONE,
+            clock_losses=self._clock_losses & 0xFFFF,
+        )
+
+    def _code_state(self) -> int:
+        if self._run.state != State.ENDED or self.registers.field(r.CODE_SOURCE, "kind") != r.Source.PRBS:
+            return 0
+        index = self.registers.field(r.LINE, "substeps") * max(0, self._run.lines - 1)
+        return prbs_state(self.registers.get(r.PRBS_MASK), self.registers.get(r.PRBS_SEED), index)

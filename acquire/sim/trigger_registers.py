@@ -1,0 +1,139 @@
+"""The words of the model's device: what it holds, what it says of itself, what may be written when."""
+
+from __future__ import annotations
+
+import zlib
+from typing import TYPE_CHECKING
+
+from acquire.sim.arming import Refusal
+from acquire.trigger import registers as r
+from acquire.trigger.registers import ErrorCode
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+CODE_BITS = 1 << 19
+TAG_ROOM = 1 << 15
+RX_BYTES = 2048
+START_LATENCY = 6
+SUBSTEP_MIN = 5
+SUBSTEP_MAX_LOG2 = 24
+LEAD_MARGIN = 1
+INPUTS = ("pps", "external_arm")
+_SUBSTEPS = (1, 2, 3, 6)
+_END = r.REGISTERS[-1].address + r.REGISTERS[-1].words
+_REGISTER_AT = {register.address + i: register for register in r.REGISTERS for i in range(register.words)}
+
+
+class RegisterBank:
+    """Registers and code memory of one device.
+
+    Parameters
+    ----------
+    status : makes the value of each register that changes by itself
+    command : carries out what is written to COMMAND, or raises Refusal
+    demand_rest : raises Refusal, about an address, while a run is armed or running
+    """
+
+    def __init__(
+        self,
+        constants: Mapping[r.Register, int],
+        status: Mapping[r.Register, Callable[[], int]],
+        command: Callable[[int], None],
+        demand_rest: Callable[[int], None],
+    ) -> None:
+        self._status, self._command, self._demand_rest = status, command, demand_rest
+        self._words: dict[int, int] = {}
+        for register in r.REGISTERS:
+            self.put(register, constants.get(register, register.reset))
+        self._memory = bytearray(CODE_BITS // 8)
+        self.code_checked = False
+
+    def get(self, register: r.Register) -> int:
+        return sum(self._words[register.address + i] << 32 * i for i in range(register.words))
+
+    def put(self, register: r.Register, value: int) -> None:
+        for i, word in enumerate(register.to_words(value)):
+            self._words[register.address + i] = word
+
+    def field(self, register: r.Register, name: str) -> int:
+        """One field of a register."""
+        return register.field(name).of(self.get(register))
+
+    def check_code(self) -> None:
+        """CODE_CRC becomes that of the code memory in use."""
+        length = self.get(r.CODE_LENGTH)
+        if not 0 < length <= CODE_BITS:
+            raise Refusal(ErrorCode.BAD_CODE_LENGTH, r.CODE_LENGTH.address)
+        self.put(r.CODE_CRC, zlib.crc32(self._memory[: -(-length // 32) * 4]))
+        self.code_checked = True
+
+    def clear_code(self) -> None:
+        """The code memory becomes 0."""
+        self._memory[:] = bytes(len(self._memory))
+        self.code_checked = False
+
+    def read(self, address: int, count: int) -> list[int]:
+        """Words, all of one moment; Refusal where there are none."""
+        for register, value in self._status.items():
+            if register.address < address + count and register.address + register.words > address:
+                self.put(register, value())
+        return [self._read_word(address + i) for i in range(count)]
+
+    def _read_word(self, address: int) -> int:
+        at = (address - r.CODE_MEMORY) * 4
+        if 0 <= at < len(self._memory):
+            return int.from_bytes(self._memory[at : at + 4], "little")
+        if not 0 <= address < _END:
+            raise Refusal(ErrorCode.BAD_ADDRESS, address)
+        return self._words.get(address, 0)
+
+    def write(self, address: int, word: int) -> None:
+        """One word, and what follows from it; Refusal for what cannot be written, or not now."""
+        at = (address - r.CODE_MEMORY) * 4
+        if 0 <= at < len(self._memory):
+            self._demand_rest(address)
+            self._memory[at : at + 4] = word.to_bytes(4, "little")
+            self.code_checked = False
+            return
+        register = _REGISTER_AT.get(address)
+        if register is None:
+            if word or not 0 <= address < _END:
+                raise Refusal(ErrorCode.BAD_ADDRESS, address)
+            return
+        self._write_register(register, address, word)
+
+    def _write_register(self, register: r.Register, address: int, word: int) -> None:
+        if not register.writable:
+            raise Refusal(ErrorCode.READ_ONLY, address)
+        if register is r.COMMAND:
+            self._command(word)
+            return
+        if register.access == "config":
+            self._demand_rest(address)
+        if register is r.CODE_LENGTH and word != self._words[address]:
+            self.code_checked = False
+        kept = (1 << min(32, register.width - 32 * (address - register.address))) - 1
+        self._words[address] = word & kept
+
+
+def constants(clock_hz: int, serial: int) -> dict[r.Register, int]:
+    """What the model says of itself."""
+    return {
+        r.VERSION: r.VERSION.pack(
+            protocol=r.PROTOCOL_VERSION, firmware_major=1, firmware_minor=0, board=r.Board.MODEL
+        ),
+        r.MAP: r.MAP_CRC,
+        r.SERIAL: serial,
+        r.CLOCK_HZ: clock_hz,
+        r.CODE_BITS: CODE_BITS,
+        r.LIMITS: r.LIMITS.pack(
+            substep_min=SUBSTEP_MIN, substep_max_log2=SUBSTEP_MAX_LOG2, lead_margin=LEAD_MARGIN
+        ),
+        r.CAPABILITIES: r.CAPABILITIES.pack(
+            substeps=sum(1 << substeps for substeps in _SUBSTEPS),
+            start_latency=START_LATENCY,
+            **dict.fromkeys(INPUTS, 1),
+        ),
+        r.QUEUES: r.QUEUES.pack(tags=TAG_ROOM, rx_bytes=RX_BYTES),
+    }

@@ -1,0 +1,277 @@
+"""The driver of the sync trigger, the same for all transports and twins.
+
+::
+
+    prepare   handshake → limits checked → registers written, read back, compared → ARM
+    start     clocks compared → START → the tick of line 0
+    stop      STOP → the last line ends → lines counted
+
+Nothing is opened before it is needed. A link that dies raises TriggerError at once in whoever waits, and in
+every later call but three: `prepare` and `stop` connect again by themselves, since the light may still
+flash out there; `reopen` does so and says what became of the run.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass
+from hashlib import blake2b
+from typing import TYPE_CHECKING, Any
+
+from acquire.clock import NS_PER_S, ClockFit
+from acquire.errors import TriggerError
+from acquire.trigger import registers as r
+from acquire.trigger.base import LineTag, TriggerIdentity
+from acquire.trigger.device import ANSWER_S, Device, DeviceStatus
+from acquire.trigger.link import Link
+from acquire.trigger.registers import Command, State
+from acquire.trigger.settings import register_values
+from acquire.trigger.tags import TagReader, signed_ticks
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from acquire.config import TriggerConfig
+    from acquire.trigger.base import TriggerRun
+    from acquire.trigger.transports import Transport
+
+_DRIFT = 1e-4
+"""How far an ordinary oscillator may be off: the uncertainty that grows with the age of a comparison."""
+_SIGNS_OF_LIFE_PER_WATCHDOG = 4
+
+
+@dataclass(frozen=True, slots=True)
+class Reunion:
+    """What a driver finds when it connects again. ``str()`` says it in words."""
+
+    run_id: str | None
+    """The run that it had prepared or started."""
+    goes_on: bool
+    """It is still armed, running, or about to end."""
+    lines: int | None
+    """Lines started in it; None where the device does not know of it any more."""
+    status: DeviceStatus
+
+    def __str__(self) -> str:
+        if self.run_id is None:
+            return f"connected; the device is {self.status}"
+        if self.lines is None:
+            return f"run {self.run_id!r} is over: the device was restarted, or was given another run"
+        return f"run {self.run_id!r} is {self.status}"
+
+
+class TriggerDriver:
+    """One device behind ``open_transport``, as `acquire.trigger.base.Trigger`. Thread-safe.
+
+    Parameters
+    ----------
+    open_transport : connects; called at the first need, and again after the link died
+    config : what the rig wants of the outputs
+    """
+
+    def __init__(self, open_transport: Callable[[], Transport], config: TriggerConfig) -> None:
+        self._open_transport = open_transport
+        self._config = config
+        self._lock = threading.RLock()
+        self._stopped = threading.Condition()
+        self._device: Device | None = None
+        self._prepared: TriggerRun | None = None
+        self._run: TriggerRun | None = None
+        self._tags: TagReader | None = None
+        self._owed = 0  # the number of a run that could not be stopped for want of a link
+        self._sign_of_life_s = 0.0
+
+    # The protocol of triggers.
+
+    def identify(self) -> TriggerIdentity:
+        can = self.device().capabilities
+        return TriggerIdentity(f"sync trigger ({can.board})", can.serial, can.firmware, can.clock_hz)
+
+    def prepare(self, run: TriggerRun) -> None:
+        """Configure and arm. Preparing the same run again changes nothing, even while it runs."""
+        with self._lock:
+            device = self._living()
+            values = register_values(
+                run, self._config, device.capabilities, device.link.transport.bytes_per_s
+            )
+            status = device.status()
+            if not status.at_rest and status.run == run_number(run.run_id):
+                self._take_over(run, status, values)
+                return
+            self._demand_rest(run, status)
+            device.configure(values)
+            device.command(Command.ARM, run_number(run.run_id))
+            self._prepared, self._run, self._tags = run, None, None
+
+    def start(self) -> ClockFit:
+        """Start, or wait for the external start or a stop; the fit of the device's clock to UTC."""
+        with self._lock:
+            run = self._prepared
+            if run is None:
+                raise TriggerError("start of a trigger without a run", hint="prepare one")
+            device = self.device()
+            device.link.tags(0)  # of the run before
+            compared = device.compare_clocks()
+            external = self._config.external_start != "off"
+            if not external:
+                device.command(Command.START, run_number(run.run_id))
+        limit_s = self._config.external_timeout_s if external else ANSWER_S
+        start_tick = self._await_line_0(device, run, limit_s)
+        if external:
+            compared = device.compare_clocks()
+        with self._lock:
+            self._tags = TagReader(run, run_number(run.run_id), start_tick)
+            self._run, self._prepared = run, None
+        return _clock_fit(device.capabilities.clock_hz, start_tick, *compared)
+
+    def tags(self, timeout_s: float) -> list[LineTag]:
+        """Tags of lines since the last call; a stop ends the wait, a watchdog shortens it."""
+        device, tags = self._device, self._tags
+        if device is None or tags is None:
+            if device is not None and device.link.dead is not None:
+                raise device.link.dead
+            with self._stopped:
+                self._stopped.wait(timeout_s)
+            return []
+        try:
+            patience_s = self._show_life(device)
+            return tags.take(device.link.tags(min(timeout_s, patience_s)))
+        except TriggerError as error:
+            raise TriggerError(f"{error.message}; last heard of {tags}", hint=error.hint) from error
+
+    def stop(self) -> int:
+        """End the run after a whole line; the number of lines. Idempotent."""
+        with self._lock:
+            run, self._prepared = self._run or self._prepared, None
+            if self._device is None:
+                return 0
+            self._owed = run_number(run.run_id) if run else 0
+            device = self._living()
+            device.command(Command.STOP, 0)
+            period_ticks = run.line_period_ticks if run else 0
+            limit_s = ANSWER_S + period_ticks / device.capabilities.clock_hz
+            status = device.await_status(lambda status: status.at_rest, limit_s, "end")
+            self._owed = 0
+            self._end_waits(device)
+            return status.lines
+
+    def statistics(self) -> dict[str, Any]:
+        """Counters of device, link and driver. Without a link: what was known last, and ``link_lost``."""
+        device, tags = self._device, self._tags
+        known = tags.statistics() if tags else dict(TagReader.NOTHING)
+        if device is None:
+            return {"pulses": 0, **known}
+        link = {"link": device.link.statistics()}
+        if device.link.dead is not None:
+            pulses = tags.lines_known if tags else 0
+            return {"pulses": pulses, **known, **link, "link_lost": str(device.link.dead)}
+        return {"pulses": device.read(r.LINES), **known, **device.counters(), **link}
+
+    def close(self) -> None:
+        """Stop, as far as the device can still be reached, and let go of it. Idempotent."""
+        with self._lock:
+            device = self._device
+            try:
+                if device is not None and device.link.dead is None:
+                    self.stop()
+            finally:
+                self.release()
+
+    # Beyond it.
+
+    def device(self) -> Device:
+        """The device's registers; connects at the first need. TriggerError once the link is dead."""
+        with self._lock:
+            if self._device is None:
+                link = Link(self._open_transport())
+                try:
+                    self._device = Device(link)
+                except TriggerError:
+                    link.close()
+                    raise
+            if self._device.link.dead is not None:
+                raise self._device.link.dead
+            return self._device
+
+    def reopen(self) -> Reunion:
+        """Connect again, and find out what became of the run. Nothing is started or stopped."""
+        with self._lock:
+            self.release()
+            run, status = self._run or self._prepared, self.device().status()
+            if run is None:
+                return Reunion(None, False, None, status)
+            if status.run == run_number(run.run_id):
+                return Reunion(run.run_id, not status.at_rest, status.lines, status)
+            self._run = self._prepared = self._tags = None
+            return Reunion(run.run_id, False, None, status)
+
+    def release(self) -> None:
+        """Let go of the device and leave it as it is. Idempotent."""
+        with self._lock:
+            device, self._device = self._device, None
+            if device is not None:
+                device.link.close()
+
+    def _living(self) -> Device:
+        """As `device`; a dead link is replaced."""
+        if self._device is not None and self._device.link.dead is not None:
+            self.release()
+        return self.device()
+
+    def _take_over(self, run: TriggerRun, status: DeviceStatus, values: dict[r.Register, int]) -> None:
+        """The run is armed or running: as this driver has done it, or as another program has."""
+        if run in (self._prepared, self._run):
+            return
+        if self.device().configuration() != values:
+            raise TriggerError(
+                f"run {run.run_id!r} is {status}, with other settings", hint="stop it, or use another run id"
+            )
+        self._prepared, self._run, self._tags = run, None, None
+
+    def _demand_rest(self, run: TriggerRun, status: DeviceStatus) -> None:
+        """End what a stop did not reach; refuse to end what nobody here has asked to."""
+        if status.at_rest:
+            return
+        if status.run == self._owed:
+            self.stop()
+            return
+        raise TriggerError(
+            f"run {run.run_id!r} prepared while another one runs: number {status.run:#018x} is {status}",
+            hint="stop it first: acquire trigger stop",
+        )
+
+    def _await_line_0(self, device: Device, run: TriggerRun, limit_s: float) -> int:
+        def begun(status: DeviceStatus) -> bool:
+            return status.lines > 0 or status.state == State.ENDED
+
+        if not device.await_status(begun, limit_s, "start").lines:
+            raise TriggerError(f"run {run.run_id!r} was stopped before its first line")
+        return device.read(r.START_TIME)
+
+    def _end_waits(self, device: Device) -> None:
+        device.link.interrupt()
+        with self._stopped:
+            self._stopped.notify_all()
+
+    def _show_life(self, device: Device) -> float:
+        """Keep the watchdog quiet while somebody asks for tags; for how long it is now."""
+        patience_s = self._config.watchdog_ticks / self._config.clock_hz / _SIGNS_OF_LIFE_PER_WATCHDOG
+        if not patience_s:
+            return float("inf")
+        if time.monotonic() > self._sign_of_life_s + patience_s:
+            device.read(r.STATUS)
+            self._sign_of_life_s = time.monotonic()
+        return patience_s
+
+
+def run_number(run_id: str) -> int:
+    """The device's 64-bit number of a run, never 0."""
+    return int.from_bytes(blake2b(run_id.encode(), digest_size=8).digest(), "little") or 1
+
+
+def _clock_fit(hz: int, start_tick: int, utc_ns: int, tick: int, uncertainty_ns: int) -> ClockFit:
+    """UTC of the run's start, from a comparison some time before or after it."""
+    elapsed = signed_ticks(start_tick - tick)
+    drift_ns = int(abs(elapsed) * NS_PER_S / hz * _DRIFT)
+    return ClockFit(hz, utc_ns + elapsed * NS_PER_S // hz, uncertainty_ns + drift_ns + 1)

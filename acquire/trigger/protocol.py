@@ -1,0 +1,202 @@
+"""The words of the trigger's protocol besides its registers: frames, commands, states, errors, tags.
+
+Registers and everything here reach the rest of the program, and the gateware, by way of
+`acquire.trigger.registers`.
+"""
+
+from __future__ import annotations
+
+import struct
+from enum import IntEnum, IntFlag
+from typing import NamedTuple
+
+PROTOCOL_VERSION = 1
+"""In every frame; a frame of another version is refused with BAD_VERSION."""
+MAX_PAYLOAD = 240
+MAX_WORDS = 59
+"""Words of one read or write: their payload is at most 2 + 4·59 = 238 bytes."""
+TIME_BITS = 48
+
+
+class Command(IntEnum):
+    """Values of COMMAND. The run id is written just before it, in the same frame."""
+
+    ARM = 1
+    """Check the configuration, take RUN_ID, clear the counters, wait for START or the external edge."""
+    START = 2
+    """Start the armed run RUN_ID."""
+    STOP = 3
+    """End run RUN_ID, or any run if RUN_ID is 0, after the line that runs; light off."""
+    CHECK_CODE = 4
+    """Compute CODE_CRC over CODE_LENGTH bits, rounded up to words."""
+    SELF_TEST = 5
+    """Test the device; what the code memory held is lost."""
+
+
+class State(IntEnum):
+    """STATUS.state."""
+
+    IDLE = 0
+    ARMED = 1
+    RUNNING = 2
+    STOPPING = 3
+    """The last line runs."""
+    ENDED = 4
+
+
+class EndReason(IntEnum):
+    """STATUS.end_reason."""
+
+    NONE = 0
+    STOPPED = 1
+    LINE_BUDGET = 2
+    WATCHDOG = 3
+    CLOCK_LOST = 4
+
+
+class ErrorCode(IntEnum):
+    """Why a request was refused (NAK). From 32 on: why a configuration cannot be armed."""
+
+    BAD_VERSION = 1
+    BAD_TYPE = 2
+    BAD_LENGTH = 3
+    BAD_ADDRESS = 4
+    READ_ONLY = 5
+    BUSY = 6
+    """A configuration, code word, check or test while a run is armed or running; or another run's ARM."""
+    BAD_COMMAND = 7
+    WRONG_RUN = 8
+    """START or STOP of a run that is not the current one."""
+    RUN_OVER = 9
+    """ARM of the run that has just ended: a run id is used once."""
+    NOT_ARMED = 10
+    BAD_RUN_ID = 11
+    """ARM with run id 0."""
+
+    BAD_SUBSTEP = 32
+    """SUBSTEP_CLOCKS outside of LIMITS."""
+    BAD_SUBSTEPS = 33
+    """S not in CAPABILITIES."""
+    BAD_PHASES = 34
+    """The 6/S sub-phases of PHASE_CLOCKS do not fit into a sub-step."""
+    BAD_SOURCE = 35
+    BAD_SEED = 36
+    """PRBS with mask or seed 0."""
+    BAD_CODE_LENGTH = 37
+    """CODE_LENGTH is 0 or more than CODE_BITS."""
+    CODE_UNCHECKED = 38
+    """Code words, or CODE_LENGTH, were written after the last CHECK_CODE."""
+    BAD_WINDOW = 39
+    """Not WINDOW_OPEN < WINDOW_CLOSE <= SUBSTEP_CLOCKS."""
+    BAD_LEAD = 40
+    """LED.lead + LIMITS.lead_margin > SUBSTEP_CLOCKS."""
+    BAD_TRIGGER_A = 41
+    """Width 0, or delay + width >= the distance of A's pulses."""
+    BAD_TRIGGER_B = 42
+    BAD_MIN_PERIOD = 43
+    """Pulses would be closer than CAMERA_MIN_PERIOD."""
+    BAD_TAG_INTERVAL = 44
+    CLOCK_UNLOCKED = 45
+
+
+class Source(IntEnum):
+    """CODE_SOURCE.kind."""
+
+    CONSTANT = 0
+    PRBS = 1
+    MEMORY = 2
+
+
+class LineMode(IntEnum):
+    """LINE.mode: when trigger outputs A and B pulse."""
+
+    PER_LINE = 0
+    PER_SUBSTEP = 1
+    """A camera line per sub-step, as the paper's setup emulates S = 3."""
+
+
+class Board(IntEnum):
+    """FIRMWARE.board."""
+
+    NONE = 0
+    """Gateware in a simulator."""
+    ULX3S = 1
+    XC4VSX55 = 2
+    MODEL = 255
+    """The behavioural model."""
+
+
+class FrameType(IntEnum):
+    """Type byte of a frame; answers and tags have bit 7 set."""
+
+    READ = 0x01
+    WRITE = 0x02
+    DATA = 0x81
+    ACK = 0x82
+    NAK = 0x83
+    TAG = 0x90
+
+
+class TagFlag(IntFlag):
+    """Why a tag was sent. Every tag has at least one of them."""
+
+    LINE = 1 << 0
+    """The time stamp is that of the start of ``line``: every TAG_INTERVAL lines, from line 0 on."""
+    FIRST = 1 << 1
+    """Line 0; has LINE as well."""
+    LAST = 1 << 2
+    """The run has ended; ``line`` is the last one. (No line was started: line = 0 and NO_LINES.)"""
+    NO_LINES = 1 << 3
+    EXTERNAL = 1 << 4
+    """With FIRST: the external edge started the run."""
+    BUDGET = 1 << 5
+    """With LAST: the line budget is used up."""
+    WATCHDOG = 1 << 6
+    """With LAST: the host was silent for too long."""
+    CLOCK_LOST = 1 << 7
+    """With LAST: the reference clock was lost."""
+    PPS = 1 << 8
+    """A pulse-per-second edge came; PPS_TIME has its instant."""
+    MISSED_A = 1 << 9
+    """The first missed strobe of camera A in this run."""
+    MISSED_B = 1 << 10
+    UNEXPECTED_A = 1 << 11
+    """The first unexpected strobe of camera A in this run."""
+    UNEXPECTED_B = 1 << 12
+    TAGS_LOST = 1 << 13
+    """Tags before this one found the FIFO full; TAG_LOST has their number."""
+
+
+class TagRecord(NamedTuple):
+    """What a tag's payload says. ``run`` is the low half of the run id.
+
+    Without LINE in ``flags`` it tells of an event: ``line`` and ``code_index`` are those of the latest
+    line, ``timestamp`` is the event's, at most 15 clocks late.
+    """
+
+    run: int
+    line: int
+    code_index: int
+    timestamp: int
+    flags: int
+
+
+TAG_FIELDS = (("run", 32), ("line", 48), ("code_index", 64), ("timestamp", TIME_BITS), ("flags", 16))
+"""Name → bits of a tag's payload, in the order of its bytes, each little endian: 26 bytes."""
+TAG_BYTES = sum(bits for _, bits in TAG_FIELDS) // 8
+
+_TAG = struct.Struct("<IIHQIHH")
+
+
+def pack_tag(tag: TagRecord) -> bytes:
+    """A tag's payload."""
+    line, time = tag.line, tag.timestamp
+    return _TAG.pack(
+        tag.run, line & 0xFFFFFFFF, line >> 32, tag.code_index, time & 0xFFFFFFFF, time >> 32, tag.flags
+    )
+
+
+def unpack_tag(payload: bytes) -> TagRecord:
+    """The tag of a payload of `TAG_BYTES`; struct.error for another length."""
+    run, line_low, line_high, code_index, time_low, time_high, flags = _TAG.unpack(payload)
+    return TagRecord(run, line_high << 32 | line_low, code_index, time_high << 32 | time_low, flags)

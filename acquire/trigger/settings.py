@@ -1,0 +1,247 @@
+"""From a run and the rig's configuration to the values of the trigger's registers, or to a refusal.
+
+Everything the device would refuse when armed is refused here first, in words: what was asked, what can be
+had, what to try.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.codes import TAPS
+from acquire.errors import TriggerError
+from acquire.trigger import registers as r
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from acquire.config import LightOutputConfig, LineOutputConfig, TriggerConfig
+    from acquire.trigger.base import TriggerRun
+
+_DEFAULT_WIDTH = 90
+_TAG_FRAME_BYTES = r.TAG_BYTES + 10
+"""On the wire: header, CRC, COBS and delimiter."""
+_TAGS_SHARE = 0.5
+"""Of the link; answers need the rest, and it lets a FIFO that has filled empty again."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LoadedCode:
+    """What the code memory holds, as a run's code: it repeats. Bits are 0 or 1 each."""
+
+    loaded: NDArray[np.uint8]
+
+    def bits(self, start: int, length: int) -> NDArray[np.uint8]:
+        index = np.arange(start, start + length)
+        return np.where(index < 0, 0, self.loaded[index % len(self.loaded)]).astype(np.uint8)
+
+    def to_attrs(self) -> dict[str, Any]:
+        return {"kind": "memory", "length": len(self.loaded), "start": 0}
+
+
+@dataclass(frozen=True, slots=True)
+class Capabilities:
+    """What a device says of itself. Ticks are clocks of the device."""
+
+    clock_hz: int
+    serial: str
+    firmware: str
+    board: str
+    code_bits: int
+    substep_ticks_min: int
+    substep_ticks_max: int
+    lead_margin_ticks: int
+    substeps: tuple[int, ...]
+    start_latency_ticks: int
+    tag_room: int
+    rx_bytes: int
+    inputs: tuple[str, ...]
+
+    @classmethod
+    def read(cls, values: Mapping[r.Register, int]) -> Capabilities:
+        """From the constant registers."""
+        version, limits = r.VERSION.unpack(values[r.VERSION]), r.LIMITS.unpack(values[r.LIMITS])
+        can, queues = r.CAPABILITIES.unpack(values[r.CAPABILITIES]), r.QUEUES.unpack(values[r.QUEUES])
+        boards = {int(board): board.name.lower() for board in r.Board}
+        return cls(
+            clock_hz=values[r.CLOCK_HZ],
+            serial=f"{values[r.SERIAL]:016x}",
+            firmware=f"{version['firmware_major']}.{version['firmware_minor']}",
+            board=boards.get(version["board"], f"board {version['board']}"),
+            code_bits=values[r.CODE_BITS],
+            substep_ticks_min=limits["substep_min"],
+            substep_ticks_max=(1 << limits["substep_max_log2"]) - 1,
+            lead_margin_ticks=limits["lead_margin"],
+            substeps=tuple(S for S in range(8) if can["substeps"] >> S & 1),
+            start_latency_ticks=can["start_latency"],
+            tag_room=queues["tags"],
+            rx_bytes=queues["rx_bytes"],
+            inputs=tuple(name for name in ("strobes", "pps", "scene_gate", "external_arm") if can[name]),
+        )
+
+
+GATEWARE = Capabilities(
+    clock_hz=90_000_000,
+    serial="",
+    firmware="",
+    board="",
+    code_bits=1 << 19,
+    substep_ticks_min=5,
+    substep_ticks_max=(1 << 24) - 1,
+    lead_margin_ticks=1,
+    substeps=(1, 2, 3, 6),
+    start_latency_ticks=0,
+    tag_room=1024,
+    rx_bytes=2048,
+    inputs=("strobes", "pps", "scene_gate", "external_arm"),
+)
+"""The most that a device of this program's firmware can do: what is known before one is asked."""
+
+
+def register_values(
+    run: TriggerRun, config: TriggerConfig, device: Capabilities, bytes_per_s: float
+) -> dict[r.Register, int]:
+    """Every config register's value. Raises TriggerError for what the device or its link cannot do."""
+    _check_timing(run, config, device)
+    distance = run.substep_ticks if config.line_start == "per-substep" else run.line_period_ticks
+    _check_pulses(config, distance)
+    _check_tags(run, device, bytes_per_s)
+    return {
+        **_code(run.code.to_attrs(), device),
+        r.SUBSTEP_CLOCKS: run.substep_ticks,
+        r.LINE: r.LINE.pack(
+            substeps=run.substeps,
+            mode=r.LineMode.PER_SUBSTEP if config.line_start == "per-substep" else r.LineMode.PER_LINE,
+            direction=config.a.direction == "reverse",
+        ),
+        r.PHASE_CLOCKS: run.line_period_ticks // 6,
+        **_light(config.light, run.substep_ticks, device),
+        **_output(config.a, "A", distance, device),
+        **_output(config.b, "B", distance, device),
+        r.CAMERA_MIN_PERIOD: config.camera_min_period_ticks,
+        r.LINE_BUDGET: config.line_budget,
+        r.TAG_INTERVAL: run.tag_every_lines,
+        r.WATCHDOG: config.watchdog_ticks,
+        r.EXTERNAL_ARM: r.EXTERNAL_ARM.pack(
+            enable=config.external_start != "off", invert=config.external_start == "falling"
+        ),
+    }
+
+
+def _check_timing(run: TriggerRun, config: TriggerConfig, device: Capabilities) -> None:
+    if config.clock_hz != device.clock_hz:
+        raise TriggerError(
+            f"a trigger clock of {config.clock_hz} Hz",
+            possible=f"{device.clock_hz} Hz, as this device has",
+            hint="set trigger.clock_hz, and substep_ticks with it",
+        )
+    if not device.substep_ticks_min <= run.substep_ticks <= device.substep_ticks_max:
+        raise TriggerError(
+            f"sub-step of {run.substep_ticks} ticks",
+            possible=f"{device.substep_ticks_min} to {device.substep_ticks_max}",
+            hint="change trigger.substep_ticks",
+        )
+    if run.substeps not in device.substeps:
+        raise TriggerError(
+            f"{run.substeps} sub-steps per line",
+            possible=", ".join(map(str, device.substeps)),
+            hint="change geometry.substeps",
+        )
+    if config.external_start != "off" and "external_arm" not in device.inputs:
+        raise TriggerError(
+            "an external start", possible="start by command", hint="trigger.external_start='off'"
+        )
+
+
+def _check_pulses(config: TriggerConfig, distance: int) -> None:
+    if distance < config.camera_min_period_ticks:
+        raise TriggerError(
+            f"camera pulses {distance} ticks apart",
+            possible=f"{config.camera_min_period_ticks} or more, as trigger.camera_min_period_ticks says",
+            hint="a longer trigger.substep_ticks",
+        )
+
+
+def _check_tags(run: TriggerRun, device: Capabilities, bytes_per_s: float) -> None:
+    if run.tag_every_lines < 1:
+        raise TriggerError(f"a tag every {run.tag_every_lines} lines", possible="1 or more")
+    line_rate = device.clock_hz / run.line_period_ticks
+    fewest = int(line_rate * _TAG_FRAME_BYTES / (bytes_per_s * _TAGS_SHARE)) + 1
+    if run.tag_every_lines < fewest and bytes_per_s != float("inf"):
+        raise TriggerError(
+            f"a tag every {run.tag_every_lines} lines at {line_rate:g} lines/s",
+            possible=f"every {fewest} lines over a link of {bytes_per_s:g} bytes/s",
+            hint="raise trigger.tag_every_lines or trigger.baud",
+        )
+
+
+def _code(attrs: Mapping[str, Any], device: Capabilities) -> dict[r.Register, int]:
+    """Source and parameters; what the source does not need is left as at power-up."""
+    values = {r.CODE_SOURCE: 0, r.CODE_LENGTH: 0, r.PRBS_MASK: 0, r.PRBS_SEED: 0}
+    kind = attrs.get("kind")
+    if kind == "constant":
+        value = int(attrs["value"])
+        return values | {r.CODE_SOURCE: r.CODE_SOURCE.pack(kind=r.Source.CONSTANT, value=value)}
+    if kind == "memory" and 0 < int(attrs["length"]) <= device.code_bits:
+        source = r.CODE_SOURCE.pack(kind=r.Source.MEMORY)
+        return values | {r.CODE_SOURCE: source, r.CODE_LENGTH: int(attrs["length"])}
+    if kind == "prbs" and tuple(attrs["taps"]) == TAPS.get(int(attrs["degree"])):
+        mask, seed = sum(1 << tap - 1 for tap in attrs["taps"]), int(str(attrs["seed"]), 0)
+        if 0 < seed < 1 << attrs["degree"]:
+            source = r.CODE_SOURCE.pack(kind=r.Source.PRBS)
+            return values | {r.CODE_SOURCE: source, r.PRBS_MASK: mask, r.PRBS_SEED: seed}
+    raise TriggerError(
+        f"the trigger cannot generate the code: {dict(attrs)}",
+        possible=f"prbs with known taps and a seed, constant, memory of 1 to {device.code_bits} bits",
+    )
+
+
+def _light(light: LightOutputConfig, substep_ticks: int, device: Capabilities) -> dict[r.Register, int]:
+    closes = substep_ticks if light.close_ticks is None else light.close_ticks
+    if not light.open_ticks < closes <= substep_ticks:
+        raise TriggerError(
+            f"light from tick {light.open_ticks} to {closes} of a sub-step",
+            possible=f"within 0 to {substep_ticks}",
+            hint="change trigger.light.open_ticks and close_ticks",
+        )
+    most = substep_ticks - device.lead_margin_ticks
+    if light.lead_ticks > most:
+        raise TriggerError(
+            f"light {light.lead_ticks} ticks ahead", possible=f"at most {most} with this sub-step"
+        )
+    if light.scene_gate and "scene_gate" not in device.inputs:
+        raise TriggerError("light behind the scene gate", possible="trigger.light.scene_gate = false")
+    led = r.LED.pack(
+        enable=light.enable,
+        gate_enable=light.scene_gate,
+        invert=light.active == "low",
+        lead=light.lead_ticks,
+    )
+    return {r.LED: led, r.WINDOW_OPEN: light.open_ticks, r.WINDOW_CLOSE: closes}
+
+
+def _output(output: LineOutputConfig, arm: str, distance: int, device: Capabilities) -> dict[r.Register, int]:
+    width = output.width_ticks or max(1, min(_DEFAULT_WIDTH, distance // 3))
+    if output.enable and output.delay_ticks + width >= distance:
+        raise TriggerError(
+            f"pulse {arm} {width} ticks wide, {output.delay_ticks} late",
+            possible=f"delay + width below the {distance} ticks between pulses",
+            hint=f"change trigger.{arm.lower()}.delay_ticks and width_ticks",
+        )
+    if output.strobe and "strobes" not in device.inputs:
+        raise TriggerError(
+            f"strobes of camera {arm}", possible=f"trigger.{arm.lower()}.strobe = false with this device"
+        )
+    control = r.TRIGGER_A.pack(
+        enable=output.enable,
+        invert=output.active == "low",
+        direction=output.direction == "reverse",
+        strobe=output.strobe,
+    )
+    names = {name: getattr(r, f"TRIGGER_{arm}{name}") for name in ("", "_DELAY", "_WIDTH")}
+    return {names[""]: control, names["_DELAY"]: output.delay_ticks, names["_WIDTH"]: width}

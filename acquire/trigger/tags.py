@@ -1,0 +1,81 @@
+"""From what the device says of lines to the tags of a run: counted, checked, on one axis of ticks."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+from acquire.trigger.base import LineTag
+from acquire.trigger.registers import TAG_FIELDS, TIME_BITS, TagFlag
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+    from acquire.trigger.base import TriggerRun
+    from acquire.trigger.link import TagArrival
+
+_NUMBERS = 1 << 16
+_RUN_BITS = dict(TAG_FIELDS)["run"]
+_WRAP = 1 << TIME_BITS
+
+
+class TagReader:
+    """Reads the tags of ``run``, which the device knows by ``number`` and began at ``start_tick``.
+
+    What it counts: ``tags`` received, those of events included; ``tags_missing``, made by the device but
+    not received; ``tags_repeated``, older than the ones before; ``tags_wrong``, whose code index does not
+    belong to their line. The latter two are dropped.
+    """
+
+    NOTHING: ClassVar[Mapping[str, int]] = {
+        "tags": 0,
+        "tags_missing": 0,
+        "tags_repeated": 0,
+        "tags_wrong": 0,
+    }
+
+    def __init__(self, run: TriggerRun, number: int, start_tick: int) -> None:
+        self.lines_known = 0
+        """Lines that have begun for certain."""
+        self._run, self._number, self._start_tick = run, number % (1 << _RUN_BITS), start_tick
+        self._next = 0
+        self._counts = dict(self.NOTHING)
+
+    def __str__(self) -> str:
+        return f"run {self._run.run_id!r} with {self.lines_known} lines"
+
+    def statistics(self) -> dict[str, int]:
+        return dict(self._counts)
+
+    def take(self, arrivals: Iterable[TagArrival]) -> list[LineTag]:
+        """The tags of lines among them; not those of events and of other runs."""
+        return [tag for arrival in arrivals if (tag := self._take(arrival))]
+
+    def _take(self, arrival: TagArrival) -> LineTag | None:
+        number, tag = arrival
+        if tag.run != self._number:
+            return None
+        ahead = (number - self._next) % _NUMBERS
+        if ahead >= _NUMBERS // 2:
+            self._counts["tags_repeated"] += 1
+            return None
+        self._next = (number + 1) % _NUMBERS
+        self._counts["tags_missing"] += ahead
+        if tag.code_index != tag.line * self._run.substeps:
+            self._counts["tags_wrong"] += 1
+            return None
+        self._counts["tags"] += 1
+        if not tag.flags & TagFlag.NO_LINES:
+            self.lines_known = max(self.lines_known, tag.line + 1)
+        if not tag.flags & TagFlag.LINE:
+            return None
+        return LineTag(tag.line, tag.code_index, self._ticks_since_start(tag.timestamp, tag.line))
+
+    def _ticks_since_start(self, timestamp: int, line: int) -> int:
+        """48 bits wrap after weeks: of all ticks that they can mean, the one nearest to the line's."""
+        expected = line * self._run.line_period_ticks
+        return expected + signed_ticks(timestamp - self._start_tick - expected)
+
+
+def signed_ticks(ticks: int) -> int:
+    """A difference of 48-bit time stamps, as the nearest to 0."""
+    return (ticks + _WRAP // 2) % _WRAP - _WRAP // 2

@@ -1,0 +1,74 @@
+"""One user per port: an advisory lock that dies with its process, and says who holds it.
+
+pyserial's own exclusive mode only keeps out programs that ask for it as well; USB has nothing of the kind.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import tempfile
+from pathlib import Path
+
+from acquire.errors import TriggerError
+
+SHARED = Path("/run/lock")
+_COMMAND_SHOWN = 80
+
+
+class PortLock:
+    """Held from construction to `release`. Raises TriggerError when another holds it."""
+
+    def __init__(self, port: str) -> None:
+        path = lock_directory() / f"acquire-{re.sub('[^A-Za-z0-9]+', '-', port).strip('-')}.lock"
+        try:
+            self._descriptor = _open_for_all(path)
+        except OSError as error:
+            raise TriggerError(f"{port} cannot be locked: {path}: {error.strerror}") from error
+        self._take(port)
+
+    def _take(self, port: str) -> None:
+        try:
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            holder = os.pread(self._descriptor, 32, 0).decode(errors="replace").strip()
+            self.release()
+            raise TriggerError(
+                f"{port} is in use by process {_describe(holder)}", hint="stop it, or ask its daemon"
+            ) from error
+        os.ftruncate(self._descriptor, 0)
+        os.pwrite(self._descriptor, f"{os.getpid()}\n".encode(), 0)
+
+    def release(self) -> None:
+        """Idempotent. The file stays: removing it would let two processes lock two files of one name."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+
+def lock_directory() -> Path:
+    """Where locks of all users lie, else this host's directory for temporary files."""
+    return SHARED if os.access(SHARED, os.W_OK) else Path(tempfile.gettempdir())
+
+
+def _open_for_all(path: Path) -> int:
+    """Other users take the same lock: they may write here, whatever the umask of the first.
+
+    Opened without O_CREAT where it exists: with it, the kernel refuses others' files in sticky directories.
+    """
+    try:
+        return os.open(path, os.O_RDWR | os.O_CLOEXEC)
+    except FileNotFoundError:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        os.fchmod(descriptor, 0o666)
+        return descriptor
+
+
+def _describe(pid: str) -> str:
+    """``1234 (acquire serve rig.toml)``."""
+    try:
+        command = Path("/proc", pid, "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
+    except OSError:
+        return pid or "unknown"
+    return f"{pid} ({command.strip()[:_COMMAND_SHOWN]})"

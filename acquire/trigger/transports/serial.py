@@ -1,0 +1,83 @@
+"""Bytes over whatever pyserial opens: a port, ``socket://host:port``, ``loop://``, a pseudo-terminal."""
+
+from __future__ import annotations
+
+import errno
+from pathlib import Path
+
+import serial
+from serial.tools.list_ports import comports
+
+from acquire.errors import TriggerError
+from acquire.trigger.transports.base import READ_WAIT_S, UDEV_HINT
+from acquire.trigger.transports.lock import PortLock
+
+BITS_PER_BYTE = 10
+"""8N1."""
+_WRITE_S = 2.0
+_READ_BYTES = 4096
+
+
+class SerialTransport:
+    """An open serial port, locked against a second user.
+
+    Modem lines are used for ``rts_cts`` only: pseudo-terminals and many boards have none. Raises
+    TriggerError when the port is not there or in use.
+    """
+
+    def __init__(self, url: str, baud: int, *, rts_cts: bool = False) -> None:
+        self.name = url
+        self._local = local = "://" not in url
+        self.bytes_per_s = baud / BITS_PER_BYTE if local else float("inf")
+        self._lock = PortLock(str(Path(url).resolve()) if local else url)
+        try:
+            self._port = serial.serial_for_url(
+                url, baudrate=baud, timeout=READ_WAIT_S, write_timeout=_WRITE_S, rtscts=rts_cts
+            )
+            self._port.reset_input_buffer()
+        except (OSError, ValueError) as error:  # SerialException is an OSError
+            self._lock.release()
+            raise _not_opened(url, error, local) from error
+
+    def read(self) -> bytes:
+        try:
+            if self._local:
+                return bytes(self._port.read(self._port.in_waiting or 1))
+            return self._read_remote()
+        except OSError as error:
+            raise self._gone(error) from error
+
+    def _read_remote(self) -> bytes:
+        """A socket does not say how much waits; asked without a time limit, it gives what it has."""
+        data = bytes(self._port.read(1))
+        if data:
+            self._port.timeout = 0
+            data += self._port.read(_READ_BYTES)
+            self._port.timeout = READ_WAIT_S
+        return data
+
+    def write(self, data: bytes) -> None:
+        try:
+            self._port.write(data)
+        except serial.SerialTimeoutException as error:
+            raise TriggerError(f"{self.name} took no byte for {_WRITE_S:g} s") from error
+        except OSError as error:
+            raise self._gone(error) from error
+
+    def close(self) -> None:
+        self._port.close()
+        self._lock.release()
+
+    def _gone(self, error: OSError) -> TriggerError:
+        return TriggerError(f"{self.name} is gone: {error}", hint="check cable and power")
+
+
+def _not_opened(url: str, error: OSError | ValueError, local: bool) -> TriggerError:
+    """What to try depends on why: nothing is there, or it is not ours to open."""
+    if getattr(error, "errno", None) in (errno.EACCES, errno.EPERM):
+        return TriggerError(f"{url} may not be opened: permission denied", hint=UDEV_HINT)
+    if not local:
+        return TriggerError(f"{url} cannot be opened: {error}", hint="is it the right address?")
+    ports = ", ".join(sorted(port.device for port in comports()))
+    what = "is not there" if not Path(url).exists() else f"cannot be opened: {error}"
+    return TriggerError(f"{url} {what}", possible=ports or "no serial port", hint="check cable and power")

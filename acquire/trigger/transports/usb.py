@@ -1,0 +1,101 @@
+"""Bytes over the two bulk endpoints of a USB device."""
+
+from __future__ import annotations
+
+import errno
+from typing import Any
+
+import usb.core
+import usb.util
+
+from acquire.errors import TriggerError
+from acquire.trigger.transports.base import READ_WAIT_S, UDEV_HINT
+from acquire.trigger.transports.lock import PortLock
+
+VENDOR, PRODUCT = 0x1209, 0x0001
+"""pid.codes' pair for private testing."""
+_WRITE_S = 2.0
+_READ_BYTES = 16384
+_IN = usb.util.ENDPOINT_IN
+_BULK = usb.util.ENDPOINT_TYPE_BULK
+_HINTS = {
+    errno.EACCES: UDEV_HINT,
+    errno.EPERM: UDEV_HINT,
+    errno.EBUSY: "another program or a driver of the kernel has it: end that",
+}
+
+
+class UsbTransport:
+    """The device ``vendor:product``, of one ``serial`` number if several hang on the bus.
+
+    Uses the first interface that has a bulk endpoint each way. Raises TriggerError when it is not there, or
+    is not ours to open.
+    """
+
+    def __init__(
+        self, vendor: int = VENDOR, product: int = PRODUCT, serial: str = "", backend: Any = None
+    ) -> None:
+        self.name = f"usb {vendor:04x}:{product:04x}{' ' + serial if serial else ''}"
+        self.bytes_per_s = float("inf")
+        self._lock = PortLock(self.name)
+        try:
+            self._device = self._find(vendor, product, serial, backend)
+            self._in, self._out = self._claim()
+        except (usb.core.USBError, NotImplementedError, ValueError) as error:
+            self._lock.release()
+            hint = _HINTS.get(getattr(error, "errno", None) or 0, "check cable and power")
+            if isinstance(error, usb.core.NoBackendError):
+                hint = "install libusb-1.0"
+            raise TriggerError(f"{self.name} cannot be opened: {error}", hint=hint) from error
+        except TriggerError:
+            self._lock.release()
+            raise
+
+    def read(self) -> bytes:
+        try:
+            return bytes(self._in.read(_READ_BYTES, round(READ_WAIT_S * 1000)))
+        except usb.core.USBTimeoutError:
+            return b""
+        except usb.core.USBError as error:
+            raise self._gone(error) from error
+
+    def write(self, data: bytes) -> None:
+        try:
+            sent = self._out.write(data, round(_WRITE_S * 1000))
+        except usb.core.USBTimeoutError as error:
+            raise TriggerError(f"{self.name} took no byte for {_WRITE_S:g} s") from error
+        except usb.core.USBError as error:
+            raise self._gone(error) from error
+        if sent != len(data):
+            raise TriggerError(f"{self.name} took {sent} of {len(data)} bytes")
+
+    def close(self) -> None:
+        usb.util.dispose_resources(self._device)
+        self._lock.release()
+
+    def _find(self, vendor: int, product: int, serial: str, backend: Any) -> Any:
+        """Serial numbers are asked for only where one is wanted: reading one needs the right to open it."""
+        found = list(usb.core.find(find_all=True, idVendor=vendor, idProduct=product, backend=backend) or ())
+        if found and not serial:
+            return found[0]
+        devices = {str(device.serial_number or ""): device for device in found}
+        if serial in devices:
+            return devices[serial]
+        raise TriggerError(
+            f"{self.name} is not on the bus",
+            possible=", ".join(devices) or "no device of this kind is there",
+            hint="check cable and power",
+        )
+
+    def _claim(self) -> tuple[Any, Any]:
+        for interface in self._device.get_active_configuration():
+            bulk = [end for end in interface if usb.util.endpoint_type(end.bmAttributes) == _BULK]
+            ways = {usb.util.endpoint_direction(end.bEndpointAddress): end for end in bulk}
+            if len(ways) == 2:
+                usb.util.claim_interface(self._device, interface.bInterfaceNumber)
+                return ways[_IN], ways[usb.util.ENDPOINT_OUT]
+        raise TriggerError(f"{self.name} has no interface with a bulk endpoint each way")
+
+    def _gone(self, error: usb.core.USBError) -> TriggerError:
+        what = "was unplugged" if error.errno == errno.ENODEV else "failed"
+        return TriggerError(f"{self.name} {what}: {error}", hint="check cable and power")

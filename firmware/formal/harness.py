@@ -1,0 +1,126 @@
+"""A gateware module, what its surroundings promise, what is claimed of it, and what helps to prove that."""
+
+from __future__ import annotations
+
+import re
+import sys
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from amaranth.back import rtlil
+from amaranth.hdl import (
+    Assert,
+    Assume,
+    ClockDomain,
+    Const,
+    Cover,
+    Fragment,
+    Module,
+    Mux,
+    Signal,
+    Value,
+    ValueLike,
+)
+from amaranth.lib.wiring import In
+
+if TYPE_CHECKING:
+    from types import FrameType
+
+_CHECK = re.compile(r'cell \$check \$\d+\n(\s+parameter \\FORMAT "(\w+)")')
+
+
+@dataclass(frozen=True, slots=True)
+class Proof:
+    """What `engine` needs: the design as RTLIL with its properties as cells ``check.NAME``."""
+
+    name: str
+    rtlil: str
+    claims: tuple[str, ...]
+    lemmas: int
+    covers: tuple[str, ...]
+    cover_depth: int
+    """Clocks from reset within which every cover is reached."""
+    depth: int = 1
+    """Of the induction: clocks that must be good for the next to follow. Pipelines want their length."""
+
+
+class Harness:
+    """Claims and lemmas hold in every clock; both are asserted, only claims are what the proof is for.
+
+    ``m`` takes whatever registers the claims need to remember the past. Nothing has a reset but the
+    initial values: a proof's first clock is the first after configuration.
+    """
+
+    def __init__(self) -> None:
+        self.m = Module()
+        self._sync = ClockDomain("sync", reset_less=True)
+        self.m.domains += self._sync
+        self.claims: list[str] = []
+        self.covers: list[str] = []
+        self._names: set[str] = set()
+
+    def assume(self, condition: ValueLike) -> None:
+        self.m.d.comb += Assume(condition)
+
+    def claim(self, name: str, when: ValueLike, then: ValueLike) -> None:
+        self.claims.append(name)
+        self.lemma(name, when, then)
+
+    def lemma(self, name: str, when: ValueLike, then: ValueLike) -> None:
+        self._take(name)
+        self.m.d.comb += Assert(~Value.cast(when).any() | Value.cast(then).any(), name)
+
+    def cover(self, name: str, condition: ValueLike) -> None:
+        self._take(name)
+        self.covers.append(name)
+        self.m.d.comb += Cover(condition, name)
+
+    def proof(self, name: str, inputs: list[Signal], cover_depth: int, depth: int = 1) -> Proof:
+        text = rtlil.convert(self.m, ports=[self._sync.clk, *inputs])
+        text = _CHECK.sub(lambda found: f"cell $check \\check.{found[2]}\n{found[1]}", text)
+        lemmas = len(self._names) - len(self.claims) - len(self.covers)
+        return Proof(name, text, tuple(self.claims), lemmas, tuple(self.covers), cover_depth, depth)
+
+    def _take(self, name: str) -> None:
+        if name in self._names or not name.isidentifier():
+            raise ValueError(f"property name {name!r} is taken or no identifier")
+        self._names.add(name)
+
+
+def opened(component: Any, *kinds: type) -> tuple[Any, ...]:
+    """The elaborated module, and the local variables of its ``elaborate``, or its parts' of those ``kinds``.
+
+    Induction has to speak of registers that no port shows; these are under the names of the source.
+    """
+    wanted: tuple[Any, ...] = kinds or (type(component),)
+    local: dict[object, dict[str, Any]] = {kind.elaborate.__code__: {} for kind in wanted}
+
+    def watch(frame: FrameType, event: str, _: object) -> None:
+        if event == "return" and frame.f_code in local:
+            local[frame.f_code] = dict(frame.f_locals)
+
+    sys.setprofile(watch)
+    try:
+        fragment = Fragment.get(component, None)
+    finally:
+        sys.setprofile(None)
+    return fragment, *(local[kind.elaborate.__code__] for kind in wanted)
+
+
+def times(value: Value, factor: Value, most: int) -> Value:
+    """``value · factor`` for a factor of 0 to ``most``.
+
+    By repeated addition: a solver sees at once that the next multiple is this one and ``value``.
+    """
+    multiple: Value = Const(0, len(value) + most.bit_length())
+    product = multiple
+    for constant in range(1, most + 1):
+        multiple = (multiple + value)[: len(product)]
+        product = Mux(factor == constant, multiple, product)
+    return product
+
+
+def inputs_of(component: Any) -> list[Signal]:
+    """Ports whose level the surroundings choose, streams' included."""
+    members = component.signature.flatten(component)
+    return [Value.cast(signal) for _, member, signal in members if member.flow == In]

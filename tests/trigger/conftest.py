@@ -1,0 +1,44 @@
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from trigger_twins import TWINS, Bench
+from umockdev_here import missing
+
+from acquire.errors import TriggerError
+from acquire.trigger.transports import lock
+
+collect_ignore = ["usb"] if missing() else []
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    if reason := missing():
+        terminalreporter.write_line(f"tests/trigger/usb was left out: {reason}", yellow=True)
+
+
+SHARED = lock.SHARED
+
+
+@pytest.fixture(autouse=True)
+def _locks_of_its_own(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two runs of these tests at a time must not keep each other from ``loop://`` and the made-up bus."""
+    monkeypatch.setattr(lock, "SHARED", tmp_path_factory.getbasetemp())
+
+
+@pytest.fixture
+def locks_of_the_host(_locks_of_its_own: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For tests in which another process shall find the lock."""
+    monkeypatch.setattr(lock, "SHARED", SHARED)
+
+
+@pytest.fixture(params=TWINS)
+def bench(request: pytest.FixtureRequest) -> Iterator[Bench]:
+    """Every twin in turn."""
+    with TWINS[request.param]() as made:
+        yield made
+        for driver in made.drivers:
+            with contextlib.suppress(TriggerError):  # a test may have pulled the plug
+                driver.close()

@@ -1,0 +1,111 @@
+"""The commands against a device behind a real pseudo-terminal."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import closing
+
+import numpy as np
+import pytest
+from trigger_twins import SocketTwin, wired_model
+
+from acquire.codes import prbs
+from acquire.sim.twin_links import PtyTwin
+from acquire.trigger.transports.serial import SerialTransport
+
+
+@pytest.fixture
+def port() -> Iterator[str]:
+    with wired_model() as model:
+        twin = PtyTwin(model)
+        yield twin.path
+        twin.close()
+
+
+def acquire(*arguments: str, code: int = 0) -> str:
+    done = subprocess.run(
+        [sys.executable, "-m", "acquire", "trigger", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stdout if code == 0 else done.stderr
+
+
+def test_a_run_by_hand(port: str) -> None:
+    where = ("--url", port, "--json")
+    facts = json.loads(acquire("info", *where))
+    assert (facts["board"], facts["state"], facts["substeps"]) == ("model", "IDLE", [1, 2, 3, 6])
+    armed = json.loads(acquire("arm", *where, "--run-id", "mine"))
+    assert (armed["state"], armed["lines"], armed["utc_ns_at_tick_0"]) == ("ARMED", 0, None)
+    started = json.loads(acquire("arm", *where, "--run-id", "mine", "--start"))
+    assert started["state"] == "RUNNING"
+    assert started["utc_ns_at_tick_0"] > 1e18
+    tags = [json.loads(line) for line in acquire("monitor", *where, "--tags", "5").splitlines()]
+    assert len(tags) == 5
+    assert all(tag["code_index"] == 3 * tag["line"] for tag in tags)
+    assert "another one runs" in acquire("arm", "--url", port, code=5)
+    assert json.loads(acquire("stop", *where))["lines"] > 1000
+    assert json.loads(acquire("info", "--port", port, "--json"))["end_reason"] == "STOPPED"
+    assert "no run is armed" in acquire("monitor", "--url", port, code=5)
+
+
+def test_a_run_is_monitored_to_its_end() -> None:
+    settings = {"line_budget": "5000", "tag_every_lines": "1000", "external_start": "'rising'"}
+    with wired_model() as model, closing(SocketTwin(model)) as twin:
+        changes = [word for key, value in settings.items() for word in ("--set", f"trigger.{key}={value}")]
+        acquire("arm", "--url", twin.url, *changes)
+        heard = model.frames_heard
+        command = [sys.executable, "-m", "acquire", "trigger", "monitor", "--url", twin.url, "--json"]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as monitor:
+            deadline = time.monotonic() + 30
+            while model.frames_heard < heard + 3:
+                assert time.monotonic() < deadline
+                time.sleep(0.01)
+            model.external_edge()
+            tags = [json.loads(line) for line in monitor.communicate(timeout=30)[0].splitlines()]
+        assert monitor.returncode == 0
+    assert [(tag["line"], tag["flags"]) for tag in tags] == [
+        (0, "LINE+FIRST+EXTERNAL"),
+        *((line, "LINE") for line in (1000, 2000, 3000, 4000)),
+        (4999, "LAST+BUDGET"),
+    ]
+
+
+def test_a_code_is_loaded_from_text_or_array_and_used(port: str, tmp_path) -> None:
+    bits = prbs(15, 3, 0, 1000)
+    (tmp_path / "code.txt").write_text("\n".join("".join(map(str, row)) for row in bits.reshape(10, 100)))
+    np.save(tmp_path / "code.npy", bits)
+    crcs = set()
+    for name in ("code.txt", "code.npy"):
+        facts = json.loads(acquire("load", str(tmp_path / name), "--url", port, "--json"))
+        assert (facts["bits"], facts["ones"]) == (1000, int(bits.sum()))
+        crcs.add(facts["crc"])
+    assert len(crcs) == 1
+    armed = json.loads(acquire("arm", "--memory", "--url", port, "--json"))
+    assert (armed["state"], armed["code_checked"]) == ("ARMED", True)
+    (tmp_path / "bad.txt").write_text("0123")
+    assert "one row of 0 and 1" in acquire("load", str(tmp_path / "bad.txt"), "--url", port, code=2)
+
+
+@pytest.mark.usefixtures("locks_of_the_host")
+def test_self_test_and_refusals(port: str) -> None:
+    assert "passed" in acquire("selftest", "--url", port)
+    assert "no checked code" in acquire("arm", "--memory", "--url", port, code=5)
+    too_short = acquire("arm", "--url", port, "--set", "geometry.substeps=4", code=5)
+    assert "possible: 1, 2, 3, 6" in too_short
+    held = SerialTransport(port, 3_000_000)
+    assert "is in use by process" in acquire("info", "--url", port, code=5)
+    held.close()
+    assert "/dev/ttyNONE is not there" in acquire("info", "--url", "/dev/ttyNONE", code=5)
+    assert "Connection refused" in acquire("info", "--url", "socket://127.0.0.1:1", code=5)
+
+
+def test_the_demo_rig_has_a_trigger_as_well() -> None:
+    assert "sync trigger (model)" in acquire("info")

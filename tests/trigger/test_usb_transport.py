@@ -1,0 +1,62 @@
+from __future__ import annotations
+
+import errno
+
+import pytest
+import usb.core
+from fake_bus import FakeBus
+from trigger_twins import run, wired_model
+
+from acquire.config import TriggerConfig
+from acquire.errors import TriggerError
+from acquire.trigger.driver import TriggerDriver
+from acquire.trigger.transports.usb import UsbTransport
+
+
+def test_the_driver_runs_over_usb_and_hears_of_an_unplugged_cable() -> None:
+    with wired_model() as model:
+        bus = FakeBus(model)
+        driver = TriggerDriver(lambda: UsbTransport(serial="42", backend=bus), TriggerConfig())
+        driver.prepare(run())
+        driver.start()
+        assert bus.claimed == 1
+        assert driver.tags(5.0)[0].line == 0
+        bus.gone = True
+        with pytest.raises(TriggerError, match="usb 1209:0001 42 was unplugged"):
+            driver.device().status()
+        bus.gone = False
+        assert "run 'run' is running" in str(driver.reopen())
+        assert driver.stop() > 0
+        driver.close()
+        assert bus.claimed == 0
+
+
+def test_a_usb_device_that_is_not_there_is_told_with_those_that_are() -> None:
+    with wired_model() as model:
+        with pytest.raises(TriggerError, match="usb 1209:0001 7 is not on the bus; possible: 42"):
+            UsbTransport(serial="7", backend=FakeBus(model))
+        with pytest.raises(TriggerError, match="no device of this kind"):
+            UsbTransport(backend=FakeBus(model, product=2))
+        UsbTransport(backend=FakeBus(model)).close()
+
+
+@pytest.mark.parametrize(
+    ("refusal", "hint"), [(errno.EACCES, "udev rule"), (errno.EBUSY, "another program"), (errno.EIO, "cable")]
+)
+def test_a_device_that_may_not_be_opened_says_what_to_try(refusal, hint) -> None:
+    with wired_model() as model:
+        bus = FakeBus(model)
+        bus.refusal = refusal
+        with pytest.raises(TriggerError, match=f"usb 1209:0001 cannot be opened: .*try: .*{hint}"):
+            UsbTransport(backend=bus)
+        bus.refusal = None
+        UsbTransport(backend=bus).close()  # the lock was let go
+
+
+def test_without_libusb_the_error_says_what_is_missing(monkeypatch) -> None:
+    def find(**wanted):
+        raise usb.core.NoBackendError("No backend available")
+
+    monkeypatch.setattr(usb.core, "find", find)
+    with pytest.raises(TriggerError, match="No backend available; try: install libusb"):
+        UsbTransport()
