@@ -91,6 +91,16 @@ def test_nothing_exists_after_a_refusal_and_what_fails_later_says_so(tmp_path, m
     assert "function later" in recording.attrs["end_reason"]
 
 
+def test_an_interrupted_simulation_is_sealed_with_what_it_has(tmp_path):
+    def interrupt(done, total):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate(RIG, LEDS, tmp_path / "r.zarr", 5000, interrupt)
+    recording = open_recording(tmp_path / "r.zarr")
+    assert (recording.lines, recording.attrs["run_condition"]) == (1024, "INTERRUPTED")
+
+
 def test_the_study_ranks_effects_by_what_they_do():
     scene = listed(
         "shot_noise", {"kind": "read_noise", "sigma_e": 0.01}, {"kind": "beam_splitter", "part_a": 0.4}
