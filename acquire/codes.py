@@ -147,6 +147,24 @@ def prbs(degree: int, seed: int, start: int, length: int) -> NDArray[np.uint8]:
     return _extend(window, TAPS[degree], length)
 
 
+def state_at(degree: int, seed: int, index: int) -> int:
+    """The register's state when it is about to emit bit ``index``: the seed of the code from there on.
+
+    Whatever the state was, after ``degree`` steps it is made of the bits emitted meanwhile alone.
+    """
+    _check_register(degree, seed)
+    mask = sum(1 << (tap - 1) for tap in TAPS[degree])
+    if index < degree:
+        state = seed
+        for _ in range(index):
+            state = state >> 1 ^ (mask if state & 1 else 0)
+        return state
+    state = 0
+    for bit in _window(degree, seed, index - degree).tolist():
+        state = state >> 1 ^ (mask if bit else 0)
+    return state
+
+
 def mix_seed(number: int, degree: int) -> int:
     """A register state with about as many ones as zeros from any small integer (splitmix64, never 0).
 

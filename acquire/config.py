@@ -15,6 +15,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 from acquire.codes import TAPS, Code, ConstantCode, PrbsCode, mix_seed
 from acquire.errors import ConfigError
 from acquire.geometry import Geometry
+from acquire.scene_config import SceneConfig, SceneFile, VideoSceneConfig, anchored
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -55,6 +56,11 @@ class PrbsConfig(_Model):
     kind: Literal["prbs"] = "prbs"
     degree: int = Field(default=64, description="degree of the register: " + ", ".join(map(str, TAPS)))
     seed: int = Field(default=1, ge=0, description="any number; the register's first state is mixed from it")
+    state: str | None = Field(
+        default=None,
+        pattern="^0x[0-9a-f]+$",
+        description="the register's first state itself, instead of a seed",
+    )
 
     @model_validator(mode="after")
     def _degree_known(self) -> PrbsConfig:
@@ -63,7 +69,8 @@ class PrbsConfig(_Model):
         return self
 
     def build(self) -> Code:
-        return PrbsCode(self.degree, mix_seed(self.seed, self.degree))
+        state = mix_seed(self.seed, self.degree) if self.state is None else int(self.state, 16)
+        return PrbsCode(self.degree, state)
 
 
 class ConstantCodeConfig(_Model):
@@ -211,6 +218,9 @@ class SimulationConfig(_Model):
 
     scene: str = Field(description="a scene file, beside this file or one of the built-in ones")
     speed: float = Field(default=1.0, gt=0, le=1000, description="simulated seconds per second")
+    replay: Path | None = Field(default=None, description="a recording whose lines the cameras give instead")
+    replay_loop: bool = Field(default=False, description="over and over")
+    replay_hold_s: float = Field(default=0.0, ge=0, le=2.5, description="by which replayed lines come late")
 
 
 def _prbs_unless_said(value: Any) -> Any:
@@ -257,57 +267,6 @@ class RigConfig(_Model):
     @property
     def line_rate_hz(self) -> float:
         return self.trigger.clock_hz / self.line_period_ticks
-
-
-class SineDrive(_Model):
-    """Duty cycle low + (high − low)·(1 + sin(2π·f·t + phase))/2; the PWM is far faster than a sub-step."""
-
-    waveform: Literal["sine"]
-    frequency_hz: float = Field(gt=0)
-    low: float = Field(default=0.0, ge=0, le=1)
-    high: float = Field(default=1.0, ge=0, le=1)
-    phase_deg: float = 0.0
-
-
-class ConstantDrive(_Model):
-    """A fixed duty cycle."""
-
-    waveform: Literal["constant"]
-    level: float = Field(default=1.0, ge=0, le=1)
-
-
-class LedConfig(_Model):
-    """One LED behind a mask. Positions and sizes are fractions of the scene's side."""
-
-    name: str
-    shape: Literal["x", "triangle", "circle", "equals", "square"]
-    row: float = Field(ge=0, le=1, description="centre")
-    column: float = Field(ge=0, le=1, description="centre")
-    size: float = Field(gt=0, le=1, description="side of the bounding square")
-    drive: Annotated[SineDrive | ConstantDrive, Field(discriminator="waveform")]
-    saturation: float | None = Field(
-        default=None,
-        gt=0,
-        description="drive at which the LED gives 1 − 1/e of its asymptote; absent: linear",
-    )
-
-
-class LedSceneConfig(_Model):
-    """LEDs behind masks, each with its own drive (Fig. 9)."""
-
-    kind: Literal["leds"]
-    title: str
-    leds: tuple[LedConfig, ...] = Field(min_length=1)
-
-    @model_validator(mode="after")
-    def _names_differ(self) -> LedSceneConfig:
-        names = [led.name for led in self.leds]
-        if len(set(names)) < len(names):
-            raise ValueError(f"LEDs need different names, not {', '.join(names)}")
-        return self
-
-
-SceneConfig = LedSceneConfig
 
 
 def builtin_directory() -> Path:
@@ -367,9 +326,14 @@ def parse_settings(settings: Sequence[str]) -> dict[str, Any]:
 
 
 def load_scene(name: str | Path) -> SceneConfig:
-    """Read and validate a scene file."""
+    """Read and validate a scene file; a picture or video file is a scene that shows it.
+
+    Relative paths in it are resolved against the file.
+    """
     path = find(name)
-    return _validate(LedSceneConfig, _read(path), path)
+    if path.suffix != ".toml":
+        return VideoSceneConfig(kind="video", title=path.name, path=path.resolve())
+    return anchored(_validate(SceneFile, _read(path), path).root, path.parent)
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
+from acquire.codes import ConstantCode
 from acquire.config import LightOutputConfig, load_scene
 from acquire.errors import ConfigError, TriggerError
 from acquire.lines import ARMS
@@ -17,10 +18,13 @@ from acquire.sim import rtl
 from acquire.sim.clock import Wire
 from acquire.sim.devices import SimulatedCameraOpener, SimulatedOptics
 from acquire.sim.pins import PinPage, PinWire
+from acquire.sim.pipeline import Bench, describe
+from acquire.sim.replay import ReplayCameraOpener, describe_replay
 from acquire.sim.scenes import build_scene
 from acquire.sim.trigger_model import TriggerModel
 from acquire.sim.trigger_registers import INPUTS as SIMULATED_INPUTS
 from acquire.sim.twin_links import TwinTransport
+from acquire.store import open_recording
 from acquire.trigger.base import TriggerRun
 from acquire.trigger.driver import TriggerDriver
 from acquire.trigger.settings import GATEWARE, register_values
@@ -32,7 +36,8 @@ if TYPE_CHECKING:
     from types import TracebackType
 
     from acquire.camera.base import CameraOpener
-    from acquire.config import RigConfig, SceneConfig, TriggerConfig
+    from acquire.config import RigConfig, TriggerConfig
+    from acquire.scene_config import SceneConfig
     from acquire.sim.scenes import Scene
     from acquire.trigger.base import Trigger
     from acquire.trigger.transports import Transport
@@ -41,13 +46,16 @@ if TYPE_CHECKING:
 class Rig:
     """The devices of one instrument; a context manager that lets go of them.
 
-    Building one reads the scene's file and touches no device: ConfigError is all it raises.
+    Building one reads the scene and touches no device. Raises ConfigError for files and values, UsageError
+    for a scene that cannot be shown to these cameras.
     """
 
     def __init__(self, config: RigConfig) -> None:
         check_rig(config)
         self.config = config
         self._scene = load_scene(config.simulation.scene)
+        if config.simulation.replay is None:
+            _check_scene(config, self._scene)
         self._wire = Wire()
         self._pins = PinPage() if config.trigger.driver == "rtl" else None
         self._closed = False
@@ -55,11 +63,20 @@ class Rig:
 
     def openers(self) -> dict[str, CameraOpener]:
         """Arm → what opens its camera, here or in a process being spawned."""
+        if self.config.simulation.replay is not None:
+            return {arm: _replay_opener(self.config, self._wire, arm) for arm in ARMS}
         return {arm: _camera_opener(self.config, self._scene, self._pulses(arm), arm) for arm in ARMS}
 
     def describe(self) -> dict[str, Any]:
         """What a recording must say about where its lines come from (JSON)."""
-        return {"simulated": True, "scene": self._scene.model_dump(mode="json"), "effects": []}
+        replay = self.config.simulation.replay
+        return describe(self._scene) if replay is None else describe_replay(replay)
+
+    @property
+    def layout(self) -> str:
+        """How the instrument is laid out: ``dual``, ``compact``, ``emulated``, ``interline``."""
+        replay = self.config.simulation.replay
+        return self._scene.optics.layout if replay is None else str(open_recording(replay).attrs["layout"])
 
     def scene(self) -> Scene:
         """What the simulated cameras see, in camera A's rows and columns; sub-step 0 is the run's first."""
@@ -90,9 +107,22 @@ class Rig:
         self.close()
 
 
+def _check_scene(config: RigConfig, scene: SceneConfig) -> None:
+    """Raise UsageError here rather than in a camera's process."""
+    code = ConstantCode(0)
+    substep_s = config.trigger.substep_ticks / config.trigger.clock_hz
+    bench = Bench(scene, config.geometry, {arm: config.cameras.arm(arm) for arm in ARMS}, substep_s)
+    for arm in ARMS:
+        bench.camera(arm, code)
+
+
 def check_rig(config: RigConfig) -> None:
     """Raise ConfigError for what no trigger, or not the rig's simulated cameras, can honour."""
     trigger = config.trigger
+    if config.simulation.replay is not None and trigger.driver != "simulated":
+        raise ConfigError(
+            f"trigger.driver = {trigger.driver!r} with simulation.replay", possible="'simulated'"
+        )
     run = TriggerRun(
         "check",
         config.code.build(),
@@ -165,4 +195,17 @@ def _camera_opener(config: RigConfig, scene: SceneConfig, wire: Wire | PinWire, 
     optics = SimulatedOptics(arm, config.geometry, scene)
     return SimulatedCameraOpener(
         wire, optics, config.cameras.arm(arm), config.stream.block_lines, config.line_rate_hz
+    )
+
+
+def _replay_opener(config: RigConfig, wire: Wire, arm: str) -> CameraOpener:
+    simulation = config.simulation
+    assert simulation.replay is not None
+    return ReplayCameraOpener(
+        wire,
+        simulation.replay,
+        arm,
+        config.stream.block_lines,
+        simulation.replay_loop,
+        simulation.replay_hold_s,
     )

@@ -8,11 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquire.config import LedSceneConfig, load_rig
-from acquire.errors import ConfigError
+from acquire.config import load_rig, load_scene
+from acquire.errors import ConfigError, UsageError
 from acquire.geometry import Geometry
 from acquire.rig import Rig, open_trigger
+from acquire.scene_config import LedSceneConfig
 from acquire.sim import build_scene, truth
+from acquire.simulate import simulate
+from acquire.store import open_recording
 from acquire.trigger.base import TriggerRun
 
 OVERRIDES = {"geometry.stages": 8, "stream.block_lines": 16, "simulation.speed": 20.0}
@@ -109,6 +112,46 @@ def test_a_trigger_can_be_opened_on_its_own(config):
     trigger.start()
     assert trigger.stop() >= 1
     trigger.close()
+
+
+def test_a_scene_that_cannot_be_shown_is_refused_before_anything_is_made(config, tmp_path):
+    (tmp_path / "scene.toml").write_text('kind = "video"\npath = "none.mp4"\n')
+    missing = config.simulation.model_copy(update={"scene": str(tmp_path / "scene.toml")})
+    before = open_descriptors()
+    with pytest.raises(UsageError, match=r"none\.mp4"):
+        Rig(config.model_copy(update={"simulation": missing}))
+    assert open_descriptors() == before
+
+
+def test_devices_deliver_what_simulate_writes_effects_layout_losses_and_all(config, tmp_path):
+    scene = load_scene("scene-leds-measured").model_dump(mode="json")
+    scene["effects"].append({"kind": "dropped_lines", "rate": 0.03})
+    scene["optics"]["layout"] = "compact"
+    whole = LedSceneConfig.model_validate(scene)
+    simulate(config, whole, tmp_path / "r.zarr", 200)
+    stored = open_recording(tmp_path / "r.zarr")
+    with Rig(config) as rig:
+        rig._scene = whole
+        cameras = {arm: opener() for arm, opener in rig.openers().items()}
+        for camera in cameras.values():
+            camera.arm()
+        rig.trigger.prepare(run_of(config))
+        rig.trigger.start()
+        for arm, camera in cameras.items():
+            lines, flags = (stored.camera(arm).read(name, 0, 200) for name in ("lines", "flags"))
+            seen, number = [], 0
+            while number < 200:
+                if (block := camera.next_block(10.0)) is None:
+                    continue
+                for i, pixels in enumerate(block.pixels):
+                    number = block.first_line + i - 9
+                    if 0 <= number < 200:
+                        np.testing.assert_array_equal(pixels, lines[number])
+                        seen.append(number)
+            np.testing.assert_array_equal(seen, np.flatnonzero((flags & 1) == 0))
+            assert len(seen) < 200
+            assert camera.statistics()["lost"] >= 200 - len(seen)
+    assert rig.layout == "compact"
 
 
 def test_on_the_gateware_each_camera_follows_its_own_trigger_pin(config):

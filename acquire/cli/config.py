@@ -65,7 +65,7 @@ def show(file: FileArgument, json: JsonFlag = False) -> None:
     if json:
         print_json(table)
         return
-    for line in _dotted(table):
+    for line in dotted(table):
         typer.echo(line)
 
 
@@ -95,10 +95,10 @@ def _facts(rig: RigConfig) -> dict[str, Any]:
     }
 
 
-def _dotted(table: dict[str, Any], prefix: str = "") -> Iterator[str]:
+def dotted(table: dict[str, Any], prefix: str = "") -> Iterator[str]:
     """``a.b = value`` per leaf: JSON's numbers, texts, booleans and lists are TOML's, null is no key."""
     for key, value in table.items():
         if isinstance(value, dict):
-            yield from _dotted(value, f"{prefix}{key}.")
+            yield from dotted(value, f"{prefix}{key}.")
         elif value is not None:
             yield f"{prefix}{key} = {json_text.dumps(value, ensure_ascii=False)}"

@@ -10,7 +10,6 @@ import numpy as np
 
 from acquire.cli.demo_plan import N_M, SEGMENT_LINES, T_M, segment_row
 from acquire.cli.progress import stage_progress
-from acquire.config import LedSceneConfig, SineDrive
 from acquire.evaluate.report import (
     ArmLedger,
     CaptureFacts,
@@ -22,6 +21,7 @@ from acquire.evaluate.report import (
 )
 from acquire.recon import Reconstruction, reconstruct
 from acquire.reconstruct import save_reconstruction
+from acquire.scene_config import LedSceneConfig, SineDrive
 from acquire.sim.scenes import LedScene, build_scene
 from acquire.sim.voxels import truth
 from acquire.store import Recording, open_recording, write_video

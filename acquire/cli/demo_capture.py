@@ -78,13 +78,20 @@ def compile_gateware(rig: RigConfig, journal: Journal) -> None:
 
 @contextmanager
 def daemon(plan: DemoPlan, socket: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """``acquire serve`` as a process of its own, which ends with the block, however that ends."""
+    """``acquire serve`` for the demonstration."""
     settings = {"code.seed": plan.seed, **trigger_settings(plan)}
-    options = [f"--config={plan.config}", f"--socket={socket}", "--owned"]
+    options = [f"--config={plan.config}", f"--socket={socket}"]
     options += [f"--set={key}={value!r}" for key, value in settings.items()]
-    command = [sys.executable, "-m", "acquire", "serve", *options]
+    with daemon_process(options, plan.out / LOG) as process:
+        yield process
+
+
+@contextmanager
+def daemon_process(options: list[str], log: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """``acquire serve`` as a process of its own, which ends with the block, however that ends."""
+    command = [sys.executable, "-m", "acquire", "serve", "--owned", *options]
     with (
-        (plan.out / LOG).open("wb") as file,
+        log.open("wb") as file,
         subprocess.Popen(  # noqa: S603  # ourselves
             command, stdin=subprocess.PIPE, stderr=file, stdout=file
         ) as process,
@@ -128,14 +135,14 @@ def _record(client: Client, path: Path, lines: int) -> Captured:
     started = time.perf_counter()
     client.start(path, lines=lines)
     with stage_progress("recording") as advance:
-        status = _follow(client, lines, advance)
+        status = follow(client, lines, advance)
     if status.last is None or status.last.condition != "GOOD":
         reason = status.fault or (status.last and f"{status.last.condition}: {status.last.end_reason}")
         raise DataError(f"the recording {path} is not whole: {reason}", hint=f"acquire info {path}")
     return Captured(path, status, time.perf_counter() - started)
 
 
-def _follow(client: Client, lines: int, advance: Callable[[int, int], None]) -> Status:
+def follow(client: Client, lines: int, advance: Callable[[int, int], None]) -> Status:
     """Poll until the daemon is idle again; give up when nothing moves."""
     seen, moved = -1, time.monotonic()
     while (status := client.status()).state not in {State.IDLE, State.FAULTED}:

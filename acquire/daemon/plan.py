@@ -71,6 +71,7 @@ class Run:
             shard_chunks=config.recording.shard_chunks,
             codec=config.recording.codec,
             fsync=config.recording.fsync,
+            layout=self._rig.layout,
         )
 
     def _camera(self, arm: str, facts: dict[str, Any]) -> dict[str, Any]:

@@ -2,11 +2,30 @@
 
 ::
 
-    scenes (shapes) ──▶ lines: Eq. (1), streamed ──┐
-    clock: the wire between trigger and cameras ───┴──▶ devices          voxels: the truth, for comparison
+    scenes ─▶ lines: Eq. (1), streamed ─┐
+    effects: stages that are listed ────┼─▶ pipeline: a camera's lines ─┐
+                                        │                               ├─▶ devices    replay: stored lines
+    light: code and drives ─────────────┘      clock: pulses on a wire ─┘
+    voxels: the truth, for comparison
+
+From Python, without files: ``Bench(scene_config, geometry, cameras, substep_s).camera("a", code)``, or any
+object that is a `Scene` under a `StreamingArm`.
 """
 
-from acquire.sim.scenes import ArrayScene, LedScene, Scene, build_scene
+from acquire.sim.functions import FunctionScene
+from acquire.sim.lines import StreamingArm
+from acquire.sim.pipeline import Bench
+from acquire.sim.scenes import ArrayScene, LedScene, Scene, SumScene, build_scene
 from acquire.sim.voxels import truth
 
-__all__ = ["ArrayScene", "LedScene", "Scene", "build_scene", "truth"]
+__all__ = [
+    "ArrayScene",
+    "Bench",
+    "FunctionScene",
+    "LedScene",
+    "Scene",
+    "StreamingArm",
+    "SumScene",
+    "build_scene",
+    "truth",
+]

@@ -9,24 +9,27 @@ camera that loses lines: the queue behind it has no end, it is merely late (``be
 from __future__ import annotations
 
 import multiprocessing
+from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from acquire import __version__
-from acquire.camera.base import Camera, CameraBlock, CameraIdentity
+from acquire.camera import base
+from acquire.camera.base import CameraBlock, CameraIdentity
 from acquire.clock import NS_PER_S
 from acquire.errors import CameraError
+from acquire.lines import ARMS
 from acquire.sim.blas import limit_blas_threads
-from acquire.sim.lines import StreamingArm
-from acquire.sim.scenes import build_scene
+from acquire.sim.pipeline import Bench, Camera, Readout
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from collections.abc import Iterator
 
     from acquire.codes import Code
-    from acquire.config import CameraConfig, GeometryConfig, SceneConfig
+    from acquire.config import CameraConfig, GeometryConfig
+    from acquire.scene_config import SceneConfig
     from acquire.sim.clock import PulseTrain, Reading, Wire
     from acquire.sim.pins import PinWire
 
@@ -39,20 +42,19 @@ class SimulatedOptics:
     geometry: GeometryConfig
     scene: SceneConfig
 
-    def expose(self, train: PulseTrain, code: Code) -> StreamingArm:
-        """The lines that the arm gives under a train's timing and the light's code."""
-        M, S = self.geometry.stages, self.geometry.substeps
-        substep_s = float(train.line_period_ns / (S * NS_PER_S))
-        return StreamingArm(build_scene(self.scene, M * S, substep_s), code, M, S, self.arm)
+    def expose(self, train: PulseTrain, code: Code, config: CameraConfig) -> Camera:
+        """The lines that the arm's camera gives under a train's timing and the light's code."""
+        substep_s = float(train.line_period_ns / (self.geometry.substeps * NS_PER_S))
+        bench = Bench(self.scene, self.geometry, dict.fromkeys(ARMS, config), substep_s)
+        return bench.camera(self.arm, code)
 
 
 class SimulatedCamera:
     """A TDI camera that reads out one line per pulse on the wire, in blocks of ``block_lines``.
 
     It follows one train: the one that runs when it is armed, else the next one. Its line at pulse ``p`` is
-    line number ``p − (M + 1)``. Values are those of an ideal converter:
-    DN = clip(round(black level + responsivity · Y), 0, white). ``line_rate_hz`` is what it was set up for;
-    the pulses alone decide.
+    line number ``p − (M + 1)``. What its lines hold is said in `acquire.sim.pipeline`; lines that an effect
+    drops are jumped over in its count. ``line_rate_hz`` is what it was set up for; the pulses alone decide.
     """
 
     def __init__(
@@ -69,7 +71,9 @@ class SimulatedCamera:
         self._train: int | None = None
         self._first_pulse = 0
         self._delivered = 0
-        self._light: StreamingArm | None = None
+        self._lost = 0
+        self._ready: deque[CameraBlock] = deque()
+        self._light: Camera | None = None
 
     def identify(self) -> CameraIdentity:
         return CameraIdentity("acquire", "simulated TDI camera", self._config.serial, __version__)
@@ -96,13 +100,16 @@ class SimulatedCamera:
         reading = self._wire.look()
         self._train = reading.run if reading.running else reading.run + 1
         self._first_pulse = reading.issued if reading.running else 0
-        self._delivered = 0
+        self._delivered = self._lost = 0
+        self._ready.clear()
         self._light = None
 
     def next_block(self, timeout_s: float) -> CameraBlock | None:
         """The next ``block_lines`` lines; fewer only for the last of a train that was stopped."""
         if self._train is None:
             raise CameraError("a block was asked of a camera that is not armed", hint="arm it")
+        if self._ready:
+            return self._ready.popleft()
         if self._finished(self._wire.look()):
             self._wire.clock.sleep(timeout_s)
             return None
@@ -121,7 +128,7 @@ class SimulatedCamera:
 
     def statistics(self) -> dict[str, int]:
         behind = 0 if self._train is None else self._behind(self._wire.look())
-        return {"lines": self._delivered, "lost": 0, "behind_lines": behind}
+        return {"lines": self._delivered - self._lost, "lost": self._lost, "behind_lines": behind}
 
     def close(self) -> None:
         self.disarm()
@@ -141,21 +148,28 @@ class SimulatedCamera:
     def _finished(self, reading: Reading) -> bool:
         return reading.run == self._train and reading.stopped and not self._behind(reading)
 
-    def _read_out(self, reading: Reading, count: int) -> CameraBlock:
+    def _read_out(self, reading: Reading, count: int) -> CameraBlock | None:
         if self._light is None:
             assert reading.train is not None
-            self._light = self._optics.expose(reading.train, self._wire.code(reading.train))
+            code = self._wire.code(reading.train)
+            self._light = self._optics.expose(reading.train, code, self._config)
         first_line = self._first_pulse + self._delivered - self._depth_lines
-        pixels = self._convert(self._light.lines(first_line, count))
-        block = CameraBlock(self._delivered, pixels, np.zeros(count, np.uint16))
+        lines = self._light.read(first_line, count)
+        if not lines.missing.any():
+            block = CameraBlock(self._delivered, lines.pixels, np.zeros(count, np.uint16))
+            self._delivered += count
+            return block
+        self._lost += int(lines.missing.sum())
+        self._ready.extend(_whole_runs(self._delivered, lines))
         self._delivered += count
-        return block
+        return self._ready.popleft() if self._ready else None
 
-    def _convert(self, light: NDArray[np.float32]) -> NDArray[Any]:
-        """Y of Eq. (1) to DN."""
-        dn = light * np.float32(self._config.responsivity_dn) + np.float32(self._config.black_level_dn)
-        pixels: NDArray[Any] = np.clip(np.rint(dn), 0, self._config.white_dn).astype(self._config.dtype)
-        return pixels
+
+def _whole_runs(first: int, lines: Readout) -> Iterator[CameraBlock]:
+    """The stretches between lines that did not come."""
+    edges = np.flatnonzero(np.diff(lines.missing, prepend=True, append=True))
+    for begin, end in edges.reshape(-1, 2).tolist():
+        yield CameraBlock(first + begin, lines.pixels[begin:end], np.zeros(end - begin, np.uint16))
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +182,7 @@ class SimulatedCameraOpener:
     block_lines: int
     line_rate_hz: float
 
-    def __call__(self) -> Camera:
+    def __call__(self) -> base.Camera:
         if multiprocessing.parent_process() is not None:
             limit_blas_threads(1)
         return SimulatedCamera(self.wire, self.optics, self.config, self.block_lines, self.line_rate_hz)

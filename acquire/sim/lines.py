@@ -1,15 +1,17 @@
 """Streaming forward simulation: the lines of one arm by Eq. (1), whichever are asked for, in bounded memory.
 
 A line sums the scene along the shear, ``t = S·ℓ + r + u`` with row r and ``u < S``; the arm that sees the
-scene turned is the same sum over the turned scene. Two ways, chosen by the scene:
+scene turned is the same sum over the turned scene. Light need not be on or off: E says how
+bright it is. Two ways, chosen by the scene:
 
 `SeparableLines`   X = Σ_k s_k(t)·mask_k. With h_k(t) = Σ_u s_k(t + u)·E(t + u) the sum over u and time is
                    done once per LED, and a line is a matrix product of a window that slides by S::
 
                        Y(ℓ, j) = Σ_k Σ_r h_k(S·ℓ + r) · W_k(r, j)       W_k = mask_k, S columns per pixel
 
-`FrameLines`       any scene, frame by frame: row r of the frame at t belongs to line (t − r) // S alone, so
-                   a frame is added to M + 1 unfinished lines, which are carried to the next call.
+`FrameLines`       any scene, frame by frame: row r of the frame at t belongs to the fine packet of charge
+                   q = t − r alone, and line ℓ is made of the packets S·ℓ … S·ℓ + S − 1. Packets that are
+                   not whole yet are carried to the next call.
 
 Both give bit for bit the same lines however the stream is split into calls: the first computes whole tiles
 at fixed places, the second adds in the order of time.
@@ -17,14 +19,16 @@ at fixed places, the second adds in the order of time.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from acquire.errors import UsageError
 from acquire.lines import ARMS
-from acquire.sim.scenes import SeparableScene
+from acquire.scene_config import ArmOptics, OpticsConfig
+from acquire.sim.light import Illumination
+from acquire.sim.scenes import SeparableScene, frames_at
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -32,10 +36,12 @@ if TYPE_CHECKING:
     from acquire.codes import Code
     from acquire.sim.scenes import Scene
 
-_TILE_LINES = 256
+TILE_LINES = 256
 """Lines of one matrix product: enough for BLAS, few enough for the cache (windows of 0.3 MB at n = 192)."""
 _BLOCK_BYTES = 8 << 20
 """Frames of a scene held at once."""
+_GATHERED_LINES = 512
+"""Lines whose packets are summed at once."""
 
 
 class StreamingArm:
@@ -44,9 +50,10 @@ class StreamingArm:
     Parameters
     ----------
     scene : of size n = M·S
-    code : E, dark before sub-step 0
+    code : E, dark before sub-step 0; or light of which the code is a part
     stages, substeps : M and S
     arm : "a", or "b", which sees the scene turned by 90° counter-clockwise
+    optics : how the arm sees the scene, if it is not that
 
     Raises
     ------
@@ -54,7 +61,15 @@ class StreamingArm:
         The scene is not M·S wide, or there is no such arm.
     """
 
-    def __init__(self, scene: Scene, code: Code, stages: int, substeps: int, arm: str) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        code: Code | Illumination,
+        stages: int,
+        substeps: int,
+        arm: str,
+        optics: ArmOptics | None = None,
+    ) -> None:
         if scene.size != stages * substeps:
             raise UsageError(
                 f"scene of size {scene.size} for {stages} stages of {substeps} sub-steps",
@@ -62,11 +77,12 @@ class StreamingArm:
             )
         if arm not in ARMS:
             raise UsageError(f"arm {arm!r}", possible=", ".join(ARMS))
-        turns = ARMS.index(arm)
+        optics = optics or getattr(OpticsConfig(), arm)
+        light = code if isinstance(code, Illumination) else Illumination.of(scene, code)
         self._lines: _Lines = (
-            SeparableLines(scene, code, substeps, turns)
+            SeparableLines(scene, light, substeps, optics)
             if isinstance(scene, SeparableScene)
-            else FrameLines(scene, code, substeps, turns)
+            else FrameLines(scene, light, substeps, optics)
         )
 
     def lines(self, first_line: int, count: int) -> NDArray[np.float32]:
@@ -81,21 +97,21 @@ class _Lines(Protocol):
 class SeparableLines:
     """Lines of a separable scene, by tiles; the last tile is kept for the call that continues in it."""
 
-    def __init__(self, scene: SeparableScene, code: Code, substeps: int, turns: int) -> None:
-        self._scene, self._code, self._substeps = scene, code, substeps
-        pixels = _merge_columns(scene.masks, substeps, turns)
+    def __init__(self, scene: SeparableScene, light: Illumination, substeps: int, optics: ArmOptics) -> None:
+        self._size, self._source, self._substeps = scene.size, light, substeps
+        pixels = _merge_columns(seen(scene.masks, optics), substeps)
         # A mask covers few rows: the others add nothing to the product.
         self._rows = [_covered_rows(mask) for mask in pixels]
         self._weights = np.concatenate([mask[rows] for mask, rows in zip(pixels, self._rows, strict=True)])
-        self._windows = np.empty((_TILE_LINES, len(self._weights)), np.float32)
+        self._windows = np.empty((TILE_LINES, len(self._weights)), np.float32)
         self._tile_index: int | None = None
-        self._tile = np.empty((_TILE_LINES, self._weights.shape[1]), np.float32)
+        self._tile = np.empty((TILE_LINES, self._weights.shape[1]), np.float32)
 
     def lines(self, first_line: int, count: int) -> NDArray[np.float32]:
         out = np.empty((count, self._tile.shape[1]), np.float32)
         done = 0
         while done < count:
-            index, skip = divmod(first_line + done, _TILE_LINES)
+            index, skip = divmod(first_line + done, TILE_LINES)
             self._compute(index)
             part = self._tile[skip : skip + count - done]
             out[done : done + len(part)] = part
@@ -104,12 +120,12 @@ class SeparableLines:
 
     def _compute(self, index: int) -> None:
         if index != self._tile_index:
-            light = self._light(index * _TILE_LINES * self._substeps)
+            light = self._light(index * TILE_LINES * self._substeps)
             start = 0
             for h, rows in zip(light, self._rows, strict=True):
                 width = rows.stop - rows.start
                 windows = sliding_window_view(h[rows.start :], width)[:: self._substeps]
-                self._windows[:, start : start + width] = windows[:_TILE_LINES]
+                self._windows[:, start : start + width] = windows[:TILE_LINES]
                 start += width
             np.matmul(self._windows, self._weights, out=self._tile)
             self._tile_index = index
@@ -117,56 +133,88 @@ class SeparableLines:
     def _light(self, first: int) -> NDArray[np.float32]:
         """h_k(first + i) for every sub-step i at which a line of a tile meets a row: (K, i)."""
         S = self._substeps
-        count = S * (_TILE_LINES - 1) + self._scene.size
-        lit = self._scene.intensity(first, count + S - 1) * self._code.bits(first, count + S - 1)
+        count = S * (TILE_LINES - 1) + self._size
+        lit = self._source.light(first, count + S - 1)
         h: NDArray[np.float64] = sum(lit[:, u : u + count] for u in range(1, S)) + lit[:, :count]
         return h.astype(np.float32)
 
 
 class FrameLines:
-    """Lines of any scene; what unfinished lines have gathered is kept for the call that continues."""
+    """Lines of any scene; what unfinished packets have gathered is kept for the call that continues."""
 
-    def __init__(self, scene: Scene, code: Code, substeps: int, turns: int) -> None:
-        self._scene, self._code, self._substeps, self._turns = scene, code, substeps, turns
-        self._stages = scene.size // substeps
-        self._block = max(1, _BLOCK_BYTES // (4 * scene.size**2))
-        # Rows of a frame at phase t mod S that belong to one line, newest line first: where each run begins.
-        self._runs = [[0, *range(phase + 1, scene.size, substeps)] for phase in range(substeps)]
-        self._unfinished = np.zeros((self._stages, self._stages))
+    def __init__(self, scene: Scene, light: Illumination, substeps: int, optics: ArmOptics) -> None:
+        from acquire.sim import kernels  # a compiler, which separable scenes do without
+
+        self._kernels = kernels
+        self._scene, self._source, self._substeps = scene, light, substeps
+        n = scene.size
+        self._block = max(1, _BLOCK_BYTES // (4 * n**2))
+        self._along_rows = optics.turn_deg % 180 == 0
+        place = np.empty(n * n, np.int64)
+        place[seen(np.arange(n * n).reshape(1, n, n), optics).ravel()] = np.arange(n * n)
+        row, column = (place // n).reshape(n, n), (place % n).reshape(n, n)
+        # Of a row of the scene, or of a column where charge moves along those: its row on the sensor, and
+        # of the other axis its column there.
+        self._rows = row[:, 0] if self._along_rows else row[0]
+        self._columns = column[0] if self._along_rows else column[:, 0]
+        self._unfinished = np.zeros((n, n))
         self._next_line: int | None = None
 
     def lines(self, first_line: int, count: int) -> NDArray[np.float32]:
+        parts = [
+            self._some_lines(first, min(_GATHERED_LINES, first_line + count - first))
+            for first in range(first_line, first_line + count, _GATHERED_LINES)
+        ]
+        return (
+            np.concatenate(parts) if parts else np.empty((0, self._scene.size // self._substeps), np.float32)
+        )
+
+    def _some_lines(self, first_line: int, count: int) -> NDArray[np.float32]:
         S, n = self._substeps, self._scene.size
-        gathered = np.zeros((count + self._stages, self._stages))
+        # Always (along the moving charge, across it) or the reverse, as the kernel walks through the frames.
+        packets = np.zeros((S * count + n, n) if self._along_rows else (n, S * count + n))
+        gathered = packets if self._along_rows else packets.T
         begin, end = S * first_line, S * (first_line + count) + n - 1
         if first_line == self._next_line:
-            gathered[: self._stages] = self._unfinished
+            gathered[:n] = self._unfinished
             begin += n - 1
         for first in range(begin, end, self._block):
-            self._gather(gathered, first_line, first, min(self._block, end - first))
-        self._unfinished = gathered[count:]
+            self._gather(packets, S * first_line, first, min(self._block, end - first))
+        self._unfinished = gathered[S * count :].copy()
         self._next_line = first_line + count
-        return gathered[:count].astype(np.float32)
+        whole = gathered[: S * count, :: 1 if self._columns[0] <= self._columns[-1] else -1]
+        merged = np.zeros((count, n // S))
+        for u, c in np.ndindex(S, S):
+            merged += whole[u::S, c::S]
+        return merged.astype(np.float32)
 
-    def _gather(self, gathered: NDArray[np.float64], first_line: int, first: int, count: int) -> None:
-        """Add the frames from sub-step ``first``; row i of ``gathered`` is line first_line + i."""
-        lit = np.flatnonzero(self._code.bits(first, count))
+    def _gather(self, packets: NDArray[np.float64], first_packet: int, first: int, count: int) -> None:
+        """Add the frames from sub-step ``first``; packet i of ``packets`` is number first_packet + i."""
+        light = self._source.light(first, count).sum(axis=0)
+        lit = np.flatnonzero(light)
         if not len(lit):
             return
-        frames = _merge_columns(self._scene.frames(first, count)[lit], self._substeps, self._turns)
-        for t, rows in zip((first + lit).tolist(), frames, strict=True):
-            newest = t // self._substeps - first_line
-            by_line = np.add.reduceat(rows, self._runs[t % self._substeps], axis=0, dtype=np.float64)
-            by_line = by_line[: newest + 1][::-1]
-            gathered[newest + 1 - len(by_line) : newest + 1] += by_line
+        frames = frames_at(self._scene, first + lit)
+        newest = first + lit - first_packet
+        if self._along_rows:
+            self._kernels.add_along_rows(frames, light[lit], newest, self._rows, packets)
+        else:
+            if self._rows[0] < self._rows[-1]:
+                frames = frames[:, :, ::-1]
+            self._kernels.add_along_columns(frames, light[lit], newest - (self._scene.size - 1), packets)
 
 
-def _merge_columns(video: NDArray[np.float32], substeps: int, turns: int) -> NDArray[np.float32]:
-    """(…, row, pixel): the sum of S columns per pixel, as the arm sees them; one column after the other."""
-    turned = np.rot90(video, turns, axes=(1, 2))
-    merged: NDArray[np.float32] = turned[:, :, ::substeps].copy()
+def seen(video: NDArray[Any], optics: ArmOptics) -> NDArray[Any]:
+    """Frames (…, row, column) as an arm sees them: mirrored, then turned counter-clockwise."""
+    mirrored = video[:, :, ::-1] if optics.mirror else video
+    return np.rot90(mirrored, optics.turn_deg // 90, axes=(1, 2))
+
+
+def _merge_columns(video: NDArray[np.float32], substeps: int) -> NDArray[np.float32]:
+    """(…, row, pixel): the sum of S columns per pixel; one column after the other."""
+    merged: NDArray[np.float32] = video[:, :, ::substeps].copy()
     for column in range(1, substeps):
-        merged += turned[:, :, column::substeps]
+        merged += video[:, :, column::substeps]
     return merged
 
 

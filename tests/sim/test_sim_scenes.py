@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sim_helpers import LEDS
 
-from acquire.config import LedConfig, LedSceneConfig, SineDrive, load_scene
+from acquire.config import load_scene
 from acquire.errors import UsageError
+from acquire.scene_config import LedConfig, LedSceneConfig, SineDrive
 from acquire.sim.scenes import ArrayScene, LedScene, SeparableScene, build_scene
 from acquire.sim.shapes import SHAPES
 from acquire.sim.voxels import truth

@@ -1,0 +1,118 @@
+"""``acquire simulate``: a scene, a picture or a video becomes a recording; what its effects are worth."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from acquire.cli.output import JsonFlag, print_facts, print_json, print_table
+from acquire.cli.progress import stage_progress
+from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from acquire.config import RigConfig
+    from acquire.simulate import Study, Worth
+
+
+def register(app: typer.Typer) -> None:
+    app.command(rich_help_panel="Simulation")(simulate)
+
+
+def simulate(
+    scene: Annotated[
+        str,
+        typer.Argument(metavar="SCENE", help="Scene file; picture, video or .npy."),
+    ],
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="New recording, NAME.zarr.")] = None,
+    config: Annotated[
+        str | None, typer.Option("--config", "-c", metavar="RIG", help="Rig file; else the scene's.")
+    ] = None,
+    lines: Annotated[int | None, typer.Option(help="How many lines; else the scene's.")] = None,
+    duration: Annotated[float | None, typer.Option(metavar="SECONDS", help="Instead of --lines.")] = None,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="Change one value of the rig, e.g. code.seed=7."),
+    ] = None,
+    explain: Annotated[bool, typer.Option(help="Only show the pipeline and the cost of each stage.")] = False,
+    advice: Annotated[bool, typer.Option(help="Say which effects matter.")] = True,
+    json: JsonFlag = False,
+) -> None:
+    """Write a recording of a simulated scene as fast as it goes; no daemon needed.
+
+    Example: [bold]acquire simulate scene-digits --out digits.zarr[/]
+    """
+    from acquire.config import load_rig, load_scene, parse_settings
+    from acquire.sim.blas import limit_blas_threads
+    from acquire.simulate import bench_of, study
+    from acquire.simulate import simulate as run
+    from acquire.store.files import check_new_path
+
+    if out is None and not explain:
+        raise UsageError("simulate without --out", possible="--out NAME.zarr, or --explain")
+    limit_blas_threads(1)  # the arms share the cores
+    shown = load_scene(scene)
+    rig = load_rig(config or shown.rig, parse_settings(settings or []))
+    count = _line_count(rig, shown.lines, lines, duration)
+    facts: dict[str, Any] = {}
+    if out is not None and not explain:
+        check_new_path(out)
+        with stage_progress(f"simulating {out.name}") as advance:
+            done = run(rig, shown, out, count, advance)
+        facts = {**asdict(done), "path": str(done.path), "speed": done.speed}
+    found = study(bench_of(rig, shown), rig.code.build()) if explain or (advice and shown.effects) else None
+    if json:
+        print_json({**facts, "study": found and asdict(found)})
+        return
+    if facts:
+        print_facts(_readable(facts))
+    if found:
+        _print_study(found, explain=explain)
+
+
+def _line_count(rig: RigConfig, default: int, lines: int | None, duration: float | None) -> int:
+    if lines is not None and duration is not None:
+        raise UsageError("simulate with --lines and --duration", possible="one of them")
+    if duration is not None:
+        if not duration > 0:
+            raise UsageError(f"simulate with --duration {duration}", possible="more than 0")
+        return max(1, round(duration * rig.line_rate_hz))
+    return default if lines is None else lines
+
+
+def _readable(facts: dict[str, Any]) -> dict[str, Any]:
+    lost = facts["lost_lines"]
+    return {
+        "recording": facts["path"],
+        "lines": f"{facts['lines']} of both arms, {facts['simulated_s']:.4g} s",
+        "took": f"{facts['seconds']:.2f} s, {facts['speed']:.3g} x real time",
+        "dropped": ", ".join(f"{arm} {count}" for arm, count in lost.items()) if any(lost.values()) else None,
+    }
+
+
+def _print_study(found: Study, *, explain: bool) -> None:
+    typer.echo()
+    if explain:
+        rows = [("Eq. (1)", "forward", f"{found.bare_us_per_line:.2f}")]
+        rows += [(worth.effect, worth.place, f"{worth.us_per_line:.2f}") for worth in found.effects]
+        rows.append(("all", "", f"{found.all_us_per_line:.2f}"))
+        print_table(("stage", "acts on", "us per line and arm"), rows)
+        typer.echo()
+    typer.echo(
+        f"signal {found.signal_dn:.3g} DN RMS, temporal noise {found.noise_dn:.3g} DN RMS (rounding included)"
+    )
+    if found.effects:
+        by_size = sorted(found.effects, key=lambda worth: -(worth.noises or 0))
+        changes = [(w.effect, f"{w.change_dn:.3g}", f"{w.noises or 0:.3g}", verdict(w)) for w in by_size]
+        print_table(("left out", "lines change by DN", "noises", "so"), changes)
+
+
+def verdict(worth: Worth) -> str:
+    """What an effect's size means for the scene."""
+    if worth.noises is None:
+        return "lines are lost, and known to be"
+    if worth.noises < 0.05:
+        return f"can be left out, saves {worth.us_per_line:.2f} us a line"
+    return "small beside the noise" if worth.noises < 0.5 else "matters"

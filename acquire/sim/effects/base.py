@@ -1,0 +1,87 @@
+"""What every effect is given, what it gives back, and where its random numbers come from."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from acquire.sim.scenes import Scene
+
+PLACES = ("light", "image", "signal", "charge", "readout", "stream")
+"""Where in the chain a stage acts, in the order of the light's and the signal's way."""
+
+TILE_LINES = 256
+"""Random numbers of lines are drawn for tiles of so many, at fixed places."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What a stage may depend on besides its own parameters.
+
+    Attributes
+    ----------
+    arm : "a", "b", or "ab" for the one sensor of the compact layout
+    seed, realisation : of the random streams; temporal noise of another realisation is independent,
+        fixed patterns stay
+    stages, substeps, pixels : M and S of the sensor; pixels per line
+    substep_s : duration of a sub-step
+    scene : what it looks at
+    white_dn, black_level_dn, responsivity_dn, gain_dn_per_e : of its camera
+    """
+
+    arm: str
+    seed: int
+    realisation: int
+    stages: int
+    substeps: int
+    pixels: int
+    substep_s: float
+    scene: Scene
+    white_dn: int
+    black_level_dn: float
+    responsivity_dn: float
+    gain_dn_per_e: float
+
+    @property
+    def exposure_s(self) -> float:
+        """t_exp of a line: M line periods."""
+        return self.stages * self.substeps * self.substep_s
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One step. ``run`` is a pure function; what it takes and gives depends on the place::
+
+    light     Illumination → Illumination (wraps it)
+    image     frames (k, n, n) → frames
+    signal    lines (m, pixels), of which the first ``lead`` are only history, first line → lines
+    charge    electrons (256, pixels) float64, first line → electrons
+    readout   DN (256, pixels) float64, first line → DN
+    stream    pixels (256, pixels), first line, the line before → pixels, missing (256,) or None
+    """
+
+    effect: str
+    place: str
+    run: Callable[..., Any]
+    lead: int = 0
+
+
+def draws(effect: str, setting: Setting, tile: int, *, arm: str | None = None) -> np.random.Generator:
+    """The random stream of one effect, arm and tile; realisations of temporal noise differ."""
+    key = (*_name_key(effect, arm or setting.arm), setting.realisation, 1, tile & 0xFFFFFFFF, tile < 0)
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(setting.seed, spawn_key=key)))
+
+
+def pattern(effect: str, setting: Setting) -> np.random.Generator:
+    """The random stream of one effect's fixed pattern on one arm: the same for every line and realisation."""
+    key = (*_name_key(effect, setting.arm), 0)
+    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(setting.seed, spawn_key=key)))
+
+
+def _name_key(effect: str, arm: str) -> tuple[int, int]:
+    return zlib.crc32(effect.encode()), zlib.crc32(arm.encode())

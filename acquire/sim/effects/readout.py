@@ -1,0 +1,37 @@
+"""Effects between the pixel and the number, in DN."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.sim.effects.base import Setting, Stage, pattern
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire import effect_config as config
+
+
+def column_offsets(effect: config.ColumnOffsets, setting: Setting) -> list[Stage]:
+    """+ N(0, σ) DN, fixed per read-out channel; pixel c is read by channel c modulo their number."""
+    channel = effect.sigma_dn * pattern("column_offsets", setting).standard_normal(effect.channels)
+    offset = channel[np.arange(setting.pixels) % effect.channels]
+
+    def run(dn: NDArray[Any], first_line: int) -> NDArray[Any]:  # noqa: ARG001
+        return dn + offset
+
+    return [Stage("column_offsets", "readout", run)]
+
+
+def adc(effect: config.Adc, setting: Setting) -> list[Stage]:
+    """DN in steps of (white + 1)/2^bits, rounded, and no more than ``saturation_dn``."""
+    step = max(1.0, (setting.white_dn + 1) / 2**effect.bits)
+    top = setting.white_dn if effect.saturation_dn is None else min(effect.saturation_dn, setting.white_dn)
+
+    def run(dn: NDArray[Any], first_line: int) -> NDArray[Any]:  # noqa: ARG001
+        coarse: NDArray[Any] = np.minimum(np.rint(dn / step) * step, top)
+        return coarse
+
+    return [Stage("adc", "readout", run)]

@@ -1,0 +1,77 @@
+"""Scenes that a user writes as a Python function of time and place."""
+
+from __future__ import annotations
+
+import importlib
+import runpy
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    LightFunction = Callable[[NDArray[Any], NDArray[Any], NDArray[Any]], Any]
+
+
+class FunctionScene:
+    """``function(time_s, row, column)`` → light (count, n, n), at the middle of sub-steps and pixels.
+
+    Raises UsageError when the function gives another shape, something that is not finite, or negative light;
+    it is tried for one sub-step when the scene is made.
+    """
+
+    def __init__(self, function: LightFunction, size: int, substep_s: float) -> None:
+        self.size = size
+        self._function, self._substep_s = function, substep_s
+        centre = (np.arange(size) + 0.5) / size
+        self._row, self._column = centre[:, None], centre
+        self.frames(0, 1)
+
+    def frames(self, first: int, count: int) -> NDArray[np.float32]:
+        """(count, row, column) float32."""
+        return self.frames_at(np.arange(first, first + count))
+
+    def frames_at(self, substeps: NDArray[np.int64]) -> NDArray[np.float32]:
+        """(count, row, column) float32."""
+        light = self._function((substeps + 0.5) * self._substep_s, self._row, self._column)
+        return checked_light(light, (len(substeps), self.size, self.size), _name(self._function))
+
+
+def checked_light(light: Any, shape: tuple[int, ...], what: str) -> NDArray[np.float32]:
+    """Light as float32 of ``shape``; UsageError for what is none."""
+    try:
+        frames = np.asarray(light, dtype=np.float32)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"light of {what} is no array of numbers: {error}") from error
+    if frames.shape != shape:
+        raise UsageError(f"light of {what} has shape {frames.shape}", possible=f"{shape}")
+    if not np.isfinite(frames).all():
+        raise UsageError(f"light of {what}: {np.isnan(frames).sum()} pixels are NaN, or some infinite")
+    if frames.size and frames.min() < 0:
+        raise UsageError(f"light of {what}: {frames.min():g}", possible="0 or more")
+    return frames
+
+
+def load_function(name: str) -> LightFunction:
+    """``module:name`` or ``file.py:name``. UsageError when there is none."""
+    place, _, attribute = name.rpartition(":")
+    try:
+        if place.endswith(".py"):
+            found = runpy.run_path(str(Path(place))).get(attribute)
+        else:
+            found = getattr(importlib.import_module(place), attribute, None)
+    except (ImportError, OSError, SyntaxError) as error:
+        raise UsageError(f"scene function {name!r} cannot be loaded: {error}") from error
+    if not callable(found):
+        raise UsageError(f"scene function {name!r}: {place} has no function {attribute}")
+    return found  # type: ignore[no-any-return]
+
+
+def _name(function: LightFunction) -> str:
+    return f"function {getattr(function, '__name__', repr(function))}"

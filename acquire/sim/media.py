@@ -1,0 +1,301 @@
+"""Files of the user as scenes: pictures, videos and arrays of any size and frame rate.
+
+One frame is decoded at a time and only a few are kept, at the scene's size: an hour of video fits::
+
+    file ─▶ frame i, as light (h, w) ─▶ square (fit) ─▶ (n, n), mean over what each pixel covers ─▶ cache
+    sub-step t ─▶ position t·frame_rate ─▶ the frame before (hold), or that and the next one (blend)
+
+Pillow reads pictures and animations (PNG, TIFF, GIF, WebP …), numpy reads ``.npy``, and PyAV, where it is
+installed, every container that FFmpeg knows.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from acquire.errors import DataError, UsageError
+from acquire.sim.functions import checked_light
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from acquire.scene_config import VideoSceneConfig
+
+    Light = NDArray[np.floating[Any]]
+
+_KEPT_FRAMES = 16
+_CHECKED_VALUES = 1 << 22
+"""Elements of an array that are looked at at a time."""
+MAX_PIXELS = 1 << 26
+"""Of one frame, before it is made small."""
+
+
+class Source(Protocol):
+    """Frames of a file, in order or by their number; grey values 0 to 1."""
+
+    @property
+    def frame_rate_hz(self) -> float | None: ...
+
+    @property
+    def count(self) -> int:
+        """Frames of the file."""
+        ...
+
+    def frame(self, index: int) -> Light:
+        """(row, column) float32."""
+        ...
+
+
+class VideoScene:
+    """A file shown to the cameras; see the module. UsageError for files that are none."""
+
+    def __init__(self, config: VideoSceneConfig, size: int, substep_s: float) -> None:
+        self.size = size
+        self._config = config
+        self._source = open_media(config.path)
+        rate_hz = config.frame_rate_hz or self._source.frame_rate_hz
+        if rate_hz is None and self._source.count > 1:
+            raise UsageError(
+                f"{config.path} does not say its frame rate", hint="frame_rate_hz in the scene file"
+            )
+        self._frames_per_substep = (rate_hz or 0.0) * substep_s
+        self._kept: OrderedDict[int, Light] = OrderedDict()
+        self.frames(0, 1)
+
+    def frames(self, first: int, count: int) -> NDArray[np.float32]:
+        """(count, row, column) float32."""
+        return self.frames_at(np.arange(first, first + count))
+
+    def frames_at(self, substeps: NDArray[np.int64]) -> NDArray[np.float32]:
+        """(count, row, column) float32."""
+        position = (substeps + 0.5) * self._frames_per_substep
+        before = np.floor(position).astype(np.int64)
+        part = (position - before).astype(np.float32)
+        out = np.empty((len(substeps), self.size, self.size), np.float32)
+        for i, (index, after) in enumerate(zip(before.tolist(), part.tolist(), strict=True)):
+            out[i] = self._shown(index)
+            if after and self._config.between == "blend":
+                out[i] += after * (self._shown(index + 1) - out[i])
+        return out
+
+    def _shown(self, index: int) -> Light:
+        last = self._source.count - 1
+        index = index % (last + 1) if self._config.end == "loop" else min(max(index, 0), last)
+        if index in self._kept:
+            self._kept.move_to_end(index)
+            return self._kept[index]
+        light = np.clip(self._source.frame(index), 0, None) ** np.float32(self._config.gamma)
+        self._kept[index] = resample(_square(light, self._config.fit), self.size)
+        if len(self._kept) > _KEPT_FRAMES:
+            self._kept.popitem(last=False)
+        return self._kept[index]
+
+
+def open_media(path: Path) -> Source:
+    """The frames of a file of any kind that one of the libraries reads."""
+    if not path.is_file():
+        raise UsageError(f"scene file {path}: there is no such file")
+    if path.suffix == ".npy":
+        return _ArrayFile(path)
+    from PIL import Image
+
+    try:
+        return _PictureFile(path)
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
+        raise UsageError(f"{path}: {error}") from error
+    except (OSError, SyntaxError, ValueError):
+        return _open_container(path)
+
+
+def read_picture(path: Path, side: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Light (multiplied by its alpha) and alpha of the first frame of a file, (side, side) each."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as image:
+            channels = _grey(image.convert("LA"))
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise UsageError(f"picture {path} cannot be read: {error}") from error
+    alpha = resample(_square(channels[..., 1], "pad"), side)
+    light = resample(_square(channels[..., 0] * channels[..., 1], "pad"), side)
+    return light.astype(np.float64), alpha.astype(np.float64)
+
+
+def resample(picture: Light, size: int) -> Light:
+    """(h, w) → (size, size): means over what each pixel covers; a smaller picture's pixels become squares."""
+    rows, columns = (_weights(length, size) for length in picture.shape)
+    resampled: Light = rows @ picture @ columns.T
+    return resampled
+
+
+def _weights(length: int, size: int) -> Light:
+    """(size, length): what part of new pixel i is covered by old pixel j."""
+    new = np.arange(size + 1) * (length / size)
+    low = np.maximum(new[:-1, None], np.arange(length))
+    high = np.minimum(new[1:, None], np.arange(1, length + 1))
+    covered = np.clip(high - low, 0, None)
+    weights: Light = (covered / covered.sum(axis=1, keepdims=True)).astype(np.float32)
+    return weights
+
+
+def _square(picture: Light, fit: str) -> Light:
+    height, width = picture.shape
+    if fit == "stretch" or height == width:
+        return picture
+    if fit == "fill":
+        side = min(height, width)
+        top, left = (height - side) // 2, (width - side) // 2
+        return picture[top : top + side, left : left + side]
+    side = max(height, width)
+    padded = np.zeros((side, side), np.float32)
+    top, left = (side - height) // 2, (side - width) // 2
+    padded[top : top + height, left : left + width] = picture
+    return padded
+
+
+class _ArrayFile:
+    """``.npy``: (time, row, column) or (row, column); integers are parts of their largest value."""
+
+    frame_rate_hz = None
+
+    def __init__(self, path: Path) -> None:
+        try:
+            video = np.load(path, mmap_mode="r", allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise UsageError(f"{path} is no array: {error}") from error
+        self._video: NDArray[Any] = video[None] if video.ndim == 2 else video
+        if self._video.ndim != 3 or 0 in self._video.shape:
+            raise UsageError(
+                f"{path}: array of shape {video.shape}", possible="(time, row, column) or (row, column)"
+            )
+        if self._video.dtype.kind not in "buif":
+            raise UsageError(f"{path}: array of {self._video.dtype}", possible="numbers")
+        self._white = float(np.iinfo(video.dtype).max) if video.dtype.kind in "ui" else 1.0
+        step = max(1, _CHECKED_VALUES // self._video[0].size)
+        for at in range(0, len(self._video), step):
+            part = self._video[at : at + step]
+            checked_light(part, part.shape, f"{path}, frames {at} to {at + len(part) - 1},")
+
+    @property
+    def count(self) -> int:
+        return len(self._video)
+
+    def frame(self, index: int) -> Light:
+        frame: Light = np.asarray(self._video[index], np.float32) / np.float32(self._white)
+        return frame
+
+
+class _PictureFile:
+    """What Pillow reads; every frame must decode, which is tried at once."""
+
+    def __init__(self, path: Path) -> None:
+        from PIL import Image
+
+        self._path = path
+        with Image.open(path) as image:
+            _check_size(path, image.width, image.height)
+            self.count = int(getattr(image, "n_frames", 1))
+            image.seek(self.count - 1)
+            image.load()
+            duration_ms = float(image.info.get("duration") or 0)
+        self.frame_rate_hz = 1000 / duration_ms if duration_ms > 0 else None
+
+    def frame(self, index: int) -> Light:
+        try:
+            return self._read(index)
+        except (OSError, SyntaxError, ValueError, EOFError) as error:
+            raise DataError(f"{self._path}: frame {index} cannot be read: {error}") from error
+
+    def _read(self, index: int) -> Light:
+        from PIL import Image
+
+        with Image.open(self._path) as image:
+            image.seek(index)
+            if image.mode.startswith(("I", "F")):
+                light = np.asarray(image, np.float32) / _white(image.mode)
+                return checked_light(light, light.shape, str(self._path))
+            return _grey(image.convert("L"))
+
+
+def _grey(levels: Any) -> Light:
+    grey: Light = np.asarray(levels, np.float32) / np.float32(255)
+    return grey
+
+
+def _white(mode: str) -> float:
+    return 1.0 if mode == "F" else 65535.0
+
+
+def _check_size(path: Path, width: int, height: int) -> None:
+    if not 0 < width * height <= MAX_PIXELS:
+        raise UsageError(f"{path}: frames of {width} × {height} pixels", possible=f"1 to {MAX_PIXELS} pixels")
+
+
+def _open_container(path: Path) -> Source:
+    try:
+        import av
+    except ImportError as error:
+        raise UsageError(
+            f"{path} is not a picture that Pillow reads", hint="pip install 'tdi-acquire[video]' for videos"
+        ) from error
+    try:
+        return _Container(path)
+    except (av.FFmpegError, ValueError) as error:
+        raise UsageError(f"{path} is no picture and no video: {error}") from error
+
+
+class _Container:
+    """What FFmpeg reads, decoded forwards; asked for an earlier frame, it begins again."""
+
+    def __init__(self, path: Path) -> None:
+        import av
+
+        self._path = path
+        with av.open(str(path)) as container:
+            if not container.streams.video:
+                raise UsageError(f"{path} holds no video")
+            stream = container.streams.video[0]
+            _check_size(path, stream.width, stream.height)
+            rate = stream.average_rate or stream.guessed_rate
+            # Containers are not always right about the number of their frames; packets are.
+            self.count = sum(1 for packet in container.demux(stream) if packet.size)
+        if not self.count:
+            raise UsageError(f"{path} holds no frame")
+        self.frame_rate_hz = float(Fraction(rate)) if rate else None
+        self._next = 0
+        self._decoded: Iterator[Light] = self._decode()
+        self._latest: Light | None = None
+
+    def frame(self, index: int) -> Light:
+        if index < self._next - 1 or self._latest is None:
+            self._next, self._decoded = 0, self._decode()
+        while self._next <= index:
+            latest = self._decode_next()
+            if latest is None and self._latest is None:
+                raise UsageError(f"{self._path}: no frame can be decoded")
+            self._latest = self._latest if latest is None else latest
+            self._next += 1
+        assert self._latest is not None
+        return self._latest
+
+    def _decode_next(self) -> Light | None:
+        import av
+
+        try:
+            return next(self._decoded, None)
+        except av.FFmpegError as error:
+            raise DataError(f"{self._path}: frame {self._next} cannot be decoded: {error}") from error
+
+    def _decode(self) -> Iterator[Light]:
+        import av
+
+        with av.open(str(self._path)) as container:
+            for frame in container.decode(video=0):
+                yield _grey(frame.to_ndarray(format="gray"))

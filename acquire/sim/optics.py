@@ -1,0 +1,86 @@
+"""Scenes as optics and coarser sensors show them; separable scenes stay separable."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from acquire.sim.scenes import MaskScene, Scene, SeparableScene, frames_at
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    Image = Callable[[NDArray[np.float32]], NDArray[np.float32]]
+
+
+def mapped(scene: Scene, image: Image) -> Scene:
+    """The scene through a linear map of its frames (k, n, n)."""
+    return _MappedMasks(scene, image) if isinstance(scene, SeparableScene) else _MappedFrames(scene, image)
+
+
+def binned(scene: Scene, factor: int) -> Scene:
+    """What steps and pixels gather that are ``factor`` times longer and wider: sums of light."""
+    return _BinnedMasks(scene, factor) if isinstance(scene, SeparableScene) else _BinnedFrames(scene, factor)
+
+
+class _MappedMasks(MaskScene):
+    def __init__(self, scene: SeparableScene, image: Image) -> None:
+        self._scene = scene
+        self.masks = image(scene.masks)
+
+    def intensity(self, first: int, count: int, substep_s: float | None = None) -> NDArray[np.float64]:
+        return self._scene.intensity(first, count, substep_s)
+
+
+class _MappedFrames:
+    def __init__(self, scene: Scene, image: Image) -> None:
+        self.size = scene.size
+        self._scene, self._image = scene, image
+
+    def frames(self, first: int, count: int) -> NDArray[np.float32]:
+        return self.frames_at(np.arange(first, first + count))
+
+    def frames_at(self, substeps: NDArray[np.int64]) -> NDArray[np.float32]:
+        return self._image(frames_at(self._scene, substeps))
+
+
+class _BinnedMasks(MaskScene):
+    """Intensities are means over the sensor's steps; the masks make sums of them."""
+
+    def __init__(self, scene: SeparableScene, factor: int) -> None:
+        self._scene, self._factor = scene, factor
+        self.masks = _sum_pixels(scene.masks, factor) * np.float32(factor)
+
+    def intensity(self, first: int, count: int, substep_s: float | None = None) -> NDArray[np.float64]:
+        if substep_s is not None:
+            return self._scene.intensity(first, count, substep_s)
+        fine = self._scene.intensity(first * self._factor, count * self._factor)
+        mean: NDArray[np.float64] = fine.reshape(len(fine), count, self._factor).mean(axis=2)
+        return mean
+
+
+class _BinnedFrames:
+    def __init__(self, scene: Scene, factor: int) -> None:
+        self.size = scene.size // factor
+        self._scene, self._factor = scene, factor
+
+    def frames(self, first: int, count: int) -> NDArray[np.float32]:
+        return self.frames_at(np.arange(first, first + count))
+
+    def frames_at(self, substeps: NDArray[np.int64]) -> NDArray[np.float32]:
+        fine = (substeps[:, None] * self._factor + np.arange(self._factor)).ravel()
+        frames = _sum_pixels(frames_at(self._scene, fine), self._factor)
+        summed: NDArray[np.float32] = frames.reshape(len(substeps), self._factor, self.size, self.size).sum(
+            axis=1
+        )
+        return summed
+
+
+def _sum_pixels(frames: NDArray[np.float32], factor: int) -> NDArray[np.float32]:
+    count, size = len(frames), frames.shape[1] // factor
+    blocks = frames.reshape(count, size, factor, size, factor)
+    summed: NDArray[np.float32] = blocks.sum(axis=(2, 4))
+    return summed

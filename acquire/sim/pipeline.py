@@ -1,0 +1,363 @@
+"""From a scene file to the lines of a camera: the bare forward model, and only the stages that are listed.
+
+::
+
+    code, drives ─▶ [light] ─▶ ┐
+                               ├─▶ Eq. (1) ─▶ [signal] ─▶ K⁻¹ ─▶ [charge] ─▶ K ─▶ [readout] ─▶ DN ─▶ [stream]
+    scene ─▶ [image] ────────▶ ┘
+
+In brackets what `acquire.sim.effects` gives. With nothing listed `Sensor.read` is Eq. (1), a factor, an
+offset and a rounding. The layouts differ in what stands around it: ``compact`` has two images side by side on
+one sensor, ``emulated`` a sensor of M·S stages whose raw lines are merged S × S, ``interline`` a coarse
+sensor under the fine scene.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.errors import UsageError
+from acquire.lines import ARMS, LineFlag
+from acquire.sim.effects import in_order
+from acquire.sim.effects.base import TILE_LINES, Setting, Stage
+from acquire.sim.light import Illumination
+from acquire.sim.lines import StreamingArm
+from acquire.sim.optics import binned, mapped
+from acquire.sim.scenes import build_scene
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from acquire.codes import Code
+    from acquire.config import CameraConfig, GeometryConfig
+    from acquire.scene_config import OpticsConfig, SceneConfig
+    from acquire.sim.scenes import Scene
+    from acquire.sim.stopwatch import Stopwatch
+
+
+@dataclass(frozen=True, slots=True)
+class Converter:
+    """DN = clip(round(black level + responsivity · Y), 0, white), as ``dtype``."""
+
+    white_dn: int
+    black_level_dn: float
+    responsivity_dn: float
+    dtype: str
+
+    @classmethod
+    def of(cls, camera: CameraConfig) -> Converter:
+        return cls(camera.white_dn, camera.black_level_dn, camera.responsivity_dn, camera.dtype)
+
+    def convert(self, light: NDArray[Any]) -> NDArray[Any]:
+        """Y of Eq. (1) to DN."""
+        return self.round(light * np.float32(self.responsivity_dn) + np.float32(self.black_level_dn))
+
+    def round(self, dn: NDArray[Any]) -> NDArray[Any]:
+        """DN to whole numbers of the range."""
+        pixels: NDArray[Any] = np.clip(np.rint(dn), 0, self.white_dn).astype(self.dtype)
+        return pixels
+
+
+@dataclass(frozen=True, slots=True)
+class Readout:
+    """Lines as a camera gives them: pixels (count, M), and which of them did not come (count,)."""
+
+    pixels: NDArray[Any]
+    missing: NDArray[np.bool_]
+
+    @property
+    def flags(self) -> NDArray[np.uint16]:
+        return np.where(self.missing, np.uint16(LineFlag.MISSING), np.uint16(0))
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """Everything that a simulated camera depends on. Picklable; the scene's file decides most of it."""
+
+    scene: SceneConfig
+    geometry: GeometryConfig
+    cameras: dict[str, CameraConfig]
+    substep_s: float
+    realisation: int = 0
+    stopwatch: Stopwatch | None = None
+
+    def without(self, *effects: str) -> Bench:
+        """The same bench, some effects not listed."""
+        kept = tuple(effect for effect in self.scene.effects if effect.kind not in effects)
+        return replace(self, scene=self.scene.model_copy(update={"effects": kept}))
+
+    def camera(self, arm: str, code: Code) -> Camera:
+        """The lines that the camera of ``arm`` gives under a code. UsageError for what cannot be."""
+        optics = self.scene.optics
+        converter = Converter.of(self.cameras[arm])
+        match optics.layout:
+            case "emulated":
+                return _emulated(self, arm, code, converter)
+            case "compact":
+                return _compact(self, arm, code, converter)
+            case _:
+                return _sensor(self, arm, code, converter, {arm: 0}, self.geometry.stages)
+
+    def fine_scene(self) -> Scene:
+        """What the cameras look at, as fine as they can tell: in camera A's rows and columns."""
+        size = self.geometry.stages * self.geometry.substeps
+        if self.scene.optics.layout != "interline":
+            return build_scene(self.scene, size, self.substep_s)
+        if self.geometry.substeps != 1:
+            raise UsageError(
+                f"layout 'interline' with S = {self.geometry.substeps}", possible="geometry.substeps = 1"
+            )
+        factor = self.scene.optics.baseline_factor
+        return build_scene(self.scene, size * factor, self.substep_s / factor)
+
+
+class Camera:
+    """Something whose lines can be read; see `Bench.camera`."""
+
+    stages: tuple[Stage, ...]
+
+    def read(self, first_line: int, count: int) -> Readout:
+        raise NotImplementedError
+
+
+class Sensor(Camera):
+    """One sensor with one image, or two side by side."""
+
+    def __init__(
+        self, images: Sequence[_Image], pixels: int, stages: Sequence[Stage], setting: Setting, dtype: str
+    ) -> None:
+        self.stages = tuple(stages) + tuple(stage for image in images for stage in image.stages)
+        self._images, self._pixels = images, pixels
+        self._converter = Converter(setting.white_dn, setting.black_level_dn, setting.responsivity_dn, dtype)
+        self._gain = setting.gain_dn_per_e
+        self._by_place = {
+            place: [s for s in stages if s.place == place] for place in ("charge", "readout", "stream")
+        }
+        self._pointwise = not any(self._by_place.values())
+        self._tiles: dict[int, Readout] = {}
+
+    def read(self, first_line: int, count: int) -> Readout:
+        """Lines ``first_line .. first_line + count - 1``; numbers below 0 are preroll."""
+        if self._pointwise:
+            pixels = self._converter.convert(self._expected(first_line, count))
+            return Readout(pixels, np.zeros(count, np.bool_))
+        tiles = range(first_line // TILE_LINES, (first_line + count - 1) // TILE_LINES + 1)
+        parts = [self._tile(index) for index in tiles]
+        at = slice(first_line % TILE_LINES, first_line % TILE_LINES + count)
+        pixels = np.concatenate([part.pixels for part in parts])[at]
+        return Readout(pixels, np.concatenate([part.missing for part in parts])[at])
+
+    def _expected(self, first_line: int, count: int) -> NDArray[Any]:
+        """Y of every pixel of the sensor, with the effects on the signal."""
+        if len(self._images) == 1 and self._images[0].column == 0:
+            return self._images[0].lines(first_line, count)
+        lines = np.zeros((count, self._pixels), np.float32)
+        for image in self._images:
+            seen = image.lines(first_line, count)
+            lines[:, image.column : image.column + seen.shape[1]] = seen
+        return lines
+
+    def _tile(self, index: int) -> Readout:
+        if index not in self._tiles:
+            tile = self._delivered(index)
+            self._tiles = {key: self._tiles[key] for key in list(self._tiles)[-1:]} | {index: tile}
+        return self._tiles[index]
+
+    def _delivered(self, index: int) -> Readout:
+        first_line = index * TILE_LINES
+        pixels, missing = self._digital(index), np.zeros(TILE_LINES, np.bool_)
+        for stage in self._by_place["stream"]:
+            pixels, lost = stage.run(pixels, first_line, lambda: self._digital(index - 1)[-1:])
+            missing = missing if lost is None else missing | lost
+        return Readout(np.where(missing[:, None], 0, pixels).astype(pixels.dtype), missing)
+
+    def _digital(self, index: int) -> NDArray[Any]:
+        first_line, light = index * TILE_LINES, self._expected(index * TILE_LINES, TILE_LINES)
+        electrons = light.astype(np.float64) * (self._converter.responsivity_dn / self._gain)
+        for stage in self._by_place["charge"]:
+            electrons = stage.run(electrons, first_line)
+        dn = electrons * self._gain + self._converter.black_level_dn
+        for stage in self._by_place["readout"]:
+            dn = stage.run(dn, first_line)
+        return self._converter.round(dn)
+
+
+class Merged(Camera):
+    """Raw lines of a sensor with whole steps, merged S × S in the digital domain (Sect. 5.1).
+
+    A merged sample is white when one of its raw samples is.
+    """
+
+    def __init__(self, raw: Sensor, raw_white_dn: int, substeps: int, converter: Converter) -> None:
+        self.stages = raw.stages
+        self._raw, self._raw_white_dn, self._substeps, self._converter = (
+            raw,
+            raw_white_dn,
+            substeps,
+            converter,
+        )
+
+    def read(self, first_line: int, count: int) -> Readout:
+        """Line ℓ of Eq. (1) is the raw lines S·ℓ … S·ℓ + S − 1, S columns each."""
+        S = self._substeps
+        raw = self._raw.read(S * first_line, S * count)
+        blocks = raw.pixels.reshape(count, S, -1, S)
+        merged = blocks.sum(axis=(1, 3), dtype=np.uint32)
+        white = blocks.max(axis=(1, 3)) >= self._raw_white_dn
+        missing: NDArray[np.bool_] = np.any(raw.missing.reshape(count, S), axis=1)
+        pixels = np.where(white, self._converter.white_dn, merged) * ~missing[:, None]
+        return Readout(pixels.astype(self._converter.dtype), missing)
+
+
+class Cut(Camera):
+    """A range of columns of a sensor."""
+
+    def __init__(self, sensor: Sensor, columns: slice) -> None:
+        self.stages = sensor.stages
+        self._sensor, self._columns = sensor, columns
+
+    def read(self, first_line: int, count: int) -> Readout:
+        """The columns' part of the lines."""
+        whole = self._sensor.read(first_line, count)
+        return Readout(np.ascontiguousarray(whole.pixels[:, self._columns]), whole.missing)
+
+
+class _Image:
+    """Expected lines of one arm on a sensor, with the effects on its signal."""
+
+    def __init__(self, arm: StreamingArm, stages: Sequence[Stage], column: int) -> None:
+        self.stages, self.column = stages, column
+        self._arm = arm
+        self._signal = [stage for stage in stages if stage.place == "signal"]
+        self._lead = sum(stage.lead for stage in self._signal)
+        self._recent: dict[int, NDArray[np.float32]] = {}
+
+    def lines(self, first_line: int, count: int) -> NDArray[Any]:
+        lines: NDArray[Any] = (
+            self._with_history(first_line, count) if self._lead else self._arm.lines(first_line, count)
+        )
+        for stage in self._signal:
+            lines = stage.run(lines, first_line)
+        return lines
+
+    def _with_history(self, first_line: int, count: int) -> NDArray[Any]:
+        first = first_line - self._lead
+        tiles = range(first // TILE_LINES, (first_line + count - 1) // TILE_LINES + 1)
+        for index in tiles:
+            if index not in self._recent:
+                self._recent[index] = self._arm.lines(index * TILE_LINES, TILE_LINES)
+        skip = first % TILE_LINES
+        lines = np.concatenate([self._recent[index] for index in tiles])[skip : skip + self._lead + count]
+        self._recent = {index: self._recent[index] for index in tiles[-3:]}
+        return lines.astype(np.float64)
+
+
+def describe(scene: SceneConfig) -> dict[str, Any]:
+    """What a recording of a simulated scene says of it: effects in the order in which they acted (JSON)."""
+    effects = [effect.model_dump(mode="json") for effect in in_order(scene.effects)]
+    return {"simulated": True, "scene": scene.model_dump(mode="json"), "effects": effects}
+
+
+def _sensor(
+    bench: Bench,
+    name: str,
+    code: Code,
+    converter: Converter,
+    columns: dict[str, int],
+    pixels: int,
+    merge: int = 1,
+) -> Sensor:
+    """A sensor with the images of the arms in ``columns`` (arm → first column)."""
+    geometry, scene = bench.geometry, bench.fine_scene()
+    setting = Setting(
+        arm=name,
+        seed=bench.scene.seed,
+        realisation=bench.realisation,
+        stages=geometry.stages * merge,
+        substeps=geometry.substeps // merge,
+        pixels=pixels,
+        substep_s=bench.substep_s,
+        scene=scene,
+        white_dn=converter.white_dn,
+        black_level_dn=converter.black_level_dn,
+        responsivity_dn=converter.responsivity_dn,
+        gain_dn_per_e=bench.scene.system_gain_dn_per_e,
+    )
+    stages = _stages(bench, setting)
+    images = []
+    for arm, column in columns.items():
+        own = stages if arm == name else _stages(bench, replace(setting, arm=arm))
+        images.append(_image(bench.scene.optics, arm, column, code, setting, stages, own))
+    kept = [stage for stage in stages if stage.place not in ("image", "signal")]
+    return Sensor(images, pixels, kept, setting, converter.dtype)
+
+
+def _stages(bench: Bench, setting: Setting) -> list[Stage]:
+    if not bench.scene.effects:
+        return []
+    from acquire.sim.effects import build_stages
+
+    stages = build_stages(bench.scene.effects, setting)
+    return stages if bench.stopwatch is None else [bench.stopwatch.stage(stage) for stage in stages]
+
+
+def _image(
+    optics: OpticsConfig,
+    arm: str,
+    column: int,
+    code: Code,
+    setting: Setting,
+    common: Sequence[Stage],
+    own: Sequence[Stage],
+) -> _Image:
+    factor = optics.baseline_factor if optics.layout == "interline" else 1
+    scene = setting.scene
+    light = Illumination.of(scene if factor == 1 else binned(scene, factor), code)
+    for stage in common:
+        light = stage.run(light) if stage.place == "light" else light
+    for stage in own:
+        scene = mapped(scene, stage.run) if stage.place == "image" else scene
+    scene = scene if factor == 1 else binned(scene, factor)
+    streaming = StreamingArm(scene, light, setting.stages, setting.substeps, arm, getattr(optics, arm))
+    return _Image(streaming, [stage for stage in own if stage.place in ("image", "signal")], column)
+
+
+def _compact(bench: Bench, arm: str, code: Code, converter: Converter) -> Cut:
+    optics, M = bench.scene.optics, bench.geometry.stages
+    first = {"a": optics.column_a, "b": optics.column_b}
+    if first["b"] is None:
+        first["b"] = optics.sensor_pixels // 2
+    columns = {name: int(first[name] or 0) for name in ARMS}
+    low, high = sorted(columns.values())
+    if high < low + M or high + M > optics.sensor_pixels:
+        raise UsageError(
+            f"compact layout with images of {M} columns at {columns['a']} and {columns['b']}",
+            possible=f"two ranges beside each other on {optics.sensor_pixels} columns",
+        )
+    if converter != Converter.of(bench.cameras["b"]) or converter != Converter.of(bench.cameras["a"]):
+        raise UsageError(
+            "compact layout with two different cameras", possible="cameras.a and .b alike: it has one"
+        )
+    sensor = _sensor(bench, "ab", code, converter, columns, optics.sensor_pixels)
+    return Cut(sensor, slice(columns[arm], columns[arm] + M))
+
+
+def _emulated(bench: Bench, arm: str, code: Code, converter: Converter) -> Merged:
+    S = bench.geometry.substeps
+    raw_white = (1 << bench.scene.optics.raw_bits) - 1
+    if raw_white * S**2 > converter.white_dn:
+        raise UsageError(
+            f"layout 'emulated': {S} x {S} samples of {bench.scene.optics.raw_bits} bits in lines up to "
+            f"{converter.white_dn} DN",
+            possible="cameras with a wider pixel_format, as Mono16, or fewer optics.raw_bits",
+        )
+    raw = replace(
+        converter, white_dn=raw_white, black_level_dn=converter.black_level_dn / S**2, dtype="uint16"
+    )
+    n = bench.geometry.stages * S
+    return Merged(_sensor(bench, arm, code, raw, {arm: 0}, n, merge=S), raw_white, S, converter)

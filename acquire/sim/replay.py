@@ -1,0 +1,209 @@
+"""Simulated cameras that give a stored stream again: real lines for tests, loads and demonstrations.
+
+Line ℓ of the new run is row ℓ of the recording, and its code is the stored one from there on: a register's
+state can be taken at any index (`replay_code`). Lines that were missing are missing again. Endlessly repeated
+rows meet a code that is not theirs: from the second round on they are flagged as such.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire import __version__
+from acquire.camera.base import CameraBlock, CameraIdentity
+from acquire.codes import ConstantCode, PrbsCode, code_from_attrs, state_at
+from acquire.errors import CameraError, UsageError
+from acquire.geometry import Geometry
+from acquire.lines import LineFlag
+from acquire.store import open_recording
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from acquire.camera.base import Camera
+    from acquire.codes import Code
+    from acquire.sim.clock import Wire
+    from acquire.store.reader import Recording
+
+_PAGE_LINES = 4096
+_KEPT_FLAGS = np.uint16(LineFlag.INCOMPLETE)
+"""What was seen of a line by its camera; all else is found again."""
+_NAP_S = 0.001
+_CATCH_UP = Fraction(5, 4)
+"""Lines per pulse of a camera that is behind."""
+
+
+def replay_code(recording: Recording) -> Code:
+    """The code of a run whose line 0 is the recording's first."""
+    code = code_from_attrs(recording.attrs["code"])
+    index = recording.geometry_for(1).substeps * recording.first_line
+    if isinstance(code, PrbsCode):
+        return PrbsCode(code.degree, state_at(code.degree, code.seed, index))
+    if isinstance(code, ConstantCode):
+        return code
+    raise UsageError(
+        f"replay of a code of kind {recording.attrs['code']['kind']!r}", possible="prbs, constant"
+    )
+
+
+def describe_replay(path: Path) -> dict[str, Any]:
+    """What a recording of replayed lines says of where they come from: as the first one did (JSON)."""
+    attrs = open_recording(path).attrs
+    kept: dict[str, Any] = {key: attrs[key] for key in ("simulated", "scene", "effects") if key in attrs}
+    return {**kept, "replayed": {"run_id": attrs["run_id"], "first_line": attrs["first_line"]}}
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayCameraOpener:
+    """Opens one arm of a recording as a camera. Picklable.
+
+    Its lines come ``hold_s`` after their pulses, so that a recording can be started before the first.
+    """
+
+    wire: Wire
+    path: Path
+    arm: str
+    block_lines: int
+    loop: bool = False
+    hold_s: float = 0.0
+
+    def __call__(self) -> Camera:
+        return ReplayCamera(self)
+
+
+class ReplayCamera:
+    """Reads one stored line per pulse on the wire, in blocks; falls silent at the end unless it loops."""
+
+    def __init__(self, opener: ReplayCameraOpener) -> None:
+        self._opener = opener
+        self._wire = opener.wire
+        self._recording = open_recording(opener.path)
+        self._stream = self._recording.camera(opener.arm)
+        geometry = self._recording.geometry_for(1)
+        self._depth_lines = Geometry(geometry.stages, geometry.substeps, 1).depth_lines
+        self._rows = self._recording.lines
+        self._run: int | None = None
+        self._delivered = self._lost = 0
+        self._not_before_ns = 0
+        self._ready: deque[CameraBlock] = deque()
+        self._page: tuple[int, NDArray[Any], NDArray[np.uint16]] | None = None
+
+    def identify(self) -> CameraIdentity:
+        return CameraIdentity("acquire", "replayed TDI camera", str(self._opener.path), __version__)
+
+    def settings(self) -> dict[str, Any]:
+        """As they were recorded."""
+        return dict(self._recording.attrs["cameras"][self._opener.arm])
+
+    def arm(self) -> None:
+        """Follow the next train of pulses from its beginning."""
+        reading = self._wire.look()
+        if reading.running:
+            raise CameraError("a replay was armed while the trigger runs", hint="arm it before the start")
+        self._run = reading.run + 1
+        self._delivered = self._lost = 0
+        self._not_before_ns = 0
+        self._ready.clear()
+
+    def next_block(self, timeout_s: float) -> CameraBlock | None:
+        """The next lines that are due; at the end, and when all of a block were missing, none."""
+        if self._run is None:
+            raise CameraError("a block was asked of a camera that is not armed", hint="arm it")
+        if self._ready:
+            return self._ready.popleft()
+        deadline_ns = self._wire.clock.monotonic_ns() + int(timeout_s * 1e9)
+        while not (count := self._deliverable()):
+            if self._wire.clock.monotonic_ns() >= deadline_ns:
+                return None
+            self._wire.clock.sleep(min(_NAP_S, timeout_s))
+        self._ready.extend(self._blocks(count))
+        return self._ready.popleft() if self._ready else None
+
+    def release(self, block: CameraBlock) -> None:
+        """Nothing to give back: every block has memory of its own."""
+
+    def disarm(self) -> None:
+        self._run = None
+
+    def statistics(self) -> dict[str, int]:
+        return {"lines": self._delivered - self._lost, "lost": self._lost, "behind_lines": self._due()}
+
+    def close(self) -> None:
+        self.disarm()
+
+    def _deliverable(self) -> int:
+        """Lines of the next block, 0 before its time.
+
+        A camera that fell behind catches up, but no faster than a recorder can take: reading is so much
+        faster than the pulses come that the ring would overflow.
+        """
+        now_ns, count = self._wire.clock.monotonic_ns(), self._due()
+        if now_ns < self._not_before_ns or (count < self._opener.block_lines and not self._ended()):
+            return 0
+        count = min(count, self._opener.block_lines)
+        train = self._wire.look().train
+        if train is not None:
+            self._not_before_ns = now_ns + int(count * train.line_period_ns / train.speed / _CATCH_UP)
+        return count
+
+    def _due(self) -> int:
+        """Lines whose pulses came ``hold_s`` ago or earlier, and which are not delivered."""
+        reading = self._wire.look()
+        if reading.train is None or reading.run != self._run:
+            return 0
+        issued = reading.train.issued(self._wire.clock.monotonic_ns() - int(self._opener.hold_s * 1e9))
+        last = issued if self._opener.loop else min(issued, self._rows + self._depth_lines)
+        return last - self._delivered
+
+    def _ended(self) -> bool:
+        reading = self._wire.look()
+        finished = not self._opener.loop and self._delivered + self._due() >= self._rows + self._depth_lines
+        return finished or reading.stopped
+
+    def _blocks(self, count: int) -> Iterator[CameraBlock]:
+        """The next ``count`` lines, without those that were missing."""
+        at = self._delivered
+        self._delivered += count
+        while at < self._delivered:
+            line = at - self._depth_lines
+            if line < 0:
+                pixels, flags = self._dark(min(-line, self._delivered - at))
+            else:
+                pixels, flags = self._stored(line, self._delivered - at)
+            missing = (flags & LineFlag.MISSING) != 0
+            self._lost += int(missing.sum())
+            edges = np.flatnonzero(np.diff(missing, prepend=True, append=True))
+            for begin, end in edges.reshape(-1, 2).tolist():
+                yield CameraBlock(
+                    at + begin, pixels[begin:end], flags[begin:end] & ~np.uint16(LineFlag.MISSING)
+                )
+            at += len(flags)
+
+    def _dark(self, count: int) -> tuple[NDArray[Any], NDArray[np.uint16]]:
+        """What comes before line 0: preroll, which nobody keeps."""
+        pixels = np.zeros((count, self._stream.lines.shape[1]), self._stream.lines.dtype)
+        return pixels, np.zeros(count, np.uint16)
+
+    def _stored(self, line: int, count: int) -> tuple[NDArray[Any], NDArray[np.uint16]]:
+        """Rows from ``line`` on, as far as the page that holds it goes."""
+        turn, row = divmod(line, self._rows)
+        page, skip = divmod(row, _PAGE_LINES)
+        if self._page is None or self._page[0] != page:
+            start, stop = page * _PAGE_LINES, min((page + 1) * _PAGE_LINES, self._rows)
+            pixels = self._stream.read("lines", start, stop).astype(
+                self._stream.lines.dtype.newbyteorder("=")
+            )
+            flags = self._stream.read("flags", start, stop)
+            self._page = (page, pixels, flags & (_KEPT_FLAGS | np.uint16(LineFlag.MISSING)))
+        _, pixels, flags = self._page
+        part = slice(skip, skip + count)
+        again = np.uint16(LineFlag.CODE_UNVERIFIED if turn else 0)
+        return pixels[part], flags[part] | again

@@ -1,0 +1,95 @@
+"""What passes before a scene: windows that slide (Fig. 8) and chopper wheels (Fig. 11)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from acquire.scene_config import WindowConfig
+from acquire.sim.kernels import chop
+from acquire.sim.scenes import frames_at
+from acquire.sim.targets import overlap
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from acquire.scene_config import ChopperConfig, WindowPhase
+    from acquire.sim.scenes import Scene
+
+
+class Shutter(Protocol):
+    """Something opaque that moves."""
+
+    def cover(self, frames: NDArray[np.float32], substeps: NDArray[np.int64]) -> None:
+        """Take away, in place, the light that does not pass at the middle of each sub-step."""
+        ...
+
+
+class ShutteredScene:
+    """A scene behind shutters, the first of them nearest to it."""
+
+    def __init__(self, scene: Scene, shutters: Sequence[Shutter]) -> None:
+        self._scene, self._shutters = scene, shutters
+
+    @property
+    def size(self) -> int:
+        return self._scene.size
+
+    def frames(self, first: int, count: int) -> NDArray[np.float32]:
+        """(count, row, column) float32."""
+        return self.frames_at(np.arange(first, first + count))
+
+    def frames_at(self, substeps: NDArray[np.int64]) -> NDArray[np.float32]:
+        """(count, row, column) float32."""
+        frames = frames_at(self._scene, substeps)
+        for shutter in self._shutters:
+            shutter.cover(frames, substeps)
+        return frames
+
+
+def build_shutter(config: WindowConfig | ChopperConfig, size: int, substep_s: float) -> Shutter:
+    """The shutter that a configuration describes."""
+    if isinstance(config, WindowConfig):
+        return Window(config.phases, size, substep_s)
+    return Chopper(config, size, substep_s)
+
+
+class Window:
+    """Phases one after the other, in a loop that began at sub-step 0."""
+
+    def __init__(self, phases: tuple[WindowPhase, ...], size: int, substep_s: float) -> None:
+        self._phases, self._size, self._substep_s = phases, size, substep_s
+        self._ends_s = np.cumsum([phase.duration_s for phase in phases])
+
+    def cover(self, frames: NDArray[np.float32], substeps: NDArray[np.int64]) -> None:
+        time_s = (substeps + 0.5) * self._substep_s % self._ends_s[-1]
+        for frame, at_s in zip(frames, time_s.tolist(), strict=True):
+            number = min(int(np.searchsorted(self._ends_s, at_s, side="right")), len(self._phases) - 1)
+            phase = self._phases[number]
+            if phase.axis != "open":
+                done = 1 - (self._ends_s[number] - at_s) / phase.duration_s
+                opened = self._slit(phase, float(done))
+                np.multiply(frame, opened[:, None] if phase.axis == "row" else opened, out=frame)
+
+    def _slit(self, phase: WindowPhase, done: float) -> NDArray[np.float32]:
+        middle = phase.begin + (phase.end - phase.begin) * done
+        return overlap(self._size, middle - phase.width / 2, phase.width).astype(np.float32)
+
+
+class Chopper:
+    """A wheel with straight spokes; its edges are seen with the width of a pixel."""
+
+    def __init__(self, config: ChopperConfig, size: int, substep_s: float) -> None:
+        self._config, self._substep_s = config, substep_s
+        centre = (np.arange(size) + 0.5) / size
+        up, right = config.row - centre[:, None], centre[None, :] - config.column
+        self._angle = np.arctan2(up, right) / (2 * np.pi)
+        self._radius = np.hypot(up, right) * size
+
+    def cover(self, frames: NDArray[np.float32], substeps: NDArray[np.int64]) -> None:
+        config = self._config
+        turned = ((substeps + 0.5) * (config.rotation_hz * self._substep_s) + config.phase_deg / 360) % 1.0
+        chop(frames, self._angle, self._radius, turned, config.blades, config.open_part)

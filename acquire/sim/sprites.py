@@ -1,0 +1,136 @@
+"""Pictures that move through a scene: two goldfish (Fig. 7), or files of the user.
+
+A picture is a square of texels drawn four times finer than it will be seen; every frame samples it where
+the fish is at the middle of the sub-step.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.sim.kernels import paste
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from acquire.scene_config import SpriteConfig
+
+    Grid = NDArray[Any]
+    Picture = tuple[Grid, Grid]
+
+_TEXELS = 256
+
+
+class SpriteScene:
+    """Moving pictures over an even background."""
+
+    def __init__(
+        self, sprites: tuple[SpriteConfig, ...], background: float, size: int, substep_s: float
+    ) -> None:
+        self.size = size
+        self._background = background
+        self._sprites = [_Sprite(sprite, size, substep_s) for sprite in sprites]
+
+    def frames(self, first: int, count: int) -> NDArray[np.float32]:
+        """(count, row, column) float32."""
+        return self.frames_at(np.arange(first, first + count))
+
+    def frames_at(self, substeps: NDArray[np.int64]) -> NDArray[np.float32]:
+        """(count, row, column) float32."""
+        frames = np.full((len(substeps), self.size, self.size), self._background, np.float32)
+        for sprite in self._sprites:
+            sprite.draw(frames, substeps)
+        return frames
+
+
+class _Sprite:
+    def __init__(self, config: SpriteConfig, size: int, substep_s: float) -> None:
+        self._config, self._size, self._substep_s = config, size, substep_s
+        picture, alpha = _picture(config.picture)
+        self._picture = (picture * config.level).astype(np.float32)
+        self._alpha = alpha.astype(np.float32)
+        covered = np.argwhere(alpha > 0) - (len(alpha) - 1) / 2
+        self._reach_texels = float(np.hypot(*covered.T).max(initial=0)) + 1
+
+    def draw(self, frames: NDArray[np.float32], substeps: NDArray[np.int64]) -> None:
+        scale = len(self._picture) / (self._config.size * self._size)
+        paste(frames, self._picture, self._alpha, self._places(substeps), scale, self._reach_texels / scale)
+
+    def _places(self, substeps: NDArray[np.int64]) -> Grid:
+        """(frame, 4): row and column in pixels, cosine and sine of the heading."""
+        config = self._config
+        orbit = self._turns(substeps, config.orbit_hz, config.orbit_phase_deg)
+        if config.turn_hz is None:
+            ahead = 0.25 if config.orbit_hz >= 0 else -0.25
+            heading = orbit + ahead + config.turn_phase_deg / 360
+        else:
+            heading = self._turns(substeps, config.turn_hz, config.turn_phase_deg)
+        row = config.row - config.orbit_radius * np.sin(2 * np.pi * orbit)
+        column = config.column + config.orbit_radius * np.cos(2 * np.pi * orbit)
+        angle = 2 * np.pi * heading
+        return np.stack([row * self._size, column * self._size, np.cos(angle), np.sin(angle)], axis=1)
+
+    def _turns(self, substeps: NDArray[np.int64], rate_hz: float, phase_deg: float) -> Grid:
+        turns: Grid = ((substeps + 0.5) * (rate_hz * self._substep_s) + phase_deg / 360) % 1.0
+        return turns
+
+
+def _picture(name: str) -> Picture:
+    """Light (multiplied by its alpha) and alpha, both (texel, texel); the fish swim to the right."""
+    drawn = _GOLDFISH.get(name)
+    if drawn is None:
+        from acquire.sim.media import read_picture
+
+        return read_picture(Path(name), _TEXELS)
+    axis = (np.arange(_TEXELS) + 0.5) / _TEXELS * 2 - 1
+    return drawn(axis[:, None], axis[None, :])
+
+
+def _broad_finned(y: Grid, x: Grid) -> Picture:
+    """A round body, a tail and fins like veils."""
+    body = _inside(_ellipse(y, x, 0.0, 0.38, 0.24, 0.4))
+    tail = _inside(np.maximum(np.abs(y) - (0.12 - 0.85 * (x + 0.0)), np.maximum(x + 0.05, -x - 0.92)))
+    tail = tail * _inside(np.hypot(x - 0.05, y) - 0.95) * (1 - _inside(np.abs(y) - 0.25 * (-x - 0.45)))
+    veil = 0.55 + 0.25 * np.cos(26 * np.arctan2(y, 0.25 - x))
+    dorsal = _inside(_ellipse(y + 0.34, x - 0.22, 0.5, 0.0, 0.16, 0.3)) * (y < 0)
+    pectoral = _inside(_ellipse(y - 0.36, x - 0.32, -0.6, 0.0, 0.12, 0.24))
+    light = np.maximum(0.7 * np.maximum(dorsal, pectoral), veil * tail)
+    light = light * (1 - body) + body * (0.95 - 0.25 * np.abs(y) / 0.24)
+    return _with_eye(light, np.maximum.reduce([body, tail, dorsal, pectoral]), y, x, 0.64)
+
+
+def _zebra(y: Grid, x: Grid) -> Picture:
+    """A slender body with stripes across, and a forked tail."""
+    body = _inside(_ellipse(y, x, 0.0, 0.15, 0.27, 0.72))
+    tail = _inside(np.maximum(np.abs(y) - 0.75 * (-x - 0.42), np.maximum(x + 0.45, -x - 0.92)))
+    tail = tail * (1 - _inside(np.abs(y) - 0.9 * (-x - 0.7)))
+    dorsal = _inside(_ellipse(y + 0.26, x - 0.1, 0.25, 0.0, 0.14, 0.34)) * (y < 0)
+    stripes = 0.5 + 0.5 * np.tanh(5 * np.cos(2 * np.pi * x / 0.2))
+    light = np.maximum(0.75 * tail, 0.6 * dorsal) * (1 - body) + body * (0.12 + 0.88 * stripes)
+    return _with_eye(light, np.maximum.reduce([body, tail, dorsal]), y, x, 0.72)
+
+
+def _with_eye(light: Grid, alpha: Grid, y: Grid, x: Grid, at: float) -> Picture:
+    eye = _inside(np.hypot(y + 0.07, x - at) - 0.05)
+    return light * (1 - eye), alpha
+
+
+def _ellipse(y: Grid, x: Grid, turn: float, centre: float, height: float, width: float) -> Grid:
+    """About the signed distance to an ellipse, negative inside."""
+    u = np.cos(turn) * (x - centre) - np.sin(turn) * y
+    v = np.sin(turn) * (x - centre) + np.cos(turn) * y
+    distance: Grid = (np.hypot(u / width, v / height) - 1) * min(height, width)
+    return distance
+
+
+def _inside(distance: Grid) -> Grid:
+    """1 inside, 0 outside, smooth over two texels."""
+    return np.clip(0.5 - distance * _TEXELS / 4, 0, 1)
+
+
+_GOLDFISH: dict[str, Callable[[Grid, Grid], Picture]] = {"broad-finned": _broad_finned, "zebra": _zebra}

@@ -1,0 +1,250 @@
+"""From a scene to a recording without a daemon: as fast as it goes, and what its effects are worth.
+
+`simulate` writes what the daemon would have recorded from line 0 on. `study` leaves out one effect after the
+other and compares the lines: an effect that changes them by far less than their noise need not be listed.
+"""
+
+from __future__ import annotations
+
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from acquire import __version__
+from acquire.clock import ClockFit
+from acquire.errors import AcquireError, UsageError
+from acquire.lines import ARMS, LineBlock, LineFlag
+from acquire.sim.pipeline import Bench, describe
+from acquire.sim.stopwatch import Stopwatch
+from acquire.store import RecordingSpec, RecordingWriter, RunCondition
+from acquire.stream.losses import Cause
+from acquire.stream.tagger import Tagger
+from acquire.trigger.base import TriggerRun
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from acquire.codes import Code
+    from acquire.config import RigConfig
+    from acquire.scene_config import SceneConfig
+    from acquire.sim.pipeline import Camera, Readout
+
+_BLOCK_LINES = 1024
+_QUANTISATION = 1 / 12
+"""Variance of rounding to whole DN."""
+STUDIED_LINES = 512
+BARE = "Eq. (1)"
+LOSS = "dropped_lines"
+TEMPORAL_NOISE = ("shot_noise", "dark_current", "read_noise")
+
+
+@dataclass(frozen=True, slots=True)
+class Simulated:
+    """What `simulate` wrote."""
+
+    path: Path
+    lines: int
+    seconds: float
+    simulated_s: float
+    lost_lines: dict[str, int]
+
+    @property
+    def speed(self) -> float:
+        """Simulated seconds per second."""
+        return self.simulated_s / self.seconds
+
+
+@dataclass(frozen=True, slots=True)
+class Worth:
+    """What one effect does to the lines of both arms.
+
+    ``change_dn`` is the RMS change when it alone is left out, ``noises`` the same in units of the lines'
+    temporal noise (None for lines that are lost: they do not change, and are known), ``us_per_line`` the time
+    that it takes.
+    """
+
+    effect: str
+    place: str
+    change_dn: float
+    noises: float | None
+    us_per_line: float
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """What `study` found. ``bare_us_per_line`` is one arm without any effect."""
+
+    noise_dn: float
+    signal_dn: float
+    bare_us_per_line: float
+    all_us_per_line: float
+    effects: tuple[Worth, ...]
+
+
+def _unseen(done: int, total: int) -> None:
+    """Nobody watches the progress."""
+
+
+def bench_of(config: RigConfig, scene: SceneConfig) -> Bench:
+    """The simulated optics and cameras of a rig before a scene."""
+    cameras = {arm: config.cameras.arm(arm) for arm in ARMS}
+    return Bench(scene, config.geometry, cameras, config.trigger.substep_ticks / config.trigger.clock_hz)
+
+
+def simulate(
+    config: RigConfig,
+    scene: SceneConfig,
+    path: Path,
+    lines: int,
+    progress: Callable[[int, int], object] = _unseen,
+) -> Simulated:
+    """Write a recording of ``lines`` lines of both arms, from line 0 on.
+
+    Everything that can be refused is refused before ``path`` exists: UsageError. What fails later, or is
+    interrupted, leaves a sealed recording that says so.
+    """
+    if lines < 1:
+        raise UsageError(f"simulation of {lines} lines", possible="1 or more")
+    code, bench = config.code.build(), bench_of(config, scene)
+    cameras = {arm: bench.camera(arm, code) for arm in ARMS}
+    for camera in cameras.values():
+        camera.read(0, 1)
+    began = time.perf_counter()
+    run = TriggerRun("simulation", code, config.geometry.substeps, config.trigger.substep_ticks, 1)
+    spec = _spec(config, scene)
+    writer = RecordingWriter.create(path, spec)
+    tagger = Tagger(run, config.geometry.stages, spec.clock)
+    tagger.confirmed_end = lines
+    with writer, ThreadPoolExecutor(len(ARMS)) as arms:
+        lost = _write(writer, tagger, cameras, arms, lines, progress)
+    return Simulated(path, lines, time.perf_counter() - began, lines / config.line_rate_hz, lost)
+
+
+def study(bench: Bench, code: Code, lines: int = STUDIED_LINES) -> Study:
+    """Leave out one effect after the other, over ``lines`` lines of both arms that are exposed throughout."""
+    us_per_line, places = _times(bench, code, lines), _places(bench, code)
+    bench = bench.without(LOSS)
+    full = _sample(bench, code, lines)
+    again = _sample(replace(bench, realisation=bench.realisation + 1), code, lines)
+    quiet = _sample(bench.without(*TEMPORAL_NOISE), code, lines)
+    noise_dn = float(np.sqrt(np.mean((full - again) ** 2) / 2 + _QUANTISATION))
+    worths = []
+    for effect, place in places:
+        if effect in TEMPORAL_NOISE:
+            change = _rms(full - _sample(bench.without(effect), code, lines))
+        else:  # noise that is drawn anew for other lines is not the effect's doing
+            change = _rms(quiet - _sample(bench.without(effect, *TEMPORAL_NOISE), code, lines))
+        noises = None if effect == LOSS else change / noise_dn
+        worths.append(Worth(effect, place, change, noises, us_per_line.get(effect, 0.0)))
+    return Study(noise_dn, float(full.std()), us_per_line[BARE], sum(us_per_line.values()), tuple(worths))
+
+
+def _write(
+    writer: RecordingWriter,
+    tagger: Tagger,
+    cameras: dict[str, Camera],
+    arms: ThreadPoolExecutor,
+    lines: int,
+    progress: Callable[[int, int], object],
+) -> dict[str, int]:
+    lost = dict.fromkeys(ARMS, 0)
+    try:
+        for first in range(0, lines, _BLOCK_LINES):
+            count = min(_BLOCK_LINES, lines - first)
+            reads = {arm: arms.submit(camera.read, first, count) for arm, camera in cameras.items()}
+            for arm, readout in reads.items():
+                lost[arm] += _append(writer, tagger, arm, first, readout.result())
+            writer.commit()
+            progress(first + count, lines)
+    except BaseException as error:
+        aborted = isinstance(error, Exception)
+        reason = str(error.message if isinstance(error, AcquireError) else error) or "interrupted"
+        writer.seal(RunCondition.ABORTED if aborted else RunCondition.INTERRUPTED, reason, {})
+        raise
+    condition = RunCondition.INCOMPLETE if any(lost.values()) else RunCondition.GOOD
+    ledger = {arm: {"stored": lines - count, "missing": {"camera": count}} for arm, count in lost.items()}
+    writer.seal(condition, "all lines simulated", {"pulses": lines, **ledger})
+    return lost
+
+
+def _append(writer: RecordingWriter, tagger: Tagger, arm: str, first: int, readout: Readout) -> int:
+    """Write one block; the number of its lines that are missing."""
+    white = writer.spec.cameras[arm]["white_dn"]
+    flags = readout.flags | np.where(
+        (readout.pixels >= white).any(axis=1), np.uint16(LineFlag.SATURATED), np.uint16(0)
+    )
+    writer.append(tagger.tag(LineBlock(arm, first, readout.pixels, flags)))
+    edges = np.flatnonzero(np.diff(readout.missing, prepend=False, append=False)).reshape(-1, 2)
+    for begin, end in edges.tolist():
+        writer.add_gap(arm, first + begin, end - begin, Cause.CAMERA)
+    return int(readout.missing.sum())
+
+
+def _spec(config: RigConfig, scene: SceneConfig) -> RecordingSpec:
+    trigger = {"model": "simulated trigger", "serial": "simulated", "firmware": __version__}
+    keys = ("white_dn", "black_level_dn", "responsivity_dn")
+    cameras = {
+        arm: {key: getattr(config.cameras.arm(arm), key) for key in keys}
+        | {"PixelFormat": config.cameras.arm(arm).pixel_format}
+        for arm in ARMS
+    }
+    recording = config.recording
+    return RecordingSpec(
+        run_id=f"{config.name}-simulated",
+        stages=config.geometry.stages,
+        substeps=config.geometry.substeps,
+        pixels=config.geometry.stages,
+        dtype=config.cameras.a.dtype,
+        first_line=0,
+        clock=ClockFit(config.trigger.clock_hz, time.time_ns(), 1),
+        code=config.code.build().to_attrs(),
+        substep_ticks=config.trigger.substep_ticks,
+        trigger={**trigger, "settings": config.trigger.model_dump(mode="json")},
+        cameras=cameras,
+        config=config.model_dump(mode="json"),
+        extra=describe(scene),
+        chunk_lines=recording.chunk_lines,
+        shard_chunks=recording.shard_chunks,
+        codec=recording.codec,
+        fsync=recording.fsync,
+        layout=scene.optics.layout,
+    )
+
+
+def _places(bench: Bench, code: Code) -> Sequence[tuple[str, str]]:
+    """Effects of either arm, in the order in which they act, and where."""
+    from acquire.sim.effects import ORDER
+
+    stages = [stage for arm in ARMS for stage in bench.camera(arm, code).stages]
+    found = {stage.effect: stage.place for stage in reversed(stages)}
+    return sorted(found.items(), key=lambda item: ORDER.index(item[0]))
+
+
+def _sample(bench: Bench, code: Code, lines: int) -> NDArray[np.float64]:
+    """Lines of both arms, one after the other: (2·lines, M)."""
+    first = bench.geometry.stages + 1
+    return np.concatenate([bench.camera(arm, code).read(first, lines).pixels for arm in ARMS]).astype(
+        np.float64
+    )
+
+
+def _rms(change: NDArray[np.float64]) -> float:
+    return float(np.sqrt(np.mean(change**2)))
+
+
+def _times(bench: Bench, code: Code, lines: int) -> dict[str, float]:
+    """Microseconds per line and arm, by effect and of the bare model: what each does by itself."""
+    stopwatch = Stopwatch()
+    cameras = [replace(bench, stopwatch=stopwatch).camera(arm, code) for arm in ARMS]
+    for camera in cameras:
+        camera.read(0, 1)
+    stopwatch.seconds.clear()
+    for camera in cameras:
+        stopwatch.timed(BARE, camera.read)(bench.geometry.stages + 1, lines)
+    return {name: seconds / (2 * lines) * 1e6 for name, seconds in stopwatch.seconds.items()}

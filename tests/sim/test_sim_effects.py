@@ -1,0 +1,556 @@
+"""Every effect against its formula: a no-op fails, and so does an effect that is applied twice."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from math import comb
+
+import numpy as np
+import pytest
+from sim_helpers import CODE
+
+from acquire.codes import ConstantCode
+from acquire.config import CameraConfig, GeometryConfig
+from acquire.errors import UsageError
+from acquire.scene_config import FunctionSceneConfig, LedSceneConfig, SceneFile
+from acquire.sim.effects import ORDER, in_order
+from acquire.sim.effects.base import Setting
+from acquire.sim.effects.light import delays
+from acquire.sim.effects.signal import tail
+from acquire.sim.light import Illumination
+from acquire.sim.pipeline import Bench
+from acquire.sim.scenes import build_scene
+
+M, S, DT = 8, 3, 1e-5
+N = M * S
+K = 0.05
+LIT = ConstantCode(1)
+FLAT = S * S * N
+"""Y of a scene of light 1 that is always lit."""
+RESPONSIVITY = 1.0
+
+PARAMETERS = {
+    "code_errors": {"flip_rate": 0.02, "late_substeps": 1},
+    "pwm": {"carrier_hz": 37e3, "bits": 6},
+    "led_nonlinearity": {"saturation": 0.8},
+    "led_rise_fall": {"rise_s": 3e-6, "fall_s": 5e-6},
+    "trigger_jitter": {"sigma_s": 1e-6},
+    "misregistration": {"arm": "a", "rows": 0.4},
+    "psf": {"sigma_pixels": 1.2},
+    "stray_light": {"veil": 0.05, "ambient": 0.02},
+    "beam_splitter": {"part_a": 0.45},
+    "cti": {"inefficiency": 1e-3},
+    "prnu": {"prnu": 0.02},
+    "shot_noise": {},
+    "dark_current": {"electrons_per_s": 5e6},
+    "dsnu": {"dsnu_e": 40.0},
+    "full_well": {"capacity_e": 600.0},
+    "read_noise": {"sigma_e": 60.0},
+    "column_offsets": {"sigma_dn": 4.0, "channels": 4},
+    "adc": {"bits": 8},
+    "dropped_lines": {"rate": 0.02},
+    "duplicated_lines": {"rate": 0.02},
+}
+
+
+def effects(*kinds, **changes):
+    return [{"kind": kind, **PARAMETERS[kind], **changes} for kind in kinds]
+
+
+def flat(level=1.0, listed=(), **more):
+    """One square LED over the whole field, at a constant level."""
+    led = {
+        "name": "all",
+        "shape": "square",
+        "row": 0.5,
+        "column": 0.5,
+        "size": 1.0,
+        "drive": {"waveform": "constant", "level": level},
+    }
+    table = {"kind": "leds", "title": "", "leds": [led], "system_gain_dn_per_e": K, "effects": list(listed)}
+    return LedSceneConfig.model_validate(table | more)
+
+
+def blinking(listed=(), **more):
+    scene = flat(listed=listed, **more).model_dump(mode="json")
+    drive = {"waveform": "sine", "frequency_hz": 3700.0, "low": 0.1, "high": 0.9}
+    scene["leds"][0] |= {"shape": "x", "size": 0.8, "drive": drive}
+    return LedSceneConfig.model_validate(scene)
+
+
+def bench(scene, **changes):
+    camera = CameraConfig(pixel_format="Mono16", black_level_dn=300.0, responsivity_dn=RESPONSIVITY)
+    camera = CameraConfig.model_validate(camera.model_dump() | changes)
+    return Bench(scene, GeometryConfig(stages=M, substeps=S), {"a": camera, "b": camera}, DT)
+
+
+def read(scene, count=2048, code=LIT, arm="a", first=512, **changes):
+    return bench(scene, **changes).camera(arm, code).read(first, count)
+
+
+def electrons(scene, **more):
+    """DN back to electrons."""
+    return (read(scene, **more).pixels.astype(float) - 300.0) / K
+
+
+def setting(**changes):
+    scene = build_scene(flat(), N, DT)
+    facts = {
+        "arm": "a",
+        "seed": 0,
+        "realisation": 0,
+        "stages": M,
+        "substeps": S,
+        "pixels": M,
+        "substep_s": DT,
+    }
+    camera = {"white_dn": 65535, "black_level_dn": 0.0, "responsivity_dn": 1.0, "gain_dn_per_e": K}
+    return Setting(**(facts | camera | {"scene": scene} | changes))
+
+
+def through(camera, value, *more):
+    """Through every stage of a camera, in order."""
+    for stage in camera.stages:
+        value = stage.run(value, *more)
+    return value
+
+
+# What holds for all of them
+
+
+def test_a_scene_without_effects_has_no_stage_imports_none_and_draws_nothing(monkeypatch):
+    for name in [name for name in sys.modules if name.startswith("acquire.sim.effects.")]:
+        if not name.endswith(".base"):
+            monkeypatch.delitem(sys.modules, name)
+
+    def refuse(*args, **more):
+        raise AssertionError("a random number was asked for")
+
+    for name in ("SeedSequence", "Generator", "PCG64", "default_rng"):
+        monkeypatch.setattr(np.random, name, refuse)
+    for layout in ("dual", "compact", "emulated"):
+        camera = bench(flat(optics={"layout": layout})).camera("a", CODE)
+        assert camera.stages == ()
+        assert camera.read(-20, 600).pixels.any()
+    loaded = [name for name in sys.modules if name.startswith("acquire.sim.effects.")]
+    assert loaded == ["acquire.sim.effects.base"]
+    with pytest.raises(AssertionError, match="random number"):
+        read(flat(listed=effects("read_noise")))
+
+
+@pytest.mark.parametrize("kind", ORDER)
+def test_a_listed_effect_changes_lines_and_is_the_only_stage(kind):
+    scene = blinking(effects(kind))
+    camera = bench(scene).camera("a", CODE)
+    assert {stage.effect for stage in camera.stages} == {kind}
+    lines, bare = camera.read(600, 1024), read(blinking(), 1024, CODE, first=600)
+    assert not np.array_equal(lines.pixels, bare.pixels)
+
+
+@pytest.mark.parametrize("layout", ["dual", "compact", "emulated"])
+def test_lines_of_all_effects_together_do_not_depend_on_how_they_are_read(layout):
+    scene = blinking(effects(*ORDER), optics={"layout": layout})
+    whole = bench(scene).camera("b", CODE).read(-300, 1300)
+    again, pixels, line = bench(scene).camera("b", CODE), [], -300
+    for count in (1, 255, 300, 7, 737):
+        pixels.append(again.read(line, count).pixels)
+        line += count
+    np.testing.assert_array_equal(np.concatenate(pixels), whole.pixels)
+    later = bench(scene).camera("b", CODE).read(500, 300)
+    np.testing.assert_array_equal(later.pixels, whole.pixels[800:1100])
+    np.testing.assert_array_equal(later.missing, whole.missing[800:1100])
+
+
+def test_one_effect_more_leaves_the_draws_of_the_others():
+    alone = electrons(flat(0.0, effects("read_noise"))) - electrons(flat(0.0))
+    with_offset = electrons(flat(0.0, effects("dsnu", "read_noise")))
+    offset = electrons(flat(0.0, effects("dsnu")))
+    np.testing.assert_allclose(with_offset - offset, alone, atol=1.01 / K)
+    both = read(blinking(effects("shot_noise", "dropped_lines"))).missing
+    np.testing.assert_array_equal(both, read(blinking(effects("dropped_lines"))).missing)
+
+
+def test_arms_seeds_and_realisations_draw_differently_and_patterns_stay():
+    noise, fixed = flat(0.5, effects("read_noise")), flat(0.5, effects("prnu"))
+    a = electrons(noise)
+    others = [electrons(noise, arm="b"), electrons(flat(0.5, effects("read_noise"), seed=1))]
+    again = replace(bench(noise), realisation=1)
+    others.append((again.camera("a", LIT).read(512, 2048).pixels - 300.0) / K)
+    for other in others:
+        assert abs(np.corrcoef(a.ravel(), other.ravel())[0, 1]) < 0.03
+    assert np.ptp(electrons(fixed), axis=0).max() == 0
+
+
+def test_effects_act_in_the_order_of_physics_whatever_the_list_says():
+    forwards, backwards = blinking(effects(*ORDER)), blinking(effects(*ORDER[::-1]))
+    assert [effect.kind for effect in in_order(backwards.effects)] == list(ORDER)
+    np.testing.assert_array_equal(read(forwards, code=CODE).pixels, read(backwards, code=CODE).pixels)
+
+
+# Electrons
+
+
+@pytest.mark.parametrize("level", [0.1, 0.4, 1.0])
+def test_photon_transfer_has_the_slope_k(level):
+    """EMVA 1288: σ_y² − σ_dark² = K·(μ_y − μ_dark), with σ_q² = 1/12 of rounding."""
+    dn = read(flat(level, effects("shot_noise")), count=8192).pixels.astype(float) - 300.0
+    assert dn.mean() == pytest.approx(level * FLAT, rel=0.003)
+    assert dn.var() - 1 / 12 == pytest.approx(K * level * FLAT, rel=0.03)
+    assert abs(np.corrcoef(dn[:-1].ravel(), dn[1:].ravel())[0, 1]) < 0.02
+
+
+def test_read_noise_has_its_sigma_and_no_mean():
+    e = electrons(flat(0.2, effects("read_noise")), count=8192)
+    assert e.mean() == pytest.approx(0.2 * FLAT / K, rel=1e-3)
+    assert np.sqrt(e.var() - 1 / 12 / K**2) == pytest.approx(60.0, rel=0.02)
+    z = (e - e.mean()) / e.std()
+    assert (np.abs(z) < 1).mean() == pytest.approx(0.683, abs=0.01)
+
+
+def test_dark_current_is_poisson_with_rate_times_exposure():
+    mean = 5e6 * N * DT
+    e = electrons(flat(0.0, effects("dark_current")), count=8192)
+    assert e.mean() == pytest.approx(mean, rel=0.02)
+    assert e.var() - 1 / 12 / K**2 == pytest.approx(mean, rel=0.1)
+
+
+def test_prnu_and_dsnu_are_fixed_patterns_of_their_size():
+    wide = {"optics": {"layout": "compact", "sensor_pixels": 4000, "column_b": 2000}}
+    dark, bright = 0.0, 1.0
+    for kind, level, sigma in (("dsnu", dark, 40.0), ("prnu", bright, 0.02 * FLAT / K)):
+        sensor = bench(flat(level, effects(kind), **wide)).camera("a", LIT)._sensor
+        change = through(sensor, np.full((2, 4000), level * FLAT / K), 0) - level * FLAT / K
+        np.testing.assert_array_equal(change[0], change[1])
+        assert change[0].std() == pytest.approx(sigma, rel=0.05)
+        assert abs(change[0].mean()) < 4 * sigma / np.sqrt(4000)
+    lines = read(flat(bright, effects("prnu"))).pixels
+    assert np.ptp(lines, axis=0).max() == 0 < np.ptp(lines[0])
+
+
+def test_a_full_well_holds_no_more():
+    assert electrons(flat(1.0, effects("full_well"))).max() == pytest.approx(600.0)
+    np.testing.assert_array_equal(read(flat(0.1, effects("full_well"))).pixels, read(flat(0.1)).pixels)
+
+
+def test_column_offsets_repeat_by_channel():
+    change = read(flat(0.5, effects("column_offsets"))).pixels.astype(int) - read(flat(0.5)).pixels
+    assert np.ptp(change, axis=0).max() == 0
+    np.testing.assert_array_equal(change[0, :4], change[0, 4:])
+    many = [
+        read(flat(0.5, effects("column_offsets", channels=8), seed=seed), 1).pixels.astype(float)[0]
+        for seed in range(60)
+    ]
+    assert np.std(many) == pytest.approx(4.0, rel=0.15)
+
+
+def test_an_adc_of_fewer_bits_has_fewer_levels_and_an_end():
+    ramp = read(blinking(effects("adc", bits=12)), code=CODE).pixels
+    assert set(np.unique(ramp % 16)) == {0}
+    exact = read(blinking(), code=CODE).pixels.astype(int)
+    assert np.abs(ramp.astype(int) - exact).max() == 8
+    clipped = read(flat(1.0, effects("adc", bits=16, saturation_dn=400.0))).pixels
+    assert (clipped == 400).all()
+
+
+# Light
+
+
+def test_wrong_bits_come_at_their_rate_and_late_light_is_late():
+    scene = build_scene(flat(), N, DT)
+    camera = bench(flat(listed=effects("code_errors", late_substeps=0))).camera("a", CODE)
+    wrong = through(camera, Illumination.of(scene, CODE)).bits(0, 100_000) != CODE.bits(0, 100_000)
+    assert wrong.mean() == pytest.approx(0.02, rel=0.1)
+    assert not through(camera, Illumination.of(scene, CODE)).bits(-900, 900).any()
+    late = read(blinking(effects("code_errors", flip_rate=0.0, late_substeps=3)), 64, CODE)
+
+    class Late:
+        def bits(self, start, length):
+            return CODE.bits(start - 3, length)
+
+    np.testing.assert_array_equal(late.pixels, read(blinking(), 64, Late()).pixels)
+
+
+@pytest.mark.parametrize(("carrier_hz", "bits"), [(1e6, 4), (400e3, 8), (37e3, 6), (3e3, 8)])
+def test_pwm_switches_full_light_for_the_duty_cycle(carrier_hz, bits):
+    config = blinking(effects("pwm", carrier_hz=carrier_hz, bits=bits))
+    camera = bench(config).camera("a", LIT)
+    scene = build_scene(config, N, DT)
+    drives = through(camera, Illumination.of(scene, LIT)).drives(-700, 3000)[0]
+    duty = np.rint(scene.intensity(-40_000, 80_000, 1 / carrier_hz)[0] * 2**bits) / 2**bits
+    fine = (np.arange(200 * 1000) + 0.5) / 1000
+    cycle = fine * DT * carrier_hz
+    on = cycle % 1 < duty[np.floor(cycle).astype(int) + 40_000]
+    np.testing.assert_allclose(drives[700:900], on.reshape(200, 1000).mean(axis=1), atol=0.02)
+    assert drives.mean() == pytest.approx(scene.intensity(-700, 3000).mean(), rel=0.02)
+
+
+def test_a_nonlinear_led_bends_once():
+    for level in (0.1, 0.5, 1.0):
+        expected = 0.8 * (1 - np.exp(-level / 0.8))
+        dn = read(flat(level, effects("led_nonlinearity")), 300).pixels - 300.0
+        np.testing.assert_allclose(dn, expected * FLAT, atol=0.6)
+
+
+def test_led_rise_and_fall_follow_the_exponentials():
+    rise, fall = 0.7, 1.9
+
+    class Pulse:
+        def bits(self, start, length):
+            t = np.arange(start, start + length)
+            return ((t >= 0) & (t < 5)).astype(np.uint8)
+
+    listed = effects("led_rise_fall", rise_s=rise * DT, fall_s=fall * DT)
+    camera = bench(flat(listed=listed)).camera("a", LIT)
+    light = through(camera, Illumination.of(build_scene(flat(), N, DT), Pulse())).light(-3, 20)[0]
+    fine = (np.arange(20 * 2000) + 0.5) / 2000 - 3
+    peak = 1 - np.exp(-5 / rise)
+    exact = np.where(fine < 5, 1 - np.exp(-np.maximum(fine, 0) / rise), peak * np.exp(-(fine - 5) / fall))
+    np.testing.assert_allclose(light, exact.reshape(20, 2000).mean(axis=1), atol=1e-6)
+
+
+def test_jitter_has_its_histogram_and_moves_light_between_neighbours():
+    config = flat(listed=effects("trigger_jitter")).effects[0]
+    delay = delays(config, setting())
+    steps = delay(-5000, 200_000)
+    assert steps.std() == pytest.approx(0.1, rel=0.02)
+    assert steps.mean() == pytest.approx(0, abs=0.001)
+    assert (np.abs(steps) < 0.1).mean() == pytest.approx(0.683, abs=0.005)
+    assert abs(np.corrcoef(steps[:-1], steps[1:])[0, 1]) < 0.01
+    camera = bench(flat(listed=effects("trigger_jitter"))).camera("a", CODE)
+    ideal = Illumination.of(build_scene(flat(), N, DT), CODE)
+    moved = through(camera, ideal).light(100, 20_000)[0] - ideal.light(100, 20_000)[0]
+    # Light until x is piecewise linear; a step gathers what falls between its late beginning and late end.
+    until = np.concatenate([[0], np.cumsum(CODE.bits(99, 20_002), dtype=float)])
+    edges = np.arange(1, 20_002) + delay(100, 20_001)
+    gathered = np.diff(np.interp(edges, np.arange(len(until)), until))
+    np.testing.assert_allclose(moved, gathered - CODE.bits(100, 20_000), atol=1e-9)
+    assert moved.std() > 0.05
+
+
+def test_jitter_of_the_arms_differs_and_wrong_bits_are_common():
+    jitter, wrong = blinking(effects("trigger_jitter")), flat(listed=effects("code_errors"))
+    lines = [bench(wrong).camera(arm, CODE).read(512, 256).pixels for arm in "ab"]
+    np.testing.assert_array_equal(*lines)  # a flat scene is the same for both arms
+    steps = [delays(jitter.effects[0], setting(arm=arm))(0, 4000) for arm in "ab"]
+    assert abs(np.corrcoef(*steps)[0, 1]) < 0.05
+
+
+# Image and signal
+
+
+def spot(listed=()):
+    """Light in one pixel, off the middle, as frames."""
+    return FunctionSceneConfig.model_validate(
+        {"kind": "function", "function": "spot_function:spot", "effects": list(listed)}
+    )
+
+
+@pytest.fixture(autouse=True)
+def _spot(tmp_path, monkeypatch):
+    (tmp_path / "spot_function.py").write_text(
+        "import numpy as np\n"
+        "def spot(t, row, column):\n"
+        "    one = (abs(row - 10.5 / 24) < 0.01) & (abs(column - 14.5 / 24) < 0.01)\n"
+        "    return np.broadcast_to(one.astype(np.float32), (len(t), *one.shape)).copy()\n"
+    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "spot_function", raising=False)
+
+
+def image_of(listed):
+    """The spot through the image stages."""
+    frame = build_scene(spot(), N, DT).frames(0, 1)
+    assert frame[0, 10, 14] == frame.sum() == 1
+    for stage in bench(spot(listed)).camera("a", LIT).stages:
+        frame = stage.run(frame) if stage.place == "image" else frame
+    return frame[0].astype(float)
+
+
+def moments(image):
+    at = np.indices(image.shape)
+    mean = (at * image).sum(axis=(1, 2)) / image.sum()
+    return mean, ((at - mean[:, None, None]) ** 2 * image).sum(axis=(1, 2)) / image.sum()
+
+
+def test_misregistration_shifts_by_fractions_of_a_pixel_and_turns():
+    image = image_of(effects("misregistration", rows=0.4, columns=-1.25))
+    assert image.sum() == pytest.approx(1, abs=1e-5)
+    np.testing.assert_allclose(moments(image)[0], (10.4, 12.75), atol=1e-5)
+    turned = moments(image_of(effects("misregistration", rows=0.0, turn_deg=20.0)))[0]
+    angle = np.deg2rad(20.0)
+    y, x = 10 - 11.5, 14 - 11.5  # counter-clockwise, rows downwards
+    expected = (11.5 + np.cos(angle) * y - np.sin(angle) * x, 11.5 + np.sin(angle) * y + np.cos(angle) * x)
+    np.testing.assert_allclose(turned, expected, atol=0.1)
+    other = bench(spot(effects("misregistration"))).camera("b", LIT)
+    assert other.stages == ()
+
+
+def test_the_point_spread_has_its_sigma_and_keeps_the_light():
+    image = image_of(effects("psf"))
+    assert image.sum() == pytest.approx(1, abs=1e-4)
+    mean, variance = moments(image)
+    np.testing.assert_allclose(mean, (10, 14), atol=1e-4)
+    np.testing.assert_allclose(variance, 1.2**2, rtol=0.02)
+
+
+def test_a_veil_spreads_light_evenly_and_ambient_light_is_in_every_line():
+    image = image_of(effects("stray_light", ambient=0.0))
+    assert image.sum() == pytest.approx(1, abs=1e-6)
+    assert image[10, 14] == pytest.approx(0.95 + 0.05 / N**2)
+    assert image[0, 0] == pytest.approx(0.05 / N**2)
+    dark = read(flat(0.0, effects("stray_light", veil=0.0, ambient=0.5)), code=ConstantCode(0)).pixels
+    assert (dark == 300 + 0.5 * FLAT).all()
+
+
+def test_images_of_masks_and_of_frames_agree():
+    listed = effects("misregistration", "psf", "stray_light")
+    scene = blinking(listed)
+    window = {"kind": "window", "phases": [{"duration_s": 1.0}]}
+    framed = LedSceneConfig.model_validate(scene.model_dump() | {"shutters": [window]})
+    masks, frames = (read(config, 80, CODE).pixels.astype(int) for config in (scene, framed))
+    assert np.abs(masks - frames).max() <= 1
+
+
+def test_a_beam_splitter_gives_each_arm_its_part():
+    for arm, part in (("a", 0.45), ("b", 0.55)):
+        dn = read(flat(1.0, effects("beam_splitter")), 10, arm=arm).pixels - 300.0
+        np.testing.assert_allclose(dn, 2 * part * FLAT, atol=0.51)
+
+
+def test_the_tail_of_charge_transfer():
+    """A single lit line, then darkness: the tail is negative binomial, and no charge is lost."""
+    epsilon = 1e-3
+    weights = tail(epsilon, N)
+    for k in range(4):
+        exact = [comb(m + k - 1, k) * (1 - epsilon) ** m * epsilon**k for m in range(1, N + 1)]
+        assert weights[k] == pytest.approx(np.mean(exact), rel=1e-9)
+    assert weights.sum() == pytest.approx(1, abs=1e-8)
+    first_moment = (np.arange(len(weights)) * weights).sum()
+    assert first_moment == pytest.approx(epsilon / (1 - epsilon) * (N + 1) / 2, rel=1e-6)
+
+    class Flash:
+        def bits(self, start, length):
+            return (np.arange(start, start + length) == 3 * 700).astype(np.uint8)
+
+    changes = {"responsivity_dn": 5000.0, "black_level_dn": 0.0}
+    scene = [flat(1.0, listed) for listed in ((), effects("cti"))]
+    bare, moved = (read(one, 80, Flash(), first=680, **changes).pixels.astype(float) for one in scene)
+    expected = sum(weights[k] * np.roll(bare, k, axis=0) for k in range(len(weights)))
+    np.testing.assert_allclose(moved, expected, atol=0.51)
+    assert moved.sum() == pytest.approx(bare.sum(), rel=1e-4)
+    last = np.flatnonzero(bare[:, 0])[-1]
+    assert moved[last + 1, 0] == pytest.approx(weights[1] * bare[last, 0], rel=0.3)
+
+
+# Stream
+
+
+def test_lines_drop_at_their_rate_and_are_told():
+    lines = read(blinking(effects("dropped_lines")), 20_000, CODE)
+    assert lines.missing.mean() == pytest.approx(0.02, rel=0.15)
+    assert (lines.pixels[lines.missing] == 0).all()
+    kept = ~lines.missing
+    np.testing.assert_array_equal(lines.pixels[kept], read(blinking(), 20_000, CODE).pixels[kept])
+
+
+def test_duplicated_lines_repeat_the_line_before_at_their_rate_across_tiles_too():
+    noise = effects("read_noise")
+    bare = read(blinking(noise), 20_001, CODE, first=511).pixels
+    lines = read(blinking(noise + effects("duplicated_lines")), 20_000, CODE).pixels
+    twice = (lines != bare[1:]).any(axis=1)
+    assert twice.mean() == pytest.approx(0.02, rel=0.15)
+    np.testing.assert_array_equal(lines[twice], bare[:-1][twice])
+    at = np.flatnonzero(twice) + 512
+    assert (at % 256 == 0).any()
+
+
+# Layouts
+
+
+def naive(frames, bits, turns, stages=M, substeps=S):
+    """Eq. (1) of lines from sub-step 0 on."""
+    X = np.rot90(frames, turns, axes=(1, 2)).astype(float) * bits[:, None, None]
+    n = stages * substeps
+    count = (len(frames) - n - substeps + 1) // substeps
+    Y = np.zeros((count, stages))
+    for i in range(count):
+        for u in range(substeps):
+            for r in range(n):
+                Y[i] += X[substeps * i + u + r, r].reshape(stages, substeps).sum(axis=1)
+    return Y
+
+
+@pytest.fixture
+def integers(tmp_path):
+    """A video of whole numbers of light, one frame per sub-step."""
+    video = np.random.default_rng(5).integers(0, 3, (200, N, N)).astype(np.float32)
+    np.save(tmp_path / "v.npy", video)
+    table = {"kind": "video", "path": tmp_path / "v.npy", "frame_rate_hz": 1 / DT, "between": "hold"}
+    return table, video
+
+
+@pytest.mark.parametrize("layout", ["dual", "compact", "emulated"])
+@pytest.mark.parametrize("arm", ["a", "b"])
+def test_every_layout_gives_equation_1(integers, layout, arm):
+    table, video = integers
+    scene = SceneFile.model_validate(table | {"optics": {"layout": layout}}).root
+    lines = read(scene, 50, CODE, arm, first=0, black_level_dn=9.0).pixels
+    expected = naive(video, CODE.bits(0, 200), "ab".index(arm))[:50]
+    np.testing.assert_array_equal(lines, expected + 9)
+
+
+def test_merged_raw_lines_equal_the_model_of_three_substeps_exactly(integers):
+    table, _ = integers
+    both = [
+        read(
+            SceneFile.model_validate(table | {"optics": {"layout": layout}}).root, 700, CODE, "b", first=-20
+        ).pixels
+        for layout in ("dual", "emulated")
+    ]
+    np.testing.assert_array_equal(*(lines.astype(int) - 300 for lines in (both[0], both[1] + 3)))
+
+
+def test_a_saturated_raw_sample_makes_the_merged_one_white():
+    scene = flat(1.0, optics={"layout": "emulated", "raw_bits": 4})
+    assert (read(scene, 5).pixels == 65535).all()
+
+
+def test_the_baseline_sums_fine_pixels_and_sub_steps(integers):
+    table, video = integers
+    scene = SceneFile.model_validate(
+        table | {"frame_rate_hz": 3 / DT, "optics": {"layout": "interline", "baseline_factor": 3}}
+    ).root
+    one = bench(scene)
+    coarse = Bench(scene, GeometryConfig(stages=M, substeps=1), one.cameras, DT)
+    lines = coarse.camera("a", CODE).read(0, 20).pixels
+    summed = video[:198].reshape(66, 3, M, 3, M, 3).sum(axis=(1, 3, 5))
+    np.testing.assert_array_equal(lines - 300, naive(summed, CODE.bits(0, 66), 0, M, 1)[:20])
+
+
+@pytest.mark.parametrize("turn", [0, 90, 180, 270])
+@pytest.mark.parametrize("mirror", [False, True])
+@pytest.mark.parametrize("separable", [False, True])
+def test_the_eight_orientations(integers, turn, mirror, separable):
+    table, video = integers
+    optics = {"a": {"turn_deg": turn, "mirror": mirror}}
+    if separable:
+        scene = blinking(optics=optics)
+        video = build_scene(blinking(), N, DT).frames(0, 200)
+    else:
+        scene = SceneFile.model_validate(table | {"optics": optics}).root
+    lines = read(scene, 40, CODE, first=0).pixels - 300.0
+    seen = video[:, :, ::-1] if mirror else video
+    expected = naive(seen, CODE.bits(0, 200), turn // 90)[:40]
+    np.testing.assert_allclose(lines, expected, atol=0.51)
+
+
+def test_layouts_that_cannot_be_are_refused(integers):
+    for optics, words in (
+        ({"layout": "compact", "sensor_pixels": 10}, "on 10 columns"),
+        ({"layout": "compact", "column_b": 4}, "beside each other"),
+        ({"layout": "emulated", "raw_bits": 14}, "Mono16"),
+        ({"layout": "interline"}, "substeps = 1"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            read(flat(optics=optics), 1)
