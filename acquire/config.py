@@ -23,6 +23,9 @@ PIXEL_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16}
 """SFNC PixelFormat → significant bits of an (unpacked) pixel."""
 
 
+GentlModule = Literal["remote", "interface", "device", "stream", "system"]
+"""Where a camera's features are: in the camera itself, or in a module of the host's side."""
+
 MAX_RING_BYTES = 4 * 2**30
 """Pixels that may wait in the ring of one arm."""
 
@@ -88,8 +91,18 @@ class TriggerConfig(_Model):
 class CameraConfig(_Model):
     """One camera. DN = black level + responsivity · Y, with Y of Eq. (1)."""
 
-    driver: Literal["simulated"] = "simulated"
+    driver: Literal["simulated", "gentl-simulated", "harvesters"] = Field(
+        default="simulated",
+        description="'harvesters': through the maker's GenTL producer; 'gentl-simulated': through ours",
+    )
     serial: str = "simulated"
+    model: str = Field(default="", description="what the camera must be; absent: any")
+    cti: str = Field(default="", description="GenTL producer; absent: those of GENICAM_GENTL64_PATH")
+    settings: tuple[tuple[GentlModule, str, bool | int | float | str], ...] = Field(
+        default=(), description="[module, feature, value] in the order in which they are written"
+    )
+    buffer_s: float = Field(default=0.5, ge=0.2, le=60, description="lines that the driver can hold")
+    frame_id_bits: int = Field(default=0, ge=0, le=64, description="0: found when the ids wrap")
     pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16"] = "Mono12"
     black_level_dn: float = Field(default=0.0, ge=0)
     responsivity_dn: float = Field(default=1.0, gt=0, description="DN per unit of scene light and sub-step")
@@ -131,6 +144,7 @@ class StreamConfig(_Model):
 
     block_lines: int = Field(default=256, ge=1, le=65536, description="lines per camera block and ring slot")
     ring_slots: int = Field(default=64, ge=2, le=4096)
+    reopen_s: float = Field(default=2.0, ge=0, le=600, description="wait for a camera that is gone")
 
 
 class RecordingConfig(_Model):

@@ -8,10 +8,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Self
 
+from acquire.camera.harvesters import HarvestersOpener
+from acquire.camera.spec import spec_of
 from acquire.config import load_scene
 from acquire.lines import ARMS
 from acquire.sim.clock import Wire
 from acquire.sim.devices import SimulatedCameraOpener, SimulatedOptics, SimulatedTrigger
+from acquire.sim.gentl.arms import GentlArms
 from acquire.sim.scenes import build_scene
 
 if TYPE_CHECKING:
@@ -33,12 +36,26 @@ class Rig:
         self.config = config
         self._scene = load_scene(config.simulation.scene)
         self._wire = Wire()
+        self._gentl = GentlArms(config)
         self._closed = False
         self.trigger: Trigger = open_trigger(config, self._wire)
 
     def openers(self) -> dict[str, CameraOpener]:
         """Arm → what opens its camera, here or in a process being spawned."""
-        return {arm: _camera_opener(self.config, self._scene, self._wire, arm) for arm in ARMS}
+        return {arm: self._opener(arm) for arm in ARMS}
+
+    def _opener(self, arm: str) -> CameraOpener:
+        match self.config.cameras.arm(arm).driver:
+            case "harvesters":
+                return HarvestersOpener(spec_of(self.config, arm))
+            case "gentl-simulated":
+                return self._gentl.opener(arm, self._sensor)
+            case "simulated":
+                return self._sensor(arm)
+
+    def _sensor(self, arm: str) -> SimulatedCameraOpener:
+        """The model of the arm's camera, in the process that opens it."""
+        return _camera_opener(self.config, self._scene, self._wire, arm)
 
     def describe(self) -> dict[str, Any]:
         """What a recording must say about where its lines come from (JSON)."""
@@ -55,6 +72,7 @@ class Rig:
         """Stop the trigger and take the wire away. Idempotent."""
         if not self._closed:
             self._closed = True
+            self._gentl.close()
             self.trigger.close()
             self._wire.close()
 
@@ -74,7 +92,7 @@ def open_trigger(config: RigConfig, wire: Wire | None = None) -> Trigger:
     )
 
 
-def _camera_opener(config: RigConfig, scene: SceneConfig, wire: Wire, arm: str) -> CameraOpener:
+def _camera_opener(config: RigConfig, scene: SceneConfig, wire: Wire, arm: str) -> SimulatedCameraOpener:
     optics = SimulatedOptics(arm, config.geometry, scene)
     return SimulatedCameraOpener(
         wire, optics, config.cameras.arm(arm), config.stream.block_lines, config.line_rate_hz

@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from acquire.stream import CaptureStatus
 
 
+STALL_S = 3.0
+"""An arm that is silent for so long has stalled, unless its camera is waited for longer."""
+
+
 class Run:
     """One run of a rig: armed once, records at most once, closed once."""
 
@@ -100,6 +104,9 @@ def capture_plan(config: RigConfig, rig: Rig, run_id: str) -> CapturePlan:
         ring_slots=config.stream.ring_slots,
         white_dn=config.cameras.a.white_dn,
         openers=rig.openers(),
+        stall_timeout_s=max(STALL_S, config.stream.reopen_s + 1.0),
+        reopen_timeout_s=config.stream.reopen_s,
+        line_period_ns=1e9 / config.line_rate_hz,
     )
 
 

@@ -215,6 +215,16 @@ class SimulatedCamera:
             return None
         return self._read_out(reading, ready)
 
+    def times_ns(self, first_line: int, count: int) -> NDArray[np.int64]:
+        """CLOCK_MONOTONIC at which lines, counted since arm, were triggered (count,)."""
+        train = self._wire.look().train
+        if train is None or train.run != self._train:
+            raise CameraError("times were asked of a camera without its pulses")
+        spacing = train.line_period_ns / train.speed
+        pulses = self._first_pulse + first_line + np.arange(count, dtype=np.int64)
+        times: NDArray[np.int64] = train.start_ns - (-pulses * spacing.numerator // spacing.denominator)
+        return times
+
     def release(self, block: CameraBlock) -> None:
         """Nothing to give back: every block has memory of its own."""
 

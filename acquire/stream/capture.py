@@ -176,7 +176,13 @@ class Capture:
         )
         for arm, ring in self._rings.items():
             task = grabber.GrabberPlan(
-                arm, plan.openers[arm], plan.depth_lines, plan.white_dn, plan.max_skew_lines
+                arm,
+                plan.openers[arm],
+                plan.depth_lines,
+                plan.white_dn,
+                plan.max_skew_lines,
+                plan.reopen_timeout_s,
+                plan.line_period_ns,
             )
             self._workers[arm] = Worker(f"grabber {arm}", grabber.grab, task, ring, self._counters[arm])
 
@@ -217,8 +223,9 @@ class Capture:
     def _line_counts(self, arm: str, *, began: bool) -> dict[str, Any]:
         grabbed, recorded = self._counters[arm], self._counters[RECORDER]
         lost = {
-            str(Cause.CAMERA): grabbed["camera_lost"],
+            str(Cause.CAMERA): grabbed[Cause.CAMERA],
             str(Cause.RING_FULL): self._rings[arm].statistics().dropped_lines,
+            **{str(cause): grabbed[cause] for cause in grabber.CAMERA_CAUSES[1:] if grabbed[cause]},
         }
         return {
             "delivered": grabbed["delivered"],

@@ -36,6 +36,9 @@ class CapturePlan:
     stall_timeout_s : an arm that delivers nothing for so long ends the recording; while nothing is
         recorded it is a fault, as is a recorder that shows no life for so long
     tag_wait_s : how long lines wait for the tag that confirms them before they are flagged
+    reopen_timeout_s : how long a camera that is gone is waited for; less than ``stall_timeout_s``, or the
+        arm counts as stalled first
+    line_period_ns : by the trigger's clock; 0: not told
     """
 
     run: TriggerRun
@@ -48,6 +51,8 @@ class CapturePlan:
     openers: dict[str, CameraOpener]
     stall_timeout_s: float = 3.0
     tag_wait_s: float = 1.0
+    reopen_timeout_s: float = 2.0
+    line_period_ns: float = 0.0
 
     def __post_init__(self) -> None:
         if tuple(sorted(self.openers)) != ARMS:
