@@ -103,6 +103,9 @@ class CameraConfig(_Model):
     )
     buffer_s: float = Field(default=0.5, ge=0.2, le=60, description="lines that the driver can hold")
     frame_id_bits: int = Field(default=0, ge=0, le=64, description="0: found when the ids wrap")
+    frame_id_first: Literal[0, 1] | None = Field(
+        default=None, description="of the first frame; absent: 1 if the first to come is 1, else 0"
+    )
     pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16"] = "Mono12"
     black_level_dn: float = Field(default=0.0, ge=0)
     responsivity_dn: float = Field(default=1.0, gt=0, description="DN per unit of scene light and sub-step")

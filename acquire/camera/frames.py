@@ -52,12 +52,20 @@ class FramePlace:
 
 
 class FrameCount:
-    """Numbers the frames of one acquisition. ``id_bits`` = 0: the width of ids is found when they wrap."""
+    """Numbers the frames of one acquisition.
 
-    def __init__(self, height: int, id_bits: int = 0) -> None:
+    Parameters
+    ----------
+    height : lines per frame
+    id_bits : width of frame ids; 0: found when they wrap
+    first_id : id of the first frame and of the one after a wrap; None: 1 if the first to come is 1, else 0.
+        (A camera that counts from 0 and loses its first frame then seems to have lost none.)
+    """
+
+    def __init__(self, height: int, id_bits: int = 0, first_id: int | None = None) -> None:
         self._height = height
         self._id_bits = id_bits
-        self._first_id: int | None = None
+        self._first_id = first_id
         self._last: FrameFacts | None = None
         self._underruns = 0
         self._missed = 0
@@ -81,8 +89,8 @@ class FrameCount:
     def _lost_frames(self, frame: FrameFacts) -> int:
         last = self._last
         if last is None:
-            # Cameras begin at 0 or at 1; a larger first id is a loss before the first frame.
-            self._first_id = 1 if frame.frame_id == 1 else 0
+            if self._first_id is None:
+                self._first_id = 1 if frame.frame_id == 1 else 0
             return frame.frame_id - self._first_id
         return self._ahead(last.frame_id, frame.frame_id) - 1
 

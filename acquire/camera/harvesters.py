@@ -169,7 +169,7 @@ class HarvestersCamera:
             # harvesters keeps its monitors to itself; without one there is no word of incomplete buffers.
             self._stream = acquirer.data_streams[0]
             self._monitor = acquirer._new_buffer_event_monitor_dict[self._stream]
-        self._count = FrameCount(self._height, self._spec.frame_id_bits)
+        self._count = FrameCount(self._height, self._spec.frame_id_bits, self._spec.frame_id_first)
         self._views: dict[int, Any] = {}
         self._reader: LineReader | None = None
         self._delivered = self._lost = self._incomplete = 0
@@ -301,6 +301,7 @@ class _Library:
         self._producers = find_producers(cti)
         self._words = _Words()
         with warnings.catch_warnings(), _told("load harvesters"):
+            warnings.simplefilter("ignore")
             try:
                 from harvesters.core import Harvester, ParameterKey, ParameterSet
             except ImportError as error:

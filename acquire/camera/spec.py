@@ -22,7 +22,7 @@ class GenicamSpec:
     pixels, bits : what its lines must then be; 0: whatever they are
     line_rate_hz, buffer_s : buffers for so long at that rate are announced
     cti : the producer; empty: those of GENICAM_GENTL64_PATH
-    frame_id_bits : width of the camera's frame ids; 0: found when they wrap
+    frame_id_bits, frame_id_first : see `acquire.camera.frames.FrameCount`
     """
 
     serial: str
@@ -34,6 +34,7 @@ class GenicamSpec:
     buffer_s: float = 0.5
     cti: str = ""
     frame_id_bits: int = 0
+    frame_id_first: int | None = None
 
 
 def spec_of(config: RigConfig, arm: str, cti: str | None = None) -> GenicamSpec:
@@ -49,4 +50,5 @@ def spec_of(config: RigConfig, arm: str, cti: str | None = None) -> GenicamSpec:
         buffer_s=camera.buffer_s,
         cti=camera.cti if cti is None else cti,
         frame_id_bits=camera.frame_id_bits,
+        frame_id_first=camera.frame_id_first,
     )

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import itertools
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
-from acquire.cli.demo_plan import LINES, RIG, SEED, TWIST_BUDGET_S, DemoPlan, check
+from acquire.cli.demo_plan import LINES, RIG, SEED, TWIST_BUDGET_S, DemoPlan, check, rig_of
 from acquire.cli.journal import Journal
 from acquire.cli.output import JsonFlag, print_facts, print_json
 
@@ -29,6 +29,10 @@ def demo(
         float, typer.Option(metavar="SECONDS", help="For the paper's solver.")
     ] = TWIST_BUDGET_S,
     config: Annotated[str, typer.Option("--config", "-c", metavar="FILE", help="Rig file.")] = RIG,
+    cameras: Annotated[
+        Literal["simulated", "gentl"],
+        typer.Option(help="Cameras in the grabbers, or behind a GenTL producer as real ones are."),
+    ] = "simulated",
     json: JsonFlag = False,
 ) -> None:
     """Record Scene #1 of the paper with a simulated rig, reconstruct it, and write a report.
@@ -39,6 +43,7 @@ def demo(
     """
     from acquire.config import load_rig
 
+    config = rig_of(config, cameras)
     plan = DemoPlan(out or _free(Path("acquire-demo")), config, seed, lines, budget, twist_budget)
     rig = load_rig(config)
     check(plan, rig)

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from acquire.config import RigConfig
 
 RIG = "rig-demo"
+GENTL_RIG = "rig-demo-gentl"
 SEED = 1
 LINES = 33_334
 TWIST_BUDGET_S = 30.0
@@ -57,6 +58,17 @@ class DemoPlan:
         return shlex.join(words)
 
 
+def rig_of(config: str, cameras: str) -> str:
+    """The rig file for the cameras that were asked for. Raises UsageError for a file of the user's own."""
+    if cameras == "simulated" or config == GENTL_RIG:
+        return config
+    if config != RIG:
+        raise UsageError(
+            f"demo of {config} with --cameras {cameras}", hint="cameras.a.driver in that file, or no --config"
+        )
+    return GENTL_RIG
+
+
 def check(plan: DemoPlan, rig: RigConfig) -> None:
     """Raise UsageError for what could not be carried out to the end."""
     from acquire.config import check_directory
@@ -65,6 +77,10 @@ def check(plan: DemoPlan, rig: RigConfig) -> None:
     _check_budgets(plan)
     _check_rig(plan, rig)
     check_directory(rig)
+    if "gentl-simulated" in (rig.cameras.a.driver, rig.cameras.b.driver):
+        from acquire.sim.gentl.build import build
+
+        build()
     least = segment_row(rig) + SEGMENT_LINES
     if plan.lines < least:
         raise UsageError(

@@ -111,7 +111,7 @@ class CameraMemory:
 
         ``BAD`` marks the frame incomplete · ``SHORT`` delivers its first ``count`` lines only · ``DROP``
         loses ``count`` frames on the link · ``OVERRUN`` finds no buffer for ``count`` frames · ``GONE``
-        unplugs the device · ``MISSED`` makes the camera blind for ``count`` trigger pulses from line ``at`` on.
+        unplugs the device · ``MISSED`` blinds the camera for ``count`` trigger pulses from line ``at`` on.
         """
         if kind not in layout.FAULT_KINDS[1:]:
             raise UsageError(f"fault {kind!r}", possible=", ".join(layout.FAULT_KINDS[1:]))

@@ -1,0 +1,192 @@
+"""One suite for every way to a camera: in this process, through our GenTL producer, through a foreign one."""
+
+from __future__ import annotations
+
+import itertools
+import pickle
+import signal
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from acquire.camera.base import Camera, CameraBlock
+from acquire.camera.harvesters import HarvestersOpener
+from acquire.camera.settings import Setting
+from acquire.camera.spec import GenicamSpec, spec_of
+from acquire.config import load_rig, load_scene
+from acquire.errors import CameraError
+from acquire.sim.clock import Wire
+from acquire.sim.devices import SimulatedCameraOpener, SimulatedOptics
+from acquire.sim.gentl.bench import GentlBench
+from acquire.sim.gentl.models import CameraModel
+
+WAIT_S = 20.0
+STAGES, BLOCK = 16, 32
+OVERRIDES = {
+    "geometry.stages": STAGES,
+    "stream.block_lines": BLOCK,
+    "cameras.a.frame_id_first": 1,
+    **{
+        f"cameras.{arm}.settings": [
+            ["remote", "Width", STAGES],
+            ["remote", "PixelFormat", "Mono12p"],
+            ["stream", "BufferHeight", BLOCK],
+        ]
+        for arm in "ab"
+    },
+}
+
+
+@dataclass
+class Stand:
+    """A way to a camera, its trigger, and what its lines must be; None: they are not ours to know."""
+
+    open: Callable[[], Camera]
+    start: Callable[[], object]
+    stop: Callable[[], object]
+    lines: Callable[[int, int], np.ndarray] | None
+    opener: object
+    serial: str
+
+
+def simulated_stand(gentl: bool) -> Iterator[Stand]:
+    rig = load_rig("rig-demo-gentl", OVERRIDES)
+    optics = SimulatedOptics("a", rig.geometry, load_scene(rig.simulation.scene))
+    wire, code = Wire(), rig.code.build()
+    sensor = SimulatedCameraOpener(wire, optics, rig.cameras.a, BLOCK, rig.line_rate_hz)
+    start = lambda: wire.start(Fraction(30_000), Fraction(1), code.to_attrs())  # noqa: E731
+
+    def lines(first: int, count: int) -> np.ndarray:
+        train = wire.look().train
+        assert train is not None
+        light = optics.expose(train).lines(first - STAGES - 1, count)
+        return np.clip(np.rint(light * np.float32(6.0)), 0, 4095)
+
+    if gentl:
+        model = CameraModel("SIM-A", STAGES, row_padding=5, id_bits=16, id_first=1)
+        with GentlBench({model: sensor}) as bench:
+            opener = HarvestersOpener(spec_of(rig, "a", str(bench.cti)))
+            yield Stand(opener, start, wire.stop, lines, opener.spec, "SIM-A")
+    else:
+        yield Stand(sensor, start, wire.stop, lines, optics, "SIM-A")
+    wire.close()
+
+
+def foreign_stand() -> Iterator[Stand]:
+    """The producer in the genicam wheel: an area camera that runs freely and shows its own pictures."""
+    import genicam
+
+    cti = str(Path(genicam.__file__).with_name("viky.cti"))
+    settings = (Setting("remote", "PixelFormat", "Mono8"),)
+    opener = HarvestersOpener(GenicamSpec("", settings=settings, cti=cti, bits=8))
+    nothing = lambda: None  # noqa: E731
+    yield Stand(opener, nothing, nothing, None, opener, "")
+
+
+@pytest.fixture(
+    scope="module",
+    params=["in process", pytest.param("our producer", marks=pytest.mark.needs_compiler), "foreign producer"],
+)
+def stand(request: pytest.FixtureRequest) -> Iterator[Stand]:
+    makers = {
+        "in process": lambda: simulated_stand(gentl=False),
+        "our producer": lambda: simulated_stand(gentl=True),
+        "foreign producer": foreign_stand,
+    }
+    yield from makers[request.param]()
+
+
+@pytest.fixture
+def camera(stand: Stand) -> Iterator[Camera]:
+    opened = stand.open()
+    yield opened
+    opened.close()
+    stand.stop()
+
+
+def take(camera: Camera, blocks: int) -> list[CameraBlock]:
+    """So many blocks, copied and released."""
+    found: list[CameraBlock] = []
+    deadline = time.monotonic() + WAIT_S
+    while len(found) < blocks:
+        assert time.monotonic() < deadline, f"{len(found)} of {blocks} blocks came"
+        block = camera.next_block(0.2)
+        if block is not None:
+            found.append(CameraBlock(block.first_line, block.pixels.copy(), block.flags.copy(), block.losses))
+            camera.release(block)
+    return found
+
+
+def test_it_says_who_it_is_and_how_it_is_set(stand: Stand, camera: Camera) -> None:
+    identity, settings = camera.identify(), camera.settings()
+    assert identity.model
+    assert stand.serial in identity.serial
+    assert settings["Width"] >= 1
+    assert settings["PixelFormat"].startswith("Mono")
+
+
+def test_a_camera_that_is_not_armed_gives_no_lines(camera: Camera) -> None:
+    with pytest.raises(CameraError, match="not armed"):
+        camera.next_block(0.1)
+
+
+def test_without_a_trigger_the_wait_is_bounded_and_in_vain(stand: Stand, camera: Camera) -> None:
+    camera.arm()
+    if stand.lines is not None:
+        begin = time.monotonic()
+        assert camera.next_block(0.1) is None
+        assert time.monotonic() - begin < 1.0
+    camera.disarm()
+
+
+def test_lines_count_from_arm_without_a_hole_and_are_what_the_sensor_saw(
+    stand: Stand, camera: Camera
+) -> None:
+    camera.arm()
+    stand.start()
+    blocks = take(camera, 12)
+    if stand.lines is not None:
+        assert blocks[0].first_line == 0
+        expected = stand.lines(0, 12 * len(blocks[0].flags))
+        np.testing.assert_array_equal(np.concatenate([block.pixels for block in blocks]), expected)
+    for before, after in itertools.pairwise(blocks):
+        assert after.first_line == before.first_line + len(before.flags) + sum(
+            loss.count for loss in after.losses
+        )
+    assert all(block.pixels.ndim == 2 and len(block.pixels) == len(block.flags) for block in blocks)
+    assert camera.statistics()["lines"] == sum(len(block.flags) for block in blocks)
+
+
+def test_every_arming_counts_anew_and_ending_twice_is_ending_once(stand: Stand, camera: Camera) -> None:
+    for _ in range(2):
+        camera.arm()
+        stand.start()
+        assert take(camera, 2)[0].first_line == 0
+        camera.disarm()
+        camera.disarm()
+        stand.stop()
+    camera.close()
+    camera.close()
+
+
+def test_a_closed_camera_can_be_opened_again(stand: Stand) -> None:
+    for _ in range(2):
+        opened = stand.open()
+        opened.arm()
+        opened.close()
+
+
+def test_opening_leaves_signals_and_warnings_as_they_were(stand: Stand) -> None:
+    before = signal.getsignal(signal.SIGINT), list(warnings.filters)
+    stand.open().close()
+    assert (signal.getsignal(signal.SIGINT), list(warnings.filters)) == before
+
+
+def test_what_opens_it_can_be_given_to_another_process(stand: Stand) -> None:
+    assert pickle.loads(pickle.dumps(stand.opener)) == stand.opener
