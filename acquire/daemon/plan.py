@@ -90,13 +90,7 @@ class Run:
 def capture_plan(config: RigConfig, rig: Rig, run_id: str) -> CapturePlan:
     """What the capture path is asked to do. Raises UsageError for what cannot work."""
     return CapturePlan(
-        run=TriggerRun(
-            run_id=run_id,
-            code=config.code.build(),
-            substeps=config.geometry.substeps,
-            substep_ticks=config.trigger.substep_ticks,
-            tag_every_lines=config.trigger.tag_every_lines,
-        ),
+        run=trigger_run(config, run_id),
         stages=config.geometry.stages,
         pixels=config.geometry.stages,
         dtype=config.cameras.a.dtype,
@@ -107,6 +101,17 @@ def capture_plan(config: RigConfig, rig: Rig, run_id: str) -> CapturePlan:
         stall_timeout_s=max(STALL_S, config.stream.reopen_s + 1.0),
         reopen_timeout_s=config.stream.reopen_s,
         line_period_ns=1e9 / config.line_rate_hz,
+    )
+
+
+def trigger_run(config: RigConfig, run_id: str) -> TriggerRun:
+    """What the trigger is asked to do."""
+    return TriggerRun(
+        run_id=run_id,
+        code=config.code.build(),
+        substeps=config.geometry.substeps,
+        substep_ticks=config.trigger.substep_ticks,
+        tag_every_lines=config.trigger.tag_every_lines,
     )
 
 

@@ -91,7 +91,11 @@ def foreign_stand() -> Iterator[Stand]:
 
 @pytest.fixture(
     scope="module",
-    params=["in process", pytest.param("our producer", marks=pytest.mark.needs_compiler), "foreign producer"],
+    params=[
+        "in process",
+        pytest.param("our producer", marks=pytest.mark.needs_compiler),
+        pytest.param("foreign producer", marks=pytest.mark.needs_genicam),
+    ],
 )
 def stand(request: pytest.FixtureRequest) -> Iterator[Stand]:
     makers = {
