@@ -139,6 +139,8 @@ class CamerasConfig(_Model):
             raise ValueError(
                 f"both arms need one pixel_format, not {self.a.pixel_format} and {self.b.pixel_format}"
             )
+        if self.a.serial == self.b.serial and (self.a.driver, self.b.driver) != ("simulated", "simulated"):
+            raise ValueError(f"both arms have the camera with serial {self.a.serial!r}")
         return self
 
 

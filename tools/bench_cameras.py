@@ -206,7 +206,8 @@ def _watch(load: Load, seconds: float, bench: GentlBench, arms: list[Any]) -> No
         late = np.array(side.latencies_ms)
         print(
             f"  {side.memory.model.serial}  {side.lines} lines in {elapsed_s:.1f} s, lost {side.lost}"
-            f" {why or ''}, torn {side.torn}\n         core: grabber {own:.3f}, producer's thread {producer:.3f};"
+            f" {why or ''}, torn {side.torn}\n"
+            f"         core: grabber {own:.3f}, producer's thread {producer:.3f};"
             f" first line of a block to ring: median {np.median(late):.2f},"
             f" p99 {np.percentile(late, 99):.2f}, most {late.max():.1f} ms"
         )

@@ -84,7 +84,8 @@ class Run:
             "black_level_dn": camera.black_level_dn,
             "responsivity_dn": camera.responsivity_dn,
         }
-        return {**calibration, **facts}
+        lines = self._capture.poll().lines.get(arm, {})
+        return {**calibration, **facts, "clock": lines.get("clock", {})}
 
 
 def capture_plan(config: RigConfig, rig: Rig, run_id: str) -> CapturePlan:
@@ -100,7 +101,7 @@ def capture_plan(config: RigConfig, rig: Rig, run_id: str) -> CapturePlan:
         openers=rig.openers(),
         stall_timeout_s=max(STALL_S, config.stream.reopen_s + 1.0),
         reopen_timeout_s=config.stream.reopen_s,
-        line_period_ns=1e9 / config.line_rate_hz,
+        line_period_ns=1e9 / config.line_rate_hz / config.simulation.speed,
     )
 
 

@@ -155,7 +155,12 @@ class Capture:
         self._workers[RECORDER].post(RunStarted(self.clock))
         assert self._tags is not None
         self._supervisor = Supervisor(
-            self._trigger, self._workers, self._tags, self._counters, self._plan.stall_timeout_s
+            self._trigger,
+            self._workers,
+            self._tags,
+            self._counters,
+            self._plan.stall_timeout_s,
+            self._plan.margin_lines,
         )
         self._supervisor.start()
 
@@ -234,6 +239,8 @@ class Capture:
             "lost": lost,
             "recorded": recorded[f"rows_{arm}"] if began else 0,
             "missing": recorded[f"missing_{arm}"] if began else 0,
+            "reopened": grabbed["reopened"],
+            "clock": {name: grabbed[name] for name in ("stamp_line", "stamp_ns", "drift_ppb")},
         }
 
     # ---- end

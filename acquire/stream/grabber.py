@@ -33,9 +33,12 @@ if TYPE_CHECKING:
     from acquire.stream.shared import Counters
 
 CAMERA_CAUSES = (Cause.CAMERA, *(Cause(cause) for cause in LossCause))
-COUNTERS = ("delivered", "preroll", *CAMERA_CAUSES, "reopened", "drift_ppb")
-"""Lines since arm: delivered by the camera (preroll included), discarded as preroll, lost by cause. How
-often the camera was opened again; how much faster its clock runs than the trigger's.
+COUNTERS = (
+    "delivered", "preroll", *CAMERA_CAUSES, "next_line", "reopened", "stamp_line", "stamp_ns", "drift_ppb",
+)  # fmt: skip
+"""Lines since arm: delivered by the camera (preroll included), discarded as preroll, lost by cause; the line
+that comes next. How often the camera was opened again; a line and its time by the camera's clock, and how
+much faster that runs than the trigger's.
 """
 
 _BLOCK_WAIT_S = 0.05
@@ -158,8 +161,7 @@ class Intake:
         first = block.first_line + self._shift
         self._note_jump(first, losses)
         if block.time_ns is not None:
-            self._clock.note(first, block.time_ns)
-            self._counters["drift_ppb"] = self._clock.drift_ppb
+            self._stamp(first, block.time_ns)
         count = len(block.flags)
         preroll = min(max(-first, 0), count)
         self._counters.add("delivered", count)
@@ -168,6 +170,13 @@ class Intake:
             part = slice(at, at + self._ring.shape.rows)
             self._put(first + at, block.pixels[part], block.flags[part])
         self._next = first + count
+        self._counters["next_line"] = self._next
+
+    def _stamp(self, line: int, time_ns: int) -> None:
+        self._clock.note(line, time_ns)
+        stamp = {"stamp_line": line, "stamp_ns": time_ns, "drift_ppb": self._clock.drift_ppb}
+        for name, value in stamp.items():
+            self._counters[name] = value
 
     def _check(self, block: CameraBlock) -> None:
         shape = self._ring.shape

@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 MAX_SUBSTEPS = 8
 """A line's code is recorded in one byte."""
 
+TAG_DELAY_S = 0.5
+"""How late a tag may come."""
+
 SKEW_RINGS = 32
 """An arm that lags behind the other by the lines of so many rings is taken for stalled."""
 
@@ -80,6 +83,13 @@ class CapturePlan:
         return RingShape(self.ring_slots, self.block_lines, self.pixels, self.dtype)
 
     @property
+    def margin_lines(self) -> int | None:
+        """Lines by which a camera may seem ahead of the trigger's tags; None where time is not told."""
+        if not self.line_period_ns:
+            return None
+        return self.run.tag_every_lines + round(TAG_DELAY_S * 1e9 / self.line_period_ns)
+
+    @property
     def max_skew_lines(self) -> int:
         """Lines by which one arm may be ahead of the other, and by which a camera's count may jump: after
         a larger jump the other arm would be taken for stalled, and its rows would be written in one go.
@@ -101,7 +111,9 @@ class CaptureStatus:
     ring : arm → slots, fill, peak, drops (blocks), dropped_lines, all since arm
     lines : arm → delivered, preroll, discarded (taken from the ring, but in no recording), and lost by
         cause, since arm; and of the latest recording ``recorded`` rows, of which ``missing``. After
-        `close`: delivered = preroll + lost["ring_full"] + discarded + recorded − missing
+        `close`: delivered = preroll + lost["ring_full"] + discarded + recorded − missing. Also how often
+        the camera was ``reopened``, and its ``clock``: the latest stamp (line, its time by the camera) and
+        how much faster it runs than the trigger's, in parts per billion; all 0 where it tells no time
     fault : what failed first, or None
     """
 

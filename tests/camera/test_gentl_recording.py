@@ -52,6 +52,7 @@ def record(
         run = Run(config, rig)
         try:
             run.arm()
+            until(lambda: all(run.poll().lines[arm]["clock"]["stamp_ns"] for arm in "ab"), "time stamps")
             run.start(path, lines)
             happen(rig, run)
             until(lambda: run.poll().done, "the recording's end")
@@ -81,6 +82,8 @@ def test_what_is_recorded_through_the_producer_is_eq1(tmp_path: Path) -> None:
         camera = recording.attrs["cameras"][arm]
         assert (camera["PixelFormat"], camera["BufferHeight"]) == ("Mono12Packed", 100)
         assert camera["identity"]["serial"] == f"SIM-{arm.upper()}"
+        assert abs(camera["clock"]["drift_ppb"]) < 1000, "the simulated cameras' clock is the trigger's"
+        assert camera["clock"]["stamp_ns"] > 0
 
 
 def test_faults_of_one_camera_are_gaps_by_cause_and_the_other_arm_is_whole(tmp_path: Path) -> None:
