@@ -91,9 +91,10 @@ class TriggerConfig(_Model):
 class CameraConfig(_Model):
     """One camera. DN = black level + responsivity · Y, with Y of Eq. (1)."""
 
-    driver: Literal["simulated", "gentl-simulated", "harvesters"] = Field(
+    driver: Literal["simulated", "gentl-simulated", "harvesters", "aravis"] = Field(
         default="simulated",
-        description="'harvesters': through the maker's GenTL producer; 'gentl-simulated': through ours",
+        description="'harvesters': through the maker's GenTL producer; 'gentl-simulated': through ours; "
+        "'aravis': GigE Vision and USB3 Vision",
     )
     serial: str = "simulated"
     model: str = Field(default="", description="what the camera must be; absent: any")
@@ -104,7 +105,7 @@ class CameraConfig(_Model):
     buffer_s: float = Field(default=0.5, ge=0.2, le=60, description="lines that the driver can hold")
     frame_id_bits: int = Field(default=0, ge=0, le=64, description="0: found when the ids wrap")
     frame_id_first: Literal[0, 1] | None = Field(
-        default=None, description="of the first frame; absent: 1 if the first to come is 1, else 0"
+        default=None, description="of the first frame; absent: whichever comes first"
     )
     pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16"] = "Mono12"
     black_level_dn: float = Field(default=0.0, ge=0)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Self
 
+from acquire.camera.aravis import AravisOpener
 from acquire.camera.harvesters import HarvestersOpener
 from acquire.camera.spec import spec_of
 from acquire.config import load_scene
@@ -48,6 +49,8 @@ class Rig:
         match self.config.cameras.arm(arm).driver:
             case "harvesters":
                 return HarvestersOpener(spec_of(self.config, arm))
+            case "aravis":
+                return AravisOpener(spec_of(self.config, arm))
             case "gentl-simulated":
                 return self._gentl.opener(arm, self._sensor)
             case "simulated":

@@ -4,14 +4,30 @@ from __future__ import annotations
 
 import importlib.util
 from collections import Counter
+from shutil import which
 from typing import Any
 
 import pytest
 
+from acquire.camera import aravis
+from acquire.errors import CameraError
 from acquire.sim.gentl.build import compiler
 
+FAKE_GIGE = "arv-fake-gv-camera-0.8"
 _HAVE_GENICAM = importlib.util.find_spec("genicam") is not None
+
+
+def _have_aravis() -> bool:
+    try:
+        aravis.load()
+    except CameraError:
+        return False
+    return True
+
+
 MISSING = {
+    "needs_aravis": not _have_aravis() and "Aravis' library",
+    "needs_gige_camera": not (_have_aravis() and which(FAKE_GIGE)) and f"Aravis and {FAKE_GIGE}",
     "needs_compiler": not (compiler() and _HAVE_GENICAM) and "a C compiler and the genicam package",
     "needs_genicam": not _HAVE_GENICAM and "the genicam package",
 }
@@ -21,6 +37,8 @@ _left_out: Counter[str] = Counter()
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "needs_compiler: builds the simulated GenTL producer")
     config.addinivalue_line("markers", "needs_genicam: loads a GenTL producer")
+    config.addinivalue_line("markers", "needs_aravis: loads Aravis' shared library")
+    config.addinivalue_line("markers", "needs_gige_camera: runs Aravis' GigE Vision camera on loopback")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -58,8 +58,9 @@ class FrameCount:
     ----------
     height : lines per frame
     id_bits : width of frame ids; 0: found when they wrap
-    first_id : id of the first frame and of the one after a wrap; None: 1 if the first to come is 1, else 0.
-        (A camera that counts from 0 and loses its first frame then seems to have lost none.)
+    first_id : id of the first frame and of the one after a wrap; None: whichever comes first is the first,
+        as with cameras whose ids go on from one acquisition to the next, and a wrap leads to 0, or to 1 if
+        that was the first. (A camera that loses its first frame then seems to have lost none.)
     """
 
     def __init__(self, height: int, id_bits: int = 0, first_id: int | None = None) -> None:
@@ -89,9 +90,10 @@ class FrameCount:
     def _lost_frames(self, frame: FrameFacts) -> int:
         last = self._last
         if last is None:
-            if self._first_id is None:
-                self._first_id = 1 if frame.frame_id == 1 else 0
-            return frame.frame_id - self._first_id
+            if self._first_id is not None:
+                return frame.frame_id - self._first_id
+            self._first_id = 1 if frame.frame_id == 1 else 0
+            return 0
         return self._ahead(last.frame_id, frame.frame_id) - 1
 
     def _ahead(self, last: int, now: int) -> int:

@@ -13,7 +13,6 @@ again by `release`.
 from __future__ import annotations
 
 import logging
-import math
 import signal
 import threading
 import time
@@ -25,22 +24,28 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.camera.base import CameraBlock, CameraIdentity, CameraLoss, LossCause
-from acquire.camera.frames import FrameCount, FrameFacts
-from acquire.camera.pixels import LineReader, layout_of
+from acquire.camera.assembly import (
+    STATISTICS,
+    Assembly,
+    MissedTriggers,
+    buffer_count,
+    check_format,
+    frame_format,
+    read_settings,
+)
+from acquire.camera.base import CameraIdentity
+from acquire.camera.frames import FrameFacts
 from acquire.camera.producers import find_producers
 from acquire.camera.settings import apply_settings
 from acquire.errors import CameraError, CameraLostError
-from acquire.lines import LineFlag
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from acquire.camera.base import CameraBlock
     from acquire.camera.settings import Kind, Value
     from acquire.camera.spec import GenicamSpec
 
-_LEAST_BUFFERS = 16
-_MOST_BUFFER_BYTES = 1 << 30
 _ALIVE_S = 0.5
 """How often a silent camera is asked whether it is still there."""
 _COMMAND_S = 5.0
@@ -91,7 +96,8 @@ class HarvestersCamera:
         self._library = _Library(spec.cti)
         self._acquirer: Any = None
         self._armed = False
-        self._delivered = self._lost = self._incomplete = 0
+        self._assembly: Assembly | None = None
+        self._views: dict[int, Any] = {}
         self._held: dict[CameraBlock, Any] = {}
         try:
             self._open()
@@ -105,52 +111,14 @@ class HarvestersCamera:
         self._acquirer = self._library.create(self._found)
         self._features = _modules(self._acquirer)
         apply_settings(spec.settings, self._features)
-        self._measure()
-        self._check_lines()
-
-    def _measure(self) -> None:
-        """Width, format and height as they are now."""
-        self._width = int(self._value("remote", "Width"))
-        self._format = layout_of(str(self._value("remote", "PixelFormat")))
-        of_stream = self._features["stream"].find("BufferHeight") if "stream" in self._features else None
-        height = of_stream.read() if of_stream is not None else self._value("remote", "Height")
-        self._height = max(1, int(height))
-
-    def _check_lines(self) -> None:
-        spec = self._spec
-        if spec.pixels and self._width != spec.pixels:
-            raise CameraError(
-                f"camera {spec.serial}: lines of {self._width} pixels",
-                possible=f"{spec.pixels}, as the rig's geometry has stages",
-                hint=f'the setting ["remote", "Width", {spec.pixels}]',
-            )
-        if spec.bits and self._format.bits != spec.bits:
-            raise CameraError(
-                f"camera {spec.serial}: pixel format {self._format.name} of {self._format.bits} bits",
-                possible=f"{spec.bits} bits, as the rig's pixel_format",
-                hint=f'the setting ["remote", "PixelFormat", "Mono{spec.bits}"]',
-            )
-
-    def _value(self, module: str, feature: str) -> Any:
-        node = self._features[module].find(feature)
-        if node is None:
-            raise CameraError(f"camera {self._spec.serial}: {module} has no {feature}")
-        return node.read()
+        check_format(frame_format(self._features), spec)
 
     def identify(self) -> CameraIdentity:
         found = self._found
         return CameraIdentity(found.vendor, found.model, found.serial, found.firmware)
 
     def settings(self) -> dict[str, Any]:
-        """Every readable number, entry, boolean and text of the camera and its stream, as it is now."""
-        facts: dict[str, Any] = {}
-        for module in ("stream", "remote"):
-            for name in self._features[module].names() if module in self._features else ():
-                node = self._features[module].find(name)
-                if node is not None and node.kind not in ("command", "other") and node.readable:
-                    with suppress(CameraError):  # a feature that its maker got wrong is not worth the camera
-                        facts[name] = node.read()
-        return facts
+        return read_settings(self._features)
 
     def features(self) -> dict[str, _Features]:
         """Module → its features, for a look at everything (`acquire.camera.settings.Features`)."""
@@ -158,28 +126,20 @@ class HarvestersCamera:
 
     def arm(self) -> None:
         self.disarm()
-        self._measure()
+        found = frame_format(self._features)
+        self._views.clear()
+        self._missed = MissedTriggers(self._features)
+        self._assembly = Assembly(found, self._spec)
         with _told(f"arm camera {self._spec.serial}"), _signals_kept():
             acquirer = self._acquirer
-            acquirer.num_buffers = self._buffers()
-            self._missed_before = self._missed_triggers()
-            self._underruns_before = self._underruns()
-            acquirer.start()
-            self._armed = True
+            acquirer.num_buffers = buffer_count(self._spec, found)
             # harvesters keeps its monitors to itself; without one there is no word of incomplete buffers.
             self._stream = acquirer.data_streams[0]
             self._monitor = acquirer._new_buffer_event_monitor_dict[self._stream]
-        self._count = FrameCount(self._height, self._spec.frame_id_bits, self._spec.frame_id_first)
-        self._views: dict[int, Any] = {}
-        self._reader: LineReader | None = None
-        self._delivered = self._lost = self._incomplete = 0
+            self._underruns_before = self._underruns()
+            acquirer.start()
+            self._armed = True
         self._heard_s = time.monotonic()
-
-    def _buffers(self) -> int:
-        """Buffers for ``buffer_s`` of lines, within reason."""
-        size = self._height * self._format.row_bytes(self._width)
-        wanted = math.ceil(self._spec.buffer_s * self._spec.line_rate_hz / self._height)
-        return max(_LEAST_BUFFERS, min(wanted, _MOST_BUFFER_BYTES // size))
 
     def next_block(self, timeout_s: float) -> CameraBlock | None:
         """The next frame's lines; those of an incomplete frame are flagged, the absent ones told as lost."""
@@ -192,8 +152,6 @@ class HarvestersCamera:
         self._heard_s = time.monotonic()
         with _told(f"camera {self._spec.serial}"):
             block = self._read_out(buffer)
-        self._delivered += len(block.flags)
-        self._lost += sum(loss.count for loss in block.losses)
         self._held[block] = buffer
         return block
 
@@ -221,29 +179,18 @@ class HarvestersCamera:
         facts = FrameFacts(
             int(buffer.frame_id),
             self._underruns() - self._underruns_before,
-            self._missed_triggers() - self._missed_before,
-            _time_ns(buffer),
+            self._missed.count(),
+            _or(lambda: int(buffer.timestamp_ns), 0) or None,
         )
-        place = self._count.place(facts)
-        incomplete = not buffer.is_complete()
-        if self._reader is None:
-            self._reader = LineReader(self._format, self._width, _or_zero(lambda: buffer.padding_x))
-        count = min(self._height, self._arrived(buffer, self._reader))
-        pixels = self._reader.lines(self._memory(buffer), count)
-        flag = LineFlag.INCOMPLETE if incomplete or place.doubtful else 0
-        losses = self._after_short + place.losses if self._after_short else place.losses
-        short = self._height - count
-        self._after_short = (CameraLoss(LossCause.INCOMPLETE, short),) if short else ()
-        self._incomplete += incomplete
-        return CameraBlock(place.first_line, pixels, np.full(count, flag, np.uint16), losses, facts.time_ns)
-
-    _after_short: tuple[CameraLoss, ...] = ()
-
-    def _arrived(self, buffer: Any, reader: LineReader) -> int:
-        """Whole lines in the buffer."""
-        filled = int(buffer.size_filled)
-        lines = filled // reader.pitch if filled < reader.size(self._height) else self._height
-        return min(lines, _or(lambda: int(buffer.delivered_image_height), self._height) or self._height)
+        assert self._assembly is not None
+        return self._assembly.block(
+            self._memory(buffer),
+            int(buffer.size_filled),
+            _or_zero(lambda: buffer.padding_x),
+            facts,
+            complete=buffer.is_complete(),
+            rows=_or_zero(lambda: buffer.delivered_image_height),
+        )
 
     def _memory(self, buffer: Any) -> Any:
         """The announced bytes as an array; made once per buffer."""
@@ -253,20 +200,7 @@ class HarvestersCamera:
         return self._views[key]
 
     def _underruns(self) -> int:
-        return _or_zero(lambda: self._acquirer.data_streams[0].module.num_underrun)
-
-    def _missed_triggers(self) -> int:
-        """The camera's counter of missed line triggers, where a setting has made one of it."""
-        remote = self._features["remote"]
-        if self._counts_missed is None:
-            source = remote.find("CounterEventSource")
-            self._counts_missed = source is not None and source.read() == "LineTriggerMissed"
-        if not self._counts_missed:
-            return 0
-        value = remote.find("CounterValue")
-        return int(value.read()) if value is not None else 0
-
-    _counts_missed: bool | None = None
+        return _or_zero(lambda: self._stream.module.num_underrun)
 
     def release(self, block: CameraBlock) -> None:
         buffer = self._held.pop(block, None)
@@ -280,12 +214,11 @@ class HarvestersCamera:
             return
         self._armed = False
         self._held.clear()
-        self._views = {}
-        self._after_short = ()
+        self._views.clear()
         _stop(self._acquirer)
 
     def statistics(self) -> dict[str, int]:
-        return {"lines": self._delivered, "lost": self._lost, "incomplete_frames": self._incomplete}
+        return self._assembly.statistics() if self._assembly else dict.fromkeys(STATISTICS, 0)
 
     def close(self) -> None:
         self.disarm()
@@ -536,11 +469,6 @@ def _stop(acquirer: Any) -> None:
     ):
         with suppress(CameraError), _told("stop"):
             step()
-
-
-def _time_ns(buffer: Any) -> int | None:
-    """The camera's clock, None where it tells none."""
-    return _or(lambda: int(buffer.timestamp_ns), 0) or None
 
 
 def _or(ask: Any, otherwise: Any) -> Any:

@@ -1,10 +1,13 @@
-"""One suite for every way to a camera: in this process, through our GenTL producer, through a foreign one."""
+"""One suite for every way to a camera: in this process, through our GenTL producer and a foreign one, through
+Aravis and GigE Vision.
+"""
 
 from __future__ import annotations
 
 import itertools
 import pickle
 import signal
+import subprocess
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -14,7 +17,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from left_out import FAKE_GIGE
 
+from acquire.camera.aravis import FAKE, AravisOpener
 from acquire.camera.base import Camera, CameraBlock
 from acquire.camera.harvesters import HarvestersOpener
 from acquire.camera.settings import Setting
@@ -89,12 +94,44 @@ def foreign_stand() -> Iterator[Stand]:
     yield Stand(opener, nothing, nothing, None, opener, "")
 
 
+AREA = (
+    Setting("remote", "Width", 64),
+    Setting("remote", "Height", 16),
+    Setting("remote", "PixelFormat", "Mono8"),
+)
+
+
+def aravis_stand(serial: str, interface: str = "") -> Iterator[Stand]:
+    """Aravis keeps what its first look at the network made: that look is taken here."""
+    opener = AravisOpener(GenicamSpec(serial, settings=AREA, cti=interface, pixels=64, bits=8))
+    deadline = time.monotonic() + WAIT_S
+    while True:
+        try:
+            opener().close()
+            break
+        except CameraError:
+            assert time.monotonic() < deadline
+    nothing = lambda: None  # noqa: E731
+    yield Stand(opener, nothing, nothing, None, opener, serial)
+
+
+def gige_stand() -> Iterator[Stand]:
+    """Aravis' GigE Vision camera: packets over the loopback interface."""
+    with subprocess.Popen(
+        [FAKE_GIGE, "-i", "127.0.0.1", "-s", "GV-TEST"], stdout=subprocess.DEVNULL
+    ) as server:
+        yield from aravis_stand("GV-TEST")
+        server.kill()
+
+
 @pytest.fixture(
     scope="module",
     params=[
         "in process",
         pytest.param("our producer", marks=pytest.mark.needs_compiler),
         pytest.param("foreign producer", marks=pytest.mark.needs_genicam),
+        pytest.param("Aravis' fake camera", marks=pytest.mark.needs_aravis),
+        pytest.param("Aravis' GigE camera", marks=pytest.mark.needs_gige_camera),
     ],
 )
 def stand(request: pytest.FixtureRequest) -> Iterator[Stand]:
@@ -102,6 +139,8 @@ def stand(request: pytest.FixtureRequest) -> Iterator[Stand]:
         "in process": lambda: simulated_stand(gentl=False),
         "our producer": lambda: simulated_stand(gentl=True),
         "foreign producer": foreign_stand,
+        "Aravis' fake camera": lambda: aravis_stand("1", FAKE),
+        "Aravis' GigE camera": gige_stand,
     }
     yield from makers[request.param]()
 
