@@ -91,10 +91,10 @@ class TriggerConfig(_Model):
 class CameraConfig(_Model):
     """One camera. DN = black level + responsivity · Y, with Y of Eq. (1)."""
 
-    driver: Literal["simulated", "gentl-simulated", "harvesters", "aravis"] = Field(
+    driver: Literal["simulated", "gentl-simulated", "gige-simulated", "harvesters", "aravis"] = Field(
         default="simulated",
-        description="'harvesters': through the maker's GenTL producer; 'gentl-simulated': through ours; "
-        "'aravis': GigE Vision and USB3 Vision",
+        description="'harvesters': through the maker's GenTL producer; 'aravis': GigE and USB3 Vision; "
+        "'gentl-simulated', 'gige-simulated': simulated cameras through either",
     )
     serial: str = "simulated"
     model: str = Field(default="", description="what the camera must be; absent: any")

@@ -16,6 +16,7 @@ from acquire.lines import ARMS
 from acquire.sim.clock import Wire
 from acquire.sim.devices import SimulatedCameraOpener, SimulatedOptics, SimulatedTrigger
 from acquire.sim.gentl.arms import GentlArms
+from acquire.sim.gige.arms import GigeArms
 from acquire.sim.scenes import build_scene
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ class Rig:
         self.config = config
         self._scene = load_scene(config.simulation.scene)
         self._wire = Wire()
-        self._gentl = GentlArms(config)
+        self._gentl, self._gige = GentlArms(config), GigeArms(config)
         self._closed = False
         self.trigger: Trigger = open_trigger(config, self._wire)
 
@@ -53,6 +54,8 @@ class Rig:
                 return AravisOpener(spec_of(self.config, arm))
             case "gentl-simulated":
                 return self._gentl.opener(arm, self._sensor)
+            case "gige-simulated":
+                return self._gige.opener(arm, self._sensor)
             case "simulated":
                 return self._sensor(arm)
 
@@ -76,6 +79,7 @@ class Rig:
         if not self._closed:
             self._closed = True
             self._gentl.close()
+            self._gige.close()
             self.trigger.close()
             self._wire.close()
 

@@ -30,8 +30,8 @@ def demo(
     ] = TWIST_BUDGET_S,
     config: Annotated[str, typer.Option("--config", "-c", metavar="FILE", help="Rig file.")] = RIG,
     cameras: Annotated[
-        Literal["simulated", "gentl"],
-        typer.Option(help="Cameras in the grabbers, or behind a GenTL producer as real ones are."),
+        Literal["simulated", "gentl", "gige"],
+        typer.Option(help="Cameras in the grabbers, or behind a GenTL producer or GigE Vision."),
     ] = "simulated",
     json: JsonFlag = False,
 ) -> None:

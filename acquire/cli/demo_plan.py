@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from acquire.config import RigConfig
 
 RIG = "rig-demo"
-GENTL_RIG = "rig-demo-gentl"
+CAMERA_RIGS = {"simulated": RIG, "gentl": "rig-demo-gentl", "gige": "rig-demo-gige"}
 SEED = 1
 LINES = 33_334
 TWIST_BUDGET_S = 30.0
@@ -60,13 +60,13 @@ class DemoPlan:
 
 def rig_of(config: str, cameras: str) -> str:
     """The rig file for the cameras that were asked for. Raises UsageError for a file of the user's own."""
-    if cameras == "simulated" or config == GENTL_RIG:
+    if cameras == "simulated" or config == CAMERA_RIGS[cameras]:
         return config
     if config != RIG:
         raise UsageError(
             f"demo of {config} with --cameras {cameras}", hint="cameras.a.driver in that file, or no --config"
         )
-    return GENTL_RIG
+    return CAMERA_RIGS[cameras]
 
 
 def check(plan: DemoPlan, rig: RigConfig) -> None:
@@ -77,10 +77,7 @@ def check(plan: DemoPlan, rig: RigConfig) -> None:
     _check_budgets(plan)
     _check_rig(plan, rig)
     check_directory(rig)
-    if "gentl-simulated" in (rig.cameras.a.driver, rig.cameras.b.driver):
-        from acquire.sim.gentl.build import build
-
-        build()
+    _check_cameras(rig)
     least = segment_row(rig) + SEGMENT_LINES
     if plan.lines < least:
         raise UsageError(
@@ -104,6 +101,18 @@ def _check_budgets(plan: DemoPlan) -> None:
     for budget_s in (plan.budget_s, plan.twist_budget_s):
         if budget_s is not None and not budget_s > 0:
             raise UsageError(f"demo with a budget of {budget_s} s", possible="more than 0")
+
+
+def _check_cameras(rig: RigConfig) -> None:
+    drivers = (rig.cameras.a.driver, rig.cameras.b.driver)
+    if "gentl-simulated" in drivers:
+        from acquire.sim.gentl.build import build
+
+        build()
+    if "gige-simulated" in drivers:
+        from acquire.camera.aravis import load
+
+        load()
 
 
 def _check_rig(plan: DemoPlan, rig: RigConfig) -> None:

@@ -11,7 +11,7 @@ import subprocess
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -30,6 +30,9 @@ from acquire.sim.clock import Wire
 from acquire.sim.devices import SimulatedCameraOpener, SimulatedOptics
 from acquire.sim.gentl.bench import GentlBench
 from acquire.sim.gentl.models import CameraModel
+from acquire.sim.gige.camera import serve
+from acquire.stream.messages import Ready
+from acquire.stream.process import Worker
 
 WAIT_S = 20.0
 STAGES, BLOCK = 16, 32
@@ -60,7 +63,7 @@ class Stand:
     serial: str
 
 
-def simulated_stand(gentl: bool) -> Iterator[Stand]:
+def simulated_stand(way: str) -> Iterator[Stand]:
     rig = load_rig("rig-demo-gentl", OVERRIDES)
     optics = SimulatedOptics("a", rig.geometry, load_scene(rig.simulation.scene))
     wire, code = Wire(), rig.code.build()
@@ -73,11 +76,21 @@ def simulated_stand(gentl: bool) -> Iterator[Stand]:
         light = optics.expose(train).lines(first - STAGES - 1, count)
         return np.clip(np.rint(light * np.float32(6.0)), 0, 4095)
 
-    if gentl:
+    if way == "gige":
+        spec = replace(spec_of(rig, "a", ""), settings=GIGE)
+        server = Worker("camera", serve, CameraModel("SIM-A", STAGES, pixel_format="Mono12"), sensor)
+        server.expect(Ready, time.monotonic() + WAIT_S)
+        opener = AravisOpener(spec)
+        opener().close()  # Aravis keeps what its first look at the network made
+        try:
+            yield Stand(opener, start, wire.stop, lines, spec, "SIM-A")
+        finally:
+            server.end(time.monotonic() + WAIT_S)
+    elif way == "gentl":
         model = CameraModel("SIM-A", STAGES, row_padding=5, id_bits=16, id_first=1)
         with GentlBench({model: sensor}) as bench:
-            opener = HarvestersOpener(spec_of(rig, "a", str(bench.cti)))
-            yield Stand(opener, start, wire.stop, lines, opener.spec, "SIM-A")
+            gentl = HarvestersOpener(spec_of(rig, "a", str(bench.cti)))
+            yield Stand(gentl, start, wire.stop, lines, gentl.spec, "SIM-A")
     else:
         yield Stand(sensor, start, wire.stop, lines, optics, "SIM-A")
     wire.close()
@@ -94,6 +107,11 @@ def foreign_stand() -> Iterator[Stand]:
     yield Stand(opener, nothing, nothing, None, opener, "")
 
 
+GIGE = (
+    Setting("remote", "Width", STAGES),
+    Setting("remote", "Height", BLOCK),
+    Setting("remote", "PixelFormat", "Mono12"),
+)
 AREA = (
     Setting("remote", "Width", 64),
     Setting("remote", "Height", 16),
@@ -117,11 +135,12 @@ def aravis_stand(serial: str, interface: str = "") -> Iterator[Stand]:
 
 def gige_stand() -> Iterator[Stand]:
     """Aravis' GigE Vision camera: packets over the loopback interface."""
-    with subprocess.Popen(
-        [FAKE_GIGE, "-i", "127.0.0.1", "-s", "GV-TEST"], stdout=subprocess.DEVNULL
-    ) as server:
-        yield from aravis_stand("GV-TEST")
-        server.kill()
+    command = [FAKE_GIGE, "-i", "127.0.0.1", "-s", "GV-TEST"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as server:
+        try:
+            yield from aravis_stand("GV-TEST")
+        finally:
+            server.kill()
 
 
 @pytest.fixture(
@@ -130,15 +149,17 @@ def gige_stand() -> Iterator[Stand]:
         "in process",
         pytest.param("our producer", marks=pytest.mark.needs_compiler),
         pytest.param("foreign producer", marks=pytest.mark.needs_genicam),
+        pytest.param("our GigE camera", marks=pytest.mark.needs_aravis),
         pytest.param("Aravis' fake camera", marks=pytest.mark.needs_aravis),
         pytest.param("Aravis' GigE camera", marks=pytest.mark.needs_gige_camera),
     ],
 )
 def stand(request: pytest.FixtureRequest) -> Iterator[Stand]:
     makers = {
-        "in process": lambda: simulated_stand(gentl=False),
-        "our producer": lambda: simulated_stand(gentl=True),
+        "in process": lambda: simulated_stand("in process"),
+        "our producer": lambda: simulated_stand("gentl"),
         "foreign producer": foreign_stand,
+        "our GigE camera": lambda: simulated_stand("gige"),
         "Aravis' fake camera": lambda: aravis_stand("1", FAKE),
         "Aravis' GigE camera": gige_stand,
     }

@@ -33,21 +33,23 @@ class GentlArms:
         """
         if self._bench is None:
             arms = [name for name in ARMS if self._config.cameras.arm(name).driver == DRIVER]
-            self._bench = GentlBench({self._model(name): sensor(name) for name in arms})
+            self._bench = GentlBench({model_of(self._config, name): sensor(name) for name in arms})
         return HarvestersOpener(spec_of(self._config, arm, str(self._bench.cti)))
-
-    def _model(self, arm: str) -> CameraModel:
-        camera = self._config.cameras.arm(arm)
-        return CameraModel(
-            camera.serial,
-            sensor_width=self._config.geometry.stages,
-            bits=camera.bits,
-            line_rate_hz=self._config.line_rate_hz,
-            pixel_format=camera.pixel_format,
-        )
 
     def close(self) -> None:
         """Take the cameras away. Idempotent."""
         if self._bench is not None:
             self._bench.close()
             self._bench = None
+
+
+def model_of(config: RigConfig, arm: str) -> CameraModel:
+    """The camera that the rig's file describes for an arm."""
+    camera = config.cameras.arm(arm)
+    return CameraModel(
+        camera.serial,
+        sensor_width=config.geometry.stages,
+        bits=camera.bits,
+        line_rate_hz=config.line_rate_hz,
+        pixel_format=camera.pixel_format,
+    )

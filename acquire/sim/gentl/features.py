@@ -62,8 +62,10 @@ class Module:
     Raises ValueError for a table that does not fit its space.
     """
 
-    def __init__(self, name: str, features: Iterable[Feature]) -> None:
+    def __init__(self, name: str, features: Iterable[Feature], port: str = "") -> None:
         self.name = name
+        self.port = port or f"{name}Port"
+        self._base = 0
         self.features: dict[str, Feature] = {}
         free = FREE_REGISTERS_AT
         for feature in features:
@@ -74,9 +76,9 @@ class Module:
         if free > URL_AT:
             raise ValueError(f"module {name}: registers up to {free:#x}, room until {URL_AT:#x}")
 
-    def space(self) -> bytes:
-        """The module's whole register space: values, URL and XML."""
-        text = self.xml().encode()
+    def space(self, base: int = 0) -> bytes:
+        """The module's whole register space, at address ``base``: values, URL and XML."""
+        text = self.xml(base).encode()
         url = f"local:{self.name}.xml;{XML_AT:X};{len(text):X}".encode()
         if XML_AT + len(text) > PORT_BYTES:
             raise ValueError(f"module {self.name}: {len(text)} bytes of XML, room for {PORT_BYTES - XML_AT}")
@@ -93,16 +95,17 @@ class Module:
     def _copies(self, feature: Feature) -> int:
         return len(self.features[feature.selector].entries) if feature.selector else 1
 
-    def xml(self) -> str:
+    def xml(self, base: int = 0) -> str:
         """The GenICam description (schema 1.1); node order inside an element is the schema's."""
+        self._base = base
         categories: dict[str, list[str]] = {}
         for feature in self.features.values():
             categories.setdefault(feature.category, []).append(feature.name)
-        parts = [_HEAD.format(name=self.name, port=f"{self.name}Port")]
+        parts = [_HEAD.format(name=self.name, port=self.port)]
         parts.append(_category("Root", list(categories)))
         parts += [_category(name, members) for name, members in categories.items()]
         parts += [self._node(feature) for feature in self.features.values()]
-        parts.append(f'<Port Name="{self.name}Port"/>\n</RegisterDescription>\n')
+        parts.append(f'<Port Name="{self.port}"/>\n</RegisterDescription>\n')
         return "".join(parts)
 
     def _node(self, feature: Feature) -> str:
@@ -117,9 +120,9 @@ class Module:
         index = f'<pIndex Offset="{feature.size}">{feature.selector}Reg</pIndex>' if feature.selector else ""
         access = "WO" if feature.kind == "command" else "RW" if feature.writable else "RO"
         return (
-            f'<{kind} Name="{feature.name}Reg"><Address>{feature.at}</Address>{index}'
+            f'<{kind} Name="{feature.name}Reg"><Address>{self._base + feature.at}</Address>{index}'
             f"<Length>{feature.size}</Length><AccessMode>{access}</AccessMode>"
-            f"<pPort>{self.name}Port</pPort><Cachable>NoCache</Cachable>{tail}</{kind}>\n"
+            f"<pPort>{self.port}</pPort><Cachable>NoCache</Cachable>{tail}</{kind}>\n"
         )
 
     def _integer(self, feature: Feature, selected: str) -> str:
@@ -180,9 +183,9 @@ class Module:
     def _text(self, feature: Feature, _: str) -> str:
         access = "RW" if feature.writable else "RO"
         return (
-            f'<StringReg Name="{feature.name}">{_common(feature)}<Address>{feature.at}</Address>'
+            f'<StringReg Name="{feature.name}">{_common(feature)}<Address>{self._base + feature.at}</Address>'
             f"<Length>{feature.size}</Length><AccessMode>{access}</AccessMode>"
-            f"<pPort>{self.name}Port</pPort></StringReg>\n"
+            f"<pPort>{self.port}</pPort></StringReg>\n"
         )
 
 

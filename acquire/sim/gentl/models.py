@@ -6,7 +6,7 @@ what cameras on the market call them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from acquire.sim.gentl.features import Feature, Module, enum
 from acquire.sim.gentl.layout import PIXEL_FORMATS, REGISTERS
@@ -133,6 +133,27 @@ def _counters() -> tuple[Feature, ...]:
             "CounterValue", maximum=2**62, writable=False, category=category, at=REGISTERS["CounterValue"]
         ),
     )
+
+
+def gige(model: CameraModel) -> Module:
+    """The camera with a GigE Vision port: its frames have a height, and pixels are not packed."""
+    kept = [feature for feature in remote(model).features.values() if feature.name != "PixelFormat"]
+    formats = {name: PIXEL_FORMATS[name][0] for name in ("Mono8", "Mono10", "Mono12", "Mono16")}
+    format_of = Feature(
+        "PixelFormat", "enum", model.pixel_format, entries=formats, locked=True,
+        category="ImageFormatControl", at=REGISTERS["PixelFormat"],
+    )  # fmt: skip
+    features = [*(_gige_feature(feature, model) for feature in kept), format_of]
+    return Module("Remote", features, port="Device")  # the name that GigE Vision gives it
+
+
+def _gige_feature(feature: Feature, model: CameraModel) -> Feature:
+    match feature.name:
+        case "Height":
+            return replace(feature, value=256, maximum=4096, tip="lines per frame")
+        case "PayloadSize":
+            return replace(feature, value=256 * model.sensor_width * model.sample_bytes)
+    return feature
 
 
 def device(model: CameraModel) -> Module:

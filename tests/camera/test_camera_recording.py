@@ -1,4 +1,4 @@
-"""Whole recordings through the GenTL producer: what is on disk is Eq. (1), and what is missing is told."""
+"""Recordings through a GenTL producer and GigE Vision: on disk is Eq. (1), and what is missing is told."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from acquire.rig import Rig
 from acquire.sim.lines import StreamingArm
 from acquire.store import Recording, RunCondition, open_recording
 
-pytestmark = pytest.mark.needs_compiler
+needs_compiler = pytest.mark.needs_compiler
 
 STAGES = 16
 WAIT_S = 60.0
@@ -73,6 +73,7 @@ def check_lines(config: RigConfig, recording: Recording, arm: str) -> np.ndarray
     return flags
 
 
+@needs_compiler
 def test_what_is_recorded_through_the_producer_is_eq1(tmp_path: Path) -> None:
     config = rig_config()
     recording, status = record(config, tmp_path / "r.zarr", 20_000)
@@ -86,6 +87,24 @@ def test_what_is_recorded_through_the_producer_is_eq1(tmp_path: Path) -> None:
         assert camera["clock"]["stamp_ns"] > 0
 
 
+@pytest.mark.needs_aravis
+def test_what_is_recorded_through_gige_vision_is_eq1(tmp_path: Path) -> None:
+    settings = [
+        ["remote", "Width", STAGES],
+        ["remote", "PixelFormat", "Mono12"],
+        ["remote", "Height", 100],
+    ]
+    given = {"geometry.stages": STAGES, "recording.chunk_lines": 1024, "stream.block_lines": 128}
+    given |= {f"cameras.{arm}.settings": settings for arm in "ab"}
+    config = load_rig("rig-demo-gige", given)
+    recording, status = record(config, tmp_path / "r.zarr", 20_000)
+    assert status.condition is RunCondition.GOOD
+    for arm in "ab":
+        assert not check_lines(config, recording, arm).any()
+        assert recording.attrs["cameras"][arm]["identity"]["serial"] == f"SIM-{arm.upper()}"
+
+
+@needs_compiler
 def test_faults_of_one_camera_are_gaps_by_cause_and_the_other_arm_is_whole(tmp_path: Path) -> None:
     config = rig_config()
 
@@ -105,6 +124,7 @@ def test_faults_of_one_camera_are_gaps_by_cause_and_the_other_arm_is_whole(tmp_p
     assert not check_lines(config, recording, "b").any()
 
 
+@needs_compiler
 def test_a_camera_that_was_away_goes_on_at_the_right_line_and_the_gap_is_recorded(tmp_path: Path) -> None:
     config = rig_config()
 
@@ -127,6 +147,7 @@ def test_a_camera_that_was_away_goes_on_at_the_right_line_and_the_gap_is_recorde
     assert not check_lines(config, recording, "b").any()
 
 
+@needs_compiler
 def test_a_camera_that_does_not_come_back_ends_the_recording_in_time(tmp_path: Path) -> None:
     config = rig_config(**{"stream.reopen_s": 0.5})
 
@@ -143,6 +164,7 @@ def test_a_camera_that_does_not_come_back_ends_the_recording_in_time(tmp_path: P
     check_lines(config, recording, "a")
 
 
+@needs_compiler
 def test_the_demo_runs_through_the_producer(tmp_path: Path) -> None:
     out = tmp_path / "demo"
     command = ["demo", f"--out={out}", "--cameras=gentl", "--lines=2200", "--budget=2", "--twist-budget=1"]
