@@ -103,6 +103,7 @@ class CameraConfig(_Model):
         default=(), description="[module, feature, value] in the order in which they are written"
     )
     buffer_s: float = Field(default=0.5, ge=0.2, le=60, description="lines that the driver can hold")
+    first_column: int = Field(default=0, ge=0, description="layout 'compact': where the arm's image begins")
     frame_id_bits: int = Field(default=0, ge=0, le=64, description="0: found when the ids wrap")
     frame_id_first: Literal[0, 1] | None = Field(
         default=None, description="of the first frame; absent: whichever comes first"
@@ -126,8 +127,9 @@ class CameraConfig(_Model):
 
 
 class CamerasConfig(_Model):
-    """The camera of either arm."""
+    """The camera of either arm; or one that has both, opened as table a says: of b only the image counts."""
 
+    layout: Literal["dual", "compact"] = "dual"
     a: CameraConfig
     b: CameraConfig
 
@@ -140,7 +142,13 @@ class CamerasConfig(_Model):
             raise ValueError(
                 f"both arms need one pixel_format, not {self.a.pixel_format} and {self.b.pixel_format}"
             )
-        if self.a.serial == self.b.serial and (self.a.driver, self.b.driver) != ("simulated", "simulated"):
+        if self.layout == "compact" and (self.a.serial, self.a.driver) != (self.b.serial, self.b.driver):
+            raise ValueError("layout 'compact' is one camera: both arms need its serial and driver")
+        if (
+            self.layout == "dual"
+            and self.a.serial == self.b.serial
+            and (self.a.driver, self.b.driver) != ("simulated", "simulated")
+        ):
             raise ValueError(f"both arms have the camera with serial {self.a.serial!r}")
         return self
 
@@ -214,6 +222,22 @@ class RigConfig(_Model):
                 "half of what a ring holds (stream.ring_slots x stream.block_lines)"
             )
         return self
+
+    @model_validator(mode="after")
+    def _arms_apart(self) -> RigConfig:
+        if self.columns:
+            first, second = sorted(self.columns.values())
+            if second[0] < first[1]:
+                raise ValueError(f"cameras.a and b overlap in columns {second[0]} to {first[1] - 1}")
+        return self
+
+    @property
+    def columns(self) -> dict[str, tuple[int, int]]:
+        """Compact layout: arm → first column and the one after the last; empty in dual layout."""
+        if self.cameras.layout == "dual":
+            return {}
+        starts = {"a": self.cameras.a.first_column, "b": self.cameras.b.first_column}
+        return {arm: (start, start + self.geometry.stages) for arm, start in starts.items()}
 
     @property
     def line_period_ticks(self) -> int:

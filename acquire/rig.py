@@ -14,8 +14,9 @@ from acquire.camera.spec import spec_of
 from acquire.config import load_scene
 from acquire.lines import ARMS
 from acquire.sim.clock import Wire
+from acquire.sim.compact import SideBySideOpener
 from acquire.sim.devices import SimulatedCameraOpener, SimulatedOptics, SimulatedTrigger
-from acquire.sim.gentl.arms import GentlArms
+from acquire.sim.gentl.arms import GentlArms, sensor_width
 from acquire.sim.gige.arms import GigeArms
 from acquire.sim.scenes import build_scene
 
@@ -44,6 +45,8 @@ class Rig:
 
     def openers(self) -> dict[str, CameraOpener]:
         """Arm → what opens its camera, here or in a process being spawned."""
+        if self.config.columns:
+            return dict.fromkeys(ARMS, self._opener(ARMS[0]))
         return {arm: self._opener(arm) for arm in ARMS}
 
     def _opener(self, arm: str) -> CameraOpener:
@@ -59,9 +62,15 @@ class Rig:
             case "simulated":
                 return self._sensor(arm)
 
-    def _sensor(self, arm: str) -> SimulatedCameraOpener:
+    def _sensor(self, arm: str) -> CameraOpener:
         """The model of the arm's camera, in the process that opens it."""
-        return _camera_opener(self.config, self._scene, self._wire, arm)
+        parts = {arm: _camera_opener(self.config, self._scene, self._wire, arm) for arm in ARMS}
+        columns = self.config.columns
+        if not columns:
+            return parts[arm]
+        return SideBySideOpener(
+            tuple(parts.values()), tuple(columns[arm][0] for arm in ARMS), sensor_width(self.config)
+        )
 
     def describe(self) -> dict[str, Any]:
         """What a recording must say about where its lines come from (JSON)."""

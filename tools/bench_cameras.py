@@ -147,6 +147,10 @@ def spec_of(model: CameraModel, load: Load, cti: str) -> GenicamSpec:
     )
 
 
+def grabber_plan(model: CameraModel, load: Load, cti: str) -> grabber.GrabberPlan:
+    return grabber.GrabberPlan("a", HarvestersOpener(spec_of(model, load, cti)), 0, 256, 1 << 30)
+
+
 def models(load: Load) -> list[CameraModel]:
     return [
         CameraModel(f"SIM-{arm}", load.width, bits=8, pixel_format="Mono8", line_rate_hz=load.rate_hz)
@@ -165,11 +169,7 @@ def run(load: Load, seconds: float) -> None:
             Worker(
                 f"grabber {model.serial}",
                 grabber.grab,
-                grabber.GrabberPlan(
-                    "a", HarvestersOpener(spec_of(model, load, str(bench.cti))), 0, 256, 1 << 30
-                ),
-                ring,
-                counters,
+                (grabber_plan(model, load, str(bench.cti)), ring, counters),
             )
             for model, ring, counters in zip(cameras, rings, counts, strict=True)
         ]

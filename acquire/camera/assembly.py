@@ -136,7 +136,7 @@ class Assembly:
         """
         found = self._format
         if self._reader is None:
-            self._reader = LineReader(found.layout, found.width, padding)
+            self._reader = LineReader.for_frames(found.layout, found.width, padding, found.height, filled)
         place = self._count.place(facts)
         count = found.height if filled >= self._reader.size(found.height) else filled // self._reader.pitch
         count = min(count, rows or count)

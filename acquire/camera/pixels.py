@@ -65,13 +65,15 @@ def layout_of(name: str) -> PixelLayout:
 
 
 class LineReader:
-    """Reads lines of ``width`` pixels out of buffers; ``padding`` bytes follow each line."""
+    """Reads lines of ``width`` pixels out of buffers; ``padding`` bytes follow each line.
 
-    def __init__(self, layout: PixelLayout, width: int, padding: int = 0) -> None:
+    ``joined``: packed lines begin inside a byte where the one before ends, all one run of pixels.
+    """
+
+    def __init__(self, layout: PixelLayout, width: int, padding: int = 0, *, joined: bool = False) -> None:
         self._layout, self._width = layout, width
         self._row = layout.row_bytes(width)
-        # Packed lines without padding may begin inside a byte: they are then one run of pixels.
-        self._joined = padding == 0 and (width * layout.stored_bits) % 8 != 0
+        self._joined = joined
         self.pitch = self._row + padding
 
     def lines(self, memory: NDArray[np.uint8], count: int) -> NDArray[Any]:
@@ -91,6 +93,14 @@ class LineReader:
         if self._joined:
             return -(-count * self._width * self._layout.stored_bits // 8)
         return count * self.pitch
+
+    @classmethod
+    def for_frames(
+        cls, layout: PixelLayout, width: int, padding: int, height: int, filled: int
+    ) -> LineReader:
+        """The reader for a camera of whose frames one of ``height`` lines fills ``filled`` bytes."""
+        joined, aligned = cls(layout, width, joined=True), cls(layout, width, padding)
+        return joined if filled == joined.size(height) != aligned.size(height) else aligned
 
     def _joined_lines(self, memory: NDArray[np.uint8], count: int) -> NDArray[Any]:
         pixels = count * self._width

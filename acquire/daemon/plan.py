@@ -75,6 +75,7 @@ class Run:
             shard_chunks=config.recording.shard_chunks,
             codec=config.recording.codec,
             fsync=config.recording.fsync,
+            layout=config.cameras.layout,
         )
 
     def _camera(self, arm: str, facts: dict[str, Any]) -> dict[str, Any]:
@@ -101,6 +102,7 @@ def capture_plan(config: RigConfig, rig: Rig, run_id: str) -> CapturePlan:
         openers=rig.openers(),
         stall_timeout_s=max(STALL_S, config.stream.reopen_s + 1.0),
         reopen_timeout_s=config.stream.reopen_s,
+        columns=config.columns,
         line_period_ns=1e9 / config.line_rate_hz / config.simulation.speed,
     )
 

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire import __version__
-from acquire.camera.base import Camera, CameraBlock, CameraIdentity
+from acquire.camera.base import CameraBlock, CameraIdentity
 from acquire.clock import NS_PER_S, ClockFit
 from acquire.codes import code_from_attrs
 from acquire.errors import CameraError, TriggerError, UsageError
@@ -201,6 +201,12 @@ class SimulatedCamera:
         self._delivered = 0
         self._light = None
 
+    def arm_like(self, other: SimulatedCamera) -> None:
+        """Be armed from the same pulse on as ``other``, just armed: both are one sensor."""
+        self._train, self._first_pulse = other._train, other._first_pulse
+        self._delivered = 0
+        self._light = None
+
     def next_block(self, timeout_s: float) -> CameraBlock | None:
         """The next ``block_lines`` lines; fewer only for the last of a train that was stopped."""
         if self._train is None:
@@ -280,7 +286,7 @@ class SimulatedCameraOpener:
     block_lines: int
     line_rate_hz: float
 
-    def __call__(self) -> Camera:
+    def __call__(self) -> SimulatedCamera:
         if multiprocessing.parent_process() is not None:
             limit_blas_threads(1)
         return SimulatedCamera(self.wire, self.optics, self.config, self.block_lines, self.line_rate_hz)

@@ -59,6 +59,7 @@ class RecordingSpec:
     chunk_lines, shard_chunks : lines per chunk; chunks per file
     codec : of the pixels
     fsync : force bytes to the medium at every ``"commit"``, or only at the ``"seal"``
+    layout : a camera per arm, or both arms on one
     """
 
     run_id: str
@@ -78,6 +79,7 @@ class RecordingSpec:
     shard_chunks: int = 64
     codec: Codec = "none"
     fsync: Literal["commit", "seal"] = "seal"
+    layout: Literal["dual", "compact"] = "dual"
 
     def __post_init__(self) -> None:
         self._check_choices()
@@ -93,6 +95,7 @@ class RecordingSpec:
             "dtype": ("uint8", "uint16"),
             "codec": ("none", "lz4", "zstd"),
             "fsync": ("commit", "seal"),
+            "layout": ("dual", "compact"),
         }
         for name, allowed in choices.items():
             if getattr(self, name) not in allowed:
@@ -160,7 +163,7 @@ def _own_attributes(spec: RecordingSpec, ending: Ending | None) -> dict[str, Any
         "state": state,
         "run_condition": str(ending.condition) if ending else None,
         "end_reason": ending.reason if ending else None,
-        "layout": "dual",
+        "layout": spec.layout,
         "first_line": spec.first_line,
         "geometry": {"stages": spec.stages, "substeps": spec.substeps, "pixels": spec.pixels},
         "trigger": {

@@ -120,7 +120,7 @@ class Capture:
 
     @property
     def pids(self) -> dict[str, int | None]:
-        """Process numbers: of the recorder, and of each arm's grabber."""
+        """Process numbers: of the recorder, and of each grabber."""
         return {name: worker.pid for name, worker in self._workers.items()}
 
     def close(self, timeout_s: float = 10.0) -> None:
@@ -148,7 +148,11 @@ class Capture:
         self._make_memory()
         self._spawn()
         self._workers[RECORDER].expect(Ready, deadline)
-        self.cameras = {arm: self._workers[arm].expect(Ready, deadline).facts for arm in ARMS}
+        cameras: dict[str, dict[str, Any]] = {}
+        for name, arms in self._plan.grabbers.items():
+            facts = self._workers[name].expect(Ready, deadline).facts
+            cameras |= dict.fromkeys(arms, facts)
+        self.cameras = cameras
         self._trigger_used = True
         self._trigger.prepare(self._plan.run)
         self.clock = self._trigger.start()
@@ -161,6 +165,7 @@ class Capture:
             self._counters,
             self._plan.stall_timeout_s,
             self._plan.margin_lines,
+            self._plan.grabbers,
         )
         self._supervisor.start()
 
@@ -179,17 +184,22 @@ class Capture:
         self._workers[RECORDER] = Worker(
             RECORDER, recorder.record, what, self._rings, self._tags, self._counters[RECORDER]
         )
-        for arm, ring in self._rings.items():
-            task = grabber.GrabberPlan(
-                arm,
-                plan.openers[arm],
-                plan.depth_lines,
-                plan.white_dn,
-                plan.max_skew_lines,
-                plan.reopen_timeout_s,
-                plan.line_period_ns,
-            )
-            self._workers[arm] = Worker(f"grabber {arm}", grabber.grab, task, ring, self._counters[arm])
+        for name, arms in plan.grabbers.items():
+            tasks = [(self._grabber_plan(arm), self._rings[arm], self._counters[arm]) for arm in arms]
+            self._workers[name] = Worker(f"grabber {name}", grabber.grab, *tasks)
+
+    def _grabber_plan(self, arm: str) -> grabber.GrabberPlan:
+        plan = self._plan
+        return grabber.GrabberPlan(
+            arm,
+            plan.openers[arm],
+            plan.depth_lines,
+            plan.white_dn,
+            plan.max_skew_lines,
+            plan.reopen_timeout_s,
+            plan.line_period_ns,
+            plan.columns.get(arm),
+        )
 
     def _running(self, command: str) -> Supervisor:
         if self._supervisor is None or self._closed:
@@ -263,7 +273,8 @@ class Capture:
 
     def _end_workers(self, deadline: float) -> None:
         deadline = max(deadline, time.monotonic() + _LEAST_END_S)
-        order = [self._workers[name] for name in (*ARMS, RECORDER) if name in self._workers]
+        grabbers = [name for name in self._workers if name != RECORDER]
+        order = [self._workers[name] for name in (*grabbers, RECORDER) if name in self._workers]
         for worker in order:
             worker.post(Quit())
         _run_all(*(partial(worker.end, deadline) for worker in order))

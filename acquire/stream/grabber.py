@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -51,7 +51,8 @@ class GrabberPlan:
     """What one grabber needs to know. Picklable.
 
     A jump of the camera's count by more than ``max_jump_lines`` is a broken count, not a loss. A camera that
-    is gone is waited for as long as ``reopen_timeout_s``; ``line_period_ns`` is the trigger's.
+    is gone is waited for as long as ``reopen_timeout_s``; ``line_period_ns`` is the trigger's. ``columns``
+    are the arm's on a camera that has both arms, None on one of its own.
     """
 
     arm: str
@@ -61,22 +62,28 @@ class GrabberPlan:
     max_jump_lines: int
     reopen_timeout_s: float = 0.0
     line_period_ns: float = 0.0
+    columns: tuple[int, int] | None = None
 
 
-def grab(mailbox: Mailbox, plan: GrabberPlan, ring: Ring, counters: Counters) -> None:
-    """Life of a grabber: open and arm the camera, say so, fill the ring until told to end."""
+def grab(mailbox: Mailbox, *arms: tuple[GrabberPlan, Ring, Counters]) -> None:
+    """Life of a grabber: open and arm the camera, say so, fill the rings until told to end.
+
+    Several ``arms`` fall on one camera, each on columns of its own.
+    """
+    plan = arms[0][0]
     camera = plan.opener()
-    intake = Intake(plan, ring, counters)
+    intakes = [Intake(*arm) for arm in arms]
     try:
         facts = {**camera.settings(), "identity": asdict(camera.identify())}
         camera.arm()
         mailbox.post(Ready(facts))
         while True:
             try:
-                _pump(mailbox, camera, intake)
+                _pump(mailbox, camera, intakes)
             except CameraLostError as lost:
                 camera = _reopen(mailbox, plan, camera, lost)
-                intake.realign()
+                for intake in intakes:
+                    intake.realign()
     except BaseException as error:  # the only way out
         try:
             _let_go(camera)
@@ -123,7 +130,7 @@ def _let_go(camera: Camera) -> None:
         camera.close()
 
 
-def _pump(mailbox: Mailbox, camera: Camera, intake: Intake) -> None:
+def _pump(mailbox: Mailbox, camera: Camera, intakes: list[Intake]) -> None:
     """Move blocks until the mailbox raises OwnerGone."""
     look = 0.0
     while True:
@@ -132,7 +139,8 @@ def _pump(mailbox: Mailbox, camera: Camera, intake: Intake) -> None:
             look = now + _MAIL_INTERVAL_S
         block = camera.next_block(_BLOCK_WAIT_S)
         if block is not None:
-            intake.take(block)
+            for intake in intakes:
+                intake.take(block)
             camera.release(block)
 
 
@@ -156,6 +164,8 @@ class Intake:
 
     def take(self, block: CameraBlock) -> None:
         """Put the block's lines into the ring. Raises CameraError for a block that cannot be right."""
+        if self._plan.columns is not None:
+            block = replace(block, pixels=block.pixels[:, slice(*self._plan.columns)])
         self._check(block)
         losses = self._come_back(block) if self._away else block.losses
         first = block.first_line + self._shift

@@ -42,6 +42,8 @@ class CapturePlan:
     reopen_timeout_s : how long a camera that is gone is waited for; less than ``stall_timeout_s``, or the
         arm counts as stalled first
     line_period_ns : by the trigger's clock; 0: not told
+    columns : compact layout: arm → first column and the one after the last, on the one camera that
+        ``openers["a"]`` opens; empty: a camera per arm
     """
 
     run: TriggerRun
@@ -56,6 +58,7 @@ class CapturePlan:
     tag_wait_s: float = 1.0
     reopen_timeout_s: float = 2.0
     line_period_ns: float = 0.0
+    columns: dict[str, tuple[int, int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if tuple(sorted(self.openers)) != ARMS:
@@ -81,6 +84,11 @@ class CapturePlan:
     @property
     def ring_shape(self) -> RingShape:
         return RingShape(self.ring_slots, self.block_lines, self.pixels, self.dtype)
+
+    @property
+    def grabbers(self) -> dict[str, tuple[str, ...]]:
+        """Name of a grabber → the arms that it serves."""
+        return {"".join(ARMS): ARMS} if self.columns else {arm: (arm,) for arm in ARMS}
 
     @property
     def margin_lines(self) -> int | None:

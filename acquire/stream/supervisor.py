@@ -15,6 +15,8 @@ from acquire.stream.stalls import Excess, Heartbeat
 from acquire.stream.tagger import tag_rows
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from acquire.stream.messages import Begin
     from acquire.stream.process import Worker
     from acquire.stream.ring import Ring
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
     from acquire.trigger.base import LineTag, Trigger
 
 RECORDER = "recorder"
-"""Key of the recorder among the workers; the grabbers have their arms'."""
+"""Key of the recorder among the workers; the grabbers have their arms' names."""
 
 _TAG_WAIT_S = 0.02
 _ANSWER_S = 20.0
@@ -49,6 +51,7 @@ class Supervisor:
         counters: dict[str, Counters],
         stall_timeout_s: float,
         margin_lines: int | None = None,
+        grabbers: Mapping[str, tuple[str, ...]] | None = None,
     ) -> None:
         self.began: Began | None = None
         self.sealed: Sealed | None = None
@@ -59,6 +62,7 @@ class Supervisor:
         self._stall_timeout_s = stall_timeout_s
         self._loop = Heartbeat(counters[RECORDER], "turns")
         self._cameras = {arm: Heartbeat(counters[arm], "delivered") for arm in ARMS}
+        self._arms_of = grabbers or {arm: (arm,) for arm in ARMS}
         self._excess = {arm: Excess(counters[arm], margin_lines) for arm in ARMS if margin_lines is not None}
         self._newest_pulse: int | None = None
         self._refused: Refused | None = None
@@ -201,4 +205,4 @@ class Supervisor:
         with self._news:
             self.fault = self.fault or text
             self._news.notify_all()
-        self._workers[RECORDER].post(Interrupt(text, tuple(arm for arm in ARMS if arm == name)))
+        self._workers[RECORDER].post(Interrupt(text, self._arms_of.get(name or "", ())))

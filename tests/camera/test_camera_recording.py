@@ -15,6 +15,7 @@ import pytest
 
 from acquire.config import RigConfig, load_rig
 from acquire.daemon.plan import Run
+from acquire.errors import ConfigError
 from acquire.lines import LineFlag
 from acquire.rig import Rig
 from acquire.sim.lines import StreamingArm
@@ -46,13 +47,18 @@ def until(condition: Callable[[], object], what: str) -> None:
 
 
 def record(
-    config: RigConfig, path: Path, lines: int, happen: Callable[[Rig, Run], None] = lambda rig, run: None
+    config: RigConfig,
+    path: Path,
+    lines: int,
+    happen: Callable[[Rig, Run], None] = lambda rig, run: None,
+    stamps: bool = True,
 ) -> tuple[Recording, Any]:
     with Rig(config) as rig:
         run = Run(config, rig)
         try:
             run.arm()
-            until(lambda: all(run.poll().lines[arm]["clock"]["stamp_ns"] for arm in "ab"), "time stamps")
+            if stamps:
+                until(lambda: all(run.poll().lines[arm]["clock"]["stamp_ns"] for arm in "ab"), "time stamps")
             run.start(path, lines)
             happen(rig, run)
             until(lambda: run.poll().done, "the recording's end")
@@ -102,6 +108,32 @@ def test_what_is_recorded_through_gige_vision_is_eq1(tmp_path: Path) -> None:
     for arm in "ab":
         assert not check_lines(config, recording, arm).any()
         assert recording.attrs["cameras"][arm]["identity"]["serial"] == f"SIM-{arm.upper()}"
+
+
+@pytest.mark.parametrize("rig", ["rig-demo", pytest.param("rig-demo-gentl", marks=needs_compiler)])
+def test_both_arms_from_one_camera_are_eq1(tmp_path: Path, rig: str) -> None:
+    settings = [["remote", "PixelFormat", "Mono12p"], ["stream", "BufferHeight", 100]]
+    given = {"geometry.stages": STAGES, "recording.chunk_lines": 1024, "stream.block_lines": 128}
+    given |= {"cameras.layout": "compact", "cameras.b.serial": "SIM-A", "cameras.b.first_column": STAGES + 5}
+    config = load_rig(rig, given | ({"cameras.a.settings": settings} if "gentl" in rig else {}))
+    recording, status = record(config, tmp_path / "r.zarr", 20_000, stamps="gentl" in rig)
+    assert status.condition is RunCondition.GOOD
+    assert recording.attrs["layout"] == "compact"
+    for arm in "ab":
+        assert not check_lines(config, recording, arm).any()
+        assert recording.attrs["cameras"][arm]["Width"] == 2 * STAGES + 5
+
+
+def test_arms_that_cannot_share_a_camera_are_refused() -> None:
+    compact = {"cameras.layout": "compact", "cameras.b.serial": "SIM-A"}
+    for changes, words in (
+        ({"cameras.layout": "compact"}, "both arms need its serial"),
+        (compact | {"cameras.b.first_column": 63}, "overlap in columns 63 to 63"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            load_rig("rig-demo", changes)
+    with pytest.raises(ConfigError, match="both arms have the camera with serial 'SIM-A'"):
+        load_rig("rig-demo-gentl", {"cameras.b.serial": "SIM-A"})
 
 
 @needs_compiler

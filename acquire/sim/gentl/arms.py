@@ -33,6 +33,7 @@ class GentlArms:
         """
         if self._bench is None:
             arms = [name for name in ARMS if self._config.cameras.arm(name).driver == DRIVER]
+            arms = arms[:1] if self._config.columns else arms
             self._bench = GentlBench({model_of(self._config, name): sensor(name) for name in arms})
         return HarvestersOpener(spec_of(self._config, arm, str(self._bench.cti)))
 
@@ -48,8 +49,13 @@ def model_of(config: RigConfig, arm: str) -> CameraModel:
     camera = config.cameras.arm(arm)
     return CameraModel(
         camera.serial,
-        sensor_width=config.geometry.stages,
+        sensor_width=sensor_width(config),
         bits=camera.bits,
         line_rate_hz=config.line_rate_hz,
         pixel_format=camera.pixel_format,
     )
+
+
+def sensor_width(config: RigConfig) -> int:
+    """Pixels of the camera's lines: an arm's, or as many as both arms take."""
+    return max((end for _, end in config.columns.values()), default=config.geometry.stages)

@@ -68,8 +68,6 @@ class GigeCamera:
         ready, _, _ = select.select(self._control, [], [], 0 if self._acquiring else _IDLE_S)
         for control in ready:
             self._answer(control)
-        if ready:
-            self._obey()
         if self._acquiring and (block := self._sensor.next_block(_BLOCK_WAIT_S)) is not None:
             time_ns = int(self._sensor.times_ns(block.first_line, 1)[0])
             self._waiting.append((time_ns, np.array(block.pixels)))
@@ -80,6 +78,7 @@ class GigeCamera:
         request = protocol.parse(packet)
         reply = self._registers.handle(request) if request is not None else None
         if reply is not None:
+            self._obey()  # the host may start the trigger once it has the answer
             self._control[0].sendto(reply, sender)
 
     def _obey(self) -> None:
