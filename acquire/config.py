@@ -24,6 +24,9 @@ PIXEL_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16}
 """SFNC PixelFormat → significant bits of an (unpacked) pixel."""
 
 
+GentlModule = Literal["remote", "interface", "device", "stream", "system"]
+"""Where a camera's features are: in the camera itself, or in a module of the host's side."""
+
 MAX_RING_BYTES = 4 * 2**30
 """Pixels that may wait in the ring of one arm."""
 
@@ -150,8 +153,23 @@ class TriggerConfig(_Model):
 class CameraConfig(_Model):
     """One camera. DN = black level + responsivity · Y, with Y of Eq. (1)."""
 
-    driver: Literal["simulated"] = "simulated"
+    driver: Literal["simulated", "gentl-simulated", "gige-simulated", "harvesters", "aravis"] = Field(
+        default="simulated",
+        description="'harvesters': through the maker's GenTL producer; 'aravis': GigE and USB3 Vision; "
+        "'gentl-simulated', 'gige-simulated': simulated cameras through either",
+    )
     serial: str = "simulated"
+    model: str = Field(default="", description="what the camera must be; absent: any")
+    cti: str = Field(default="", description="GenTL producer; absent: those of GENICAM_GENTL64_PATH")
+    settings: tuple[tuple[GentlModule, str, bool | int | float | str], ...] = Field(
+        default=(), description="[module, feature, value] in the order in which they are written"
+    )
+    buffer_s: float = Field(default=0.5, ge=0.2, le=60, description="lines that the driver can hold")
+    first_column: int = Field(default=0, ge=0, description="layout 'compact': where the arm's image begins")
+    frame_id_bits: int = Field(default=0, ge=0, le=64, description="0: found when the ids wrap")
+    frame_id_first: Literal[0, 1] | None = Field(
+        default=None, description="of the first frame; absent: whichever comes first"
+    )
     pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16"] = "Mono12"
     black_level_dn: float = Field(default=0.0, ge=0)
     responsivity_dn: float = Field(default=1.0, gt=0, description="DN per unit of scene light and sub-step")
@@ -171,8 +189,9 @@ class CameraConfig(_Model):
 
 
 class CamerasConfig(_Model):
-    """The camera of either arm."""
+    """The camera of either arm; or one that has both, opened as table a says: of b only the image counts."""
 
+    layout: Literal["dual", "compact"] = "dual"
     a: CameraConfig
     b: CameraConfig
 
@@ -185,6 +204,14 @@ class CamerasConfig(_Model):
             raise ValueError(
                 f"both arms need one pixel_format, not {self.a.pixel_format} and {self.b.pixel_format}"
             )
+        if self.layout == "compact" and (self.a.serial, self.a.driver) != (self.b.serial, self.b.driver):
+            raise ValueError("layout 'compact' is one camera: both arms need its serial and driver")
+        if (
+            self.layout == "dual"
+            and self.a.serial == self.b.serial
+            and (self.a.driver, self.b.driver) != ("simulated", "simulated")
+        ):
+            raise ValueError(f"both arms have the camera with serial {self.a.serial!r}")
         return self
 
 
@@ -193,6 +220,7 @@ class StreamConfig(_Model):
 
     block_lines: int = Field(default=256, ge=1, le=65536, description="lines per camera block and ring slot")
     ring_slots: int = Field(default=64, ge=2, le=4096)
+    reopen_s: float = Field(default=2.0, ge=0, le=600, description="wait for a camera that is gone")
 
 
 class RecordingConfig(_Model):
@@ -259,6 +287,22 @@ class RigConfig(_Model):
                 "half of what a ring holds (stream.ring_slots x stream.block_lines)"
             )
         return self
+
+    @model_validator(mode="after")
+    def _arms_apart(self) -> RigConfig:
+        if self.columns:
+            first, second = sorted(self.columns.values())
+            if second[0] < first[1]:
+                raise ValueError(f"cameras.a and b overlap in columns {second[0]} to {first[1] - 1}")
+        return self
+
+    @property
+    def columns(self) -> dict[str, tuple[int, int]]:
+        """Compact layout: arm → first column and the one after the last; empty in dual layout."""
+        if self.cameras.layout == "dual":
+            return {}
+        starts = {"a": self.cameras.a.first_column, "b": self.cameras.b.first_column}
+        return {arm: (start, start + self.geometry.stages) for arm, start in starts.items()}
 
     @property
     def line_period_ticks(self) -> int:

@@ -10,6 +10,7 @@
     ├── DeviceError             5  trigger, camera or host hardware
     │   ├── TriggerError        5
     │   └── CameraError         5
+    │       └── CameraLostError 5  it does not answer any more; it may come back
     ├── DataError               6  a recording is damaged, or lines were lost
     └── NumericsError           1  a computation left the finite numbers
 
@@ -95,6 +96,10 @@ class TriggerError(DeviceError):
 
 class CameraError(DeviceError):
     """A camera failed or refused."""
+
+
+class CameraLostError(CameraError):
+    """A camera that was open does not answer any more; it may come back."""
 
 
 class DataError(AcquireError):

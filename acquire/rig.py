@@ -10,13 +10,19 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
+from acquire.camera.aravis import AravisOpener
+from acquire.camera.harvesters import HarvestersOpener
+from acquire.camera.spec import spec_of
 from acquire.codes import ConstantCode
 from acquire.config import LightOutputConfig, load_scene
 from acquire.errors import ConfigError, TriggerError
 from acquire.lines import ARMS
 from acquire.sim import rtl
 from acquire.sim.clock import Wire
+from acquire.sim.compact import SideBySideOpener
 from acquire.sim.devices import SimulatedCameraOpener, SimulatedOptics
+from acquire.sim.gentl.arms import GentlArms, sensor_width
+from acquire.sim.gige.arms import GigeArms
 from acquire.sim.pins import PinPage, PinWire
 from acquire.sim.pipeline import Bench, describe
 from acquire.sim.replay import ReplayCameraOpener, describe_replay
@@ -42,6 +48,9 @@ if TYPE_CHECKING:
     from acquire.trigger.base import Trigger
     from acquire.trigger.transports import Transport
 
+SIMULATED_CAMERAS = ("simulated", "gentl-simulated", "gige-simulated")
+"""Drivers of cameras that only a simulated trigger, or the compiled gateware, can pulse."""
+
 
 class Rig:
     """The devices of one instrument; a context manager that lets go of them.
@@ -58,14 +67,40 @@ class Rig:
             _check_scene(config, self._scene)
         self._wire = Wire()
         self._pins = PinPage() if config.trigger.driver == "rtl" else None
+        self._gentl, self._gige = GentlArms(config), GigeArms(config)
         self._closed = False
         self.trigger: Trigger = open_trigger(config, self._wire, self._pins)
 
     def openers(self) -> dict[str, CameraOpener]:
         """Arm → what opens its camera, here or in a process being spawned."""
+        if self.config.columns:
+            return dict.fromkeys(ARMS, self._opener(ARMS[0]))
+        return {arm: self._opener(arm) for arm in ARMS}
+
+    def _opener(self, arm: str) -> CameraOpener:
         if self.config.simulation.replay is not None:
-            return {arm: _replay_opener(self.config, self._wire, arm) for arm in ARMS}
-        return {arm: _camera_opener(self.config, self._scene, self._pulses(arm), arm) for arm in ARMS}
+            return _replay_opener(self.config, self._wire, arm)
+        match self.config.cameras.arm(arm).driver:
+            case "harvesters":
+                return HarvestersOpener(spec_of(self.config, arm))
+            case "aravis":
+                return AravisOpener(spec_of(self.config, arm))
+            case "gentl-simulated":
+                return self._gentl.opener(arm, self._sensor)
+            case "gige-simulated":
+                return self._gige.opener(arm, self._sensor)
+            case "simulated":
+                return self._sensor(arm)
+
+    def _sensor(self, arm: str) -> CameraOpener:
+        """The model of the arm's camera, in the process that opens it."""
+        parts = {arm: _camera_opener(self.config, self._scene, self._pulses(arm), arm) for arm in ARMS}
+        columns = self.config.columns
+        if not columns:
+            return parts[arm]
+        return SideBySideOpener(
+            tuple(parts.values()), tuple(columns[arm][0] for arm in ARMS), sensor_width(self.config)
+        )
 
     def describe(self) -> dict[str, Any]:
         """What a recording must say about where its lines come from (JSON)."""
@@ -76,7 +111,10 @@ class Rig:
     def layout(self) -> str:
         """How the instrument is laid out: ``dual``, ``compact``, ``emulated``, ``interline``."""
         replay = self.config.simulation.replay
-        return self._scene.optics.layout if replay is None else str(open_recording(replay).attrs["layout"])
+        if replay is not None:
+            return str(open_recording(replay).attrs["layout"])
+        cameras = self.config.cameras.layout
+        return cameras if cameras != "dual" else self._scene.optics.layout
 
     def scene(self) -> Scene:
         """What the simulated cameras see, in camera A's rows and columns; sub-step 0 is the run's first."""
@@ -89,6 +127,8 @@ class Rig:
         """Stop the trigger and take the wire away. Idempotent."""
         if not self._closed:
             self._closed = True
+            self._gentl.close()
+            self._gige.close()
             self.trigger.close()
             self._wire.close()
             if self._pins is not None:
@@ -137,7 +177,8 @@ def check_rig(config: RigConfig) -> None:
         register_values(run, trigger, possible, _link_bytes_per_s(trigger))
     except TriggerError as error:
         raise ConfigError(error.message, possible=error.possible, hint=error.hint) from error
-    _check_simulated_cameras(trigger)
+    if not {config.cameras.arm(arm).driver for arm in ARMS}.isdisjoint(SIMULATED_CAMERAS):
+        _check_simulated_cameras(trigger)
 
 
 def _link_bytes_per_s(trigger: TriggerConfig) -> float:
@@ -191,7 +232,9 @@ def _trigger_way(config: RigConfig, wire: Wire, pins: PinPage | None) -> Callabl
             return partial(UsbTransport, serial=trigger.serial)
 
 
-def _camera_opener(config: RigConfig, scene: SceneConfig, wire: Wire | PinWire, arm: str) -> CameraOpener:
+def _camera_opener(
+    config: RigConfig, scene: SceneConfig, wire: Wire | PinWire, arm: str
+) -> SimulatedCameraOpener:
     optics = SimulatedOptics(arm, config.geometry, scene)
     return SimulatedCameraOpener(
         wire, optics, config.cameras.arm(arm), config.stream.block_lines, config.line_rate_hz

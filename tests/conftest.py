@@ -25,6 +25,8 @@ from numcodecs import blosc
 
 from acquire.forward.kernels import transpose_frames
 
+pytest_plugins = ["left_out"]
+
 POOL_THREADS = re.compile(r"asyncio_\d+|zarr|fsspec|pydevd|AnyIO worker thread")
 """Worker threads that libraries keep for reuse; they hold nothing of a test."""
 

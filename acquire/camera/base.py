@@ -7,6 +7,7 @@ line numbers: the grabber subtracts the sensor's depth.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Protocol
 
 if TYPE_CHECKING:
@@ -24,17 +25,43 @@ class CameraIdentity:
     firmware: str
 
 
+class LossCause(StrEnum):
+    """Why lines did not come out of the camera; the words that a recording's gaps carry."""
+
+    NO_BUFFER = "no_buffer"
+    """The host had no free buffer: its reader was late."""
+    INCOMPLETE = "incomplete"
+    """The frame arrived without these lines."""
+    ID_GAP = "id_gap"
+    """Frame numbers jumped: lost on the link."""
+    MISSED_TRIGGER = "missed_trigger"
+    """The camera did not see the line triggers."""
+    DEVICE_LOST = "device_lost"
+    """The camera was away, and was opened again."""
+
+
+@dataclass(frozen=True, slots=True)
+class CameraLoss:
+    """``count`` lines lost for one cause."""
+
+    cause: LossCause
+    count: int
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraBlock:
     """Consecutive lines as delivered; valid until released.
 
     ``first_line`` counts since arm, gaps included; ``pixels`` is (line, pixel), uint8 or uint16;
-    ``flags`` is (line) uint16 of LineFlag.
+    ``flags`` is (line) uint16 of LineFlag. ``losses`` explains, in order, the lines that are missing just
+    before the first; ``time_ns`` is the camera's own clock at the first line, where it tells.
     """
 
     first_line: int
     pixels: NDArray[Any]
     flags: NDArray[np.uint16]
+    losses: tuple[CameraLoss, ...] = ()
+    time_ns: int | None = None
 
 
 class Camera(Protocol):

@@ -15,11 +15,22 @@ import sys
 
 import typer
 
-from acquire.cli import config, control, demo, reconstruct, recordings, replay, serve, simulate, trigger
+from acquire.cli import (
+    camera,
+    config,
+    control,
+    demo,
+    reconstruct,
+    recordings,
+    replay,
+    serve,
+    simulate,
+    trigger,
+)
 from acquire.cli.output import print_error
 from acquire.errors import EXIT_INTERRUPTED, AcquireError, UsageError
 
-MODULES = (demo, serve, control, recordings, reconstruct, simulate, replay, config, trigger)
+MODULES = (demo, serve, control, recordings, reconstruct, simulate, replay, config, trigger, camera)
 """Modules of commands, in the order of the help; each has ``register(app)``. New groups are added here."""
 
 app = typer.Typer(

@@ -8,7 +8,16 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from acquire.cli.demo_plan import LINES, RIG, SEED, TWIST_BUDGET_S, DemoPlan, check, trigger_settings
+from acquire.cli.demo_plan import (
+    LINES,
+    RIG,
+    SEED,
+    TWIST_BUDGET_S,
+    DemoPlan,
+    check,
+    rig_of,
+    trigger_settings,
+)
 from acquire.cli.journal import Journal
 from acquire.cli.output import JsonFlag, print_facts, print_json
 
@@ -33,6 +42,10 @@ def demo(
         Literal["simulated", "rtl"],
         typer.Option(help="A model of the sync trigger, or its gateware itself, clock by clock."),
     ] = "simulated",
+    cameras: Annotated[
+        Literal["simulated", "gentl", "gige"],
+        typer.Option(help="Cameras in the grabbers, or behind a GenTL producer or GigE Vision."),
+    ] = "simulated",
     json: JsonFlag = False,
 ) -> None:
     """Record Scene #1 of the paper with a simulated rig, reconstruct it, and write a report.
@@ -43,6 +56,7 @@ def demo(
     """
     from acquire.config import load_rig
 
+    config = rig_of(config, cameras)
     plan = DemoPlan(out or _free(Path("acquire-demo")), config, seed, lines, budget, twist_budget, trigger)
     rig = load_rig(config, trigger_settings(plan))
     check(plan, rig)

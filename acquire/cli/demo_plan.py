@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from acquire.config import RigConfig
 
 RIG = "rig-demo"
+CAMERA_RIGS = {"simulated": RIG, "gentl": "rig-demo-gentl", "gige": "rig-demo-gige"}
 SEED = 1
 LINES = 33_334
 TWIST_BUDGET_S = 30.0
@@ -81,6 +82,17 @@ def trigger_settings(plan: DemoPlan) -> dict[str, str | int]:
     return {"trigger.driver": "rtl", "trigger.clock_hz": clock_hz, "trigger.substep_ticks": ticks}
 
 
+def rig_of(config: str, cameras: str) -> str:
+    """The rig file for the cameras that were asked for. Raises UsageError for a file of the user's own."""
+    if cameras == "simulated" or config == CAMERA_RIGS[cameras]:
+        return config
+    if config != RIG:
+        raise UsageError(
+            f"demo of {config} with --cameras {cameras}", hint="cameras.a.driver in that file, or no --config"
+        )
+    return CAMERA_RIGS[cameras]
+
+
 def check(plan: DemoPlan, rig: RigConfig) -> None:
     """Raise UsageError for what could not be carried out to the end."""
     from acquire.config import check_directory
@@ -93,6 +105,7 @@ def check(plan: DemoPlan, rig: RigConfig) -> None:
         from acquire.sim.rtl import demand
 
         demand()
+    _check_cameras(rig)
     least = segment_row(rig) + SEGMENT_LINES
     if plan.lines < least:
         raise UsageError(
@@ -116,6 +129,18 @@ def _check_budgets(plan: DemoPlan) -> None:
     for budget_s in (plan.budget_s, plan.twist_budget_s):
         if budget_s is not None and not budget_s > 0:
             raise UsageError(f"demo with a budget of {budget_s} s", possible="more than 0")
+
+
+def _check_cameras(rig: RigConfig) -> None:
+    drivers = (rig.cameras.a.driver, rig.cameras.b.driver)
+    if "gentl-simulated" in drivers:
+        from acquire.sim.gentl.build import build
+
+        build()
+    if "gige-simulated" in drivers:
+        from acquire.camera.aravis import load
+
+        load()
 
 
 def _check_rig(plan: DemoPlan, rig: RigConfig) -> None:

@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from acquire.stream import CaptureStatus
 
 
+STALL_S = 3.0
+"""An arm that is silent for so long has stalled, unless its camera is waited for longer."""
+
+
 class Run:
     """One run of a rig: armed once, records at most once, closed once."""
 
@@ -81,19 +85,14 @@ class Run:
             "black_level_dn": camera.black_level_dn,
             "responsivity_dn": camera.responsivity_dn,
         }
-        return {**calibration, **facts}
+        lines = self._capture.poll().lines.get(arm, {})
+        return {**calibration, **facts, "clock": lines.get("clock", {})}
 
 
 def capture_plan(config: RigConfig, rig: Rig, run_id: str) -> CapturePlan:
     """What the capture path is asked to do. Raises UsageError for what cannot work."""
     return CapturePlan(
-        run=TriggerRun(
-            run_id=run_id,
-            code=config.code.build(),
-            substeps=config.geometry.substeps,
-            substep_ticks=config.trigger.substep_ticks,
-            tag_every_lines=config.trigger.tag_every_lines,
-        ),
+        run=trigger_run(config, run_id),
         stages=config.geometry.stages,
         pixels=config.geometry.stages,
         dtype=config.cameras.a.dtype,
@@ -101,6 +100,21 @@ def capture_plan(config: RigConfig, rig: Rig, run_id: str) -> CapturePlan:
         ring_slots=config.stream.ring_slots,
         white_dn=config.cameras.a.white_dn,
         openers=rig.openers(),
+        stall_timeout_s=max(STALL_S, config.stream.reopen_s + 1.0),
+        reopen_timeout_s=config.stream.reopen_s,
+        columns=config.columns,
+        line_period_ns=1e9 / config.line_rate_hz / config.simulation.speed,
+    )
+
+
+def trigger_run(config: RigConfig, run_id: str) -> TriggerRun:
+    """What the trigger is asked to do."""
+    return TriggerRun(
+        run_id=run_id,
+        code=config.code.build(),
+        substeps=config.geometry.substeps,
+        substep_ticks=config.trigger.substep_ticks,
+        tag_every_lines=config.trigger.tag_every_lines,
     )
 
 

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire import __version__
-from acquire.camera import base
 from acquire.camera.base import CameraBlock, CameraIdentity
 from acquire.clock import NS_PER_S
 from acquire.errors import CameraError
@@ -26,6 +25,8 @@ from acquire.sim.pipeline import Bench, Camera, Readout
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+    from numpy.typing import NDArray
 
     from acquire.codes import Code
     from acquire.config import CameraConfig, GeometryConfig
@@ -104,6 +105,13 @@ class SimulatedCamera:
         self._ready.clear()
         self._light = None
 
+    def arm_like(self, other: SimulatedCamera) -> None:
+        """Be armed from the same pulse on as ``other``, just armed: both are one sensor."""
+        self._train, self._first_pulse = other._train, other._first_pulse
+        self._delivered = self._lost = 0
+        self._ready.clear()
+        self._light = None
+
     def next_block(self, timeout_s: float) -> CameraBlock | None:
         """The next ``block_lines`` lines; fewer only for the last of a train that was stopped."""
         if self._train is None:
@@ -119,6 +127,16 @@ class SimulatedCamera:
         if ready < self._block_lines and not (ready and reading.stopped):
             return None
         return self._read_out(reading, ready)
+
+    def times_ns(self, first_line: int, count: int) -> NDArray[np.int64]:
+        """CLOCK_MONOTONIC at which lines, counted since arm, were triggered (count,)."""
+        train = self._wire.look().train
+        if train is None or train.run != self._train:
+            raise CameraError("times were asked of a camera without its pulses")
+        spacing = train.line_period_ns / train.speed
+        pulses = self._first_pulse + first_line + np.arange(count, dtype=np.int64)
+        times: NDArray[np.int64] = train.start_ns - (-pulses * spacing.numerator // spacing.denominator)
+        return times
 
     def release(self, block: CameraBlock) -> None:
         """Nothing to give back: every block has memory of its own."""
@@ -182,7 +200,7 @@ class SimulatedCameraOpener:
     block_lines: int
     line_rate_hz: float
 
-    def __call__(self) -> base.Camera:
+    def __call__(self) -> SimulatedCamera:
         if multiprocessing.parent_process() is not None:
             limit_blas_threads(1)
         return SimulatedCamera(self.wire, self.optics, self.config, self.block_lines, self.line_rate_hz)

@@ -95,6 +95,7 @@ class RecordingSpec:
             "dtype": ("uint8", "uint16"),
             "codec": ("none", "lz4", "zstd"),
             "fsync": ("commit", "seal"),
+            "layout": ("dual", "compact"),
         }
         for name, allowed in choices.items():
             if getattr(self, name) not in allowed:

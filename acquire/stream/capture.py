@@ -120,7 +120,7 @@ class Capture:
 
     @property
     def pids(self) -> dict[str, int | None]:
-        """Process numbers: of the recorder, and of each arm's grabber."""
+        """Process numbers: of the recorder, and of each grabber."""
         return {name: worker.pid for name, worker in self._workers.items()}
 
     def close(self, timeout_s: float = 10.0) -> None:
@@ -148,14 +148,24 @@ class Capture:
         self._make_memory()
         self._spawn()
         self._workers[RECORDER].expect(Ready, deadline)
-        self.cameras = {arm: self._workers[arm].expect(Ready, deadline).facts for arm in ARMS}
+        cameras: dict[str, dict[str, Any]] = {}
+        for name, arms in self._plan.grabbers.items():
+            facts = self._workers[name].expect(Ready, deadline).facts
+            cameras |= dict.fromkeys(arms, facts)
+        self.cameras = cameras
         self._trigger_used = True
         self._trigger.prepare(self._plan.run)
         self.clock = self._trigger.start()
         self._workers[RECORDER].post(RunStarted(self.clock))
         assert self._tags is not None
         self._supervisor = Supervisor(
-            self._trigger, self._workers, self._tags, self._counters, self._plan.stall_timeout_s
+            self._trigger,
+            self._workers,
+            self._tags,
+            self._counters,
+            self._plan.stall_timeout_s,
+            self._plan.margin_lines,
+            self._plan.grabbers,
         )
         self._supervisor.start()
 
@@ -174,11 +184,22 @@ class Capture:
         self._workers[RECORDER] = Worker(
             RECORDER, recorder.record, what, self._rings, self._tags, self._counters[RECORDER]
         )
-        for arm, ring in self._rings.items():
-            task = grabber.GrabberPlan(
-                arm, plan.openers[arm], plan.depth_lines, plan.white_dn, plan.max_skew_lines
-            )
-            self._workers[arm] = Worker(f"grabber {arm}", grabber.grab, task, ring, self._counters[arm])
+        for name, arms in plan.grabbers.items():
+            tasks = [(self._grabber_plan(arm), self._rings[arm], self._counters[arm]) for arm in arms]
+            self._workers[name] = Worker(f"grabber {name}", grabber.grab, *tasks)
+
+    def _grabber_plan(self, arm: str) -> grabber.GrabberPlan:
+        plan = self._plan
+        return grabber.GrabberPlan(
+            arm,
+            plan.openers[arm],
+            plan.depth_lines,
+            plan.white_dn,
+            plan.max_skew_lines,
+            plan.reopen_timeout_s,
+            plan.line_period_ns,
+            plan.columns.get(arm),
+        )
 
     def _running(self, command: str) -> Supervisor:
         if self._supervisor is None or self._closed:
@@ -217,8 +238,9 @@ class Capture:
     def _line_counts(self, arm: str, *, began: bool) -> dict[str, Any]:
         grabbed, recorded = self._counters[arm], self._counters[RECORDER]
         lost = {
-            str(Cause.CAMERA): grabbed["camera_lost"],
+            str(Cause.CAMERA): grabbed[Cause.CAMERA],
             str(Cause.RING_FULL): self._rings[arm].statistics().dropped_lines,
+            **{str(cause): grabbed[cause] for cause in grabber.CAMERA_CAUSES[1:] if grabbed[cause]},
         }
         return {
             "delivered": grabbed["delivered"],
@@ -227,6 +249,8 @@ class Capture:
             "lost": lost,
             "recorded": recorded[f"rows_{arm}"] if began else 0,
             "missing": recorded[f"missing_{arm}"] if began else 0,
+            "reopened": grabbed["reopened"],
+            "clock": {name: grabbed[name] for name in ("stamp_line", "stamp_ns", "drift_ppb")},
         }
 
     # ---- end
@@ -249,7 +273,8 @@ class Capture:
 
     def _end_workers(self, deadline: float) -> None:
         deadline = max(deadline, time.monotonic() + _LEAST_END_S)
-        order = [self._workers[name] for name in (*ARMS, RECORDER) if name in self._workers]
+        grabbers = [name for name in self._workers if name != RECORDER]
+        order = [self._workers[name] for name in (*grabbers, RECORDER) if name in self._workers]
         for worker in order:
             worker.post(Quit())
         _run_all(*(partial(worker.end, deadline) for worker in order))

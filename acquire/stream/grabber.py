@@ -3,18 +3,24 @@
 The camera counts lines since it was armed; line ``k`` of that count is the trigger's line
 ``k - depth_lines``, and what comes before the trigger's line 0 (preroll) is discarded. Lines that do not
 come, or find the ring full, are located and told with the next slot that is committed.
+
+A camera that is gone is opened again, for a bounded time. It then counts from 0: its time stamps say which
+line that is, and what the trigger issued meanwhile is a loss like any other.
 """
 
 from __future__ import annotations
 
+import contextlib
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.errors import AcquireError, CameraError
+from acquire.camera.base import CameraLoss, LossCause
+from acquire.errors import AcquireError, CameraError, CameraLostError
 from acquire.lines import LineFlag
+from acquire.stream.lineclock import LineClock
 from acquire.stream.losses import Cause, Loss, LossLog
 from acquire.stream.messages import Ready
 
@@ -26,10 +32,17 @@ if TYPE_CHECKING:
     from acquire.stream.ring import Ring
     from acquire.stream.shared import Counters
 
-COUNTERS = ("delivered", "preroll", "camera_lost")
-"""Lines since arm: delivered by the camera (preroll included), discarded as preroll, jumped over."""
+CAMERA_CAUSES = (Cause.CAMERA, *(Cause(cause) for cause in LossCause))
+COUNTERS = (
+    "delivered", "preroll", *CAMERA_CAUSES, "next_line", "reopened", "stamp_line", "stamp_ns", "drift_ppb",
+)  # fmt: skip
+"""Lines since arm: delivered by the camera (preroll included), discarded as preroll, lost by cause; the line
+that comes next. How often the camera was opened again; a line and its time by the camera's clock, and how
+much faster that runs than the trigger's.
+"""
 
 _BLOCK_WAIT_S = 0.05
+_REOPEN_PAUSE_S = 0.1
 _MAIL_INTERVAL_S = 0.02
 
 
@@ -37,7 +50,9 @@ _MAIL_INTERVAL_S = 0.02
 class GrabberPlan:
     """What one grabber needs to know. Picklable.
 
-    A jump of the camera's count by more than ``max_jump_lines`` is a broken count, not a loss.
+    A jump of the camera's count by more than ``max_jump_lines`` is a broken count, not a loss. A camera that
+    is gone is waited for as long as ``reopen_timeout_s``; ``line_period_ns`` is the trigger's. ``columns``
+    are the arm's on a camera that has both arms, None on one of its own.
     """
 
     arm: str
@@ -45,22 +60,67 @@ class GrabberPlan:
     depth_lines: int
     white_dn: int
     max_jump_lines: int
+    reopen_timeout_s: float = 0.0
+    line_period_ns: float = 0.0
+    columns: tuple[int, int] | None = None
 
 
-def grab(mailbox: Mailbox, plan: GrabberPlan, ring: Ring, counters: Counters) -> None:
-    """Life of a grabber: open and arm the camera, say so, fill the ring until told to end."""
+def grab(mailbox: Mailbox, *arms: tuple[GrabberPlan, Ring, Counters]) -> None:
+    """Life of a grabber: open and arm the camera, say so, fill the rings until told to end.
+
+    Several ``arms`` fall on one camera, each on columns of its own.
+    """
+    plan = arms[0][0]
     camera = plan.opener()
+    intakes = [Intake(*arm) for arm in arms]
     try:
         facts = {**camera.settings(), "identity": asdict(camera.identify())}
         camera.arm()
         mailbox.post(Ready(facts))
-        _pump(mailbox, camera, Intake(plan, ring, counters))
+        while True:
+            try:
+                _pump(mailbox, camera, intakes)
+            except CameraLostError as lost:
+                camera = _reopen(mailbox, plan, camera, lost)
+                for intake in intakes:
+                    intake.realign()
     except BaseException as error:  # the only way out
         try:
             _let_go(camera)
         except AcquireError as second:
             error.add_note(f"while letting go: {second}")
         raise
+
+
+def _reopen(mailbox: Mailbox, plan: GrabberPlan, camera: Camera, lost: CameraLostError) -> Camera:
+    """The camera, open and armed again; CameraLostError when it does not come back in time."""
+    deadline = time.monotonic() + plan.reopen_timeout_s
+    with contextlib.suppress(AcquireError):
+        _let_go(camera)
+    while True:
+        if time.monotonic() >= deadline:
+            raise CameraLostError(
+                f"camera {plan.arm} is gone: {lost.message}",
+                hint=f"it was waited for {plan.reopen_timeout_s:g} s",
+            ) from lost
+        mailbox.take()
+        if (again := _try_open(plan)) is not None:
+            return again
+        time.sleep(_REOPEN_PAUSE_S)
+
+
+def _try_open(plan: GrabberPlan) -> Camera | None:
+    try:
+        camera = plan.opener()
+    except CameraError:
+        return None
+    try:
+        camera.arm()
+    except CameraError:
+        with contextlib.suppress(AcquireError):
+            _let_go(camera)
+        return None
+    return camera
 
 
 def _let_go(camera: Camera) -> None:
@@ -70,7 +130,7 @@ def _let_go(camera: Camera) -> None:
         camera.close()
 
 
-def _pump(mailbox: Mailbox, camera: Camera, intake: Intake) -> None:
+def _pump(mailbox: Mailbox, camera: Camera, intakes: list[Intake]) -> None:
     """Move blocks until the mailbox raises OwnerGone."""
     look = 0.0
     while True:
@@ -79,7 +139,8 @@ def _pump(mailbox: Mailbox, camera: Camera, intake: Intake) -> None:
             look = now + _MAIL_INTERVAL_S
         block = camera.next_block(_BLOCK_WAIT_S)
         if block is not None:
-            intake.take(block)
+            for intake in intakes:
+                intake.take(block)
             camera.release(block)
 
 
@@ -92,12 +153,25 @@ class Intake:
         self._counters = counters
         self._losses = LossLog()
         self._next = -plan.depth_lines
+        self._shift = -plan.depth_lines
+        self._clock = LineClock(plan.line_period_ns)
+        self._away = False
+
+    def realign(self) -> None:
+        """The camera was opened again: it counts from 0, and its next time stamp says from which line."""
+        self._away = True
+        self._counters.add("reopened", 1)
 
     def take(self, block: CameraBlock) -> None:
         """Put the block's lines into the ring. Raises CameraError for a block that cannot be right."""
+        if self._plan.columns is not None:
+            block = replace(block, pixels=block.pixels[:, slice(*self._plan.columns)])
         self._check(block)
-        first = block.first_line - self._plan.depth_lines
-        self._note_jump(first)
+        losses = self._come_back(block) if self._away else block.losses
+        first = block.first_line + self._shift
+        self._note_jump(first, losses)
+        if block.time_ns is not None:
+            self._stamp(first, block.time_ns)
         count = len(block.flags)
         preroll = min(max(-first, 0), count)
         self._counters.add("delivered", count)
@@ -106,6 +180,13 @@ class Intake:
             part = slice(at, at + self._ring.shape.rows)
             self._put(first + at, block.pixels[part], block.flags[part])
         self._next = first + count
+        self._counters["next_line"] = self._next
+
+    def _stamp(self, line: int, time_ns: int) -> None:
+        self._clock.note(line, time_ns)
+        stamp = {"stamp_line": line, "stamp_ns": time_ns, "drift_ppb": self._clock.drift_ppb}
+        for name, value in stamp.items():
+            self._counters[name] = value
 
     def _check(self, block: CameraBlock) -> None:
         shape = self._ring.shape
@@ -116,18 +197,40 @@ class Intake:
                 possible=f"(lines, {shape.width}) {shape.dtype} with a flag per line",
             )
 
-    def _note_jump(self, first: int) -> None:
+    def _come_back(self, block: CameraBlock) -> tuple[CameraLoss, ...]:
+        """Number a camera that was away by its time stamps."""
+        line = None if block.time_ns is None else self._clock.line_at(block.time_ns)
+        if line is None:
+            raise CameraError(
+                f"camera {self._plan.arm} is there again, but its time stamps do not say at which line",
+                hint="arm again",
+            )
+        self._away = False
+        self._shift = line - block.first_line
+        return (CameraLoss(LossCause.DEVICE_LOST, line - self._next),)
+
+    def _note_jump(self, first: int, losses: tuple[CameraLoss, ...]) -> None:
         jump = first - self._next
         if not 0 <= jump <= self._plan.max_jump_lines:
             raise CameraError(
                 f"camera {self._plan.arm}: its count of lines went from "
-                f"{self._next + self._plan.depth_lines} to {first + self._plan.depth_lines}",
+                f"{self._next - self._shift} to {first - self._shift}",
                 possible=f"the next line, or up to {self._plan.max_jump_lines} lost ones",
             )
-        lost = first - max(self._next, 0)
-        if lost > 0:
-            self._counters.add("camera_lost", lost)
-            self._losses.add(Loss(first - lost, lost, Cause.CAMERA))
+        unexplained = jump - sum(loss.count for loss in losses)
+        self._lose(self._next, unexplained, Cause.CAMERA)
+        at = self._next + max(unexplained, 0)
+        for loss in losses:
+            count = min(loss.count, first - at)
+            self._lose(at, count, Cause(loss.cause))
+            at += count
+
+    def _lose(self, first: int, count: int, cause: Cause) -> None:
+        """Note lines that did not come, but for the preroll's."""
+        count += min(first, 0)
+        if count > 0:
+            self._counters.add(cause, count)
+            self._losses.add(Loss(max(first, 0), count, cause))
 
     def _put(self, first_line: int, pixels: NDArray[Any], flags: NDArray[np.uint16]) -> None:
         count = len(flags)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
+from acquire.camera.base import LossCause
+
 MAX_LOSSES = 8
 """Losses that one ring slot can report about the lines before it."""
 
@@ -13,7 +15,13 @@ class Cause(StrEnum):
     """Why lines are missing; the word that the recording's gaps carry."""
 
     CAMERA = "camera"
-    """The camera's own count jumped."""
+    """The camera's own count jumped, for a reason that it did not tell."""
+    NO_BUFFER = LossCause.NO_BUFFER.value
+    INCOMPLETE = LossCause.INCOMPLETE.value
+    ID_GAP = LossCause.ID_GAP.value
+    MISSED_TRIGGER = LossCause.MISSED_TRIGGER.value
+    DEVICE_LOST = LossCause.DEVICE_LOST.value
+    """What the camera told: see `acquire.camera.base.LossCause`."""
     RING_FULL = "ring_full"
     """The recorder was late: the grabber found no free slot."""
     MIXED = "mixed"

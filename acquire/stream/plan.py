@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 MAX_SUBSTEPS = 8
 """A line's code is recorded in one byte."""
 
+TAG_DELAY_S = 0.5
+"""How late a tag may come."""
+
 SKEW_RINGS = 32
 """An arm that lags behind the other by the lines of so many rings is taken for stalled."""
 
@@ -36,6 +39,11 @@ class CapturePlan:
     stall_timeout_s : an arm that delivers nothing for so long ends the recording; while nothing is
         recorded it is a fault, as is a recorder that shows no life for so long
     tag_wait_s : how long lines wait for the tag that confirms them before they are flagged
+    reopen_timeout_s : how long a camera that is gone is waited for; less than ``stall_timeout_s``, or the
+        arm counts as stalled first
+    line_period_ns : by the trigger's clock; 0: not told
+    columns : compact layout: arm → first column and the one after the last, on the one camera that
+        ``openers["a"]`` opens; empty: a camera per arm
     """
 
     run: TriggerRun
@@ -48,6 +56,9 @@ class CapturePlan:
     openers: dict[str, CameraOpener]
     stall_timeout_s: float = 3.0
     tag_wait_s: float = 1.0
+    reopen_timeout_s: float = 2.0
+    line_period_ns: float = 0.0
+    columns: dict[str, tuple[int, int]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if tuple(sorted(self.openers)) != ARMS:
@@ -75,6 +86,18 @@ class CapturePlan:
         return RingShape(self.ring_slots, self.block_lines, self.pixels, self.dtype)
 
     @property
+    def grabbers(self) -> dict[str, tuple[str, ...]]:
+        """Name of a grabber → the arms that it serves."""
+        return {"".join(ARMS): ARMS} if self.columns else {arm: (arm,) for arm in ARMS}
+
+    @property
+    def margin_lines(self) -> int | None:
+        """Lines by which a camera may seem ahead of the trigger's tags; None where time is not told."""
+        if not self.line_period_ns:
+            return None
+        return self.run.tag_every_lines + round(TAG_DELAY_S * 1e9 / self.line_period_ns)
+
+    @property
     def max_skew_lines(self) -> int:
         """Lines by which one arm may be ahead of the other, and by which a camera's count may jump: after
         a larger jump the other arm would be taken for stalled, and its rows would be written in one go.
@@ -96,7 +119,9 @@ class CaptureStatus:
     ring : arm → slots, fill, peak, drops (blocks), dropped_lines, all since arm
     lines : arm → delivered, preroll, discarded (taken from the ring, but in no recording), and lost by
         cause, since arm; and of the latest recording ``recorded`` rows, of which ``missing``. After
-        `close`: delivered = preroll + lost["ring_full"] + discarded + recorded − missing
+        `close`: delivered = preroll + lost["ring_full"] + discarded + recorded − missing. Also how often
+        the camera was ``reopened``, and its ``clock``: the latest stamp (line, its time by the camera) and
+        how much faster it runs than the trigger's, in parts per billion; all 0 where it tells no time
     fault : what failed first, or None
     """
 

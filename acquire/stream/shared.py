@@ -34,6 +34,11 @@ class SharedBytes:
         start = first * WORD_BYTES
         return memoryview(self.map)[start : start + count * WORD_BYTES].cast("q")
 
+    @property
+    def path(self) -> str:
+        """A path to the bytes for programs that are not spawned from here; good while this process lives."""
+        return f"/proc/{os.getpid()}/fd/{self._fd}"
+
     def close(self) -> None:
         """Unmap; the owner of views must have released them before. Idempotent."""
         if not self.map.closed:

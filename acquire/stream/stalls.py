@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from acquire.stream.shared import Counters
 
 _LONGEST_LOOK_S = 0.5
+_EXCESS_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +74,27 @@ class Heartbeat:
     def revive(self) -> None:
         """Count silence from now."""
         self.still_s = 0.0
+
+
+class Excess:
+    """An arm that counts lines which the trigger has not issued is not triggered by it.
+
+    Tags come in steps and late: only what exceeds them by ``margin_lines`` for a whole second counts.
+    """
+
+    def __init__(self, counters: Counters, margin_lines: int) -> None:
+        self._counters = counters
+        self._margin_lines = margin_lines
+        self._since_s: float | None = None
+
+    def look(self, newest_pulse: int, now_s: float) -> int:
+        """The arm's next line when it cannot be, else 0; ``newest_pulse`` is the latest tag's."""
+        line = self._counters["next_line"]
+        if line <= newest_pulse + self._margin_lines:
+            self._since_s = None
+            return 0
+        self._since_s = self._since_s or now_s
+        return line if now_s - self._since_s > _EXCESS_S else 0
 
 
 def find_stall(session: Session, arms: dict[str, Arm], limit_s: float, max_skew_lines: int) -> Stall | None:

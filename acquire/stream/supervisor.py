@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING
 from acquire.errors import AcquireError, DeviceError, TriggerError
 from acquire.lines import ARMS
 from acquire.stream.messages import Began, Failed, Interrupt, Refused, Sealed
-from acquire.stream.stalls import Heartbeat
+from acquire.stream.stalls import Excess, Heartbeat
 from acquire.stream.tagger import tag_rows
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from acquire.stream.messages import Begin
     from acquire.stream.process import Worker
     from acquire.stream.ring import Ring
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
     from acquire.trigger.base import LineTag, Trigger
 
 RECORDER = "recorder"
-"""Key of the recorder among the workers; the grabbers have their arms'."""
+"""Key of the recorder among the workers; the grabbers have their arms' names."""
 
 _TAG_WAIT_S = 0.02
 _ANSWER_S = 20.0
@@ -31,6 +33,8 @@ _JOIN_S = 5.0
 
 class Supervisor:
     """Owns the thread. What it learnt can be read at any time: `began`, `sealed`, `fault`.
+
+    With ``margin_lines`` it holds the cameras' count of lines against the trigger's (`stalls.Excess`).
 
     Attributes
     ----------
@@ -46,6 +50,8 @@ class Supervisor:
         tags: Ring,
         counters: dict[str, Counters],
         stall_timeout_s: float,
+        margin_lines: int | None = None,
+        grabbers: Mapping[str, tuple[str, ...]] | None = None,
     ) -> None:
         self.began: Began | None = None
         self.sealed: Sealed | None = None
@@ -56,6 +62,9 @@ class Supervisor:
         self._stall_timeout_s = stall_timeout_s
         self._loop = Heartbeat(counters[RECORDER], "turns")
         self._cameras = {arm: Heartbeat(counters[arm], "delivered") for arm in ARMS}
+        self._arms_of = grabbers or {arm: (arm,) for arm in ARMS}
+        self._excess = {arm: Excess(counters[arm], margin_lines) for arm in ARMS if margin_lines is not None}
+        self._newest_pulse: int | None = None
         self._refused: Refused | None = None
         self._trigger_lost = False
         self._dead: set[str] = set()
@@ -129,6 +138,8 @@ class Supervisor:
             kind = "" if isinstance(error, AcquireError) else f"{type(error).__name__}: "
             self._fail(f"trigger: {kind}{error}")
             return []
+        if tags:
+            self._newest_pulse = tags[-1].line
         rows = self._tags.shape.rows
         for at in range(0, len(tags), rows):
             self._pass_on(tags[at : at + rows])
@@ -148,6 +159,7 @@ class Supervisor:
         limit_s = self._stall_timeout_s
         if self._loop.look(now_s) > limit_s:
             self._fail(f"{self._workers[RECORDER].name}: no sign of life for {limit_s:g} s")
+        self._watch_counts(now_s)
         if self.recording:
             for camera in self._cameras.values():
                 camera.revive()
@@ -156,6 +168,15 @@ class Supervisor:
             # Arms that fall silent together do so to within a block: half the limit tells both from one.
             arms = " and ".join(arm for arm in ARMS if silent_s[arm] > limit_s / 2)
             self._fail(f"arm {arms}: no line for {limit_s:g} s")
+
+    def _watch_counts(self, now_s: float) -> None:
+        pulse = self._newest_pulse
+        for arm, excess in self._excess.items() if pulse is not None else ():
+            if line := excess.look(pulse or 0, now_s):
+                self._fail(
+                    f"arm {arm}: line {line} came with the trigger at line {pulse}: "
+                    "the camera does not wait for it"
+                )
 
     def _hear(self, name: str, worker: Worker) -> None:
         death = worker.death  # looked at before the messages: what a process said last counts
@@ -184,4 +205,4 @@ class Supervisor:
         with self._news:
             self.fault = self.fault or text
             self._news.notify_all()
-        self._workers[RECORDER].post(Interrupt(text, tuple(arm for arm in ARMS if arm == name)))
+        self._workers[RECORDER].post(Interrupt(text, self._arms_of.get(name or "", ())))

@@ -318,6 +318,15 @@ def test_silence_while_armed_is_a_fault(tmp_path: Path, stalled: str, fault: str
     assert not any(tmp_path.iterdir())
 
 
+def test_a_camera_that_does_not_wait_for_the_trigger_is_a_fault() -> None:
+    bench = make_bench(line_period_ns=5e4)
+    bench.plan.openers["b"] = replace(bench.plan.openers["b"], rate_hz=40_000)
+    with armed(bench) as capture:
+        until(lambda: capture.poll().fault, "the fault")
+        assert "arm b: line" in str(capture.poll().fault)
+        assert "the camera does not wait for it" in str(capture.poll().fault)
+
+
 def test_a_killed_recorder_leaves_what_was_committed(tmp_path: Path) -> None:
     with armed(make_bench()) as capture:
         capture.start(tmp_path / "r.zarr", make_spec())

@@ -46,7 +46,7 @@ class Path:
         return found
 
     def counts(self) -> tuple[int, ...]:
-        return tuple(self.counters[name] for name in COUNTERS)
+        return tuple(self.counters[name] for name in ("delivered", "preroll", "camera"))
 
     def close(self) -> None:
         self.ring.close()

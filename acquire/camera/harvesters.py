@@ -1,0 +1,522 @@
+"""Cameras through harvesters: any camera whose maker gives a GenTL producer (.cti).
+
+The only file that imports harvesters and genicam, and only when a camera is opened: importing them changes
+warning filters, opening takes over SIGINT (both are put back), and a producer must never be forked. Their
+binding holds the interpreter's lock while it waits, so a camera wants a process of its own.
+
+What harvesters does: find producers and devices, load the node maps, announce buffers, start and stop.
+What it is not asked to do: fetch. It requeues incomplete buffers without a word, so buffers are taken from
+its NewBuffer monitor directly. A buffer is announced once, shown as an array without a copy, and queued
+again by `release`.
+"""
+
+from __future__ import annotations
+
+import logging
+import signal
+import threading
+import time
+import warnings
+from collections import deque
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.camera.assembly import (
+    STATISTICS,
+    Assembly,
+    MissedTriggers,
+    buffer_count,
+    check_format,
+    frame_format,
+    read_settings,
+)
+from acquire.camera.base import CameraIdentity
+from acquire.camera.frames import FrameFacts
+from acquire.camera.producers import find_producers
+from acquire.camera.settings import apply_settings
+from acquire.errors import CameraError, CameraLostError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Sequence
+
+    from acquire.camera.base import CameraBlock
+    from acquire.camera.settings import Kind, Value
+    from acquire.camera.spec import GenicamSpec
+
+_ALIVE_S = 0.5
+"""How often a silent camera is asked whether it is still there."""
+_COMMAND_S = 5.0
+_KINDS: dict[str, Kind] = {
+    "intfIInteger": "integer",
+    "intfIFloat": "float",
+    "intfIEnumeration": "enumeration",
+    "intfIBoolean": "boolean",
+    "intfIString": "text",
+    "intfICommand": "command",
+}
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class FoundCamera:
+    """A camera that a producer lists; ``access`` is "free", or why it cannot be opened."""
+
+    serial: str
+    model: str
+    vendor: str
+    firmware: str
+    access: str
+    cti: str
+
+
+@dataclass(frozen=True, slots=True)
+class HarvestersOpener:
+    """Opens the camera in the process that calls it."""
+
+    spec: GenicamSpec
+
+    def __call__(self) -> HarvestersCamera:
+        return HarvestersCamera(self.spec)
+
+
+def list_cameras(cti: str = "") -> list[FoundCamera]:
+    """Every camera that the producers show now. Raises CameraError where there is no producer."""
+    with _Library(cti) as library:
+        return library.found()
+
+
+class HarvestersCamera:
+    """One camera, opened and set; see `acquire.camera.base.Camera`."""
+
+    def __init__(self, spec: GenicamSpec) -> None:
+        self._spec = spec
+        self._library = _Library(spec.cti)
+        self._acquirer: Any = None
+        self._armed = False
+        self._assembly: Assembly | None = None
+        self._views: dict[int, Any] = {}
+        self._held: dict[CameraBlock, Any] = {}
+        try:
+            self._open()
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self) -> None:
+        spec = self._spec
+        self._found = self._library.pick(spec.serial, spec.model)
+        self._acquirer = self._library.create(self._found)
+        self._features = _modules(self._acquirer)
+        apply_settings(spec.settings, self._features)
+        check_format(frame_format(self._features), spec)
+
+    def identify(self) -> CameraIdentity:
+        found = self._found
+        return CameraIdentity(found.vendor, found.model, found.serial, found.firmware)
+
+    def settings(self) -> dict[str, Any]:
+        return read_settings(self._features)
+
+    def features(self) -> dict[str, _Features]:
+        """Module → its features, for a look at everything (`acquire.camera.settings.Features`)."""
+        return self._features
+
+    def arm(self) -> None:
+        self.disarm()
+        found = frame_format(self._features)
+        self._views.clear()
+        self._missed = MissedTriggers(self._features)
+        self._assembly = Assembly(found, self._spec)
+        with _told(f"arm camera {self._spec.serial}"), _signals_kept():
+            acquirer = self._acquirer
+            acquirer.num_buffers = buffer_count(self._spec, found)
+            # harvesters keeps its monitors to itself; without one there is no word of incomplete buffers.
+            self._stream = acquirer.data_streams[0]
+            self._monitor = acquirer._new_buffer_event_monitor_dict[self._stream]
+            self._underruns_before = self._underruns()
+            acquirer.start()
+            self._armed = True
+        self._heard_s = time.monotonic()
+
+    def next_block(self, timeout_s: float) -> CameraBlock | None:
+        """The next frame's lines; those of an incomplete frame are flagged, the absent ones told as lost."""
+        if not self._armed:
+            raise CameraError("a block was asked of a camera that is not armed", hint="arm it")
+        buffer = self._await_buffer(timeout_s)
+        if buffer is None:
+            self._ask_alive()
+            return None
+        self._heard_s = time.monotonic()
+        with _told(f"camera {self._spec.serial}"):
+            block = self._read_out(buffer)
+        self._held[block] = buffer
+        return block
+
+    def _await_buffer(self, timeout_s: float) -> Any:
+        from genicam import gentl
+
+        try:
+            with _told(f"camera {self._spec.serial}"):
+                self._monitor.update_event_data(max(1, round(timeout_s * 1000)))
+                return self._monitor.buffer
+        except CameraError as error:
+            if isinstance(error.__cause__, gentl.TimeoutException):
+                return None
+            raise
+
+    def _ask_alive(self) -> None:
+        """Some producers are silent when their camera goes: reading a register is not."""
+        if time.monotonic() - self._heard_s > _ALIVE_S:
+            self._heard_s = time.monotonic()
+            node = self._features["remote"].find("AcquisitionMode") or self._features["remote"].find("Width")
+            if node is not None:
+                node.read_afresh()
+
+    def _read_out(self, buffer: Any) -> CameraBlock:
+        facts = FrameFacts(
+            int(buffer.frame_id),
+            self._underruns() - self._underruns_before,
+            self._missed.count(),
+            _or(lambda: int(buffer.timestamp_ns), 0) or None,
+        )
+        assert self._assembly is not None
+        return self._assembly.block(
+            self._memory(buffer),
+            int(buffer.size_filled),
+            _or_zero(lambda: buffer.padding_x),
+            facts,
+            complete=buffer.is_complete(),
+            rows=_or_zero(lambda: buffer.delivered_image_height),
+        )
+
+    def _memory(self, buffer: Any) -> Any:
+        """The announced bytes as an array; made once per buffer."""
+        key = buffer.context
+        if key not in self._views:
+            self._views[key] = np.frombuffer(buffer.raw_buffer, np.uint8)
+        return self._views[key]
+
+    def _underruns(self) -> int:
+        return _or_zero(lambda: self._stream.module.num_underrun)
+
+    def release(self, block: CameraBlock) -> None:
+        buffer = self._held.pop(block, None)
+        if buffer is not None and self._armed:
+            with _told(f"camera {self._spec.serial}"):
+                self._stream.module.queue_buffer(buffer, False)
+
+    def disarm(self) -> None:
+        """Stop, whatever state the camera is in."""
+        if not self._armed:
+            return
+        self._armed = False
+        self._held.clear()
+        self._views.clear()
+        _stop(self._acquirer)
+
+    def statistics(self) -> dict[str, int]:
+        return self._assembly.statistics() if self._assembly else dict.fromkeys(STATISTICS, 0)
+
+    def close(self) -> None:
+        self.disarm()
+        self._features = {}
+        self._acquirer = None
+        self._library.close()
+
+
+class _Library:
+    """harvesters with its producers loaded: one per camera, closed with it."""
+
+    def __init__(self, cti: str) -> None:
+        self._producers = find_producers(cti)
+        self._words = _Words()
+        with warnings.catch_warnings(), _told("load harvesters"):
+            warnings.simplefilter("ignore")
+            try:
+                from harvesters.core import Harvester, ParameterKey, ParameterSet
+            except ImportError as error:
+                raise CameraError(
+                    f"harvesters cannot be imported: {error}", hint="pip install harvesters genicam"
+                ) from error
+            logger = logging.Logger("harvesters", logging.WARNING)
+            logger.addHandler(self._words)
+            self._harvester = Harvester(config=ParameterSet({ParameterKey.LOGGER: logger}))
+            for path in self._producers:
+                self._harvester.add_file(str(path))
+            self._harvester.update()
+
+    def found(self) -> list[FoundCamera]:
+        return [_describe(info) for info in self._harvester.device_info_list]
+
+    def pick(self, serial: str, model: str) -> FoundCamera:
+        """The camera with this serial number. Raises CameraError that says who is there instead."""
+        found = self.found()
+        chosen = next((camera for camera in found if serial in (camera.serial, "")), None)
+        if chosen is None:
+            there = ", ".join(f"{camera.serial} ({camera.model})" for camera in found)
+            raise CameraError(
+                f"there is no camera with serial number {serial!r}",
+                possible=there or "no camera answers",
+                hint=self._words.last or "cable, power, and acquire devices",
+            )
+        if model and chosen.model != model:
+            raise CameraError(
+                f"camera {serial} is a {chosen.model!r}, not a {model!r}", hint="are the cameras swapped?"
+            )
+        if chosen.access != "free":
+            raise CameraError(f"camera {serial} is {chosen.access}", hint="end the program that holds it")
+        return chosen
+
+    def create(self, camera: FoundCamera) -> Any:
+        infos = self._harvester.device_info_list
+        index = next(k for k, info in enumerate(infos) if _describe(info) == camera)
+        with _told(f"open camera {camera.serial}", self._words), _signals_kept():
+            acquirer = self._harvester.create(index)
+        node_map = acquirer.remote_device.node_map
+        if node_map is None or _Features(node_map).find("Width") is None:
+            raise CameraError(
+                f"camera {camera.serial}: its description cannot be used", hint=self._words.last
+            )
+        return acquirer
+
+    def close(self) -> None:
+        """Idempotent; what a camera that is gone refuses does not matter any more."""
+        with suppress(CameraError), _told("close"), _signals_kept():
+            self._harvester.reset()
+
+    def __enter__(self) -> _Library:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class _Words(logging.Handler):
+    """What harvesters only logs, such as a description that cannot be parsed."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._last: deque[str] = deque(maxlen=3)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        text = record.getMessage().splitlines()
+        if text:
+            self._last.append(text[0])
+            _log.debug("harvesters: %s", text[0])
+
+    @property
+    def last(self) -> str:
+        return self._last[-1] if self._last else ""
+
+
+class _Features:
+    """`acquire.camera.settings.Features` of a node map."""
+
+    def __init__(self, node_map: Any) -> None:
+        self._map = node_map
+        self._nodes: dict[str, _Node] = {}
+
+    def find(self, name: str) -> _Node | None:
+        if name not in self._nodes:
+            from genicam import genapi
+
+            try:
+                self._nodes[name] = _Node(self._map.get_node(name))
+            except genapi.GenericException:
+                return None
+        return self._nodes[name]
+
+    def names(self) -> list[str]:
+        return [name for names in self.categories().values() for name in names]
+
+    def categories(self) -> dict[str, list[str]]:
+        """Category → its features, in the order of the description."""
+        found: dict[str, list[str]] = {}
+        with _told("read the features"):
+            self._collect(self._map.get_node("Root"), "Root", found)
+        return found
+
+    def _collect(self, category: Any, name: str, found: dict[str, list[str]]) -> None:
+        from genicam import genapi
+
+        for feature in category.features:
+            if feature.node.principal_interface_type == genapi.EInterfaceType.intfICategory:
+                if feature.node.name not in found:
+                    self._collect(feature, feature.node.name, found)
+            elif feature.node.name not in found.setdefault(name, []):
+                found[name].append(feature.node.name)
+
+
+class _Node:
+    """`acquire.camera.settings.Node` of a GenApi node."""
+
+    def __init__(self, node: Any) -> None:
+        from genicam import genapi
+
+        self._node = node
+        self.name: str = node.node.name
+        self.kind: Kind = _KINDS.get(genapi.EInterfaceType(node.node.principal_interface_type).name, "other")
+
+    @property
+    def readable(self) -> bool:
+        return self.kind not in ("command", "other") and self._mode in ("RO", "RW")
+
+    @property
+    def writable(self) -> bool:
+        return self._mode in ("WO", "RW")
+
+    @property
+    def _mode(self) -> str:
+        from genicam import genapi
+
+        with _told(self.name):
+            return str(genapi.EAccessMode(self._node.get_access_mode()).name)
+
+    @property
+    def selected(self) -> bool:
+        with _told(self.name):
+            return bool(self._node.node.selecting_features)
+
+    @property
+    def about(self) -> str:
+        """What the camera says of the feature."""
+        return str(self._node.node.tooltip or self._node.node.description)
+
+    def read(self) -> Value:
+        with _told(f"read {self.name}"):
+            value: Value = self._node.value
+            return value
+
+    def read_afresh(self) -> None:
+        """Read the register itself, not what is remembered of it."""
+        with _told(f"read {self.name}"):
+            self._node.node.invalidate_node()
+            self._node.to_string()
+
+    def write(self, value: Value) -> None:
+        with _told(f"set {self.name} to {value!r}"):
+            if self.kind != "command":
+                self._node.value = value
+            elif value:
+                self._execute()
+
+    def _execute(self) -> None:
+        self._node.execute()
+        deadline = time.monotonic() + _COMMAND_S
+        while not self._node.is_done():
+            if time.monotonic() > deadline:
+                raise CameraError(f"{self.name} is not done after {_COMMAND_S:g} s")
+            time.sleep(0.001)
+
+    def limits(self) -> tuple[float, float, float]:
+        with _told(self.name):
+            if self.kind == "integer":
+                return self._node.min, self._node.max, self._node.inc
+            return self._node.min, self._node.max, self._node.inc if self._node.has_inc() else 0
+
+    def entries(self) -> list[str]:
+        with _told(self.name):
+            return list(self._node.symbolics)
+
+
+def _modules(acquirer: Any) -> dict[str, _Features]:
+    """The node maps of a camera; a producer need not have all."""
+    streams: Sequence[Any] = acquirer.data_streams
+    maps = {
+        "remote": acquirer.remote_device.node_map,
+        "interface": _map_of(acquirer.interface),
+        "device": _map_of(acquirer.device),
+        "stream": _map_of(streams[0]) if streams else None,
+        "system": _map_of(acquirer.system),
+    }
+    return {name: _Features(node_map) for name, node_map in maps.items() if node_map is not None}
+
+
+def _map_of(module: Any) -> Any:
+    """harvesters makes node maps of modules without a description: they have no root."""
+    node_map = module.node_map
+    return node_map if node_map is not None and _Features(node_map).find("Root") is not None else None
+
+
+def _describe(info: Any) -> FoundCamera:
+    texts = [_or(lambda name=name: str(getattr(info, name)), "") for name in _IDENTITY]
+    if not texts[0]:
+        texts[0] = _or(lambda: str(info.id_), "")
+    status = _or(lambda: int(info.access_status), 0)
+    cti = _or(lambda: str(info.parent.parent.parent.path_name), "")
+    return FoundCamera(texts[0], texts[1], texts[2], texts[3], _ACCESS.get(status, "free"), cti)
+
+
+_IDENTITY = ("serial_number", "model", "vendor", "version")
+_ACCESS = {2: "open for reading only", 3: "not accessible", 4: "in use by another program", 5: "in use here"}
+
+
+def _stop(acquirer: Any) -> None:
+    """Stop as harvesters does; where the camera is gone that ends half-way, so finish by hand."""
+    from genicam import gentl
+
+    with suppress(CameraError), _told("stop"):
+        acquirer.stop()
+        return
+    stream = acquirer.data_streams[0]
+    for step in (
+        lambda: stream.stop_acquisition(gentl.ACQ_STOP_FLAGS_LIST.ACQ_STOP_FLAGS_KILL),
+        acquirer._release_buffers,
+        lambda: [monitor.flush_event_queue() for monitor in acquirer._new_buffer_event_monitor_dict.values()],
+    ):
+        with suppress(CameraError), _told("stop"):
+            step()
+
+
+def _or(ask: Any, otherwise: Any) -> Any:
+    """What a producer says, or ``otherwise`` where it does not know the question."""
+    from genicam import gentl
+
+    try:
+        return ask()
+    except gentl.GenericException as error:
+        if _is_gone(error):
+            raise
+        return otherwise
+
+
+def _or_zero(ask: Any) -> int:
+    return int(_or(ask, 0))
+
+
+def _is_gone(error: Exception) -> bool:
+    from genicam import gentl
+
+    return isinstance(error, gentl.IoException | gentl.InvalidHandleException | gentl.ClosedException)
+
+
+@contextmanager
+def _told(what: str, words: _Words | None = None) -> Iterator[None]:
+    """Errors of the libraries as ours: CameraLostError when the device is gone, else CameraError."""
+    try:
+        from genicam import genapi, gentl
+    except ImportError as error:
+        raise CameraError(
+            f"genicam cannot be imported: {error}", hint="pip install harvesters genicam"
+        ) from error
+    try:
+        yield
+    except (genapi.GenericException, gentl.GenericException, ValueError) as error:
+        kind = CameraLostError if _is_gone(error) else CameraError
+        raise kind(f"{what}: {error}", hint=words.last if words else "") from error
+
+
+@contextmanager
+def _signals_kept() -> Iterator[None]:
+    """harvesters takes SIGINT over in the main thread; here it is given back."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    kept = signal.getsignal(signal.SIGINT)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, kept)

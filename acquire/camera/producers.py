@@ -1,0 +1,28 @@
+"""Where GenTL producers (.cti files) are: as configured, else as GENICAM_GENTL64_PATH says."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from acquire.errors import CameraError
+
+PATH = "GENICAM_GENTL64_PATH"
+
+
+def find_producers(cti: str = "") -> list[Path]:
+    """The producer ``cti``, or all that the environment names. Raises CameraError where there is none."""
+    if cti:
+        path = Path(cti).expanduser()
+        if not path.is_file():
+            raise CameraError(f"GenTL producer {cti}: there is no such file", hint="the path of a .cti file")
+        return [path.absolute()]
+    directories = [Path(entry) for entry in os.environ.get(PATH, "").split(os.pathsep) if entry]
+    found = [path for directory in directories for path in sorted(directory.glob("*.cti"))]
+    if not found:
+        raise CameraError(
+            "no GenTL producer",
+            possible=f".cti files in the directories of {PATH}, which the maker of a frame grabber installs",
+            hint=f"cti in the camera's table, or {PATH} in the environment",
+        )
+    return found

@@ -1,0 +1,221 @@
+"""Settings of a camera as a list: written in order, coerced by the feature's type, read back, compared.
+
+What a GenICam feature accepts depends on others (a selector, a width, a mode), so the order is the user's
+and an error says what the camera offers at that moment. This module knows no GenICam library: a camera's
+driver gives it nodes.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+from acquire.errors import CameraError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping
+
+MODULES = ("remote", "interface", "device", "stream", "system")
+"""GenTL modules that have features: the camera itself, then the host's side of it."""
+
+Kind = Literal["integer", "float", "enumeration", "boolean", "text", "command", "other"]
+Value = bool | int | float | str
+
+FLOAT_TOLERANCE = 1e-3
+"""Cameras round what they cannot have exactly; more than this is another value."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """``feature`` of ``module`` shall be ``value``; a command is executed when its value is true."""
+
+    module: str
+    feature: str
+    value: Value
+
+    def __str__(self) -> str:
+        return f"{self.module} {self.feature} = {self.value!r}"
+
+
+class Node(Protocol):
+    """One feature of a camera, whatever library shows it. Access raises CameraError."""
+
+    name: str
+    kind: Kind
+
+    @property
+    def readable(self) -> bool: ...
+
+    @property
+    def writable(self) -> bool: ...
+
+    @property
+    def selected(self) -> bool:
+        """Its value belongs to what a selector points at."""
+        ...
+
+    def read(self) -> Value: ...
+
+    def write(self, value: Value) -> None:
+        """Set the value; execute a command and wait, for a bounded time, until it is done."""
+        ...
+
+    def limits(self) -> tuple[float, float, float]:
+        """Minimum, maximum, increment (0 for any) of a number."""
+        ...
+
+    def entries(self) -> list[str]:
+        """The names that an enumeration takes now."""
+        ...
+
+
+class Features(Protocol):
+    """The features of one module."""
+
+    def find(self, name: str) -> Node | None: ...
+
+    def names(self) -> list[str]: ...
+
+
+def apply_settings(settings: Iterable[Setting], modules: Mapping[str, Features]) -> None:
+    """Write every setting in order. Raises CameraError at the first that cannot be had.
+
+    Each is read back at once; at the end all but selected ones are read again, since a later setting may
+    have changed an earlier one.
+    """
+    written: dict[tuple[str, str], tuple[Setting, Node]] = {}
+    for setting in settings:
+        node = find_node(setting.module, setting.feature, modules)
+        value = coerce(setting, node)
+        _check_writable(setting, node)
+        node.write(value)
+        if node.kind != "command":
+            _compare(setting, node, "it reads back as")
+            written[setting.module, setting.feature] = (setting, node)
+    for setting, node in written.values():
+        if not node.selected:
+            _compare(setting, node, "a later setting has made it")
+
+
+def find_node(module: str, feature: str, modules: Mapping[str, Features]) -> Node:
+    """The feature. Raises CameraError that names what is there instead."""
+    if module not in modules:
+        raise CameraError(f"setting of module {module!r}", possible=", ".join(modules))
+    node = modules[module].find(feature)
+    if node is not None:
+        return node
+    names = modules[module].names()
+    close = difflib.get_close_matches(feature, names, 5, 0.4)
+    elsewhere = [other for other in modules if modules[other].find(feature) is not None]
+    hint = f"module {' or '.join(elsewhere)}" if elsewhere else "acquire camera features"
+    raise CameraError(
+        f"{module} has no feature {feature!r}", possible=", ".join(close or names[:20]), hint=hint
+    )
+
+
+def coerce(setting: Setting, node: Node) -> Value:
+    """The value as the feature's type has it. Raises CameraError for another type, or out of range."""
+    value: Value | None = _COERCE[node.kind](setting.value)
+    if value is None:
+        raise CameraError(f"{setting}: not a value for it", possible=describe(node))
+    if node.kind in ("integer", "float"):
+        _check_range(setting, node, float(value))
+    elif node.kind == "enumeration" and value not in node.entries():
+        raise CameraError(f"{setting}: no such entry", possible=describe(node))
+    return value
+
+
+def describe(node: Node) -> str:
+    """What the feature accepts now."""
+    if node.kind in ("integer", "float"):
+        low, high, step = node.limits()
+        every = f" in steps of {step:g}" if step not in (0, 1) else ""
+        return f"{_number(low)} to {_number(high)}{every}"
+    if node.kind == "enumeration":
+        return ", ".join(node.entries()) or "no entry now"
+    return {"boolean": "true, false", "text": "a text", "command": "true: it is executed"}.get(
+        node.kind, "nothing that can be set"
+    )
+
+
+def _number(value: float) -> str:
+    return f"{value:.0f}" if value == round(value) else f"{value:g}"
+
+
+def _check_range(setting: Setting, node: Node, value: float) -> None:
+    low, high, step = node.limits()
+    inside = low <= value <= high
+    if not inside or (step and node.kind == "integer" and (value - low) % step):
+        raise CameraError(f"{setting}: out of range", possible=describe(node))
+
+
+def _check_writable(setting: Setting, node: Node) -> None:
+    if not node.writable:
+        now = f", it reads {node.read()!r}" if node.readable else ""
+        raise CameraError(
+            f"{setting}: it cannot be written now{now}",
+            hint="a setting that frees it first (a selector or mode), or none: it may be read-only",
+        )
+
+
+def _compare(setting: Setting, node: Node, how: str) -> None:
+    if not node.readable:
+        return
+    found, wanted = node.read(), coerce_loosely(setting, node)
+    if node.kind == "float":
+        same = math.isclose(float(found), float(wanted), rel_tol=FLOAT_TOLERANCE)
+    else:
+        same = found == wanted
+    if not same:
+        raise CameraError(f"{setting}: {how} {found!r}", possible=describe(node))
+
+
+def coerce_loosely(setting: Setting, node: Node) -> Value:
+    """As `coerce`, of a value that has been accepted: the limits may have moved since."""
+    value: Value | None = _COERCE[node.kind](setting.value)
+    assert value is not None
+    return value
+
+
+def _integer(value: Value) -> int | None:
+    if isinstance(value, str):
+        try:
+            return int(value, 0)
+        except ValueError:
+            return None
+    return None if isinstance(value, bool) or value != int(value) else int(value)
+
+
+def _real(value: Value) -> float | None:
+    if isinstance(value, bool):
+        return None
+    try:
+        number = float(value)
+    except ValueError:
+        return None
+    return number if math.isfinite(number) else None
+
+
+def _boolean(value: Value) -> bool | None:
+    return bool(value) if value in (0, 1) else None
+
+
+def _text(value: Value) -> str | None:
+    return value if isinstance(value, str) else None
+
+
+def _none(value: Any) -> None:  # noqa: ARG001 - the signature of its siblings
+    return None
+
+
+_COERCE: dict[str, Any] = {
+    "integer": _integer,
+    "float": _real,
+    "enumeration": _text,
+    "boolean": _boolean,
+    "text": _text,
+    "command": _boolean,
+    "other": _none,
+}

@@ -1,0 +1,54 @@
+"""What a GenICam camera is asked to be, for whichever library opens it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from acquire.camera.settings import Setting
+
+if TYPE_CHECKING:
+    from acquire.config import RigConfig
+
+
+@dataclass(frozen=True, slots=True)
+class GenicamSpec:
+    """Which camera, how it is set, and what it must then be. Picklable.
+
+    Attributes
+    ----------
+    serial, model : who it must be; an empty model is any
+    settings : in order; Width, PixelFormat and the stream's BufferHeight usually among them
+    pixels, bits : what its lines must then be; 0: whatever they are
+    line_rate_hz, buffer_s : buffers for so long at that rate are announced
+    cti : the producer; empty: those of GENICAM_GENTL64_PATH
+    frame_id_bits, frame_id_first : see `acquire.camera.frames.FrameCount`
+    """
+
+    serial: str
+    model: str = ""
+    settings: tuple[Setting, ...] = ()
+    pixels: int = 0
+    bits: int = 0
+    line_rate_hz: float = 10_000.0
+    buffer_s: float = 0.5
+    cti: str = ""
+    frame_id_bits: int = 0
+    frame_id_first: int | None = None
+
+
+def spec_of(config: RigConfig, arm: str, cti: str | None = None) -> GenicamSpec:
+    """The camera of an arm as the rig's file has it; ``cti`` instead of the file's producer."""
+    camera = config.cameras.arm(arm)
+    return GenicamSpec(
+        serial=camera.serial,
+        model=camera.model,
+        settings=tuple(Setting(*setting) for setting in camera.settings),
+        pixels=0 if config.columns else config.geometry.stages,
+        bits=camera.bits,
+        line_rate_hz=config.line_rate_hz,
+        buffer_s=camera.buffer_s,
+        cti=camera.cti if cti is None else cti,
+        frame_id_bits=camera.frame_id_bits,
+        frame_id_first=camera.frame_id_first,
+    )

@@ -1,0 +1,229 @@
+"""``acquire devices`` and ``acquire camera features | snapshot``: what there is, before it is used."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from acquire.cli.output import JsonFlag, print_facts, print_json, print_table
+from acquire.errors import AcquireError, UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from acquire.camera.base import CameraOpener
+    from acquire.config import RigConfig
+    from acquire.rig import Rig
+
+ConfigOption = Annotated[
+    str | None,
+    typer.Option(
+        "--config", "-c", metavar="FILE", help="Rig file; else all cameras of GENICAM_GENTL64_PATH."
+    ),
+]
+SerialArgument = Annotated[str, typer.Argument(help="Serial number: acquire devices lists them.")]
+OPEN_S = 60.0
+
+
+def register(app: typer.Typer) -> None:
+    app.command(rich_help_panel="Rig")(devices)
+    group = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
+    for command in (features, snapshot):
+        group.command()(command)
+    app.add_typer(group, name="camera", help="Look at one camera.", rich_help_panel="Rig")
+
+
+def devices(config: ConfigOption = None, json: JsonFlag = False) -> None:
+    """List triggers and cameras with their serial numbers, and say what each lacks.
+
+    With a rig file its devices are opened and set, one after the other, and let go of again.
+
+    Example: [bold]acquire devices --config rig-demo[/]
+    """
+    rows = list(_of_rig(config) if config else _of_producers())
+    if json:
+        print_json(rows)
+        return
+    columns = ("device", "serial", "model", "firmware", "state")
+    print_table(columns, [[row[column] for column in columns] for row in rows])
+
+
+def features(serial: SerialArgument, config: ConfigOption = None, json: JsonFlag = False) -> None:
+    """Print every feature of a camera and of the host's side of it: value, access, what is possible.
+
+    With a rig file the camera's settings are written first.
+
+    Example: [bold]acquire camera features SIM-A --config rig-demo[/]
+    """
+    from acquire.camera.look import feature_table
+    from acquire.stream.visit import visit
+
+    with _Bench(config) as bench:
+        rows = visit(bench.opener(serial), feature_table, timeout_s=OPEN_S)
+    if json:
+        print_json(rows)
+        return
+    columns = ("module", "feature", "value", "access", "possible")
+    print_table(columns, [["" if row.get(c) is None else row.get(c, "") for c in columns] for row in rows])
+
+
+def snapshot(
+    serial: SerialArgument,
+    config: ConfigOption = None,
+    lines: Annotated[int, typer.Option(min=1, max=1_000_000, help="Lines of the picture.")] = 1024,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="A picture (.png), or the values (.npy).")
+    ] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Save a picture of the next lines. With a rig file its trigger runs meanwhile.
+
+    Pictures are stretched from the darkest to the brightest value; .npy has the values as they are.
+
+    Example: [bold]acquire camera snapshot SIM-A --config rig-demo --lines 500[/]
+    """
+    from acquire.camera.look import snapshot as take
+    from acquire.stream.visit import visit
+
+    path = out or Path(f"{serial}.png")
+    _check_out(path)
+    with _Bench(config) as bench:
+        seconds = OPEN_S + lines / bench.line_rate_hz
+        pixels, flags = visit(
+            bench.opener(serial), take, lines, seconds, timeout_s=2 * OPEN_S + seconds, armed=bench.pulse
+        )
+    _save(path, pixels)
+    facts = {
+        "picture": str(path),
+        "lines": len(pixels),
+        "pixels": pixels.shape[1],
+        "type": str(pixels.dtype),
+        "darkest": int(pixels.min()),
+        "brightest": int(pixels.max()),
+        "mean": round(float(pixels.mean()), 1),
+        "flagged_lines": int((flags != 0).sum()),
+    }
+    (print_json if json else print_facts)(facts)
+
+
+class _Bench:
+    """A rig to look at, or, without a file, whatever the environment's producers show."""
+
+    def __init__(self, config: str | None) -> None:
+        from acquire.config import load_rig
+
+        self._config: RigConfig | None = load_rig(config) if config else None
+        self._rig: Rig | None = None
+
+    @property
+    def line_rate_hz(self) -> float:
+        return self._config.line_rate_hz if self._config else 1000.0
+
+    def opener(self, serial: str) -> CameraOpener:
+        if self._rig is None or self._config is None:
+            from acquire.camera.harvesters import HarvestersOpener
+            from acquire.camera.spec import GenicamSpec
+
+            return HarvestersOpener(GenicamSpec(serial))
+        arms = {self._config.cameras.arm(arm).serial: arm for arm in ("a", "b")}
+        if serial not in arms:
+            raise UsageError(f"the rig has no camera {serial!r}", possible=", ".join(arms))
+        return self._rig.openers()[arms[serial]]
+
+    def pulse(self) -> None:
+        """Let the rig's trigger run; a camera without a rig has its own."""
+        if self._rig is not None and self._config is not None:
+            from acquire.daemon.plan import trigger_run
+
+            self._rig.trigger.prepare(trigger_run(self._config, "snapshot"))
+            self._rig.trigger.start()
+
+    def __enter__(self) -> _Bench:
+        if self._config is not None:
+            from acquire.rig import Rig
+
+            self._rig = Rig(self._config)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._rig is not None:
+            self._rig.close()
+
+
+def _of_rig(config: str) -> Iterator[dict[str, Any]]:
+    from acquire.camera.look import facts
+    from acquire.config import load_rig
+    from acquire.rig import Rig
+    from acquire.stream.visit import visit
+
+    rig_config = load_rig(config)
+    with Rig(rig_config) as rig:
+        yield _trigger(rig)
+        openers = _openers(rig)
+        for arm in ("a", "b"):
+            camera = rig_config.cameras.arm(arm)
+            row = {"device": f"camera {arm}", "serial": camera.serial, "model": camera.model, "firmware": ""}
+            try:
+                if isinstance(openers, AcquireError):
+                    raise openers
+                seen = visit(openers[arm], facts, timeout_s=OPEN_S)["identity"]
+                yield row | {k: seen[k] for k in ("serial", "model", "firmware")} | {"state": "ready"}
+            except AcquireError as error:
+                yield row | {"state": str(error)}
+
+
+def _openers(rig: Rig) -> dict[str, CameraOpener] | AcquireError:
+    try:
+        return rig.openers()
+    except AcquireError as error:
+        return error
+
+
+def _trigger(rig: Rig) -> dict[str, Any]:
+    try:
+        found = rig.trigger.identify()
+    except AcquireError as error:
+        return {"device": "trigger", "serial": "", "model": "", "firmware": "", "state": str(error)}
+    return {
+        "device": "trigger",
+        "serial": found.serial,
+        "model": found.model,
+        "firmware": found.firmware,
+        "state": "ready",
+    }
+
+
+def _of_producers() -> Iterator[dict[str, Any]]:
+    from acquire.camera.harvesters import list_cameras
+
+    for camera in list_cameras():
+        yield {
+            "device": "camera",
+            "serial": camera.serial,
+            "model": camera.model,
+            "firmware": camera.firmware,
+            "state": camera.access,
+        }
+
+
+def _check_out(path: Path) -> None:
+    if path.suffix.lower() not in (".png", ".npy"):
+        raise UsageError(f"snapshot to {path}", possible=".png, .npy")
+    if path.exists():
+        raise UsageError(f"snapshot to {path}: it exists and stays untouched", hint="--out with a new file")
+    if not path.absolute().parent.is_dir():
+        raise UsageError(f"snapshot to {path}: there is no directory {path.absolute().parent}")
+
+
+def _save(path: Path, pixels: Any) -> None:
+    import numpy as np
+    from PIL import Image
+
+    if path.suffix.lower() == ".npy":
+        np.save(path, pixels)
+        return
+    low, span = int(pixels.min()), max(1, int(pixels.max()) - int(pixels.min()))
+    stretched = np.rint((pixels.astype(np.float32) - low) * (255 / span)).astype(np.uint8)
+    Image.fromarray(stretched).save(path)

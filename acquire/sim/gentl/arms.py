@@ -1,0 +1,61 @@
+"""The simulated cameras of a rig behind our GenTL producer: made when first opened, one bench for all."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from acquire.camera.harvesters import HarvestersOpener
+from acquire.camera.spec import spec_of
+from acquire.lines import ARMS
+from acquire.sim.gentl.bench import GentlBench
+from acquire.sim.gentl.models import CameraModel
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from acquire.camera.base import CameraOpener
+    from acquire.config import RigConfig
+
+DRIVER = "gentl-simulated"
+
+
+class GentlArms:
+    """Openers of the arms whose driver is "gentl-simulated"; touches nothing until one is asked for."""
+
+    def __init__(self, config: RigConfig) -> None:
+        self._config = config
+        self._bench: GentlBench | None = None
+
+    def opener(self, arm: str, sensor: Callable[[str], CameraOpener]) -> CameraOpener:
+        """What opens the arm's camera through harvesters; ``sensor`` gives the model that feeds it.
+
+        Raises DeviceError without a C compiler.
+        """
+        if self._bench is None:
+            arms = [name for name in ARMS if self._config.cameras.arm(name).driver == DRIVER]
+            arms = arms[:1] if self._config.columns else arms
+            self._bench = GentlBench({model_of(self._config, name): sensor(name) for name in arms})
+        return HarvestersOpener(spec_of(self._config, arm, str(self._bench.cti)))
+
+    def close(self) -> None:
+        """Take the cameras away. Idempotent."""
+        if self._bench is not None:
+            self._bench.close()
+            self._bench = None
+
+
+def model_of(config: RigConfig, arm: str) -> CameraModel:
+    """The camera that the rig's file describes for an arm."""
+    camera = config.cameras.arm(arm)
+    return CameraModel(
+        camera.serial,
+        sensor_width=sensor_width(config),
+        bits=camera.bits,
+        line_rate_hz=config.line_rate_hz,
+        pixel_format=camera.pixel_format,
+    )
+
+
+def sensor_width(config: RigConfig) -> int:
+    """Pixels of the camera's lines: an arm's, or as many as both arms take."""
+    return max((end for _, end in config.columns.values()), default=config.geometry.stages)

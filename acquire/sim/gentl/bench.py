@@ -1,0 +1,93 @@
+"""A directory that any GenICam program can load: the producer, and beside it its cameras.
+
+Closing it ends the feeding processes and takes the cameras away. Should the owner be killed, the cameras'
+memory goes with it; what stays is a directory of dead links.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+from acquire.errors import UsageError
+from acquire.sim.gentl import layout
+from acquire.sim.gentl.build import build
+from acquire.sim.gentl.feeder import feed
+from acquire.sim.gentl.memory import CameraMemory, host_ports
+from acquire.stream.messages import Ready
+from acquire.stream.process import Worker
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from types import TracebackType
+
+    from acquire.sim.gentl.models import CameraModel
+
+CTI = "simulated.cti"
+_START_S = 20.0
+_END_S = 5.0
+
+
+class GentlBench:
+    """Simulated cameras behind a real GenTL producer; a context manager.
+
+    Parameters
+    ----------
+    cameras : model of each camera → what opens its sensor, in a process of its own
+    life : what such a process does; `acquire.sim.gentl.feeder.feed` unless a test has a better idea
+
+    Raises DeviceError without a C compiler (nothing is left behind then), UsageError for equal serials.
+    """
+
+    def __init__(self, cameras: Mapping[CameraModel, Any], life: Callable[..., None] = feed) -> None:
+        producer = build()
+        serials = [model.serial for model in cameras]
+        if len(set(serials)) < len(serials):
+            raise UsageError(f"simulated cameras with serials {', '.join(serials)}", possible="each its own")
+        self._directory = Path(tempfile.mkdtemp(prefix="acquire-gentl-"))
+        self.cameras: dict[str, CameraMemory] = {}
+        self._feeders: list[Worker] = []
+        try:
+            self._fill(producer, cameras, life)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def cti(self) -> Path:
+        """The producer's file."""
+        return self._directory / CTI
+
+    def _fill(self, producer: Path, cameras: Mapping[CameraModel, Any], life: Callable[..., None]) -> None:
+        # A copy, not a link: the producer looks for its cameras beside itself.
+        shutil.copy(producer, self.cti)
+        (self._directory / layout.HOST_FILE).write_bytes(host_ports())
+        for model, opener in cameras.items():
+            memory = self.cameras[model.serial] = CameraMemory(model)
+            (self._directory / f"{model.serial}{layout.SUFFIX}").symlink_to(memory.path)
+            self._feeders.append(Worker(f"sensor {model.serial}", life, memory, opener))
+        deadline = time.monotonic() + _START_S
+        for feeder in self._feeders:
+            feeder.expect(Ready, deadline)
+
+    def close(self) -> None:
+        """End the feeders, take cameras and directory away. Idempotent."""
+        deadline = time.monotonic() + _END_S
+        for feeder in self._feeders:
+            feeder.end(deadline)
+        self._feeders.clear()
+        for memory in self.cameras.values():
+            memory.close()
+        self.cameras.clear()
+        shutil.rmtree(self._directory, ignore_errors=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()

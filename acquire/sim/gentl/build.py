@@ -1,0 +1,77 @@
+"""``python -m acquire.sim.gentl.build``: compile the producer, once per content, where a C compiler is.
+
+The result lies in the user's cache, named after a hash of the sources and of the compiler's name.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import subprocess
+import tempfile
+from pathlib import Path
+
+from acquire.errors import DeviceError
+from acquire.sim.gentl.layout import header
+
+SOURCE = Path(__file__).with_name("producer.c")
+OPTIONS = (
+    "-std=gnu11",
+    "-O2",
+    "-shared",
+    "-fPIC",
+    "-fvisibility=hidden",
+    "-Wall",
+    "-Wextra",
+    "-lpthread",
+    "-ldl",
+)
+COMPILE_S = 120.0
+
+
+def compiler() -> str | None:
+    """The C compiler that would be used: $CC, else cc, gcc or clang; None where there is none."""
+    names = [os.environ["CC"]] if os.environ.get("CC") else ["cc", "gcc", "clang"]
+    return next((found for name in names if (found := shutil.which(name))), None)
+
+
+def build() -> Path:
+    """The producer's .cti, compiled if it is not there. Raises DeviceError without a compiler."""
+    found = compiler()
+    if found is None:
+        raise DeviceError(
+            "the simulated GenTL producer has to be compiled, and there is no C compiler",
+            possible="cc, gcc or clang on PATH, or CC in the environment",
+            hint="the system's compiler package, or the simulated cameras without GenTL",
+        )
+    digest = hashlib.sha256("\0".join((SOURCE.read_text(), header(), found, *OPTIONS)).encode()).hexdigest()
+    target = _cache() / f"acquire-simulated-{digest[:16]}.cti"
+    if not target.is_file():
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _compile(found, target)
+    return target
+
+
+def _cache() -> Path:
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "tdi-acquire"
+
+
+def _compile(found: str, target: Path) -> None:
+    """Into a directory beside the target, then moved: two builds at once both end well."""
+    with tempfile.TemporaryDirectory(dir=target.parent) as name:
+        directory = Path(name)
+        (directory / "layout.h").write_text(header())
+        made = directory / target.name
+        command = [found, *OPTIONS, f"-I{directory}", "-o", str(made), str(SOURCE)]
+        done = subprocess.run(  # noqa: S603 - the user's own compiler
+            command, capture_output=True, text=True, timeout=COMPILE_S, check=False
+        )
+        if done.returncode:
+            raise DeviceError(f"{found} refused the producer: {done.stderr.strip()[-2000:]}")
+        made.replace(target)
+
+
+if __name__ == "__main__":
+    print(build())  # noqa: T201 - the command's answer

@@ -1,0 +1,50 @@
+"""The simulated cameras of a rig behind GigE Vision: a process and a loopback address for each."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+from acquire.camera.aravis import AravisOpener, load
+from acquire.camera.spec import spec_of
+from acquire.lines import ARMS
+from acquire.sim.gentl.arms import model_of
+from acquire.sim.gige.camera import serve
+from acquire.stream.messages import Ready
+from acquire.stream.process import Worker
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from acquire.camera.base import CameraOpener
+    from acquire.config import RigConfig
+
+_START_S = 20.0
+_END_S = 5.0
+
+
+class GigeArms:
+    """Openers of the arms whose driver is "gige-simulated"; touches nothing until one is asked for."""
+
+    def __init__(self, config: RigConfig) -> None:
+        self._config = config
+        self._servers: dict[str, Worker] = {}
+
+    def opener(self, arm: str, sensor: Callable[[str], CameraOpener]) -> CameraOpener:
+        """What opens the arm's camera through Aravis; ``sensor`` gives the model that feeds it.
+
+        Raises CameraError without Aravis, DeviceError where another camera has the address.
+        """
+        load()
+        if arm not in self._servers:
+            address = f"127.0.0.{1 + ARMS.index(arm)}"
+            server = Worker(f"camera {arm}", serve, model_of(self._config, arm), sensor(arm), address)
+            self._servers[arm] = server
+            server.expect(Ready, time.monotonic() + _START_S)
+        return AravisOpener(spec_of(self._config, arm, ""))
+
+    def close(self) -> None:
+        """Take the cameras away. Idempotent."""
+        while self._servers:
+            _, server = self._servers.popitem()
+            server.end(time.monotonic() + _END_S)

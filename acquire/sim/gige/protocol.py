@@ -1,0 +1,134 @@
+"""The packets of GigE Vision that a camera needs: bytes in, bytes out, no socket.
+
+::
+
+    GVCP   control, UDP port 3956     42 flags command length id │ body        (big-endian)
+           answers                    status command length id   │ body
+    GVSP   lines, UDP                 status block id │ format packet id │ leader, payload or trailer
+"""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+PORT = 3956
+KEY = 0x42
+OVERHEAD = 20 + 8 + 8
+"""Bytes of IP, UDP and GVSP headers within the packet size that the host sets."""
+
+DEVICE_MODE, MAC, ADDRESS = 0x0004, 0x0008, 0x0024
+VENDOR, MODEL, FIRMWARE, SERIAL, XML_URL = 0x0048, 0x0068, 0x0088, 0x00D8, 0x0200
+DISCOVERY_BYTES = 0xF8
+STREAM_CHANNELS, HEARTBEAT_MS, TICK_HIGH, TICK_LOW = 0x0904, 0x0938, 0x093C, 0x0940
+PRIVILEGE, STREAM_PORT, PACKET_SIZE, STREAM_ADDRESS = 0x0A00, 0x0D00, 0x0D04, 0x0D18
+BOOTSTRAP_BYTES = 0x1_0000
+"""Registers of the standard below, the camera's own from here."""
+
+_HEADER = struct.Struct(">BBHHH")
+_ANSWER = struct.Struct(">HHHH")
+_GVSP = struct.Struct(">HHI")
+_LEADER = struct.Struct(">HHQIIIIIHH")
+_TRAILER = struct.Struct(">HHI")
+_IMAGE = 1
+
+
+class Command(IntEnum):
+    DISCOVERY = 0x0002
+    READ_REGISTER = 0x0080
+    WRITE_REGISTER = 0x0082
+    READ_MEMORY = 0x0084
+    WRITE_MEMORY = 0x0086
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """A command as it came."""
+
+    command: int
+    number: int
+    body: bytes
+
+
+def parse(packet: bytes) -> Request | None:
+    """A GVCP command, or None for what is none."""
+    if len(packet) < _HEADER.size:
+        return None
+    key, _, command, length, number = _HEADER.unpack_from(packet)
+    body = packet[_HEADER.size : _HEADER.size + length]
+    return Request(command, number, body) if key == KEY and len(body) == length else None
+
+
+def answer(request: Request, body: bytes) -> bytes:
+    return _ANSWER.pack(0, request.command + 1, len(body), request.number) + body
+
+
+class Registers:
+    """The camera's address space, and what control commands do to it."""
+
+    def __init__(self, space: bytes, texts: dict[int, str], address: bytes) -> None:
+        self.memory = bytearray(BOOTSTRAP_BYTES) + bytearray(space)
+        for at, text in texts.items():
+            self.memory[at : at + len(text)] = text.encode()
+        self.memory[ADDRESS : ADDRESS + 4] = address
+        numbers = {0: 0x1_0000, DEVICE_MODE: 0x8000_0000, STREAM_CHANNELS: 1, HEARTBEAT_MS: 3000}
+        for at, value in (numbers | {TICK_LOW: 1_000_000_000, PACKET_SIZE: 1400}).items():
+            self.set(at, value)
+
+    def get(self, at: int) -> int:
+        value: int = struct.unpack_from(">I", self.memory, at)[0]
+        return value
+
+    def set(self, at: int, value: int) -> None:
+        struct.pack_into(">I", self.memory, at, value)
+
+    def handle(self, request: Request) -> bytes | None:
+        """The answer to a command; None for one that is not served."""
+        match request.command:
+            case Command.DISCOVERY:
+                return answer(request, bytes(self.memory[:DISCOVERY_BYTES]))
+            case Command.READ_REGISTER:
+                (at,) = struct.unpack(">I", request.body[:4])
+                return answer(request, bytes(self.memory[at : at + 4]))
+            case Command.WRITE_REGISTER:
+                at, value = struct.unpack(">II", request.body[:8])
+                self.set(at, value)
+                return answer(request, struct.pack(">I", 1))
+            case Command.READ_MEMORY:
+                at, count = struct.unpack(">IxxH", request.body[:8])
+                return answer(request, request.body[:4] + bytes(self.memory[at : at + count]))
+            case Command.WRITE_MEMORY:
+                (at,) = struct.unpack(">I", request.body[:4])
+                data = request.body[4:]
+                self.memory[at : at + len(data)] = data
+                return answer(request, struct.pack(">I", len(data)))
+        return None
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """One block of lines on its way: ``number`` is 16 bits and never 0."""
+
+    number: int
+    time_ns: int
+    pixel_format: int
+    width: int
+    height: int
+    data: bytes
+
+
+def packets(frame: Frame, packet_size: int) -> Iterator[bytes]:
+    """Leader, payload and trailer."""
+    step = packet_size - OVERHEAD
+    leader = (0, _IMAGE, frame.time_ns, frame.pixel_format, frame.width, frame.height, 0, 0, 0, 0)
+    yield _GVSP.pack(0, frame.number, 1 << 24) + _LEADER.pack(*leader)
+    count = 0
+    for at in range(0, len(frame.data), step):
+        count += 1
+        yield _GVSP.pack(0, frame.number, 3 << 24 | count) + frame.data[at : at + step]
+    yield _GVSP.pack(0, frame.number, 2 << 24 | count + 1) + _TRAILER.pack(0, _IMAGE, frame.height)

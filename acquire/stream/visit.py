@@ -1,0 +1,62 @@
+"""A short visit to one camera: in a fresh process, as a grabber has it, and ended afterwards."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from acquire.stream.process import Worker
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from acquire.camera.base import Camera, CameraOpener
+    from acquire.stream.process import Mailbox
+
+T = TypeVar("T")
+_END_S = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Armed:
+    """The camera waits for line triggers."""
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What came of the visit."""
+
+    result: Any
+
+
+def visit(
+    opener: CameraOpener,
+    look: Callable[..., T],
+    *args: Any,
+    timeout_s: float = 30.0,
+    armed: Callable[[], object] | None = None,
+) -> T:
+    """``look(camera, tell, *args)`` in a process that opens the camera; its result, or its error.
+
+    ``armed`` is called here when ``look`` calls ``tell``, which it then must do. DeviceError when the
+    process does not answer within ``timeout_s``.
+    """
+    worker = Worker("camera", _visit, opener, look, args)
+    deadline = time.monotonic() + timeout_s
+    try:
+        if armed is not None:
+            worker.expect(Armed, deadline)
+            armed()
+        seen: T = worker.expect(Seen, deadline).result
+        return seen
+    finally:
+        worker.end(time.monotonic() + _END_S)
+
+
+def _visit(mailbox: Mailbox, opener: CameraOpener, look: Callable[..., Any], args: tuple[Any, ...]) -> None:
+    camera: Camera = opener()
+    try:
+        mailbox.post(Seen(look(camera, lambda: mailbox.post(Armed()), *args)))
+    finally:
+        camera.close()

@@ -1,0 +1,215 @@
+"""Recordings through a GenTL producer and GigE Vision: on disk is Eq. (1), and what is missing is told."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from acquire.config import RigConfig, load_rig
+from acquire.daemon.plan import Run
+from acquire.errors import ConfigError
+from acquire.lines import LineFlag
+from acquire.rig import Rig
+from acquire.sim.lines import StreamingArm
+from acquire.store import Recording, RunCondition, open_recording
+
+needs_compiler = pytest.mark.needs_compiler
+
+STAGES = 16
+WAIT_S = 60.0
+
+
+def rig_config(**changes: Any) -> RigConfig:
+    settings = [
+        ["remote", "Width", STAGES],
+        ["remote", "PixelFormat", "Mono12Packed"],
+        ["remote", "CounterEventSource", "LineTriggerMissed"],
+        ["stream", "BufferHeight", 100],
+    ]
+    given = {"geometry.stages": STAGES, "recording.chunk_lines": 1024, "stream.block_lines": 128, **changes}
+    given |= {f"cameras.{arm}.settings": settings for arm in "ab"}
+    return load_rig("rig-demo-gentl", given)
+
+
+def until(condition: Callable[[], object], what: str) -> None:
+    deadline = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < deadline, f"waited in vain for {what}"
+        time.sleep(0.01)
+
+
+def record(
+    config: RigConfig,
+    path: Path,
+    lines: int,
+    happen: Callable[[Rig, Run], None] = lambda rig, run: None,
+    stamps: bool = True,
+) -> tuple[Recording, Any]:
+    with Rig(config) as rig:
+        run = Run(config, rig)
+        try:
+            run.arm()
+            if stamps:
+                until(lambda: all(run.poll().lines[arm]["clock"]["stamp_ns"] for arm in "ab"), "time stamps")
+            run.start(path, lines)
+            happen(rig, run)
+            until(lambda: run.poll().done, "the recording's end")
+        finally:
+            run.close()
+        return open_recording(path), run.poll()
+
+
+def check_lines(config: RigConfig, recording: Recording, arm: str) -> np.ndarray:
+    """Every row that is not flagged is Eq. (1) of scene and code; returns the flags."""
+    stream = recording.camera(arm)
+    flags = np.asarray(stream.flags[:])
+    with Rig(config) as rig:
+        light = StreamingArm(rig.scene(), config.code.build(), STAGES, 3, arm)
+        expected = np.clip(np.rint(light.lines(recording.first_line, len(flags)) * np.float32(6.0)), 0, 4095)
+    good = flags & (LineFlag.MISSING | LineFlag.INCOMPLETE) == 0
+    np.testing.assert_array_equal(np.asarray(stream.lines[:])[good], expected[good])
+    return flags
+
+
+@needs_compiler
+def test_what_is_recorded_through_the_producer_is_eq1(tmp_path: Path) -> None:
+    config = rig_config()
+    recording, status = record(config, tmp_path / "r.zarr", 20_000)
+    assert status.condition is RunCondition.GOOD
+    for arm in "ab":
+        assert not check_lines(config, recording, arm).any()
+        camera = recording.attrs["cameras"][arm]
+        assert (camera["PixelFormat"], camera["BufferHeight"]) == ("Mono12Packed", 100)
+        assert camera["identity"]["serial"] == f"SIM-{arm.upper()}"
+        assert abs(camera["clock"]["drift_ppb"]) < 1000, "the simulated cameras' clock is the trigger's"
+        assert camera["clock"]["stamp_ns"] > 0
+
+
+@pytest.mark.needs_aravis
+def test_what_is_recorded_through_gige_vision_is_eq1(tmp_path: Path) -> None:
+    settings = [
+        ["remote", "Width", STAGES],
+        ["remote", "PixelFormat", "Mono12"],
+        ["remote", "Height", 100],
+    ]
+    given = {"geometry.stages": STAGES, "recording.chunk_lines": 1024, "stream.block_lines": 128}
+    given |= {f"cameras.{arm}.settings": settings for arm in "ab"}
+    config = load_rig("rig-demo-gige", given)
+    recording, status = record(config, tmp_path / "r.zarr", 20_000)
+    assert status.condition is RunCondition.GOOD
+    for arm in "ab":
+        assert not check_lines(config, recording, arm).any()
+        assert recording.attrs["cameras"][arm]["identity"]["serial"] == f"SIM-{arm.upper()}"
+
+
+@pytest.mark.parametrize("rig", ["rig-demo", pytest.param("rig-demo-gentl", marks=needs_compiler)])
+def test_both_arms_from_one_camera_are_eq1(tmp_path: Path, rig: str) -> None:
+    settings = [["remote", "PixelFormat", "Mono12p"], ["stream", "BufferHeight", 100]]
+    given = {"geometry.stages": STAGES, "recording.chunk_lines": 1024, "stream.block_lines": 128}
+    given |= {"cameras.layout": "compact", "cameras.b.serial": "SIM-A", "cameras.b.first_column": STAGES + 5}
+    config = load_rig(rig, given | ({"cameras.a.settings": settings} if "gentl" in rig else {}))
+    recording, status = record(config, tmp_path / "r.zarr", 20_000, stamps="gentl" in rig)
+    assert status.condition is RunCondition.GOOD
+    assert recording.attrs["layout"] == "compact"
+    for arm in "ab":
+        assert not check_lines(config, recording, arm).any()
+        assert recording.attrs["cameras"][arm]["Width"] == 2 * STAGES + 5
+
+
+def test_arms_that_cannot_share_a_camera_are_refused() -> None:
+    compact = {"cameras.layout": "compact", "cameras.b.serial": "SIM-A"}
+    for changes, words in (
+        ({"cameras.layout": "compact"}, "both arms need its serial"),
+        (compact | {"cameras.b.first_column": 63}, "overlap in columns 63 to 63"),
+    ):
+        with pytest.raises(ConfigError, match=words):
+            load_rig("rig-demo", changes)
+    with pytest.raises(ConfigError, match="both arms have the camera with serial 'SIM-A'"):
+        load_rig("rig-demo-gentl", {"cameras.b.serial": "SIM-A"})
+
+
+@needs_compiler
+def test_faults_of_one_camera_are_gaps_by_cause_and_the_other_arm_is_whole(tmp_path: Path) -> None:
+    config = rig_config()
+
+    def happen(rig: Rig, run: Run) -> None:
+        memory = rig._gentl._bench.cameras["SIM-A"]
+        frame = memory["FRAMES"] + 100
+        for kind, after, count in (("DROP", 0, 2), ("OVERRUN", 20, 3), ("SHORT", 40, 60), ("MISSED", 0, 5)):
+            memory.inject(kind, (frame + 60) * 100 + 30 if kind == "MISSED" else frame + after, count)
+
+    recording, status = record(config, tmp_path / "r.zarr", 50_000, happen)
+    lost = {cause: lines for cause, lines in status.lines["a"]["lost"].items() if lines}
+    assert lost == {"id_gap": 200, "no_buffer": 300, "incomplete": 40, "missed_trigger": 5}
+    gaps = {gap.cause: gap.count for gap in recording.gaps if gap.arm == "a"}
+    assert gaps == lost
+    flags = check_lines(config, recording, "a")
+    assert int((flags & LineFlag.MISSING != 0).sum()) == 545
+    assert not check_lines(config, recording, "b").any()
+
+
+@needs_compiler
+def test_a_camera_that_was_away_goes_on_at_the_right_line_and_the_gap_is_recorded(tmp_path: Path) -> None:
+    config = rig_config()
+
+    def happen(rig: Rig, run: Run) -> None:
+        until(lambda: run.poll().recorded_lines > 10_000, "lines")
+        memory = rig._gentl._bench.cameras["SIM-A"]
+        memory.unplug()
+        until(
+            lambda: memory["SESSION"] == memory["ACK"] and not memory["SESSION"] & 1, "the driver to let go"
+        )
+        memory.plug()
+
+    recording, status = record(config, tmp_path / "r.zarr", 80_000, happen)
+    (gap,) = [gap for gap in recording.gaps if gap.arm == "a"]
+    assert gap.cause == "device_lost"
+    assert status.lines["a"]["lost"]["device_lost"] == gap.count > 0
+    flags = check_lines(config, recording, "a")
+    missing = np.flatnonzero(flags & LineFlag.MISSING)
+    assert (missing[0] + recording.first_line, len(missing)) == (gap.first_line, gap.count)
+    assert not check_lines(config, recording, "b").any()
+
+
+@needs_compiler
+def test_a_camera_that_does_not_come_back_ends_the_recording_in_time(tmp_path: Path) -> None:
+    config = rig_config(**{"stream.reopen_s": 0.5})
+
+    def happen(rig: Rig, run: Run) -> None:
+        until(lambda: run.poll().recorded_lines > 5_000, "lines")
+        rig._gentl._bench.cameras["SIM-A"].unplug()
+        begin = time.monotonic()
+        until(lambda: run.poll().done, "the end")
+        assert time.monotonic() - begin < 6.0
+
+    recording, status = record(config, tmp_path / "r.zarr", 10_000_000, happen)
+    assert status.condition is RunCondition.INTERRUPTED
+    assert "SIM-A is gone" in status.end_reason
+    check_lines(config, recording, "a")
+
+
+@needs_compiler
+def test_the_demo_runs_through_the_producer(tmp_path: Path) -> None:
+    out = tmp_path / "demo"
+    command = ["demo", f"--out={out}", "--cameras=gentl", "--lines=2200", "--budget=2", "--twist-budget=1"]
+    done = subprocess.run(
+        [sys.executable, "-m", "acquire", *command, "--json"],
+        capture_output=True,
+        text=True,
+        timeout=110,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    summary = json.loads(done.stdout)
+    assert summary["capture"]["condition"] == "GOOD"
+    assert summary["capture"]["lost_lines"] == 0
+    cameras = open_recording(out / "recording.zarr").attrs["cameras"]
+    assert [cameras[arm]["TriggerMode"] for arm in "ab"] == ["On", "On"]

@@ -1,0 +1,99 @@
+"""``acquire devices`` and ``acquire camera`` on simulated rigs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from acquire.config import load_rig
+from acquire.geometry import Geometry
+from acquire.rig import Rig
+from acquire.sim.lines import StreamingArm
+
+Cli = Callable[..., Any]
+GENTL = pytest.param("rig-demo-gentl", marks=pytest.mark.needs_compiler)
+RIGS = ["rig-demo", GENTL]
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_devices_of_a_rig_are_listed_with_their_serial_numbers(cli: Cli, rig: str) -> None:
+    rows = cli("devices", "--config", rig, "--json").json
+    assert [(row["device"], row["serial"], row["state"]) for row in rows] == [
+        ("trigger", "simulated", "ready"),
+        ("camera a", "SIM-A", "ready"),
+        ("camera b", "SIM-B", "ready"),
+    ]
+
+
+def test_what_a_rig_lacks_is_said(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("GENICAM_GENTL64_PATH", raising=False)
+    answer = cli("devices", "--config", "rig-vt-4k5c-h100")
+    assert answer.code == 0
+    assert answer.out.count("no GenTL producer; possible: .cti files") == 2
+
+
+def test_without_a_producer_there_is_nothing_to_list(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("GENICAM_GENTL64_PATH", raising=False)
+    answer = cli("devices")
+    assert answer.code == 5
+    assert "try: cti in the camera's table, or GENICAM_GENTL64_PATH" in answer.err
+
+
+@pytest.mark.needs_genicam
+def test_cameras_of_the_environment_s_producers_are_listed(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+    import genicam
+
+    monkeypatch.setenv("GENICAM_GENTL64_PATH", str(Path(genicam.__file__).parent))
+    rows = cli("devices", "--json").json
+    assert {row["model"] for row in rows} == {"Viky"}
+
+
+@pytest.mark.needs_compiler
+def test_features_show_value_and_what_is_possible(cli: Cli) -> None:
+    rows = cli("camera", "features", "SIM-A", "--config", "rig-demo-gentl", "--json").json
+    by_name = {(row["module"], row["feature"]): row for row in rows}
+    assert by_name["remote", "PixelFormat"]["value"] == "Mono12p"
+    assert by_name["remote", "TDIStages"]["possible"] == "TDI64, TDI128, TDI192, TDI256"
+    assert by_name["stream", "BufferHeight"]["value"] == 256
+    assert by_name["remote", "SensorWidth"]["access"] == "r"
+    assert {module for module, _ in by_name} == {"remote", "interface", "device", "stream", "system"}
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_a_snapshot_is_what_the_camera_sees(cli: Cli, tmp_path: Path, rig: str) -> None:
+    out = tmp_path / "b.npy"
+    facts = cli("camera", "snapshot", "SIM-B", "--config", rig, "--lines", 300, "--out", out, "--json").json
+    pixels = np.load(out)
+    config = load_rig(rig)
+    depth = Geometry(64, 3, 1).depth_lines
+    with Rig(config) as made:
+        light = StreamingArm(made.scene(), config.code.build(), 64, 3, "b").lines(-depth, 300)
+    np.testing.assert_array_equal(pixels, np.rint(light * np.float32(6.0)))
+    assert (facts["lines"], facts["pixels"], facts["flagged_lines"]) == (300, 64, 0)
+
+
+def test_a_picture_is_stretched(cli: Cli, tmp_path: Path) -> None:
+    out = tmp_path / "a.png"
+    assert cli("camera", "snapshot", "SIM-A", "-c", "rig-demo", "--lines", 200, "--out", out).code == 0
+    with Image.open(out) as picture:
+        assert (picture.size, picture.getextrema()) == ((64, 200), (0, 255))
+
+
+def test_wrong_words_touch_nothing(cli: Cli, tmp_path: Path) -> None:
+    taken = tmp_path / "a.png"
+    taken.touch()
+    for words, text in (
+        (
+            ("SIM-C", "-c", "rig-demo", "--out", tmp_path / "x.png"),
+            "no camera 'SIM-C'\n  possible: SIM-A, SIM-B",
+        ),
+        (("SIM-A", "-c", "rig-demo", "--out", taken), "exists and stays untouched"),
+        (("SIM-A", "-c", "rig-demo", "--out", tmp_path / "x.jpg"), "possible: .png, .npy"),
+    ):
+        answer = cli("camera", "snapshot", *words)
+        assert (answer.code, text in answer.err) == (2, True), answer.err

@@ -1,0 +1,58 @@
+"""Tests that need a compiler or genicam are left out where there is none, and the summary says so."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections import Counter
+from shutil import which
+from typing import Any
+
+import pytest
+
+from acquire.camera import aravis
+from acquire.errors import CameraError
+from acquire.sim.gentl.build import compiler
+
+FAKE_GIGE = "arv-fake-gv-camera-0.8"
+_HAVE_GENICAM = importlib.util.find_spec("genicam") is not None
+
+
+def _have_aravis() -> bool:
+    try:
+        aravis.load()
+    except CameraError:
+        return False
+    return True
+
+
+MISSING = {
+    "needs_aravis": not _have_aravis() and "Aravis' library",
+    "needs_gige_camera": not (_have_aravis() and which(FAKE_GIGE)) and f"Aravis and {FAKE_GIGE}",
+    "needs_compiler": not (compiler() and _HAVE_GENICAM) and "a C compiler and the genicam package",
+    "needs_genicam": not _HAVE_GENICAM and "the genicam package",
+}
+_left_out: Counter[str] = Counter()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    config.addinivalue_line("markers", "needs_compiler: builds the simulated GenTL producer")
+    config.addinivalue_line("markers", "needs_genicam: loads a GenTL producer")
+    config.addinivalue_line("markers", "needs_aravis: loads Aravis' shared library")
+    config.addinivalue_line("markers", "needs_gige_camera: runs Aravis' GigE Vision camera on loopback")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    out: list[pytest.Item] = []
+    for item in items:
+        wants = next((m for m, what in MISSING.items() if what and item.get_closest_marker(m)), None)
+        if wants:
+            out.append(item)
+            _left_out[str(MISSING[wants])] += 1
+    if out:
+        config.hook.pytest_deselected(items=out)
+        items[:] = [item for item in items if item not in out]
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    for what, count in _left_out.items():
+        terminalreporter.write_line(f"left out, for want of {what}: {count} tests")

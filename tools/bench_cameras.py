@@ -1,0 +1,278 @@
+"""Cameras through harvesters and our GenTL producer into the ring: lines lost or torn, cores, latency.
+
+::
+
+    pattern ──▶ CameraMemory ──▶ producer (C thread) ──▶ harvesters ──▶ grabber ──▶ ring ──▶ check, here
+                                └──────────── one process per camera ───────────┘
+
+``python tools/bench_cameras.py`` runs two cameras of 4640 px at 100 klines/s, then of 54 px at 600 klines/s,
+and says what the bare copy of the same bytes costs. ``--cycles 1000`` starts and stops one camera instead.
+The producer's thread stands for grabber card and DMA: its share of the process is told apart.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import psutil
+
+from acquire.camera.harvesters import HarvestersCamera, HarvestersOpener
+from acquire.camera.settings import Setting
+from acquire.camera.spec import GenicamSpec
+from acquire.sim.gentl.bench import GentlBench
+from acquire.sim.gentl.models import CameraModel
+from acquire.stream import grabber
+from acquire.stream.messages import Ready
+from acquire.stream.process import Worker
+from acquire.stream.ring import Ring, RingShape
+from acquire.stream.shared import Counters
+
+if TYPE_CHECKING:
+    from acquire.sim.gentl.memory import CameraMemory
+    from acquire.stream.process import Mailbox
+
+COLUMNS = 5
+"""Pixels of every line that are compared."""
+
+
+@dataclass(frozen=True)
+class Load:
+    """Two cameras: pixels per line, lines per second, lines per buffer."""
+
+    width: int
+    rate_hz: float
+    height: int
+
+    @property
+    def period_ns(self) -> float:
+        return 1e9 / self.rate_hz
+
+    @property
+    def title(self) -> str:
+        mb = 2 * self.width * self.rate_hz / 1e6
+        return f"2 x {self.width} px x {self.rate_hz / 1e3:g} klines/s = {mb:.0f} MB/s"
+
+
+LOADS = (Load(4640, 100_000.0, 256), Load(54, 600_000.0, 1536))
+
+
+def pattern(capacity: int, width: int) -> np.ndarray:
+    """What line k shows is row k mod capacity."""
+    return (np.arange(capacity)[:, None] * 13 + np.arange(width) * 7).astype(np.uint8)
+
+
+def feed_pattern(mailbox: Mailbox, memory: CameraMemory, load: Load) -> None:
+    """Life of a feeder that writes pixels once and then only numbers lines, when they are due."""
+    capacity = len(memory.lines)
+    memory.lines[:] = pattern(capacity, load.width)
+    mailbox.post(Ready())
+    wanted, start_ns, line = False, 0, 0
+    while True:
+        mailbox.take()
+        if memory.asked:
+            # The ring goes on where it is: a session's line 0 is the next row of the pattern's beginning.
+            wanted = memory.obey(memory["SESSION"])
+            memory["HEAD"] = memory["TAIL"] = memory["HEAD"] // capacity * capacity + capacity
+            start_ns, line = time.monotonic_ns(), 0
+        due = int((time.monotonic_ns() - start_ns) / load.period_ns) if wanted else 0
+        room = capacity - (memory["HEAD"] - memory["TAIL"])
+        count = min(due - line, room)
+        if count > 0:
+            numbers = np.arange(line, line + count)
+            slots = (memory["HEAD"] + np.arange(count)) % capacity
+            memory.headers[slots, 0] = numbers
+            memory.headers[slots, 1] = start_ns + (numbers * load.period_ns).astype(np.int64)
+            memory["HEAD"] += count
+            line += count
+        time.sleep(0.0005)
+
+
+class Side:
+    """What comes out of one camera's ring."""
+
+    def __init__(
+        self, memory: CameraMemory, ring: Ring, counters: Counters, worker: Worker, load: Load
+    ) -> None:
+        self.memory, self.worker = memory, worker
+        self._ring, self._counters, self._load = ring, counters, load
+        self._next_line: int | None = None
+        self.lost = self.torn = self.lines = 0
+        self.latencies_ms: list[float] = []
+
+    def settle(self) -> bool:
+        """Throw away what has gathered since the camera was armed; True when lines come as they are due."""
+        return self._ring.empty() < 2 * self._load.height and self.memory["HEAD"] > 0
+
+    def take(self) -> bool:
+        block = self._ring.acquire()
+        if block is None:
+            return False
+        numbers = np.arange(block.first_line, block.end_line)
+        at = np.linspace(0, self._load.width - 1, COLUMNS).astype(int)
+        expected = (numbers[:, None] % len(self.memory.lines) * 13 + at * 7).astype(np.uint8)
+        self.torn += int((block.pixels[:, at] != expected).any(axis=1).sum())
+        self.lost += block.first_line - (block.first_line if self._next_line is None else self._next_line)
+        self._next_line = block.end_line
+        self.lines += len(block.flags)
+        self.latencies_ms.append((block.time_ns - self._due_ns(block.first_line)) / 1e6)
+        self._ring.release()
+        return True
+
+    def _due_ns(self, line: int) -> float:
+        """When the sensor had the line: lines come evenly, so any header tells of all."""
+        number, time_ns = self.memory.headers[0].tolist()
+        return time_ns + (line - number) * self._load.period_ns
+
+    def losses(self) -> dict[str, int]:
+        found = {str(cause): self._counters[cause] for cause in grabber.CAMERA_CAUSES}
+        return found | {"ring_full": self._ring.statistics().dropped_lines}
+
+
+def spec_of(model: CameraModel, load: Load, cti: str) -> GenicamSpec:
+    settings = (
+        Setting("remote", "PixelFormat", "Mono8"),
+        Setting("stream", "BufferHeight", load.height),
+    )
+    return GenicamSpec(
+        model.serial,
+        settings=settings,
+        pixels=load.width,
+        line_rate_hz=load.rate_hz,
+        cti=cti,
+        frame_id_first=0,
+    )
+
+
+def grabber_plan(model: CameraModel, load: Load, cti: str) -> grabber.GrabberPlan:
+    return grabber.GrabberPlan("a", HarvestersOpener(spec_of(model, load, cti)), 0, 256, 1 << 30)
+
+
+def models(load: Load) -> list[CameraModel]:
+    return [
+        CameraModel(f"SIM-{arm}", load.width, bits=8, pixel_format="Mono8", line_rate_hz=load.rate_hz)
+        for arm in "AB"
+    ]
+
+
+def run(load: Load, seconds: float) -> None:
+    """Two grabbers as a capture has them; this process is the recorder that checks and forgets."""
+    print(load.title)
+    cameras = models(load)
+    with GentlBench(dict.fromkeys(cameras, load), feed_pattern) as bench:
+        rings = [Ring(model.serial, RingShape(64, load.height, load.width, "uint8")) for model in cameras]
+        counts = [Counters(grabber.COUNTERS) for _ in cameras]
+        workers = [
+            Worker(
+                f"grabber {model.serial}",
+                grabber.grab,
+                (grabber_plan(model, load, str(bench.cti)), ring, counters),
+            )
+            for model, ring, counters in zip(cameras, rings, counts, strict=True)
+        ]
+        for worker in workers:
+            worker.expect(Ready, time.monotonic() + 30)
+        try:
+            _watch(load, seconds, bench, list(zip(cameras, rings, counts, workers, strict=True)))
+        finally:
+            for worker in workers:
+                worker.end(time.monotonic() + 5)
+            for ring, counters in zip(rings, counts, strict=True):
+                ring.close()
+                counters.close()
+
+
+def _watch(load: Load, seconds: float, bench: GentlBench, arms: list[Any]) -> None:
+    """Take and check for ``seconds``, from the moment when all rings are empty."""
+    sides = [
+        Side(bench.cameras[model.serial], ring, counts, worker, load) for model, ring, counts, worker in arms
+    ]
+    while not all(tuple(side.settle() for side in sides)):
+        time.sleep(0.0005)
+    before = [(threads_of(side.worker.pid), side.losses()) for side in sides]
+    begin = time.monotonic()
+    while time.monotonic() - begin < seconds:
+        if not any(tuple(side.take() for side in sides)):
+            time.sleep(0.0005)
+    elapsed_s = time.monotonic() - begin
+    for side, (threads, losses) in zip(sides, before, strict=True):
+        own, producer = share(threads, threads_of(side.worker.pid), side.worker.pid, elapsed_s)
+        why = {
+            cause: count - losses[cause] for cause, count in side.losses().items() if count > losses[cause]
+        }
+        late = np.array(side.latencies_ms)
+        print(
+            f"  {side.memory.model.serial}  {side.lines} lines in {elapsed_s:.1f} s, lost {side.lost}"
+            f" {why or ''}, torn {side.torn}\n"
+            f"         core: grabber {own:.3f}, producer's thread {producer:.3f};"
+            f" first line of a block to ring: median {np.median(late):.2f},"
+            f" p99 {np.percentile(late, 99):.2f}, most {late.max():.1f} ms"
+        )
+
+
+def threads_of(pid: int | None) -> dict[int, float]:
+    return {thread.id: thread.user_time + thread.system_time for thread in psutil.Process(pid).threads()}
+
+
+def share(
+    before: dict[int, float], after: dict[int, float], pid: int | None, elapsed_s: float
+) -> tuple[float, float]:
+    """Cores of the process's main thread, and of its others."""
+    used = {thread: (time_s - before.get(thread, 0.0)) / elapsed_s for thread, time_s in after.items()}
+    return used.pop(pid or 0), sum(used.values())
+
+
+def bare_copy(load: Load) -> None:
+    """The same bytes, copied by numpy from one place to another, and looked through for their maximum."""
+    source = [np.ones((load.height, load.width), np.uint8) for _ in range(64)]
+    target = [np.ones((load.height, load.width), np.uint8) for _ in range(64)]
+    blocks = max(64, round(load.rate_hz / load.height))
+    began, used = time.perf_counter(), time.process_time()
+    for k in range(blocks):
+        target[k % 64][:] = source[k % 64]
+    copied_s, wall_s = time.process_time() - used, time.perf_counter() - began
+    used = time.process_time()
+    for k in range(blocks):
+        source[k % 64].max()
+    looked_s = time.process_time() - used
+    rate = blocks * load.height / load.rate_hz
+    print(
+        f"  bare memcpy of one camera's lines: core {copied_s / rate:.3f}"
+        f" ({blocks * load.height * load.width / wall_s / 1e9:.1f} GB/s), maximum {looked_s / rate:.3f}"
+    )
+
+
+def cycles(count: int) -> None:
+    """Arm and disarm one camera; memory, descriptors and threads before and after."""
+    load = Load(512, 10_000.0, 64)
+    model = models(load)[0]
+    with GentlBench({model: load}, feed_pattern) as bench:
+        camera = HarvestersCamera(spec_of(model, load, str(bench.cti)))
+        process = psutil.Process()
+        for k in range(count + 1):
+            if k % max(1, count // 10) == 0:
+                mb, fds = process.memory_info().rss / 1e6, process.num_fds()
+                print(f"  {k:5d} cycles: {mb:.1f} MB, {fds} descriptors, {process.num_threads()} threads")
+            camera.arm()
+            camera.disarm()
+        camera.close()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--cycles", type=int, default=0)
+    options = parser.parse_args()
+    if options.cycles:
+        cycles(options.cycles)
+        return
+    for load in LOADS:
+        run(load, options.seconds)
+        bare_copy(load)
+
+
+if __name__ == "__main__":
+    main()
