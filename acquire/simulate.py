@@ -7,6 +7,7 @@ other and compares the lines: an effect that changes them by far less than their
 from __future__ import annotations
 
 import time
+from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -25,7 +26,8 @@ from acquire.stream.tagger import Tagger
 from acquire.trigger.base import TriggerRun
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
+    from concurrent.futures import Future
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -35,7 +37,10 @@ if TYPE_CHECKING:
     from acquire.scene_config import SceneConfig
     from acquire.sim.pipeline import Camera, Readout
 
+    _Block = tuple[int, dict[str, Future[Readout]]]
+
 _BLOCK_LINES = 1024
+_COMMIT_BLOCKS = 32
 _QUANTISATION = 1 / 12
 """Variance of rounding to whole DN."""
 STUDIED_LINES = 512
@@ -121,8 +126,10 @@ def simulate(
     writer = RecordingWriter.create(path, spec)
     tagger = Tagger(run, config.geometry.stages, spec.clock)
     tagger.confirmed_end = lines
-    with writer, ThreadPoolExecutor(len(ARMS)) as arms:
-        lost = _write(writer, tagger, cameras, arms, lines, progress)
+    # A thread per arm: a camera's lines are read one block after the other.
+    with writer, ThreadPoolExecutor(1) as a, ThreadPoolExecutor(1) as b:
+        threads = dict(zip(ARMS, (a, b), strict=True))
+        lost = _write(writer, tagger, _read_ahead(cameras, threads, lines), lines, progress)
     return Simulated(path, lines, time.perf_counter() - began, lines / config.line_rate_hz, lost)
 
 
@@ -148,20 +155,18 @@ def study(bench: Bench, code: Code, lines: int = STUDIED_LINES) -> Study:
 def _write(
     writer: RecordingWriter,
     tagger: Tagger,
-    cameras: dict[str, Camera],
-    arms: ThreadPoolExecutor,
+    blocks: Iterator[_Block],
     lines: int,
     progress: Callable[[int, int], object],
 ) -> dict[str, int]:
     lost = dict.fromkeys(ARMS, 0)
     try:
-        for first in range(0, lines, _BLOCK_LINES):
-            count = min(_BLOCK_LINES, lines - first)
-            reads = {arm: arms.submit(camera.read, first, count) for arm, camera in cameras.items()}
+        for first, reads in blocks:
             for arm, readout in reads.items():
                 lost[arm] += _append(writer, tagger, arm, first, readout.result())
-            writer.commit()
-            progress(first + count, lines)
+            if first // _BLOCK_LINES % _COMMIT_BLOCKS == 0:
+                writer.commit()
+            progress(min(first + _BLOCK_LINES, lines), lines)
     except BaseException as error:
         aborted = isinstance(error, Exception)
         reason = str(error.message if isinstance(error, AcquireError) else error) or "interrupted"
@@ -171,6 +176,20 @@ def _write(
     ledger = {arm: {"stored": lines - count, "missing": {"camera": count}} for arm, count in lost.items()}
     writer.seal(condition, "all lines simulated", {"pulses": lines, **ledger})
     return lost
+
+
+def _read_ahead(
+    cameras: dict[str, Camera], threads: dict[str, ThreadPoolExecutor], lines: int
+) -> Iterator[_Block]:
+    """First line and lines of each block; the next one is computed while the caller has this one."""
+    waiting: deque[_Block] = deque()
+    for first in range(0, lines, _BLOCK_LINES):
+        count = min(_BLOCK_LINES, lines - first)
+        reads = {arm: threads[arm].submit(camera.read, first, count) for arm, camera in cameras.items()}
+        waiting.append((first, reads))
+        if len(waiting) > 1:
+            yield waiting.popleft()
+    yield from waiting
 
 
 def _append(writer: RecordingWriter, tagger: Tagger, arm: str, first: int, readout: Readout) -> int:

@@ -49,6 +49,18 @@ def test_a_simulated_recording_is_equation_1_with_its_code_and_time(tmp_path):
     assert np.diff(opened.time.values).astype(int).min() >= 29_999
 
 
+def test_blocks_read_ahead_by_two_threads_are_those_of_one(tmp_path):
+    """What is kept between blocks (frames, tiles, charge) is never touched by two threads at once."""
+    window = {"kind": "window", "phases": [{"duration_s": 7e-3, "axis": "row"}]}
+    table = listed("shot_noise", "cti").model_dump(mode="json") | {"shutters": [window]}
+    scene = LedSceneConfig.model_validate(table)
+    simulate(RIG, scene, tmp_path / "r.zarr", 6000)
+    stored = open_recording(tmp_path / "r.zarr")
+    for arm in "ab":
+        alone = bench_of(RIG, scene).camera(arm, RIG.code.build()).read(0, 6000).pixels
+        np.testing.assert_array_equal(stored.camera(arm).read("lines", 0, 6000), alone)
+
+
 def test_dropped_lines_are_flagged_and_listed(tmp_path):
     scene = listed({"kind": "dropped_lines", "rate": 0.05})
     done = simulate(RIG, scene, tmp_path / "r.zarr", 1500)
