@@ -160,7 +160,10 @@ class CameraConfig(_Model):
     )
     serial: str = "simulated"
     model: str = Field(default="", description="what the camera must be; absent: any")
-    cti: str = Field(default="", description="GenTL producer; absent: those of GENICAM_GENTL64_PATH")
+    cti: str = Field(
+        default="",
+        description="GenTL producer; absent: those of GENICAM_GENTL64_PATH. 'aravis': the camera's address",
+    )
     settings: tuple[tuple[GentlModule, str, bool | int | float | str], ...] = Field(
         default=(), description="[module, feature, value] in the order in which they are written"
     )

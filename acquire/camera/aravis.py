@@ -155,12 +155,14 @@ class AravisCamera:
         self._buffers: set[int] = set()
         self._held: dict[CameraBlock, int] = {}
         self._camera: int | None = None
-        device_id, self._identity = _pick(library, spec)
+        device_id = spec.cti.encode() if spec.cti not in ("", FAKE) else _find(library, spec)
         with _errors(f"open camera {spec.serial}") as error:
             self._camera = library.arv_camera_new(device_id, error)
         try:
             self._device = library.arv_camera_get_device(self._camera)
             self._features = _Features(library, self._device)
+            self._identity = _identify(self._features)
+            _check_identity(self._identity, spec)
             apply_settings(spec.settings, self.features())
             check_format(frame_format(self.features()), spec)
         except BaseException:
@@ -280,28 +282,42 @@ def load() -> Any:
     )
 
 
-def _pick(library: Any, spec: GenicamSpec) -> tuple[bytes, CameraIdentity]:
+def _find(library: Any, spec: GenicamSpec) -> bytes:
+    """The device with the serial number, of all that answer."""
     if spec.cti == FAKE:
         library.arv_enable_interface(FAKE.encode())
     library.arv_update_device_list()
-    found = [_describe(library, index) for index in range(library.arv_get_n_devices())]
-    chosen = next(((device, who) for device, who in found if who.serial == spec.serial), None)
-    if chosen is None:
+    found = {}
+    for index in range(library.arv_get_n_devices()):
+        found[(library.arv_get_device_serial_nbr(index) or b"").decode()] = index
+    if spec.serial not in found:
         raise CameraError(
             f"there is no camera with serial number {spec.serial!r}",
-            possible=", ".join(f"{who.serial} ({who.model})" for _, who in found) or "no camera answers",
+            possible=", ".join(found) or "no camera answers",
         )
-    if spec.model and chosen[1].model != spec.model:
-        raise CameraError(f"camera {spec.serial} is a {chosen[1].model!r}, not a {spec.model!r}")
-    return chosen
+    device_id: bytes = library.arv_get_device_id(found[spec.serial])
+    return device_id
 
 
-def _describe(library: Any, index: int) -> tuple[bytes, CameraIdentity]:
-    ask = ("vendor", "model", "serial_nbr")
-    vendor, model, serial = (
-        (getattr(library, f"arv_get_device_{what}")(index) or b"").decode() for what in ask
+def _identify(features: _Features) -> CameraIdentity:
+    """By the camera's own features; older ones have the serial number as DeviceID."""
+    serial = _text(features, "DeviceSerialNumber") or _text(features, "DeviceID")
+    firmware = _text(features, "DeviceFirmwareVersion") or _text(features, "DeviceVersion")
+    return CameraIdentity(
+        _text(features, "DeviceVendorName"), _text(features, "DeviceModelName"), serial, firmware
     )
-    return library.arv_get_device_id(index), CameraIdentity(vendor, model, serial, firmware="")
+
+
+def _text(features: _Features, name: str) -> str:
+    node = features.find(name)
+    return str(node.read()) if node is not None and node.readable else ""
+
+
+def _check_identity(found: CameraIdentity, spec: GenicamSpec) -> None:
+    if found.serial != spec.serial:
+        raise CameraError(f"the camera at {spec.cti} has serial number {found.serial!r}, not {spec.serial!r}")
+    if spec.model and found.model != spec.model:
+        raise CameraError(f"camera {spec.serial} is a {found.model!r}, not a {spec.model!r}")
 
 
 class _Features:

@@ -21,7 +21,8 @@ class GenicamSpec:
     settings : in order; Width, PixelFormat and the stream's BufferHeight usually among them
     pixels, bits : what its lines must then be; 0: whatever they are
     line_rate_hz, buffer_s : buffers for so long at that rate are announced
-    cti : the producer; empty: those of GENICAM_GENTL64_PATH
+    cti : the producer; empty: those of GENICAM_GENTL64_PATH. For Aravis: the camera's network address;
+        empty: whichever has the serial number
     frame_id_bits, frame_id_first : see `acquire.camera.frames.FrameCount`
     """
 

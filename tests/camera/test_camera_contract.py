@@ -5,6 +5,7 @@ Aravis and GigE Vision.
 from __future__ import annotations
 
 import itertools
+import os
 import pickle
 import signal
 import subprocess
@@ -30,9 +31,10 @@ from acquire.sim.clock import Wire
 from acquire.sim.devices import SimulatedCameraOpener, SimulatedOptics
 from acquire.sim.gentl.bench import GentlBench
 from acquire.sim.gentl.models import CameraModel
+from acquire.sim.gige.arms import address_of
+from acquire.sim.gige.camera import serve
 from acquire.sim.lines import StreamingArm
 from acquire.sim.scenes import build_scene
-from acquire.sim.gige.camera import serve
 from acquire.stream.messages import Ready
 from acquire.stream.process import Worker
 
@@ -81,8 +83,9 @@ def simulated_stand(way: str) -> Iterator[Stand]:
         return np.clip(np.rint(light * np.float32(6.0)), 0, 4095)
 
     if way == "gige":
-        spec = replace(spec_of(rig, "a", ""), settings=GIGE)
-        server = Worker("camera", serve, CameraModel("SIM-A", STAGES, pixel_format="Mono12"), sensor)
+        spec = replace(spec_of(rig, "a", address_of("a")), settings=GIGE)
+        model = CameraModel("SIM-A", STAGES, pixel_format="Mono12")
+        server = Worker("camera", serve, model, sensor, address_of("a"))
         server.expect(Ready, time.monotonic() + WAIT_S)
         opener = AravisOpener(spec)
         opener().close()  # Aravis keeps what its first look at the network made
@@ -138,13 +141,19 @@ def aravis_stand(serial: str, interface: str = "") -> Iterator[Stand]:
 
 
 def gige_stand() -> Iterator[Stand]:
-    """Aravis' GigE Vision camera: packets over the loopback interface."""
-    command = [FAKE_GIGE, "-i", "127.0.0.1", "-s", "GV-TEST"]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as server:
-        try:
-            yield from aravis_stand("GV-TEST")
-        finally:
-            server.kill()
+    """Aravis' GigE Vision camera: packets over the loopback interface, whose port other tests may have."""
+    serial, deadline = f"GV-{os.getpid()}", time.monotonic() + 90
+    while True:
+        command = [FAKE_GIGE, "-i", "127.0.0.1", "-s", serial]
+        with subprocess.Popen(command, stdout=subprocess.DEVNULL) as server:
+            try:
+                server.wait(1.0)
+            except subprocess.TimeoutExpired:
+                yield from aravis_stand(serial)
+                return
+            finally:
+                server.kill()
+        assert time.monotonic() < deadline
 
 
 @pytest.fixture(
@@ -209,7 +218,7 @@ def test_without_a_trigger_the_wait_is_bounded_and_in_vain(stand: Stand, camera:
     if stand.lines is not None:
         begin = time.monotonic()
         assert camera.next_block(0.1) is None
-        assert time.monotonic() - begin < 1.0
+        assert time.monotonic() - begin < 3.0
     camera.disarm()
 
 

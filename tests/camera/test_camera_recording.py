@@ -158,7 +158,7 @@ def test_faults_of_one_camera_are_gaps_by_cause_and_the_other_arm_is_whole(tmp_p
 
 @needs_compiler
 def test_a_camera_that_was_away_goes_on_at_the_right_line_and_the_gap_is_recorded(tmp_path: Path) -> None:
-    config = rig_config()
+    config = rig_config(**{"stream.reopen_s": 20.0})
 
     def happen(rig: Rig, run: Run) -> None:
         until(lambda: run.poll().recorded_lines > 10_000, "lines")
@@ -188,7 +188,7 @@ def test_a_camera_that_does_not_come_back_ends_the_recording_in_time(tmp_path: P
         rig._gentl._bench.cameras["SIM-A"].unplug()
         begin = time.monotonic()
         until(lambda: run.poll().done, "the end")
-        assert time.monotonic() - begin < 6.0
+        assert time.monotonic() - begin < 15.0
 
     recording, status = record(config, tmp_path / "r.zarr", 10_000_000, happen)
     assert status.condition is RunCondition.INTERRUPTED

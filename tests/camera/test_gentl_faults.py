@@ -178,7 +178,7 @@ def test_a_device_that_is_gone_is_told_at_once_and_can_be_opened_again(
     begin = time.monotonic()
     with pytest.raises(CameraLostError, match="SIM-64 is gone"):
         drain(camera)
-    assert time.monotonic() - begin < 2.0
+    assert time.monotonic() - begin < 5.0
     camera.close()
     with pytest.raises(CameraError, match="no camera with serial number 'SIM-64'"):
         open_camera()

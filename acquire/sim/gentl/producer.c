@@ -220,13 +220,14 @@ API gc_error GCInitLib(void)
     Dl_info info;
     size_t size;
     int fd;
-    char path[4352];
+    char path[4096];
     if (tl.initialized) return fail(E_IN_USE, "initialised already");
     if (!dladdr((void *)GCInitLib, &info)) return fail(E_ERROR, "where am I?");
     if (!realpath(info.dli_fname, path)) return fail(E_ERROR, "where is %s?", info.dli_fname);
     *strrchr(path, '/') = 0;
-    snprintf(tl.directory, sizeof tl.directory, "%s", path);
-    snprintf(path, sizeof path, "%s/%s", tl.directory, HOST_FILE);
+    memcpy(tl.directory, path, sizeof path);
+    if (snprintf(path, sizeof path, "%s/%s", tl.directory, HOST_FILE) >= (int)sizeof path)
+        return fail(E_IO, "a longer path than there can be");
     tl.host = map_file(path, &fd, &size);
     if (!tl.host) return fail(E_IO, "%s cannot be opened", path);
     close(fd);

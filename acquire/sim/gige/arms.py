@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from typing import TYPE_CHECKING
 
@@ -37,14 +38,19 @@ class GigeArms:
         """
         load()
         if arm not in self._servers:
-            address = f"127.0.0.{1 + ARMS.index(arm)}"
-            server = Worker(f"camera {arm}", serve, model_of(self._config, arm), sensor(arm), address)
+            server = Worker(f"camera {arm}", serve, model_of(self._config, arm), sensor(arm), address_of(arm))
             self._servers[arm] = server
             server.expect(Ready, time.monotonic() + _START_S)
-        return AravisOpener(spec_of(self._config, arm, ""))
+        return AravisOpener(spec_of(self._config, arm, address_of(arm)))
 
     def close(self) -> None:
         """Take the cameras away. Idempotent."""
         while self._servers:
             _, server = self._servers.popitem()
             server.end(time.monotonic() + _END_S)
+
+
+def address_of(arm: str) -> str:
+    """A loopback address that no other process of this host has for its cameras."""
+    pid = os.getpid() % (1 << 16)
+    return f"127.{1 + pid // 256 % 254}.{pid % 256}.{1 + ARMS.index(arm)}"
