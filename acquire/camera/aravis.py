@@ -77,7 +77,6 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_get_device_id": (c_char_p, (c_uint,)),
     "arv_get_device_serial_nbr": (c_char_p, (c_uint,)),
     "arv_get_device_model": (c_char_p, (c_uint,)),
-    "arv_get_device_vendor": (c_char_p, (c_uint,)),
     "arv_camera_new": (c_void_p, (c_char_p, c_void_p)),
     "arv_camera_get_device": (c_void_p, (c_void_p,)),
     "arv_camera_get_payload": (c_uint, (c_void_p, c_void_p)),
@@ -282,14 +281,23 @@ def load() -> Any:
     )
 
 
+def list_cameras() -> list[tuple[str, str]]:
+    """Serial number and model of every camera that answers. Raises CameraError where there is no Aravis."""
+    library = load()
+    library.arv_update_device_list()
+    ask = (library.arv_get_device_serial_nbr, library.arv_get_device_model)
+    found = [[(what(k) or b"").decode() for what in ask] for k in range(library.arv_get_n_devices())]
+    return [(serial, model) for serial, model in found]
+
+
 def _find(library: Any, spec: GenicamSpec) -> bytes:
     """The device with the serial number, of all that answer."""
     if spec.cti == FAKE:
         library.arv_enable_interface(FAKE.encode())
     library.arv_update_device_list()
-    found = {}
-    for index in range(library.arv_get_n_devices()):
-        found[(library.arv_get_device_serial_nbr(index) or b"").decode()] = index
+    found = {
+        (library.arv_get_device_serial_nbr(k) or b"").decode(): k for k in range(library.arv_get_n_devices())
+    }
     if spec.serial not in found:
         raise CameraError(
             f"there is no camera with serial number {spec.serial!r}",

@@ -1,6 +1,6 @@
 """Cameras through harvesters: any camera whose maker gives a GenTL producer (.cti).
 
-The only file that imports harvesters and genicam, and only when a camera is opened: importing them changes
+The only file that imports harvesters, and only when a camera is opened: importing it changes
 warning filters, opening takes over SIGINT (both are put back), and a producer must never be forked. Their
 binding holds the interpreter's lock while it waits, so a camera wants a process of its own.
 
@@ -17,7 +17,6 @@ import signal
 import threading
 import time
 import warnings
-from collections import deque
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -35,28 +34,19 @@ from acquire.camera.assembly import (
 )
 from acquire.camera.base import CameraIdentity
 from acquire.camera.frames import FrameFacts
+from acquire.camera.genapi import GenapiFeatures, Words, is_gone, told
 from acquire.camera.producers import find_producers
 from acquire.camera.settings import apply_settings
-from acquire.errors import CameraError, CameraLostError
+from acquire.errors import CameraError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from acquire.camera.base import CameraBlock
-    from acquire.camera.settings import Kind, Value
     from acquire.camera.spec import GenicamSpec
 
 _ALIVE_S = 0.5
 """How often a silent camera is asked whether it is still there."""
-_COMMAND_S = 5.0
-_KINDS: dict[str, Kind] = {
-    "intfIInteger": "integer",
-    "intfIFloat": "float",
-    "intfIEnumeration": "enumeration",
-    "intfIBoolean": "boolean",
-    "intfIString": "text",
-    "intfICommand": "command",
-}
 _log = logging.getLogger(__name__)
 
 
@@ -120,7 +110,7 @@ class HarvestersCamera:
     def settings(self) -> dict[str, Any]:
         return read_settings(self._features)
 
-    def features(self) -> dict[str, _Features]:
+    def features(self) -> dict[str, GenapiFeatures]:
         """Module → its features, for a look at everything (`acquire.camera.settings.Features`)."""
         return self._features
 
@@ -130,7 +120,7 @@ class HarvestersCamera:
         self._views.clear()
         self._missed = MissedTriggers(self._features)
         self._assembly = Assembly(found, self._spec)
-        with _told(f"arm camera {self._spec.serial}"), _signals_kept():
+        with told(f"arm camera {self._spec.serial}"), _signals_kept():
             acquirer = self._acquirer
             acquirer.num_buffers = buffer_count(self._spec, found)
             # harvesters keeps its monitors to itself; without one there is no word of incomplete buffers.
@@ -150,7 +140,7 @@ class HarvestersCamera:
             self._ask_alive()
             return None
         self._heard_s = time.monotonic()
-        with _told(f"camera {self._spec.serial}"):
+        with told(f"camera {self._spec.serial}"):
             block = self._read_out(buffer)
         self._held[block] = buffer
         return block
@@ -159,7 +149,7 @@ class HarvestersCamera:
         from genicam import gentl
 
         try:
-            with _told(f"camera {self._spec.serial}"):
+            with told(f"camera {self._spec.serial}"):
                 self._monitor.update_event_data(max(1, round(timeout_s * 1000)))
                 return self._monitor.buffer
         except CameraError as error:
@@ -205,7 +195,7 @@ class HarvestersCamera:
     def release(self, block: CameraBlock) -> None:
         buffer = self._held.pop(block, None)
         if buffer is not None and self._armed:
-            with _told(f"camera {self._spec.serial}"):
+            with told(f"camera {self._spec.serial}"):
                 self._stream.module.queue_buffer(buffer, False)
 
     def disarm(self) -> None:
@@ -232,8 +222,8 @@ class _Library:
 
     def __init__(self, cti: str) -> None:
         self._producers = find_producers(cti)
-        self._words = _Words()
-        with warnings.catch_warnings(), _told("load harvesters"):
+        self._words = Words()
+        with warnings.catch_warnings(), told("load harvesters"):
             warnings.simplefilter("ignore")
             try:
                 from harvesters.core import Harvester, ParameterKey, ParameterSet
@@ -273,10 +263,10 @@ class _Library:
     def create(self, camera: FoundCamera) -> Any:
         infos = self._harvester.device_info_list
         index = next(k for k, info in enumerate(infos) if _describe(info) == camera)
-        with _told(f"open camera {camera.serial}", self._words), _signals_kept():
+        with told(f"open camera {camera.serial}", self._words), _signals_kept():
             acquirer = self._harvester.create(index)
         node_map = acquirer.remote_device.node_map
-        if node_map is None or _Features(node_map).find("Width") is None:
+        if node_map is None or GenapiFeatures(node_map).find("Width") is None:
             raise CameraError(
                 f"camera {camera.serial}: its description cannot be used", hint=self._words.last
             )
@@ -284,7 +274,7 @@ class _Library:
 
     def close(self) -> None:
         """Idempotent; what a camera that is gone refuses does not matter any more."""
-        with suppress(CameraError), _told("close"), _signals_kept():
+        with suppress(CameraError), told("close"), _signals_kept():
             self._harvester.reset()
 
     def __enter__(self) -> _Library:
@@ -294,135 +284,7 @@ class _Library:
         self.close()
 
 
-class _Words(logging.Handler):
-    """What harvesters only logs, such as a description that cannot be parsed."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self._last: deque[str] = deque(maxlen=3)
-
-    def emit(self, record: logging.LogRecord) -> None:
-        text = record.getMessage().splitlines()
-        if text:
-            self._last.append(text[0])
-            _log.debug("harvesters: %s", text[0])
-
-    @property
-    def last(self) -> str:
-        return self._last[-1] if self._last else ""
-
-
-class _Features:
-    """`acquire.camera.settings.Features` of a node map."""
-
-    def __init__(self, node_map: Any) -> None:
-        self._map = node_map
-        self._nodes: dict[str, _Node] = {}
-
-    def find(self, name: str) -> _Node | None:
-        if name not in self._nodes:
-            from genicam import genapi
-
-            try:
-                self._nodes[name] = _Node(self._map.get_node(name))
-            except genapi.GenericException:
-                return None
-        return self._nodes[name]
-
-    def names(self) -> list[str]:
-        return [name for names in self.categories().values() for name in names]
-
-    def categories(self) -> dict[str, list[str]]:
-        """Category → its features, in the order of the description."""
-        found: dict[str, list[str]] = {}
-        with _told("read the features"):
-            self._collect(self._map.get_node("Root"), "Root", found)
-        return found
-
-    def _collect(self, category: Any, name: str, found: dict[str, list[str]]) -> None:
-        from genicam import genapi
-
-        for feature in category.features:
-            if feature.node.principal_interface_type == genapi.EInterfaceType.intfICategory:
-                if feature.node.name not in found:
-                    self._collect(feature, feature.node.name, found)
-            elif feature.node.name not in found.setdefault(name, []):
-                found[name].append(feature.node.name)
-
-
-class _Node:
-    """`acquire.camera.settings.Node` of a GenApi node."""
-
-    def __init__(self, node: Any) -> None:
-        from genicam import genapi
-
-        self._node = node
-        self.name: str = node.node.name
-        self.kind: Kind = _KINDS.get(genapi.EInterfaceType(node.node.principal_interface_type).name, "other")
-
-    @property
-    def readable(self) -> bool:
-        return self.kind not in ("command", "other") and self._mode in ("RO", "RW")
-
-    @property
-    def writable(self) -> bool:
-        return self._mode in ("WO", "RW")
-
-    @property
-    def _mode(self) -> str:
-        from genicam import genapi
-
-        with _told(self.name):
-            return str(genapi.EAccessMode(self._node.get_access_mode()).name)
-
-    @property
-    def selected(self) -> bool:
-        with _told(self.name):
-            return bool(self._node.node.selecting_features)
-
-    @property
-    def about(self) -> str:
-        """What the camera says of the feature."""
-        return str(self._node.node.tooltip or self._node.node.description)
-
-    def read(self) -> Value:
-        with _told(f"read {self.name}"):
-            value: Value = self._node.value
-            return value
-
-    def read_afresh(self) -> None:
-        """Read the register itself, not what is remembered of it."""
-        with _told(f"read {self.name}"):
-            self._node.node.invalidate_node()
-            self._node.to_string()
-
-    def write(self, value: Value) -> None:
-        with _told(f"set {self.name} to {value!r}"):
-            if self.kind != "command":
-                self._node.value = value
-            elif value:
-                self._execute()
-
-    def _execute(self) -> None:
-        self._node.execute()
-        deadline = time.monotonic() + _COMMAND_S
-        while not self._node.is_done():
-            if time.monotonic() > deadline:
-                raise CameraError(f"{self.name} is not done after {_COMMAND_S:g} s")
-            time.sleep(0.001)
-
-    def limits(self) -> tuple[float, float, float]:
-        with _told(self.name):
-            if self.kind == "integer":
-                return self._node.min, self._node.max, self._node.inc
-            return self._node.min, self._node.max, self._node.inc if self._node.has_inc() else 0
-
-    def entries(self) -> list[str]:
-        with _told(self.name):
-            return list(self._node.symbolics)
-
-
-def _modules(acquirer: Any) -> dict[str, _Features]:
+def _modules(acquirer: Any) -> dict[str, GenapiFeatures]:
     """The node maps of a camera; a producer need not have all."""
     streams: Sequence[Any] = acquirer.data_streams
     maps = {
@@ -432,13 +294,13 @@ def _modules(acquirer: Any) -> dict[str, _Features]:
         "stream": _map_of(streams[0]) if streams else None,
         "system": _map_of(acquirer.system),
     }
-    return {name: _Features(node_map) for name, node_map in maps.items() if node_map is not None}
+    return {name: GenapiFeatures(node_map) for name, node_map in maps.items() if node_map is not None}
 
 
 def _map_of(module: Any) -> Any:
     """harvesters makes node maps of modules without a description: they have no root."""
     node_map = module.node_map
-    return node_map if node_map is not None and _Features(node_map).find("Root") is not None else None
+    return node_map if node_map is not None and GenapiFeatures(node_map).find("Root") is not None else None
 
 
 def _describe(info: Any) -> FoundCamera:
@@ -458,7 +320,7 @@ def _stop(acquirer: Any) -> None:
     """Stop as harvesters does; where the camera is gone that ends half-way, so finish by hand."""
     from genicam import gentl
 
-    with suppress(CameraError), _told("stop"):
+    with suppress(CameraError), told("stop"):
         acquirer.stop()
         return
     stream = acquirer.data_streams[0]
@@ -467,7 +329,7 @@ def _stop(acquirer: Any) -> None:
         acquirer._release_buffers,
         lambda: [monitor.flush_event_queue() for monitor in acquirer._new_buffer_event_monitor_dict.values()],
     ):
-        with suppress(CameraError), _told("stop"):
+        with suppress(CameraError), told("stop"):
             step()
 
 
@@ -478,35 +340,13 @@ def _or(ask: Any, otherwise: Any) -> Any:
     try:
         return ask()
     except gentl.GenericException as error:
-        if _is_gone(error):
+        if is_gone(error):
             raise
         return otherwise
 
 
 def _or_zero(ask: Any) -> int:
     return int(_or(ask, 0))
-
-
-def _is_gone(error: Exception) -> bool:
-    from genicam import gentl
-
-    return isinstance(error, gentl.IoException | gentl.InvalidHandleException | gentl.ClosedException)
-
-
-@contextmanager
-def _told(what: str, words: _Words | None = None) -> Iterator[None]:
-    """Errors of the libraries as ours: CameraLostError when the device is gone, else CameraError."""
-    try:
-        from genicam import genapi, gentl
-    except ImportError as error:
-        raise CameraError(
-            f"genicam cannot be imported: {error}", hint="pip install harvesters genicam"
-        ) from error
-    try:
-        yield
-    except (genapi.GenericException, gentl.GenericException, ValueError) as error:
-        kind = CameraLostError if _is_gone(error) else CameraError
-        raise kind(f"{what}: {error}", hint=words.last if words else "") from error
 
 
 @contextmanager

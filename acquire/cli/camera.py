@@ -1,4 +1,4 @@
-"""``acquire devices`` and ``acquire camera features | snapshot``: what there is, before it is used."""
+"""``acquire camera features | snapshot``: look at one camera before it is used."""
 
 from __future__ import annotations
 
@@ -8,11 +8,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table
-from acquire.errors import AcquireError, UsageError
+from acquire.errors import UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from acquire.camera.base import CameraOpener
     from acquire.config import RigConfig
     from acquire.rig import Rig
@@ -28,26 +26,10 @@ OPEN_S = 60.0
 
 
 def register(app: typer.Typer) -> None:
-    app.command(rich_help_panel="Rig")(devices)
     group = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
     for command in (features, snapshot):
         group.command()(command)
     app.add_typer(group, name="camera", help="Look at one camera.", rich_help_panel="Rig")
-
-
-def devices(config: ConfigOption = None, json: JsonFlag = False) -> None:
-    """List triggers and cameras with their serial numbers, and say what each lacks.
-
-    With a rig file its devices are opened and set, one after the other, and let go of again.
-
-    Example: [bold]acquire devices --config rig-demo[/]
-    """
-    rows = list(_of_rig(config) if config else _of_producers())
-    if json:
-        print_json(rows)
-        return
-    columns = ("device", "serial", "model", "firmware", "state")
-    print_table(columns, [[row[column] for column in columns] for row in rows])
 
 
 def features(serial: SerialArgument, config: ConfigOption = None, json: JsonFlag = False) -> None:
@@ -150,62 +132,6 @@ class _Bench:
     def __exit__(self, *_: object) -> None:
         if self._rig is not None:
             self._rig.close()
-
-
-def _of_rig(config: str) -> Iterator[dict[str, Any]]:
-    from acquire.camera.look import facts
-    from acquire.config import load_rig
-    from acquire.rig import Rig
-    from acquire.stream.visit import visit
-
-    rig_config = load_rig(config)
-    with Rig(rig_config) as rig:
-        yield _trigger(rig)
-        openers = _openers(rig)
-        for arm in ("a", "b"):
-            camera = rig_config.cameras.arm(arm)
-            row = {"device": f"camera {arm}", "serial": camera.serial, "model": camera.model, "firmware": ""}
-            try:
-                if isinstance(openers, AcquireError):
-                    raise openers
-                seen = visit(openers[arm], facts, timeout_s=OPEN_S)["identity"]
-                yield row | {k: seen[k] for k in ("serial", "model", "firmware")} | {"state": "ready"}
-            except AcquireError as error:
-                yield row | {"state": str(error)}
-
-
-def _openers(rig: Rig) -> dict[str, CameraOpener] | AcquireError:
-    try:
-        return rig.openers()
-    except AcquireError as error:
-        return error
-
-
-def _trigger(rig: Rig) -> dict[str, Any]:
-    try:
-        found = rig.trigger.identify()
-    except AcquireError as error:
-        return {"device": "trigger", "serial": "", "model": "", "firmware": "", "state": str(error)}
-    return {
-        "device": "trigger",
-        "serial": found.serial,
-        "model": found.model,
-        "firmware": found.firmware,
-        "state": "ready",
-    }
-
-
-def _of_producers() -> Iterator[dict[str, Any]]:
-    from acquire.camera.harvesters import list_cameras
-
-    for camera in list_cameras():
-        yield {
-            "device": "camera",
-            "serial": camera.serial,
-            "model": camera.model,
-            "firmware": camera.firmware,
-            "state": camera.access,
-        }
 
 
 def _check_out(path: Path) -> None:

@@ -81,6 +81,7 @@ class FakeBus(usb.backend.IBackend):
         )
 
     def open_device(self, dev):
+        self._refuse(errno.EACCES)
         return dev
 
     def close_device(self, dev_handle):
@@ -89,9 +90,13 @@ class FakeBus(usb.backend.IBackend):
     def get_configuration(self, dev_handle):
         return 1
 
-    def claim_interface(self, dev_handle, intf):
-        if self.refusal is not None:
+    def _refuse(self, *reasons: int) -> None:
+        """As libusb does: who has no right may not open; what another has cannot be claimed."""
+        if self.refusal in reasons:
             raise usb.core.USBError(os.strerror(self.refusal), None, self.refusal)
+
+    def claim_interface(self, dev_handle, intf):
+        self._refuse(errno.EBUSY, errno.EIO)
         self.claimed += 1
 
     def release_interface(self, dev_handle, intf):

@@ -12,6 +12,7 @@ from contextlib import suppress
 
 import pytest
 import serial
+from serial.tools.list_ports_common import ListPortInfo
 from trigger_twins import CLOCK_HZ, run, wired_model
 
 from acquire.config import TriggerConfig
@@ -19,7 +20,7 @@ from acquire.errors import TriggerError
 from acquire.sim.twin_links import PtyTwin
 from acquire.trigger.driver import TriggerDriver
 from acquire.trigger.transports.lock import PortLock
-from acquire.trigger.transports.serial import SerialTransport
+from acquire.trigger.transports.serial import FoundPort, SerialTransport, list_ports
 
 
 def test_a_loop_brings_back_what_was_sent() -> None:
@@ -29,6 +30,18 @@ def test_a_loop_brings_back_what_was_sent() -> None:
     assert port.read() == b""
     port.close()
     port.close()
+
+
+def test_ports_are_listed_with_who_uses_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    with wired_model() as model:
+        twin = PtyTwin(model)
+        there = ListPortInfo(twin.path)
+        monkeypatch.setattr("acquire.trigger.transports.serial.comports", lambda: [there])
+        assert list_ports() == [FoundPort(twin.path, "", "", "")]
+        port = SerialTransport(twin.path, 3_000_000)
+        assert f"in use by process {os.getpid()}" in list_ports()[0].held_by
+        port.close()
+        twin.close()
 
 
 def test_a_port_that_is_not_there_is_named() -> None:

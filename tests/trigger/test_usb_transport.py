@@ -10,7 +10,7 @@ from trigger_twins import run, wired_model
 from acquire.config import TriggerConfig
 from acquire.errors import TriggerError
 from acquire.trigger.driver import TriggerDriver
-from acquire.trigger.transports.usb import UsbTransport
+from acquire.trigger.transports.usb import FoundDevice, UsbTransport, list_devices
 
 
 def test_the_driver_runs_over_usb_and_hears_of_an_unplugged_cable() -> None:
@@ -53,6 +53,17 @@ def test_a_device_that_may_not_be_opened_says_what_to_try(refusal, hint) -> None
         UsbTransport(backend=bus).close()  # the lock was let go
 
 
+def test_triggers_on_the_bus_are_listed_and_what_keeps_us_from_them_said(monkeypatch) -> None:
+    with wired_model() as model:
+        bus = FakeBus(model)
+        assert list_devices(bus) == [FoundDevice("usb 1209:0001", "42", "")]
+        assert list_devices(FakeBus(model, product=2)) == []
+        bus.refusal = errno.EACCES
+        (found,) = list_devices(bus)
+        assert found.serial == ""
+        assert "udev rule" in found.lacks
+
+
 def test_without_libusb_the_error_says_what_is_missing(monkeypatch) -> None:
     def find(**wanted):
         raise usb.core.NoBackendError("No backend available")
@@ -60,3 +71,5 @@ def test_without_libusb_the_error_says_what_is_missing(monkeypatch) -> None:
     monkeypatch.setattr(usb.core, "find", find)
     with pytest.raises(TriggerError, match="No backend available; try: install libusb"):
         UsbTransport()
+    with pytest.raises(TriggerError, match="libusb is not installed"):
+        list_devices()

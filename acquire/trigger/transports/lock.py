@@ -47,6 +47,15 @@ class PortLock:
             self._descriptor = -1
 
 
+def holder_of(port: str) -> str:
+    """``in use by process 1234 (…)``, or "": asked without waiting and without keeping the lock."""
+    try:
+        PortLock(port).release()
+    except TriggerError as error:
+        return error.message
+    return ""
+
+
 def lock_directory() -> Path:
     """Where locks of all users lie, else this host's directory for temporary files."""
     return SHARED if os.access(SHARED, os.W_OK) else Path(tempfile.gettempdir())

@@ -3,19 +3,36 @@
 from __future__ import annotations
 
 import errno
+from dataclasses import dataclass
 from pathlib import Path
 
 import serial
 from serial.tools.list_ports import comports
+from serial.tools.list_ports_common import ListPortInfo
 
 from acquire.errors import TriggerError
 from acquire.trigger.transports.base import READ_WAIT_S, UDEV_HINT
-from acquire.trigger.transports.lock import PortLock
+from acquire.trigger.transports.lock import PortLock, holder_of
 
 BITS_PER_BYTE = 10
 """8N1."""
 _WRITE_S = 2.0
 _READ_BYTES = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class FoundPort:
+    """A serial port of this host; ``held_by`` says who uses it, as far as it locks ports as we do."""
+
+    device: str
+    description: str
+    serial_number: str
+    held_by: str
+
+
+def list_ports() -> list[FoundPort]:
+    """The ports that are there; none is opened."""
+    return [_describe(port) for port in sorted(comports())]
 
 
 class SerialTransport:
@@ -29,7 +46,7 @@ class SerialTransport:
         self.name = url
         self._local = local = "://" not in url
         self.bytes_per_s = baud / BITS_PER_BYTE if local else float("inf")
-        self._lock = PortLock(str(Path(url).resolve()) if local else url)
+        self._lock = PortLock(_lock_name(url) if local else url)
         try:
             self._port = serial.serial_for_url(
                 url, baudrate=baud, timeout=READ_WAIT_S, write_timeout=_WRITE_S, rtscts=rts_cts
@@ -70,6 +87,17 @@ class SerialTransport:
 
     def _gone(self, error: OSError) -> TriggerError:
         return TriggerError(f"{self.name} is gone: {error}", hint="check cable and power")
+
+
+def _describe(port: ListPortInfo) -> FoundPort:
+    """pyserial writes "n/a" where the system says nothing."""
+    description = "" if port.description == "n/a" else port.description
+    return FoundPort(port.device, description, port.serial_number or "", holder_of(_lock_name(port.device)))
+
+
+def _lock_name(path: str) -> str:
+    """One name per port, whichever link leads there."""
+    return str(Path(path).resolve())
 
 
 def _not_opened(url: str, error: OSError | ValueError, local: bool) -> TriggerError:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+from dataclasses import dataclass
 from typing import Any
 
 import usb.core
@@ -23,6 +24,36 @@ _HINTS = {
     errno.EPERM: UDEV_HINT,
     errno.EBUSY: "another program or a driver of the kernel has it: end that",
 }
+
+
+@dataclass(frozen=True, slots=True)
+class FoundDevice:
+    """A trigger on the bus; ``lacks`` says why it cannot be used."""
+
+    name: str
+    serial: str
+    lacks: str
+
+
+def list_devices(backend: Any = None) -> list[FoundDevice]:
+    """Every trigger on the bus; none is claimed. Raises TriggerError where there is no libusb."""
+    try:
+        found = list(usb.core.find(find_all=True, idVendor=VENDOR, idProduct=PRODUCT, backend=backend) or ())
+    except usb.core.NoBackendError as error:
+        raise TriggerError("no USB: libusb is not installed", hint="install libusb-1.0") from error
+    return [_look(device) for device in found]
+
+
+def _look(device: Any) -> FoundDevice:
+    """Reading a serial number needs the right to open the device."""
+    name = f"usb {VENDOR:04x}:{PRODUCT:04x}"
+    try:
+        serial = str(device.serial_number or "")
+    except (usb.core.USBError, ValueError) as error:  # ValueError: no language that we may read
+        return FoundDevice(name, "", f"it may not be opened ({error}); try: {UDEV_HINT}")
+    finally:
+        usb.util.dispose_resources(device)
+    return FoundDevice(name, serial, "")
 
 
 class UsbTransport:

@@ -1,0 +1,180 @@
+"""What a camera describes of itself: GenApi node maps, through the genicam package.
+
+genicam is imported when first used, never with this module: importing it changes warning filters.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections import deque
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from acquire.errors import CameraError, CameraLostError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from acquire.camera.settings import Kind, Value
+
+_COMMAND_S = 5.0
+_KINDS: dict[str, Kind] = {
+    "intfIInteger": "integer",
+    "intfIFloat": "float",
+    "intfIEnumeration": "enumeration",
+    "intfIBoolean": "boolean",
+    "intfIString": "text",
+    "intfICommand": "command",
+}
+_log = logging.getLogger(__name__)
+
+
+class GenapiFeatures:
+    """`acquire.camera.settings.Features` of a node map."""
+
+    def __init__(self, node_map: Any) -> None:
+        self._map = node_map
+        self._nodes: dict[str, GenapiNode] = {}
+
+    def find(self, name: str) -> GenapiNode | None:
+        if name not in self._nodes:
+            from genicam import genapi
+
+            try:
+                self._nodes[name] = GenapiNode(self._map.get_node(name))
+            except genapi.GenericException:
+                return None
+        return self._nodes[name]
+
+    def names(self) -> list[str]:
+        return [name for names in self.categories().values() for name in names]
+
+    def categories(self) -> dict[str, list[str]]:
+        """Category → its features, in the order of the description."""
+        found: dict[str, list[str]] = {}
+        with told("read the features"):
+            self._collect(self._map.get_node("Root"), "Root", found)
+        return found
+
+    def _collect(self, category: Any, name: str, found: dict[str, list[str]]) -> None:
+        from genicam import genapi
+
+        for feature in category.features:
+            if feature.node.principal_interface_type == genapi.EInterfaceType.intfICategory:
+                if feature.node.name not in found:
+                    self._collect(feature, feature.node.name, found)
+            elif feature.node.name not in found.setdefault(name, []):
+                found[name].append(feature.node.name)
+
+
+class GenapiNode:
+    """`acquire.camera.settings.Node` of a GenApi node."""
+
+    def __init__(self, node: Any) -> None:
+        from genicam import genapi
+
+        self._node = node
+        self.name: str = node.node.name
+        self.kind: Kind = _KINDS.get(genapi.EInterfaceType(node.node.principal_interface_type).name, "other")
+
+    @property
+    def readable(self) -> bool:
+        return self.kind not in ("command", "other") and self._mode in ("RO", "RW")
+
+    @property
+    def writable(self) -> bool:
+        return self._mode in ("WO", "RW")
+
+    @property
+    def _mode(self) -> str:
+        from genicam import genapi
+
+        with told(self.name):
+            return str(genapi.EAccessMode(self._node.get_access_mode()).name)
+
+    @property
+    def selected(self) -> bool:
+        with told(self.name):
+            return bool(self._node.node.selecting_features)
+
+    @property
+    def about(self) -> str:
+        """What the camera says of the feature."""
+        return str(self._node.node.tooltip or self._node.node.description)
+
+    def read(self) -> Value:
+        with told(f"read {self.name}"):
+            value: Value = self._node.value
+            return value
+
+    def read_afresh(self) -> None:
+        """Read the register itself, not what is remembered of it."""
+        with told(f"read {self.name}"):
+            self._node.node.invalidate_node()
+            self._node.to_string()
+
+    def write(self, value: Value) -> None:
+        with told(f"set {self.name} to {value!r}"):
+            if self.kind != "command":
+                self._node.value = value
+            elif value:
+                self._execute()
+
+    def _execute(self) -> None:
+        self._node.execute()
+        deadline = time.monotonic() + _COMMAND_S
+        while not self._node.is_done():
+            if time.monotonic() > deadline:
+                raise CameraError(f"{self.name} is not done after {_COMMAND_S:g} s")
+            time.sleep(0.001)
+
+    def limits(self) -> tuple[float, float, float]:
+        with told(self.name):
+            if self.kind == "integer":
+                return self._node.min, self._node.max, self._node.inc
+            return self._node.min, self._node.max, self._node.inc if self._node.has_inc() else 0
+
+    def entries(self) -> list[str]:
+        with told(self.name):
+            return list(self._node.symbolics)
+
+
+class Words(logging.Handler):
+    """What harvesters only logs, such as a description that cannot be parsed."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._last: deque[str] = deque(maxlen=3)
+
+    def emit(self, record: logging.LogRecord) -> None:
+        text = record.getMessage().splitlines()
+        if text:
+            self._last.append(text[0])
+            _log.debug("harvesters: %s", text[0])
+
+    @property
+    def last(self) -> str:
+        return self._last[-1] if self._last else ""
+
+
+def is_gone(error: Exception) -> bool:
+    from genicam import gentl
+
+    return isinstance(error, gentl.IoException | gentl.InvalidHandleException | gentl.ClosedException)
+
+
+@contextmanager
+def told(what: str, words: Words | None = None) -> Iterator[None]:
+    """Errors of the libraries as ours: CameraLostError when the device is gone, else CameraError."""
+    try:
+        from genicam import genapi, gentl
+    except ImportError as error:
+        raise CameraError(
+            f"genicam cannot be imported: {error}", hint="pip install harvesters genicam"
+        ) from error
+    try:
+        yield
+    except (genapi.GenericException, gentl.GenericException, ValueError) as error:
+        kind = CameraLostError if is_gone(error) else CameraError
+        raise kind(f"{what}: {error}", hint=words.last if words else "") from error
