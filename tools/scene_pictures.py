@@ -52,12 +52,15 @@ def picture(name: str) -> Figure:
     axes.plot(
         (begin + (np.arange(len(light)) + 0.5) * merge) * dt * 1e3, light[:, :4, :4].reshape(len(light), -1)
     )
-    axes.set_xlabel("ms; mean light of 4 × 4 areas", fontsize=8)
+    axes.set_xlabel("time, ms", fontsize=8)
+    axes.set_ylabel("light of 4 × 4 areas", fontsize=8)
     for number, arm in enumerate(ARMS):
         axes = figure.add_subplot(grid[2, number * FRAMES // 2 : (number + 1) * FRAMES // 2])
         pixels = bench.camera(arm, code).read(first, count).pixels
         axes.imshow(pixels, cmap="gray", aspect="auto", interpolation="nearest")
-        axes.set_title(f"lines of arm {arm.upper()}, {pixels.shape[0]} × {pixels.shape[1]}", fontsize=8)
+        axes.set_title(f"arm {arm.upper()}", fontsize=8)
+        axes.set_xlabel("pixel", fontsize=8)
+        axes.set_ylabel("line", fontsize=8)
     return figure
 
 

@@ -10,6 +10,7 @@ import json
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,8 +27,6 @@ from acquire.store.layout import line_columns
 from acquire.store.spec import CAMERA_KEYS, FORMAT
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from numpy.typing import NDArray
 
 UNUSABLE = LineFlag.MISSING | LineFlag.INCOMPLETE
@@ -208,8 +207,9 @@ class Recording:
             )
 
 
-def open_recording(path: Path) -> Recording:
+def open_recording(path: Path | str) -> Recording:
     """Open a recording, growing or sealed. Raises DataError when ``path`` is not one, or is damaged."""
+    path = Path(path)
     _check_format(path, format_of(path))
     try:
         group = zarr.open_group(path, mode="r", zarr_format=3)

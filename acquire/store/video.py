@@ -14,6 +14,7 @@ import math
 import os
 import shutil
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,7 +28,6 @@ from acquire.store.layout import group_document, to_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -87,8 +87,9 @@ def write_video(
         shutil.rmtree(partial, ignore_errors=True)
 
 
-def open_video(path: Path) -> VideoFile:
+def open_video(path: Path | str) -> VideoFile:
     """Open a video that `write_video` wrote. Raises DataError when ``path`` is not one, or is damaged."""
+    path = Path(path)
     if not path.exists():
         raise DataError(f"{path} does not exist", hint="the path of a video (a directory NAME.zarr)")
     try:

@@ -7,8 +7,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+from acquire.config import load_rig, load_scene
+from acquire.simulate import simulate
+
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+EXAMPLES = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 BLOCKS = re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
 
 
@@ -35,3 +41,14 @@ def test_every_path_it_names_exists() -> None:
     named = re.findall(r"`((?:acquire|configs|tests|tools)/[\w./-]*)`", README)
     assert len(named) > 10
     assert [path for path in named if not (ROOT / path).exists()] == []
+
+
+def test_its_python_examples_run_on_a_recording(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rig = load_rig("rig-demo", {"geometry.stages": 16})
+    simulate(rig, load_scene("scene-leds"), tmp_path / "run.zarr", 2000)
+    monkeypatch.chdir(tmp_path)
+    assert len(EXAMPLES) == 2
+    names: dict[str, object] = {}
+    for example in EXAMPLES:
+        exec(example.replace("lines=263", "lines=60"), names)
+    assert names["video"].shape == (3 * 60 - 3 * 16 + 1, 16, 16)
