@@ -63,7 +63,7 @@ class Rig:
         check_rig(config)
         self.config = config
         self._scene = load_scene(config.simulation.scene)
-        if config.simulation.replay is None:
+        if config.simulation.replay is None and simulates_light(config):
             _check_scene(config, self._scene)
         self._wire = Wire()
         self._pins = PinPage() if config.trigger.driver == "rtl" else None
@@ -105,7 +105,9 @@ class Rig:
     def describe(self) -> dict[str, Any]:
         """What a recording must say about where its lines come from (JSON)."""
         replay = self.config.simulation.replay
-        return describe(self._scene) if replay is None else describe_replay(replay)
+        if replay is not None:
+            return describe_replay(replay)
+        return describe(self._scene) if simulates_light(self.config) else {"simulated": False}
 
     @property
     def layout(self) -> str:
@@ -114,7 +116,9 @@ class Rig:
         if replay is not None:
             return str(open_recording(replay).attrs["layout"])
         cameras = self.config.cameras.layout
-        return cameras if cameras != "dual" else self._scene.optics.layout
+        if cameras != "dual" or not simulates_light(self.config):
+            return cameras
+        return self._scene.optics.layout
 
     def scene(self) -> Scene:
         """What the simulated cameras see, in camera A's rows and columns; sub-step 0 is the run's first."""
@@ -147,6 +151,11 @@ class Rig:
         self.close()
 
 
+def simulates_light(config: RigConfig) -> bool:
+    """Whether what the cameras see comes out of the forward model."""
+    return any(config.cameras.arm(arm).driver in SIMULATED_CAMERAS for arm in ARMS)
+
+
 def _check_scene(config: RigConfig, scene: SceneConfig) -> None:
     """Raise UsageError here rather than in a camera's process."""
     code = ConstantCode(0)
@@ -177,7 +186,7 @@ def check_rig(config: RigConfig) -> None:
         register_values(run, trigger, possible, _link_bytes_per_s(trigger))
     except TriggerError as error:
         raise ConfigError(error.message, possible=error.possible, hint=error.hint) from error
-    if not {config.cameras.arm(arm).driver for arm in ARMS}.isdisjoint(SIMULATED_CAMERAS):
+    if simulates_light(config):
         _check_simulated_cameras(trigger)
 
 

@@ -87,6 +87,12 @@ def test_what_a_recording_is_told_rebuilds_the_scene(config):
     np.testing.assert_array_equal(truth(scene, 100, 40, 3, 4), truth(again, 100, 40, 3, 4))
 
 
+def test_a_rig_of_real_cameras_is_not_said_to_be_simulated():
+    with Rig(load_rig("rig-vt-4k5c-h100")) as rig:
+        assert rig.describe() == {"simulated": False}
+        assert rig.layout == "dual"
+
+
 def test_a_rig_without_its_scene_is_refused_before_anything_is_made(config, tmp_path):
     missing = config.simulation.model_copy(update={"scene": str(tmp_path / "none.toml")})
     before = open_descriptors()
