@@ -26,6 +26,13 @@ needs_compiler = pytest.mark.needs_compiler
 STAGES = 16
 WAIT_S = 60.0
 
+SMALL: dict[str, Any] = {
+    "geometry.stages": STAGES,
+    "recording.chunk_lines": 1024,
+    "stream.block_lines": 128,
+    "stream.ring_slots": 512,  # two seconds: a busy machine loses nothing but what a test takes away
+}
+
 
 def rig_config(**changes: Any) -> RigConfig:
     settings = [
@@ -34,7 +41,7 @@ def rig_config(**changes: Any) -> RigConfig:
         ["remote", "CounterEventSource", "LineTriggerMissed"],
         ["stream", "BufferHeight", 100],
     ]
-    given = {"geometry.stages": STAGES, "recording.chunk_lines": 1024, "stream.block_lines": 128, **changes}
+    given = SMALL | changes
     given |= {f"cameras.{arm}.settings": settings for arm in "ab"}
     return load_rig("rig-demo-gentl", given)
 
@@ -100,7 +107,7 @@ def test_what_is_recorded_through_gige_vision_is_eq1(tmp_path: Path) -> None:
         ["remote", "PixelFormat", "Mono12"],
         ["remote", "Height", 100],
     ]
-    given = {"geometry.stages": STAGES, "recording.chunk_lines": 1024, "stream.block_lines": 128}
+    given = dict(SMALL)
     given |= {f"cameras.{arm}.settings": settings for arm in "ab"}
     config = load_rig("rig-demo-gige", given)
     recording, status = record(config, tmp_path / "r.zarr", 20_000)
@@ -113,7 +120,7 @@ def test_what_is_recorded_through_gige_vision_is_eq1(tmp_path: Path) -> None:
 @pytest.mark.parametrize("rig", ["rig-demo", pytest.param("rig-demo-gentl", marks=needs_compiler)])
 def test_both_arms_from_one_camera_are_eq1(tmp_path: Path, rig: str) -> None:
     settings = [["remote", "PixelFormat", "Mono12p"], ["stream", "BufferHeight", 100]]
-    given = {"geometry.stages": STAGES, "recording.chunk_lines": 1024, "stream.block_lines": 128}
+    given = dict(SMALL)
     given |= {"cameras.layout": "compact", "cameras.b.serial": "SIM-A", "cameras.b.first_column": STAGES + 5}
     config = load_rig(rig, given | ({"cameras.a.settings": settings} if "gentl" in rig else {}))
     recording, status = record(config, tmp_path / "r.zarr", 20_000, stamps="gentl" in rig)
