@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from acquire.camera.base import CameraOpener
     from acquire.config import RigConfig, TriggerConfig
     from acquire.scene_config import SceneConfig
-    from acquire.sim.scenes import Scene
+    from acquire.sim.scene import Scene
     from acquire.trigger.base import Trigger
     from acquire.trigger.transports import Transport
 

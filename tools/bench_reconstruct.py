@@ -20,8 +20,9 @@ from acquire.evaluate.metrics import psnr
 from acquire.geometry import Geometry
 from acquire.lines import ARMS, Segment
 from acquire.recon import Reconstruction, reconstruct
+from acquire.sim.leds import LedScene
 from acquire.sim.lines import StreamingArm
-from acquire.sim.scenes import LedScene, build_scene
+from acquire.sim.scenes import build_scene
 from acquire.sim.voxels import truth
 
 GEOMETRY = Geometry(64, 3, 263)

@@ -22,7 +22,8 @@ from acquire.evaluate.report import (
 from acquire.recon import Reconstruction, reconstruct
 from acquire.reconstruct import save_reconstruction
 from acquire.scene_config import LedSceneConfig, SineDrive
-from acquire.sim.scenes import LedScene, build_scene
+from acquire.sim.leds import LedScene
+from acquire.sim.scenes import build_scene
 from acquire.sim.voxels import truth
 from acquire.store import Recording, open_recording, write_video
 

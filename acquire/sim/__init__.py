@@ -13,9 +13,11 @@ object that is a `Scene` under a `StreamingArm`.
 """
 
 from acquire.sim.functions import FunctionScene
+from acquire.sim.leds import LedScene
 from acquire.sim.lines import StreamingArm
 from acquire.sim.pipeline import Bench
-from acquire.sim.scenes import ArrayScene, LedScene, Scene, SumScene, build_scene
+from acquire.sim.scene import ArrayScene, Scene, SumScene
+from acquire.sim.scenes import build_scene
 from acquire.sim.voxels import truth
 
 __all__ = [

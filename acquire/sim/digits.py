@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from acquire.sim.drives import phase, triangle_within
-from acquire.sim.scenes import MaskScene
+from acquire.sim.scene import MaskScene
 from acquire.sim.targets import overlap
 
 if TYPE_CHECKING:

@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.sim.scenes import SeparableScene
+from acquire.sim.scene import SeparableScene
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.codes import Code
-    from acquire.sim.scenes import Scene
+    from acquire.sim.scene import Scene
 
 Series = Callable[[int, int], "NDArray[Any]"]
 """(first sub-step, count) → values, time on the last axis."""

@@ -28,13 +28,13 @@ from acquire.errors import UsageError
 from acquire.lines import ARMS
 from acquire.scene_config import ArmOptics, OpticsConfig
 from acquire.sim.light import Illumination
-from acquire.sim.scenes import SeparableScene, frames_at
+from acquire.sim.scene import SeparableScene, frames_at
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.codes import Code
-    from acquire.sim.scenes import Scene
+    from acquire.sim.scene import Scene
 
 TILE_LINES = 256
 """Lines of one matrix product: enough for BLAS, few enough for the cache (windows of 0.3 MB at n = 192)."""

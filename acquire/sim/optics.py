@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from acquire.sim.scenes import MaskScene, Scene, SeparableScene, frames_at
+from acquire.sim.scene import MaskScene, Scene, SeparableScene, frames_at
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from acquire.codes import Code
     from acquire.config import CameraConfig, GeometryConfig
     from acquire.scene_config import OpticsConfig, SceneConfig
-    from acquire.sim.scenes import Scene
+    from acquire.sim.scene import Scene
     from acquire.sim.stopwatch import Stopwatch
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from acquire.scene_config import WindowConfig
 from acquire.sim.kernels import chop
-from acquire.sim.scenes import frames_at
+from acquire.sim.scene import frames_at
 from acquire.sim.targets import overlap
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.scene_config import ChopperConfig, WindowPhase
-    from acquire.sim.scenes import Scene
+    from acquire.sim.scene import Scene
 
 
 class Shutter(Protocol):

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from acquire.sim.drives import mean_drive
-from acquire.sim.scenes import MaskScene
+from acquire.sim.scene import MaskScene
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -11,7 +11,7 @@ from acquire.errors import UsageError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from acquire.sim.scenes import Scene
+    from acquire.sim.scene import Scene
 
 _BLOCK_BYTES = 16 << 20
 """Frames at full resolution held at once."""

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from acquire.camera.base import Camera, CameraOpener
     from acquire.codes import Code
     from acquire.sim.clock import Wire
-    from acquire.sim.scenes import Scene
+    from acquire.sim.scene import Scene
 
 CODE = PrbsCode(23, mix_seed(7, 23))
 LEDS = LedSceneConfig(

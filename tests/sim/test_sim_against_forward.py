@@ -9,7 +9,8 @@ from sim_helpers import CODE, LEDS
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
 from acquire.sim.lines import StreamingArm
-from acquire.sim.scenes import ArrayScene, Scene, build_scene
+from acquire.sim.scene import ArrayScene, Scene
+from acquire.sim.scenes import build_scene
 
 GEOMETRY = Geometry(8, 3, 50)
 FIRST_LINE = 1234

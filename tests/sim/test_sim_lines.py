@@ -12,7 +12,8 @@ from acquire.codes import ConstantCode
 from acquire.errors import UsageError
 from acquire.sim import lines as lines_module
 from acquire.sim.lines import FrameLines, SeparableLines, StreamingArm
-from acquire.sim.scenes import ArrayScene, build_scene
+from acquire.sim.scene import ArrayScene
+from acquire.sim.scenes import build_scene
 
 SUBSTEP_S = 1e-5
 sizes = st.tuples(st.integers(1, 4), st.integers(1, 4))

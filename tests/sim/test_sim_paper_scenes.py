@@ -10,7 +10,8 @@ from acquire.errors import ConfigError
 from acquire.scene_config import ChopperConfig, DisplayConfig, PulseDrive, TriangleDrive, WindowConfig
 from acquire.sim.digits import DigitScene
 from acquire.sim.drives import mean_drive
-from acquire.sim.scenes import ArrayScene, SeparableScene, SumScene, build_scene, frames_at
+from acquire.sim.scene import ArrayScene, SeparableScene, SumScene, frames_at
+from acquire.sim.scenes import build_scene
 from acquire.sim.shutters import Chopper, ShutteredScene, Window
 from acquire.sim.targets import bar_width_mm, line_pairs_per_mm, usaf_bars, usaf_picture
 

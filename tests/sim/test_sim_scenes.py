@@ -11,7 +11,9 @@ from sim_helpers import LEDS
 from acquire.config import load_scene
 from acquire.errors import UsageError
 from acquire.scene_config import LedConfig, LedSceneConfig, SineDrive
-from acquire.sim.scenes import ArrayScene, LedScene, SeparableScene, build_scene
+from acquire.sim.leds import LedScene
+from acquire.sim.scene import ArrayScene, SeparableScene
+from acquire.sim.scenes import build_scene
 from acquire.sim.shapes import SHAPES
 from acquire.sim.voxels import truth
 

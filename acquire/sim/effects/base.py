@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    from acquire.sim.scenes import Scene
+    from acquire.sim.scene import Scene
 
 PLACES = ("light", "image", "signal", "charge", "readout", "stream")
 """Where in the chain a stage acts, in the order of the light's and the signal's way."""

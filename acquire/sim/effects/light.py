@@ -11,7 +11,7 @@ import numpy as np
 from acquire.sim.effects.base import Setting, Stage, draws
 from acquire.sim.kernels import follow
 from acquire.sim.light import Illumination, Tiled
-from acquire.sim.scenes import SeparableScene
+from acquire.sim.scene import SeparableScene
 
 if TYPE_CHECKING:
     from collections.abc import Callable

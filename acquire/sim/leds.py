@@ -1,0 +1,56 @@
+"""LEDs behind masks, each with a drive of its own (Fig. 9)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from acquire.sim.drives import mean_drive
+from acquire.sim.scene import MaskScene
+from acquire.sim.shapes import coverage
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.scene_config import LedConfig
+
+
+class LedScene(MaskScene):
+    """LEDs behind masks, each with its own drive (Fig. 9).
+
+    Parameters
+    ----------
+    leds : shapes, places and drives
+    size : n, rows and columns of the scene
+    substep_s : duration of a sub-step in seconds of simulated time
+    """
+
+    def __init__(self, leds: tuple[LedConfig, ...], size: int, substep_s: float) -> None:
+        self.leds = leds
+        self.substep_s = substep_s
+        self.masks = np.stack([_mask(led, size) for led in leds])
+
+    def intensity(self, first: int, count: int, substep_s: float | None = None) -> NDArray[np.float64]:
+        """(K, count): light of each LED, mean over each sub-step."""
+        return np.stack([_light(led, first, count, substep_s or self.substep_s) for led in self.leds])
+
+
+def _mask(led: LedConfig, size: int) -> NDArray[np.float32]:
+    """(row, column): how far each pixel of the scene is covered by the LED's shape, 0 to 1."""
+    centre = (np.arange(size) + 0.5) / size
+    row, column = (centre - led.row) / led.size, (centre - led.column) / led.size
+    return coverage(led.shape, row[:, None], column[None, :], pixel=1 / (led.size * size))
+
+
+def _light(led: LedConfig, first: int, count: int, substep_s: float) -> NDArray[np.float64]:
+    """Light of an LED from its duty cycle d: d, or a·(1 − exp(−d/a)) when it saturates at a.
+
+    For small d both are d; the saturating LED never exceeds a and gives (1 − 1/e)·a at d = a. Saturation
+    acts on the mean over the sub-step: the driver smoothes the PWM long before the LED sees it.
+    """
+    duty = mean_drive(led.drive, first, count, substep_s)
+    if led.saturation is None:
+        return duty
+    light: NDArray[np.float64] = -led.saturation * np.expm1(-duty / led.saturation)
+    return light
