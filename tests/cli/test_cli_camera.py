@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -37,21 +41,25 @@ def test_what_a_rig_lacks_is_said(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> 
     assert answer.out.count("no GenTL producer; possible: .cti files") == 2
 
 
-def test_without_a_rig_every_way_to_a_device_says_what_it_shows(
-    cli: Cli, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.delenv("GENICAM_GENTL64_PATH", raising=False)
-    rows = {row["device"]: row["state"] for row in cli("devices", "--json").json}
+def of_host(producers: str) -> list[dict[str, str]]:
+    """``acquire devices`` as a process: libusb, Aravis and producers keep what they opened until its end."""
+    command = [sys.executable, "-m", "acquire", "devices", "--json"]
+    environment = os.environ | {"GENICAM_GENTL64_PATH": producers}
+    done = subprocess.run(command, env=environment, capture_output=True, timeout=60, check=True)
+    return json.loads(done.stdout)
+
+
+def test_without_a_rig_every_way_to_a_device_says_what_it_shows() -> None:
+    rows = {row["device"]: row["state"] for row in of_host("")}
     assert list(rows) == ["trigger, serial", "trigger, USB", "camera, GenTL", "camera, Aravis"]
     assert "try: cti in the camera's table, or GENICAM_GENTL64_PATH" in rows["camera, GenTL"]
 
 
 @pytest.mark.needs_genicam
-def test_cameras_of_the_environment_s_producers_are_listed(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cameras_of_the_environment_s_producers_are_listed() -> None:
     import genicam
 
-    monkeypatch.setenv("GENICAM_GENTL64_PATH", str(Path(genicam.__file__).parent))
-    rows = cli("devices", "--json").json
+    rows = of_host(str(Path(genicam.__file__).parent))
     assert {row["model"] for row in rows if row["device"] == "camera, GenTL"} == {"Viky"}
 
 
