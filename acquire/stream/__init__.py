@@ -10,11 +10,12 @@ Grabbers and recorder are processes, the supervisor is a thread; `Capture` owns 
 memory: nothing between a camera's buffer and the recorder's is sent, and nothing waits for a reader.
 
 `shared` memory, counters · `losses` causes · `ring` · `observer` of a ring · `process` children and their
-pipe · `messages` · `grabber` · `tagger` · `session` one recording · `recorder` · `plan` · `supervisor` ·
-`capture`
+pipe · `messages` · `grabber` · `tagger` · `window` of lines around an event · `session` one recording ·
+`recorder` · `plan` · `supervisor` · `capture`
 """
 
 from acquire.stream.capture import Capture
 from acquire.stream.plan import CapturePlan, CaptureStatus
+from acquire.stream.window import Window
 
-__all__ = ["Capture", "CapturePlan", "CaptureStatus"]
+__all__ = ["Capture", "CapturePlan", "CaptureStatus", "Window"]
