@@ -13,6 +13,8 @@ from acquire.stream.ring import RingShape
 if TYPE_CHECKING:
     from acquire.camera.base import CameraOpener
     from acquire.store import RunCondition
+    from acquire.stream.ledger import ArmLedger
+    from acquire.stream.watcher import WatchPlan
     from acquire.trigger.base import TriggerRun
 
 OBSERVERS = 2
@@ -48,6 +50,7 @@ class CapturePlan:
     columns : compact layout: arm → first column and the one after the last, on the one camera that
         ``openers["a"]`` opens; empty: a camera per arm
     ring_reserve : slots that hold no history: see `RingShape`
+    watch : what is looked for in the lines while they pass; None: nothing
     """
 
     run: TriggerRun
@@ -64,6 +67,7 @@ class CapturePlan:
     line_period_ns: float = 0.0
     columns: dict[str, tuple[int, int]] = field(default_factory=dict)
     ring_reserve: int = 2
+    watch: WatchPlan | None = None
 
     def __post_init__(self) -> None:
         if tuple(sorted(self.openers)) != ARMS:
@@ -128,7 +132,9 @@ class CaptureStatus:
         cause, since arm; and of the latest recording ``recorded`` rows, of which ``missing``. After
         `close`: delivered = preroll + lost["ring_full"] + discarded + recorded − missing. Also how often
         the camera was ``reopened``, and its ``clock``: the latest stamp (line, its time by the camera) and
-        how much faster it runs than the trigger's, in parts per billion; all 0 where it tells no time
+        how much faster it runs than the trigger's, in parts per billion; all 0 where it tells no time. The
+        ``check`` of the code, where it is made: verdict, shift, and the line after the last looked at
+    accounts : arm → what became of every pulse since arm
     fault : what failed first, or None
     """
 
@@ -144,3 +150,4 @@ class CaptureStatus:
     condition: RunCondition | None = None
     end_reason: str | None = None
     ledger: dict[str, Any] = field(default_factory=dict)
+    accounts: dict[str, ArmLedger] = field(default_factory=dict)

@@ -44,6 +44,7 @@ from acquire.stream.session import Session
 from acquire.stream.stalls import Arm, find_stall
 from acquire.stream.tagger import Tagger
 from acquire.stream.window import Span, hold, span
+from acquire.stream.witness import Witness
 
 if TYPE_CHECKING:
     from acquire.stream.messages import Sealed
@@ -54,11 +55,11 @@ if TYPE_CHECKING:
 
 COUNTERS = (
     *("recorded", "committed", "draining", "rows_a", "rows_b", "missing_a", "missing_b"),
-    *("discarded_a", "discarded_b", "turns"),
+    *("discarded_a", "discarded_b", "stored_a", "stored_b", "turns"),
 )
 """Of the latest recording: rows in both arms, rows that a reader finds, whether its last line is known; per
 arm the rows written and those of them that are missing. Since armed: per arm the lines taken from its ring
-that no recording holds; turns of the loop, which stand still when it hangs."""
+that no recording holds, and those that one does; turns of the loop, which stand still when it hangs."""
 
 _WAIT_S = 0.02
 _COMMIT_INTERVAL_S = 0.1
@@ -90,11 +91,19 @@ class Opening:
 
 
 def record(
-    mailbox: Mailbox, plan: RecorderPlan, rings: dict[str, Ring], tags: Ring, counters: Counters
+    mailbox: Mailbox,
+    plan: RecorderPlan,
+    rings: dict[str, Ring],
+    tags: Ring,
+    counters: Counters,
+    others: dict[str, Counters],
 ) -> None:
-    """Life of the recorder: empty the rings, write recordings when told to, until told to end."""
+    """Life of the recorder: empty the rings, write recordings when told to, until told to end.
+
+    ``others``: what ``trigger`` and ``watcher`` count, where there is one.
+    """
     with ThreadPoolExecutor(1, thread_name_prefix="store") as disk:
-        recorder = Recorder(mailbox, plan, rings, tags, counters, disk)
+        recorder = Recorder(mailbox, plan, rings, tags, counters, disk, Witness(others))
         mailbox.post(Ready())
         while recorder.turn():
             recorder.wait()
@@ -111,6 +120,7 @@ class Recorder:
         tags: Ring,
         counters: Counters,
         disk: ThreadPoolExecutor,
+        witness: Witness,
     ) -> None:
         self._mailbox = mailbox
         self._plan = plan
@@ -118,6 +128,7 @@ class Recorder:
         self._tags = tags
         self._counters = counters
         self._disk = disk
+        self._witness = witness
         self._tagger: Tagger | None = None
         self._opening: Opening | None = None
         self._session: Session | None = None
@@ -268,9 +279,13 @@ class Recorder:
             at = opening.span.at
             lines = None if opening.span.end_line is None else opening.span.end_line - first_line
         session = Session(writer, self._tagger, self._blank, first_line, lines)
+        self._witness.begin()
+        session.doubted = self._witness.doubted()
         window = opening.begin.window
         if window.kind:
             self._notes.append(Note(at, window.kind, window.text))
+        if doubt := self._witness.doubt():
+            self._notes.append(Note(first_line, "code_check", doubt))
         for note in self._notes:
             session.note(note.kind, note.line, note.text)
         return session
@@ -301,6 +316,7 @@ class Recorder:
                 return taken > 0
             written = self._session.take(name, block) if self._session is not None else 0
             self._counters.add(f"discarded_{name}", len(block.flags) - written)
+            self._counters.add(f"stored_{name}", written)
             arm.ring.release()
         return True
 
@@ -320,6 +336,8 @@ class Recorder:
     # ---- the recording under way
 
     def _look_after(self, session: Session) -> None:
+        session.doubted = self._witness.doubted()
+        session.trigger = self._witness.trigger()
         for name, arm in self._arms.items():
             if name in session.lost and not arm.ring.fill:
                 session.give_up(name)

@@ -7,7 +7,7 @@ deliver any more, and keeps the books: per arm, rows = stored + missing by cause
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -28,6 +28,12 @@ if TYPE_CHECKING:
 
 OPEN_END = 1 << 62
 """End line of a recording without a budget."""
+
+TAINTING = (
+    *("tags_wrong", "tags_repeated"),
+    *("strobe_a_missed", "strobe_a_unexpected", "strobe_b_missed", "strobe_b_unexpected"),
+)
+"""Counts of the trigger that make lines doubtful: a camera that misses a pulse is a line behind after it."""
 
 MAX_MISMATCH_EVENTS = 100
 _BEST_FIRST = (
@@ -60,6 +66,7 @@ class Book:
     stored: int = 0
     missing: Counter[Cause] = field(default_factory=Counter)
     unverified: int = 0
+    doubted: int = 0
     incomplete: int = 0
     saturated: int = 0
 
@@ -83,6 +90,7 @@ class Book:
             "stored": self.stored,
             "missing": {str(cause): count for cause, count in self.missing.items()},
             "unverified": self.unverified,
+            "doubted": self.doubted,
             "incomplete": self.incomplete,
             "saturated": self.saturated,
             "balanced": self.balances(lines),
@@ -93,6 +101,12 @@ class Session:
     """See the module. Methods raise what the writer raises; then `close` is what remains.
 
     ``blank`` is (line, pixel) of zeros, the rows of a missing stretch of at most so many lines.
+
+    Attributes
+    ----------
+    lost : arm → why it will deliver no more
+    doubted : arms whose lines contradict the code at the moment: what comes is flagged
+    trigger : what the trigger counted while this was recorded
     """
 
     def __init__(
@@ -103,6 +117,8 @@ class Session:
         self.end_reason = "line budget reached"
         self.books = {arm: Book(first_line) for arm in ARMS}
         self.lost: dict[str, Cause] = {}
+        self.doubted: set[str] = set()
+        self.trigger: dict[str, int] = {}
         self._writer = writer
         self._tagger = tagger
         self._blank = blank
@@ -220,25 +236,48 @@ class Session:
 
     def _append(self, block: LineBlock) -> None:
         tagged = self._tagger.tag(block)
+        book = self.books[block.arm]
+        if block.arm in self.doubted:
+            tagged = replace(tagged, flags=tagged.flags | np.uint16(LineFlag.CODE_UNVERIFIED))
+            book.doubted += len(tagged)
         self._writer.append(tagged)
-        self.books[block.arm].store(tagged.flags)
+        book.store(tagged.flags)
 
     def _condition(self) -> RunCondition:
         books = self.books.values()
         lines = self.end_line - self.first_line
         # A recording without a line was stopped before it held anything.
         found = RunCondition.GOOD if lines else RunCondition.INTERRUPTED
-        if self._mismatches or any(book.unverified or book.incomplete for book in books):
+        if self._taints():
             found = _worse(found, RunCondition.TAINTED)
         if any(book.missing or not book.balances(lines) for book in books):
             found = _worse(found, RunCondition.INCOMPLETE)
         return _worse(found, self._floor)
 
+    def _taints(self) -> dict[str, int]:
+        """Reasons to doubt lines that are there → how many times."""
+        reasons = {"tag_mismatches": self._mismatches}
+        for name in TAINTING:
+            reasons[name] = self.trigger.get(name, 0)
+        for arm, book in self.books.items():
+            reasons |= {
+                f"unconfirmed_{arm}": book.unverified - book.doubted,
+                f"code_contradicted_{arm}": book.doubted,
+                f"incomplete_{arm}": book.incomplete,
+            }
+        return {reason: count for reason, count in reasons.items() if count > 0}
+
     def _ledger(self) -> dict[str, Any]:
         end = min(self.end_line, max(book.next_line for book in self.books.values()))
         lines = end - self.first_line
         arms = {arm: book.to_attrs(lines) for arm, book in self.books.items()}
-        return {"pulses": lines, "tag_mismatches": self._mismatches, **arms}
+        return {
+            "pulses": lines,
+            "tag_mismatches": self._mismatches,
+            "trigger": self.trigger,
+            "tainted_by": self._taints(),
+            **arms,
+        }
 
     def _note(self, kind: str, line: int, text: str) -> None:
         self._writer.add_event(kind, int(self._tagger.table(line, 1).tick[0]), line, text)

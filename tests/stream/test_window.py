@@ -15,7 +15,9 @@ from acquire.errors import UsageError
 from acquire.store import RunCondition
 from acquire.stream.losses import Cause, Loss
 from acquire.stream.ring import Ring, RingShape
+from acquire.stream.messages import Note
 from acquire.stream.window import Held, Window, hold, span
+from acquire.trigger.base import TagEvent
 
 
 @pytest.fixture
@@ -147,6 +149,26 @@ def test_recordings_of_one_run_follow_one_another_without_a_hole(tmp_path: Path)
     assert second.first_line == first.first_line + 1500
     for name in ("0.zarr", "1.zarr"):
         assert not check_rows(tmp_path / name)[1]["b"].any()
+
+
+def test_what_the_trigger_tells_is_in_the_recording_that_begins_before_it(tmp_path: Path) -> None:
+    """An edge at its input is an event; a camera that missed a pulse makes what follows doubtful."""
+    bench = make_bench(ring_slots=1024)
+    with armed(bench) as capture:
+        until(lambda: capture.poll().lines["b"]["delivered"] > 3000, "history")
+        bench.trigger.told = [TagEvent(2500, 2500 * 2700, "input")]
+        notes: list[Note] = []
+        until(lambda: notes.extend(capture.take_events()) or notes, "the event")
+        assert notes == [Note(2500, "input", "tick 6750000")]
+        capture.start(tmp_path / "r.zarr", make_spec(), 4000, Window(2500, 1000, exact=False))
+        bench.trigger.missed_b = 2
+        status = sealed(capture)
+    recording, _ = check_rows(tmp_path / "r.zarr")
+    assert recording.first_line == 1500
+    assert ("input", 2500) in [(event.kind, event.line) for event in recording.events]
+    if recording.attrs["ledger"]["trigger"]["strobe_b_missed"]:  # asked about once a second
+        assert status.ledger["tainted_by"] == {"strobe_b_missed": 2}
+        assert status.condition is RunCondition.TAINTED
 
 
 def test_an_event_in_a_recording_lets_it_go_on(tmp_path: Path) -> None:
