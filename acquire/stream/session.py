@@ -35,6 +35,12 @@ TAINTING = (
 )
 """Counts of the trigger that make lines doubtful: a camera that misses a pulse is a line behind after it."""
 
+TAINTING_EVENTS = (
+    *("missed_trigger_a", "missed_trigger_b", "unexpected_strobe_a", "unexpected_strobe_b"),
+    "clock_lost",
+)
+"""Events of the run so far that do so."""
+
 MAX_MISMATCH_EVENTS = 100
 _BEST_FIRST = (
     RunCondition.GOOD,
@@ -124,6 +130,7 @@ class Session:
         self._blank = blank
         self._floor = RunCondition.GOOD
         self._mismatches = 0
+        self._doubts: Counter[str] = Counter()
         self._told_to_end = False
         self._note("started", first_line, "")
 
@@ -188,7 +195,9 @@ class Session:
             self.end_line = max(self.end_line, line)
 
     def note(self, kind: str, line: int, text: str) -> None:
-        """List an event of a line in range; others belong to other recordings."""
+        """List an event of a line in range; others belong to other recordings, but may cast doubt on this."""
+        if kind in TAINTING_EVENTS and line < self.end_line:
+            self._doubts[kind] += 1
         if self.first_line <= line < self.end_line:
             self._note(kind, line, text)
 
@@ -256,7 +265,7 @@ class Session:
 
     def _taints(self) -> dict[str, int]:
         """Reasons to doubt lines that are there → how many times."""
-        reasons = {"tag_mismatches": self._mismatches}
+        reasons = {"tag_mismatches": self._mismatches, **self._doubts}
         for name in TAINTING:
             reasons[name] = self.trigger.get(name, 0)
         for arm, book in self.books.items():

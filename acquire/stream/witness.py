@@ -39,8 +39,11 @@ class Witness:
         self._begun = self._counts()
 
     def trigger(self) -> dict[str, int]:
-        """What the trigger counted since `begin`."""
-        return {name: count - self._begun.get(name, 0) for name, count in self._counts().items()}
+        """What the trigger counted since `begin`; of strobes, since arm: a line behind is behind for good."""
+        return {
+            name: count if name.startswith("strobe") else count - self._begun.get(name, 0)
+            for name, count in self._counts().items()
+        }
 
     def doubted(self) -> set[str]:
         """Arms whose lines contradict the code."""
