@@ -217,13 +217,13 @@ class Capture:
         self._workers[RECORDER] = Worker(
             RECORDER, recorder.record, what, self._rings, self._tags, self._counters[RECORDER], self._others()
         )
-        for name, arms in plan.grabbers.items():
-            tasks = [(self._grabber_plan(arm), self._rings[arm], self._counters[arm]) for arm in arms]
-            self._workers[name] = Worker(f"grabber {name}", grabber.grab, *tasks)
         if plan.watch is not None:
             self._workers[WATCHER] = Worker(
                 WATCHER, watcher.watch, plan.watch, self._rings, self._counters[WATCHER]
             )
+        for name, arms in plan.grabbers.items():
+            tasks = [(self._grabber_plan(arm), self._rings[arm], self._counters[arm]) for arm in arms]
+            self._workers[name] = Worker(f"grabber {name}", grabber.grab, *tasks)
 
     def _others(self) -> dict[str, Counters]:
         return {name: self._counters[name] for name in (TRIGGER, WATCHER) if name in self._counters}
