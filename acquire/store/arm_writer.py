@@ -66,17 +66,18 @@ class ArmWriter:
         for array in self._arrays.values():
             array.close()
 
-    def publish(self, publisher: Publisher, rows: int) -> dict[str, layout.Document]:
-        """Make ``rows`` rows visible; returns the metadata by path below the recording."""
+    def publish(self, publisher: Publisher, rows: int, *, own: bool) -> dict[str, layout.Document]:
+        """Metadata of ``rows`` rows, by path below the recording; ``own``: what lies in the arm's directory
+        is replaced by it, too.
+        """
         documents = {
             column.name: layout.line_array(column, array.shape, rows)
             for column, array in self._arrays.items()
         }
-        for name, document in documents.items():
-            publisher.replace(self.directory / name / "zarr.json", layout.to_json(document))
         arm = self.directory.name
         group = layout.group_document({"arm": arm, "first_line": self._first_line}, documents)
-        publisher.replace(self.directory / "zarr.json", layout.to_json(group))
+        for name, document in (documents | {"": group}).items() if own else ():
+            publisher.replace(self.directory / name / "zarr.json", layout.to_json(document))
         return {arm: group} | {f"{arm}/{name}": document for name, document in documents.items()}
 
     def _check(self, block: TaggedBlock) -> None:

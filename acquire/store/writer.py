@@ -6,7 +6,8 @@ The order of a commit, each step complete before the next begins::
            → root zarr.json with the metadata of everything: the commit record
 
 A reader that starts at the root therefore sees one consistent, slightly older recording; no length ever
-covers a line that is not on disk, in both arms.
+covers a line that is not on disk, in both arms. What arrays and groups of lines say of themselves, for those
+who open one by itself, is renewed once a second only: at ten commits a second it cost more than the lines.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from __future__ import annotations
 import errno
 import json
 import shutil
+import time
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
@@ -44,6 +46,9 @@ NOT_A_PLACE = (
     errno.EROFS,
 )
 """Why a directory cannot be made where it was asked for; all other reasons are the disk's."""
+
+OWN_INTERVAL_S = 1.0
+"""How much older than the root the metadata of a group or an array opened by itself may be."""
 
 RESERVE_BYTES = 2**20
 """Kept free for the metadata of the end: more than the tables and the root take."""
@@ -78,6 +83,7 @@ class RecordingWriter:
         self._publisher = Publisher(hidden / ".next")
         self._reserve = hidden / ".reserve"
         self._committed = 0
+        self._own_due_s = 0.0
         self._failure: str | None = None
         self._closed = False
 
@@ -212,7 +218,7 @@ class RecordingWriter:
             rows = self._whole_rows() if self._failure else self._pad()
             self._reserve.unlink(missing_ok=True)
             sync_tree(self.path)
-            nodes = self._publish_parts(rows)
+            nodes = self._publish_parts(rows, own=True)
             sync_tree(self.path)
             ending = Ending(condition, end_reason, {**ledger, "store": self._ledger(rows)})
             self._publish_root(rows, nodes, durable=True, ending=ending)
@@ -235,11 +241,14 @@ class RecordingWriter:
             arm.pad()
         return rows
 
-    def _publish_parts(self, rows: int) -> dict[str, layout.Document]:
-        """Replace all metadata but the root's; returns it by path below the recording."""
+    def _publish_parts(self, rows: int, *, own: bool = False) -> dict[str, layout.Document]:
+        """Replace what is due of all metadata but the root's; returns it by path below the recording."""
         nodes: dict[str, layout.Document] = {}
+        own = own or time.monotonic() >= self._own_due_s
         for arm in self._arms.values():
-            nodes |= arm.publish(self._publisher, rows)
+            nodes |= arm.publish(self._publisher, rows, own=own)
+        if own:
+            self._own_due_s = time.monotonic() + OWN_INTERVAL_S
         for table in self._tables:
             table.publish(self._publisher)
             nodes |= table.nodes()
