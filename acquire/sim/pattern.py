@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 _TABLE_BYTES = 1 << 25
 """More than a processor's cache holds: copying lines costs what it costs with a real camera."""
 _MOST_ROWS = 1 << 16
+_NOISE_REPEATS = 16
 _FULL_WELL = 10_000.0
 """Electrons at the top of the range: what noise there is (its root) sets what can be packed."""
 
@@ -58,13 +59,14 @@ class Pattern:
 def _table(pattern: Pattern) -> NDArray[Any]:
     """(row, pixel): one round, and half of it again so that few stretches meet its end."""
     rng = np.random.default_rng(ARMS.index(pattern.arm))
-    shape = (pattern.rows, pattern.pixels)
-    profile = 0.3 + 0.2 * np.sin(np.linspace(0, 20, pattern.pixels, dtype=np.float32))
-    noise = rng.standard_normal(shape, np.float32) * np.sqrt(profile / _FULL_WELL)
-    drift = 0.1 * np.sin(np.linspace(0, 200, pattern.rows, dtype=np.float32))[:, None]
-    dn = ((profile + noise + drift) * pattern.white_dn).clip(1, pattern.white_dn - 1)
-    once = dn.astype(pattern.dtype)
-    return np.concatenate([once, once[: len(once) // 2]])
+    few = pattern.rows // _NOISE_REPEATS + 1
+    profile = 0.4 + 0.2 * np.sin(np.linspace(0, 20, pattern.pixels, dtype=np.float32))
+    noise = rng.standard_normal((few, pattern.pixels), np.float32) * np.sqrt(profile / _FULL_WELL)
+    dn = ((profile + noise) * pattern.white_dn).clip(1, 0.9 * pattern.white_dn - 1).astype(pattern.dtype)
+    drift = np.linspace(0, 0.1 * pattern.white_dn, pattern.rows).astype(pattern.dtype)
+    row = np.arange(pattern.rows + pattern.rows // 2) % pattern.rows
+    table: NDArray[Any] = dn[row % few] + drift[row, None]
+    return table
 
 
 @dataclass(frozen=True, slots=True)

@@ -199,6 +199,7 @@ class Capture:
             plan.reopen_timeout_s,
             plan.line_period_ns,
             plan.columns.get(arm),
+            plan.realtime,
         )
 
     def _running(self, command: str) -> Supervisor:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import multiprocessing
+import os
 import pickle
 import select
 import signal
@@ -138,6 +139,18 @@ class Worker:
         self._process.close()
         if forced:
             raise DeviceError(f"{self.name}: the process did not end when told to, and was killed")
+
+
+def become_urgent() -> bool:
+    """Run before everything else on the host, in real time; says whether that is allowed here.
+
+    For what waits most of the time and does little at once: it would starve the host otherwise.
+    """
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+    except PermissionError:
+        return False
+    return True
 
 
 def _live(pipe: Connection[Any, Any], name: str, target: Callable[..., None], *args: Any) -> None:
