@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
     from acquire.camera.base import CameraOpener
     from acquire.clock import ClockFit
-    from acquire.store.shard import Codec
+    from acquire.store.codecs import Codec
     from acquire.stream import CaptureStatus
 
 CLOCK_HZ = 90_000_000

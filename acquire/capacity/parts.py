@@ -19,7 +19,7 @@ from acquire.clock import ClockFit
 from acquire.lines import ARMS, LineBlock
 from acquire.sim.pattern import Pattern
 from acquire.store import RecordingWriter
-from acquire.store.shard import crc32c, encode
+from acquire.store.codecs import crc32c, encode
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.tagger import Tagger
 
@@ -128,7 +128,7 @@ def _pace_of_ring(load: Load, blocks: list[NDArray[Any]]) -> Pace:
 
 def _pace_of_codec(load: Load, blocks: list[NDArray[Any]]) -> Pace:
     def pack(k: int) -> int:
-        crc32c(encode(blocks[k % len(blocks)], load.codec))
+        crc32c(encode(blocks[k % len(blocks)], load.codec).data)
         return load.block_lines
 
     return _pace(pack)

@@ -5,7 +5,8 @@ Downwards: `writer` · `reader` · `video`; `arm_writer` · `camera_stream` one 
 """
 
 from acquire.store.camera_stream import CameraStream
-from acquire.store.reader import Event, Gap, Recording, format_of, open_recording
+from acquire.store.opening import format_of, open_recording
+from acquire.store.reader import Event, Gap, Recording
 from acquire.store.spec import FORMAT, RecordingSpec, RunCondition
 from acquire.store.video import VideoFile, open_video, write_video
 from acquire.store.writer import RecordingWriter

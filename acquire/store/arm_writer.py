@@ -6,25 +6,35 @@ from typing import TYPE_CHECKING
 
 from acquire.errors import DataError
 from acquire.store import layout
-from acquire.store.shard import ArrayWriter
+from acquire.store.array_writer import ArrayWriter
 
 if TYPE_CHECKING:
+    from concurrent.futures import ThreadPoolExecutor
     from pathlib import Path
 
     from acquire.lines import TaggedBlock
-    from acquire.store.files import Publisher
+    from acquire.store.files import Disk, Publisher
     from acquire.store.spec import RecordingSpec
 
 
 class ArmWriter:
     """The arrays of one arm; all of them get the same rows."""
 
-    def __init__(self, directory: Path, spec: RecordingSpec) -> None:
+    def __init__(
+        self, directory: Path, spec: RecordingSpec, disk: Disk, pool: ThreadPoolExecutor | None
+    ) -> None:
         self.directory = directory
         self._first_line = spec.first_line
-        durable = spec.fsync == "commit"
+        self._disk = disk
         self._arrays = {
-            column: ArrayWriter(directory / column.name, layout.column_shape(column, spec), durable=durable)
+            column: ArrayWriter(
+                directory / column.name,
+                layout.column_shape(column, spec),
+                durable=spec.fsync == "commit",
+                padding=column.fill,
+                disk=disk,
+                pool=pool if column.name == "lines" else None,
+            )
             for column in layout.line_columns(spec.dtype)
         }
 
@@ -41,9 +51,14 @@ class ArmWriter:
     def bytes_written(self) -> int:
         return sum(array.bytes_written for array in self._arrays.values())
 
+    @property
+    def direct(self) -> bool:
+        """Lines are written past the page cache."""
+        return any(array.direct for array in self._arrays.values())
+
     def create(self) -> None:
         for array in self._arrays.values():
-            array.directory.mkdir(parents=True)
+            self._disk.make_directory(array.directory, parents=True)
 
     def begin(self, first_line: int) -> None:
         """Row 0 is line ``first_line``; before the first `append`."""
@@ -57,6 +72,11 @@ class ArmWriter:
     def pad(self) -> None:
         for array in self._arrays.values():
             array.pad()
+
+    def settle(self) -> None:
+        """Wait for what is being encoded, and write it."""
+        for array in self._arrays.values():
+            array.settle()
 
     def sync(self) -> None:
         for array in self._arrays.values():

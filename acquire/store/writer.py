@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import errno
 import json
-import shutil
+import os
 import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
@@ -24,7 +25,7 @@ from acquire.errors import DataError, UsageError
 from acquire.lines import ARMS
 from acquire.store import layout
 from acquire.store.arm_writer import ArmWriter
-from acquire.store.files import Publisher, check_new_path, reserve, sync_directory, sync_tree
+from acquire.store.files import DISK, Publisher, check_new_path, lock
 from acquire.store.spec import Ending, RunCondition, root_attributes
 from acquire.store.table import event_table, gap_table
 
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from acquire.lines import TaggedBlock
+    from acquire.store.files import Disk
     from acquire.store.spec import RecordingSpec
 
 NOT_A_PLACE = (
@@ -50,6 +52,9 @@ NOT_A_PLACE = (
 OWN_INTERVAL_S = 1.0
 """How much older than the root the metadata of a group or an array opened by itself may be."""
 
+SCRATCH, RESERVE = ".next", ".reserve"
+"""Files of a recording that is being written, beside the shards of the first array."""
+
 RESERVE_BYTES = 2**20
 """Kept free for the metadata of the end: more than the tables and the root take."""
 
@@ -58,9 +63,10 @@ class RecordingWriter:
     """Writes one recording; one thread at a time.
 
     Lines go to disk in whole chunks of ``spec.chunk_lines``. Lines of the last chunk that is not whole yet
-    are held in memory and become readable at `seal` only: ``kill -9`` can lose them, and what was not
-    committed, but nothing that `committed_lines` has acknowledged. (With ``fsync="seal"`` a power failure
-    can; with ``"commit"`` it cannot, for a reader that starts at the root.)
+    are held in memory and become readable at `seal` only: ``kill -9`` can lose them, but nothing that
+    `committed_lines` has acknowledged. (With ``fsync="seal"`` a power failure can; with ``"commit"`` it
+    cannot, for a reader that starts at the root.) What can be lost is bounded, see `spec.Durability`: the
+    writer commits by itself when as many lines wait for it as the specification allows.
 
     A row is committed when both arms have it. An arm that runs ahead is written but not visible; how far
     it may run is the caller's to bound.
@@ -70,32 +76,36 @@ class RecordingWriter:
     last commit made it.
     """
 
-    def __init__(self, path: Path, spec: RecordingSpec) -> None:
+    def __init__(self, path: Path, spec: RecordingSpec, disk: Disk) -> None:
         """Use `create`."""
         self.path = path
         self.spec = spec
-        self._arms = {arm: ArmWriter(path / arm, spec) for arm in ARMS}
+        self._disk = disk
+        self._lock = -1
+        threads = 0 if spec.codec == "none" else spec.encoders
+        self._pool = ThreadPoolExecutor(threads, "encoder") if threads else None
+        self._arms = {arm: ArmWriter(path / arm, spec, disk, self._pool) for arm in ARMS}
         self._gaps = gap_table(path)
         self._events = event_table(path)
         self._tables = (self._gaps, self._events)
         # No Zarr reader lists what is inside an array's directory.
         hidden = path / ARMS[0] / "lines"
-        self._publisher = Publisher(hidden / ".next")
-        self._reserve = hidden / ".reserve"
+        self._publisher = Publisher(hidden / SCRATCH, disk)
+        self._reserve = hidden / RESERVE
         self._committed = 0
         self._own_due_s = 0.0
         self._failure: str | None = None
         self._closed = False
 
     @classmethod
-    def create(cls, path: Path, spec: RecordingSpec) -> RecordingWriter:
+    def create(cls, path: Path, spec: RecordingSpec, disk: Disk = DISK) -> RecordingWriter:
         """A new, empty recording at ``path``, from line ``spec.first_line`` on: `prepare`, then `begin`."""
-        writer = cls.prepare(path, spec)
+        writer = cls.prepare(path, spec, disk)
         writer.begin(spec.first_line)
         return writer
 
     @classmethod
-    def prepare(cls, path: Path, spec: RecordingSpec) -> RecordingWriter:
+    def prepare(cls, path: Path, spec: RecordingSpec, disk: Disk = DISK) -> RecordingWriter:
         """Do all that takes time; ``path`` becomes a recording, and takes lines, once `begin` was called.
 
         Raises UsageError when ``path`` exists or cannot be created, before anything is touched, and
@@ -103,17 +113,20 @@ class RecordingWriter:
         """
         check_new_path(path)
         try:
-            path.mkdir()
+            disk.make_directory(path)
         except FileExistsError as error:  # somebody was faster
             raise UsageError(f"{path} exists already", hint="another name") from error
         except OSError as error:
             kind = UsageError if error.errno in NOT_A_PLACE else DataError
             raise kind(f"{path} cannot be created: {error.strerror}") from error
+        writer = None
         try:
-            writer = cls(path, spec)
+            writer = cls(path, spec, disk)
             writer._create_parts()
         except (DataError, UsageError, MemoryError):
-            shutil.rmtree(path, ignore_errors=True)
+            if writer is not None:
+                writer.close()
+            disk.remove_tree(path)
             raise
         return writer
 
@@ -126,24 +139,24 @@ class RecordingWriter:
         for arm in self._arms.values():
             arm.begin(first_line)
         try:
-            with self._disk("creating the recording"):
-                durable = self.spec.fsync == "commit"
-                self._publish_root(0, self._publish_parts(0), durable=durable)
+            with self._failing("creating the recording"):
+                self._publish_root(0, self._publish_parts(0))
         except DataError:
             self.close()
-            shutil.rmtree(self.path, ignore_errors=True)
+            self._disk.remove_tree(self.path)
             raise
 
     def _create_parts(self) -> None:
-        with self._disk("creating the recording"):
+        with self._failing("creating the recording"):
+            self._lock = lock(self.path, "recording to")
             for arm in self._arms.values():
                 arm.create()
             for table in self._tables:
-                table.create()
-            reserve(self._reserve, RESERVE_BYTES)
-            if self.spec.fsync == "commit":
-                sync_tree(self.path)
-                sync_directory(self.path.parent)
+                table.create(self._disk)
+            self._disk.reserve(self._reserve, RESERVE_BYTES)
+            if self._durable:
+                self._disk.sync_tree(self.path)
+                self._disk.sync_directory(self.path.parent)
 
     def __enter__(self) -> Self:
         return self
@@ -171,8 +184,10 @@ class RecordingWriter:
         Raises DataError unless the block begins with the next line of its arm, and when the disk fails.
         """
         self._check_alive()
-        with self._disk(f"writing lines of arm {block.arm}"):
+        with self._failing(f"writing lines of arm {block.arm}"):
             self._arms[block.arm].append(block)
+        if self._whole_rows() - self._committed >= self.spec.commit_lines:
+            self.commit()
 
     def add_gap(self, arm: str, first_line: int, count: int, cause: str) -> None:
         """List ``count`` lines of ``arm`` as lost because of ``cause``, a short name.
@@ -196,15 +211,16 @@ class RecordingWriter:
         what it was.
         """
         self._check_alive()
-        rows = self._whole_rows()
-        if rows == self._committed and not any(table.dirty for table in self._tables):
-            return
-        durable = self.spec.fsync == "commit"
-        with self._disk("committing"):
-            if durable:
+        with self._failing("committing"):
+            for arm in self._arms.values():
+                arm.settle()
+            rows = self._whole_rows()
+            if rows == self._committed and not any(table.dirty for table in self._tables):
+                return
+            if self._durable:
                 for arm in self._arms.values():
                     arm.sync()
-            self._publish_root(rows, self._publish_parts(rows), durable=durable)
+            self._publish_root(rows, self._publish_parts(rows))
 
     def seal(self, condition: RunCondition, end_reason: str, ledger: dict[str, Any]) -> None:
         """Write the lines that wait, pad their chunk with 0, end the recording, and force it to the medium.
@@ -214,23 +230,32 @@ class RecordingWriter:
         """
         self._check_open()
         _check_ledger(ledger)
-        with self._disk("sealing"):
+        with self._failing("sealing"):
             rows = self._whole_rows() if self._failure else self._pad()
-            self._reserve.unlink(missing_ok=True)
-            sync_tree(self.path)
+            self._disk.remove(self._reserve)
+            self._disk.sync_tree(self.path)
             nodes = self._publish_parts(rows, own=True)
-            sync_tree(self.path)
+            self._disk.sync_tree(self.path)
             ending = Ending(condition, end_reason, {**ledger, "store": self._ledger(rows)})
-            self._publish_root(rows, nodes, durable=True, ending=ending)
-            sync_directory(self.path.parent)
+            self._publish_root(rows, nodes, ending)
+            self._disk.sync_directory(self.path.parent)
         self.close()
 
     def close(self) -> None:
         """Let go of all files; what was not committed is dropped. Idempotent."""
         self._closed = True
-        with self._disk("closing files"):
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+        with self._failing("closing files"):
             for arm in self._arms.values():
                 arm.close()
+            if self._lock >= 0:
+                held, self._lock = self._lock, -1
+                os.close(held)
+
+    @property
+    def _durable(self) -> bool:
+        return self.spec.fsync == "commit"
 
     def _whole_rows(self) -> int:
         return min(arm.whole_rows for arm in self._arms.values())
@@ -250,15 +275,16 @@ class RecordingWriter:
         if own:
             self._own_due_s = time.monotonic() + OWN_INTERVAL_S
         for table in self._tables:
-            table.publish(self._publisher)
+            table.publish(self._publisher, durable=self._durable)
             nodes |= table.nodes()
         return nodes
 
     def _publish_root(
-        self, rows: int, nodes: dict[str, layout.Document], *, durable: bool, ending: Ending | None = None
+        self, rows: int, nodes: dict[str, layout.Document], ending: Ending | None = None
     ) -> None:
         """The commit itself."""
         root = layout.group_document(root_attributes(self.spec, ending), nodes)
+        durable = self._durable or ending is not None
         self._publisher.replace(self.path / "zarr.json", layout.to_json(root), durable=durable)
         self._committed = rows
 
@@ -266,6 +292,7 @@ class RecordingWriter:
         end = self.spec.first_line + rows
         return {
             "lines": rows,
+            "direct_io": any(arm.direct for arm in self._arms.values()),
             "lines_left_out": {name: arm.next_line - end for name, arm in self._arms.items()},
             "bytes_written": self.bytes_written,
             "gaps_not_listed": self._gaps.not_listed,
@@ -288,7 +315,7 @@ class RecordingWriter:
         return f"{self._committed} lines of each arm are committed and can be read"
 
     @contextmanager
-    def _disk(self, doing: str) -> Iterator[None]:
+    def _failing(self, doing: str) -> Iterator[None]:
         """Turn what the disk refuses into DataError, and remember it: nothing after it is acknowledged."""
         try:
             yield

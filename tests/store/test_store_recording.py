@@ -300,7 +300,7 @@ def test_what_cannot_be_a_path_is_refused(tmp_path, name):
     ],
 )
 def test_a_place_that_takes_no_directory_is_not_a_disk_that_fails(path, monkeypatch, number, kind):
-    def refuse(*_):
+    def refuse(*_, **__):
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(type(path), "mkdir", refuse)
