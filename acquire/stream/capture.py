@@ -199,7 +199,12 @@ class Capture:
     def _spawn(self) -> None:
         plan = self._plan
         what = recorder.RecorderPlan(
-            plan.run, plan.stages, plan.stall_timeout_s, plan.tag_wait_s, plan.max_skew_lines
+            plan.run,
+            plan.stages,
+            plan.stall_timeout_s,
+            plan.tag_wait_s,
+            plan.max_skew_lines,
+            plan.realtime,
         )
         self._workers[RECORDER] = Worker(
             RECORDER, recorder.record, what, self._rings, self._tags, self._counters[RECORDER]

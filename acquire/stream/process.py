@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from types import FrameType
 
 _KILL_WAIT_S = 5.0
+_IMPORTANT = -15
+"""Niceness; threads that are started later have it as well."""
 
 
 class OwnerGone(Exception):  # noqa: N818 - an event, not an error: the child ends in order
@@ -148,6 +150,15 @@ def become_urgent() -> bool:
     """
     try:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+    except PermissionError:
+        return False
+    return True
+
+
+def become_important() -> bool:
+    """Get more of the processors than others, who still get some; says whether that is allowed here."""
+    try:
+        os.setpriority(os.PRIO_PROCESS, 0, _IMPORTANT)
     except PermissionError:
         return False
     return True

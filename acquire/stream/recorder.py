@@ -39,7 +39,7 @@ from acquire.stream.messages import (
     Refused,
     RunStarted,
 )
-from acquire.stream.process import OwnerGone
+from acquire.stream.process import OwnerGone, become_important
 from acquire.stream.session import Session
 from acquire.stream.stalls import Arm, find_stall
 from acquire.stream.tagger import Tagger
@@ -78,6 +78,7 @@ class RecorderPlan:
     stall_timeout_s: float
     tag_wait_s: float
     max_skew_lines: int
+    realtime: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +94,8 @@ def record(
     mailbox: Mailbox, plan: RecorderPlan, rings: dict[str, Ring], tags: Ring, counters: Counters
 ) -> None:
     """Life of the recorder: empty the rings, write recordings when told to, until told to end."""
+    if plan.realtime:
+        become_important()  # not in real time: it computes, and must not keep the grabbers waiting
     with ThreadPoolExecutor(1, thread_name_prefix="store") as disk:
         recorder = Recorder(mailbox, plan, rings, tags, counters, disk)
         mailbox.post(Ready())
