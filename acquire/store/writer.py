@@ -186,7 +186,8 @@ class RecordingWriter:
         self._check_alive()
         with self._failing(f"writing lines of arm {block.arm}"):
             self._arms[block.arm].append(block)
-        if self._whole_rows() - self._committed >= self.spec.commit_lines:
+        written = min(arm.written_rows for arm in self._arms.values())
+        if written - self._committed >= self.spec.commit_lines:
             self.commit()
 
     def add_gap(self, arm: str, first_line: int, count: int, cause: str) -> None:
@@ -231,7 +232,7 @@ class RecordingWriter:
         self._check_open()
         _check_ledger(ledger)
         with self._failing("sealing"):
-            rows = self._whole_rows() if self._failure else self._pad()
+            rows = self._rescue() if self._failure else self._pad()
             self._disk.remove(self._reserve)
             self._disk.sync_tree(self.path)
             nodes = self._publish_parts(rows, own=True)
@@ -259,6 +260,12 @@ class RecordingWriter:
 
     def _whole_rows(self) -> int:
         return min(arm.whole_rows for arm in self._arms.values())
+
+    def _rescue(self) -> int:
+        """After a failure: the rows that are whole."""
+        for arm in self._arms.values():
+            arm.publish_chunks()
+        return self._whole_rows()
 
     def _pad(self) -> int:
         rows = min(arm.next_line for arm in self._arms.values()) - self.spec.first_line
