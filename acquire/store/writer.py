@@ -140,7 +140,7 @@ class RecordingWriter:
             arm.begin(first_line)
         try:
             with self._failing("creating the recording"):
-                self._publish_root(0, self._publish_parts(0))
+                self._publish_root(0, self._publish_parts(0, own=False))  # `prepare` did all that takes time
         except DataError:
             self.close()
             self._disk.remove_tree(self.path)
@@ -153,6 +153,7 @@ class RecordingWriter:
                 arm.create()
             for table in self._tables:
                 table.create(self._disk)
+            self._publish_parts(0, own=True)
             self._disk.reserve(self._reserve, RESERVE_BYTES)
             if self._durable:
                 self._disk.sync_tree(self.path)
@@ -221,7 +222,9 @@ class RecordingWriter:
             if self._durable:
                 for arm in self._arms.values():
                     arm.sync()
-            self._publish_root(rows, self._publish_parts(rows))
+            if own := time.monotonic() >= self._own_due_s:
+                self._own_due_s = time.monotonic() + OWN_INTERVAL_S
+            self._publish_root(rows, self._publish_parts(rows, own=own))
 
     def seal(self, condition: RunCondition, end_reason: str, ledger: dict[str, Any]) -> None:
         """Write the lines that wait, pad their chunk with 0, end the recording, and force it to the medium.
@@ -273,14 +276,14 @@ class RecordingWriter:
             arm.pad()
         return rows
 
-    def _publish_parts(self, rows: int, *, own: bool = False) -> dict[str, layout.Document]:
-        """Replace what is due of all metadata but the root's; returns it by path below the recording."""
+    def _publish_parts(self, rows: int, *, own: bool) -> dict[str, layout.Document]:
+        """Replace all metadata but the root's; returns it by path below the recording.
+
+        Without ``own``, that of the arms is returned only.
+        """
         nodes: dict[str, layout.Document] = {}
-        own = own or time.monotonic() >= self._own_due_s
         for arm in self._arms.values():
             nodes |= arm.publish(self._publisher, rows, own=own)
-        if own:
-            self._own_due_s = time.monotonic() + OWN_INTERVAL_S
         for table in self._tables:
             table.publish(self._publisher, durable=self._durable)
             nodes |= table.nodes()
