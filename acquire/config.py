@@ -153,10 +153,13 @@ class TriggerConfig(_Model):
 class CameraConfig(_Model):
     """One camera. DN = black level + responsivity · Y, with Y of Eq. (1)."""
 
-    driver: Literal["simulated", "gentl-simulated", "gige-simulated", "harvesters", "aravis"] = Field(
-        default="simulated",
-        description="'harvesters': through the maker's GenTL producer; 'aravis': GigE and USB3 Vision; "
-        "'gentl-simulated', 'gige-simulated': simulated cameras through either",
+    driver: Literal["simulated", "pattern", "gentl-simulated", "gige-simulated", "harvesters", "aravis"] = (
+        Field(
+            default="simulated",
+            description="'harvesters': through the maker's GenTL producer; 'aravis': GigE and USB3 Vision; "
+            "'gentl-simulated', 'gige-simulated': simulated cameras through either; "
+            "'pattern': stored lines in place of the scene, at any rate, for loads",
+        )
     )
     serial: str = "simulated"
     model: str = Field(default="", description="what the camera must be; absent: any")

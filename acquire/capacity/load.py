@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
     from acquire.camera.base import CameraOpener
     from acquire.clock import ClockFit
+    from acquire.config import RigConfig
     from acquire.store.codecs import Codec
     from acquire.stream import CaptureStatus
 
@@ -64,6 +65,24 @@ class Load:
     codec: Codec = "none"
     fsync: Literal["commit", "seal"] = "seal"
 
+    @classmethod
+    def of(cls, config: RigConfig) -> Load:
+        """What a rig's cameras deliver, and how it is recorded."""
+        stream, recording = config.stream, config.recording
+        return cls(
+            pixels=config.geometry.stages,
+            dtype=config.cameras.a.dtype,
+            line_rate_hz=config.line_rate_hz * config.simulation.speed,
+            substeps=config.geometry.substeps,
+            stages=config.geometry.stages,
+            block_lines=stream.block_lines,
+            ring_slots=stream.ring_slots,
+            chunk_lines=recording.chunk_lines,
+            shard_chunks=recording.shard_chunks,
+            codec=recording.codec,
+            fsync=recording.fsync,
+        )
+
     @property
     def line_bytes(self) -> int:
         """Bytes of pixels that one line of both arms has."""
@@ -81,7 +100,7 @@ class Load:
     @property
     def speed(self) -> float:
         """Simulated seconds per second that make up for the rounding."""
-        return self.line_rate_hz * self.substeps * self.substep_ticks / CLOCK_HZ
+        return round(self.line_rate_hz * self.substeps * self.substep_ticks / CLOCK_HZ, 4)
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ import os
 import shutil
 import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,7 +26,6 @@ from acquire.stream.tagger import Tagger
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -35,6 +35,7 @@ PART_S = 0.25
 """How long each part is made to work."""
 _BLOCKS = 8
 """Different ones, so that a processor's cache does not hold them all."""
+_PREFIX = ".capacity-"
 _CLOCK = ClockFit(90_000_000, 0, 0)
 
 
@@ -135,7 +136,8 @@ def _pace_of_codec(load: Load, blocks: list[NDArray[Any]]) -> Pace:
 
 
 def _pace_of_recorder(load: Load, blocks: list[NDArray[Any]], directory: Path) -> Pace:
-    path = directory / f".capacity-{os.getpid()}-{time.time_ns():x}.zarr"
+    _clear(directory)
+    path = directory / f"{_PREFIX}{os.getpid()}.zarr"
     tagger = Tagger(trigger_run(load), load.stages, _CLOCK)
     flags = np.zeros(load.block_lines, np.uint16)
     with RecordingWriter.create(path, recording_spec(load, _CLOCK)) as writer:
@@ -150,4 +152,11 @@ def _pace_of_recorder(load: Load, blocks: list[NDArray[Any]], directory: Path) -
             return _pace(append, writer.commit)
         finally:
             writer.close()
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _clear(directory: Path) -> None:
+    """Remove what processes that were killed while they measured have left."""
+    for path in directory.glob(f"{_PREFIX}*.zarr"):
+        if not Path("/proc", path.stem.removeprefix(_PREFIX)).exists():
             shutil.rmtree(path, ignore_errors=True)

@@ -16,7 +16,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Protocol
 
 from acquire import __version__
-from acquire.daemon.messages import LastRecording, RecordingStatus, Status
+from acquire.daemon.messages import ArmRequest, LastRecording, RecordingStatus, Status
 from acquire.daemon.plan import default_path
 from acquire.daemon.report import Rates, arm_statuses, delivered_lines
 from acquire.daemon.states import Event, State, after, commands
@@ -29,11 +29,12 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from acquire.config import RigConfig
-    from acquire.daemon.messages import StartRequest
+    from acquire.daemon.messages import CapacityStatus, StartRequest
 
 DRAIN_TIMEOUT_S = 30.0
 """From the last line's number to the sealed recording; more is a fault."""
 POLL_S = 0.05
+ARM = ArmRequest()
 
 log = logging.getLogger("acquire.daemon")
 
@@ -50,12 +51,20 @@ class Run(Protocol):
     def close(self) -> None: ...
 
 
+class Prove(Protocol):
+    """What the service needs of `acquire.daemon.proof.Proof`."""
+
+    def __call__(self, *, force: bool) -> CapacityStatus: ...
+
+
 class Service:
     """One instrument, at most one run at a time. See the module for who may call what."""
 
-    def __init__(self, config: RigConfig, open_run: Callable[[], Run]) -> None:
+    def __init__(self, config: RigConfig, open_run: Callable[[], Run], prove: Prove | None = None) -> None:
         self._config = config
         self._open_run = open_run
+        self._prove = prove
+        self._capacity: CapacityStatus | None = None
         self._hurried = threading.Event()
         self._born = time.monotonic()
         self._state = State.IDLE
@@ -82,9 +91,13 @@ class Service:
 
     # ---- commands
 
-    def arm(self) -> None:
-        """idle → armed. Raises what the devices refuse with; the state is idle then."""
+    def arm(self, request: ArmRequest = ARM) -> None:
+        """idle → armed. Raises what the devices refuse with, and UsageError where the host is too slow for
+        them and that is not forced; the state is idle then.
+        """
         with self._doing(Event.ARM):
+            if self._prove is not None:
+                self._capacity = self._prove(force=request.force)
             run = self._open_run()
             run.arm()
             self._run, self._seen, self._rates = run, CaptureStatus(), Rates()
@@ -279,6 +292,7 @@ class Service:
             arms=arm_statuses(self._seen, self._rates),
             last=self._last,
             fault=self._fault,
+            capacity=self._capacity,
         )
 
     def _recording(self) -> RecordingStatus | None:

@@ -152,7 +152,9 @@ class SimulatedCamera:
             raise CameraError("times were asked of a camera without its pulses")
         spacing = train.line_period_ns / train.speed
         pulses = self._first_pulse + first_line + np.arange(count, dtype=np.int64)
-        times: NDArray[np.int64] = train.start_ns - (-pulses * spacing.numerator // spacing.denominator)
+        whole, rest = divmod(spacing.numerator, spacing.denominator)
+        late = pulses * whole - (-pulses * rest // spacing.denominator)  # the product as it is would overflow
+        times: NDArray[np.int64] = train.start_ns + late
         return times
 
     def release(self, block: CameraBlock) -> None:

@@ -10,10 +10,12 @@ from acquire.store import layout
 from acquire.store.array_writer import ArrayWriter
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from concurrent.futures import ThreadPoolExecutor
     from pathlib import Path
 
     from acquire.lines import TaggedBlock
+    from acquire.store.codecs import EncodeOnce
     from acquire.store.files import Disk, Publisher
     from acquire.store.spec import RecordingSpec
 
@@ -22,7 +24,12 @@ class ArmWriter:
     """The arrays of one arm; all of them get the same rows."""
 
     def __init__(
-        self, directory: Path, spec: RecordingSpec, disk: Disk, pool: ThreadPoolExecutor | None
+        self,
+        directory: Path,
+        spec: RecordingSpec,
+        disk: Disk,
+        pool: ThreadPoolExecutor | None,
+        once: Mapping[str, EncodeOnce],
     ) -> None:
         self.directory = directory
         self._first_line = spec.first_line
@@ -35,6 +42,7 @@ class ArmWriter:
                 padding=column.fill,
                 disk=disk,
                 pool=pool if column.name == "lines" else None,
+                once=once.get(column.name),
             )
             for column in layout.line_columns(spec.dtype)
         }

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.store.codecs import encode
+from acquire.store.codecs import EncodeOnce, encode
 from acquire.store.files import DISK
 from acquire.store.pages import aligned_bytes
 from acquire.store.shard import DIRECT_BYTES, Pages, ShardWriter, shard_key
@@ -35,8 +35,8 @@ class ArrayWriter:
 
     Buffers are allocated once. Rows that make a whole chunk by themselves are written without a copy, unless
     a ``pool`` encodes: then up to ``ahead`` chunks are encoded while others are filled and written, always in
-    order. ``durable`` forces each file to the medium before it is left for the next. What fills up the last
-    chunk is ``padding``.
+    order. ``once`` is shared by arrays of equal rows. ``durable`` forces each file to the medium before it is
+    left for the next. What fills up the last chunk is ``padding``.
     """
 
     def __init__(
@@ -49,6 +49,7 @@ class ArrayWriter:
         disk: Disk = DISK,
         pool: ThreadPoolExecutor | None = None,
         ahead: int = ENCODED_AHEAD,
+        once: EncodeOnce | None = None,
     ) -> None:
         self.directory = directory
         self.shape = shape
@@ -59,6 +60,7 @@ class ArrayWriter:
         self._padding = padding
         self._disk = disk
         self._pool = pool
+        self._once = once
         self._free: deque[NDArray[Any]] = deque(_buffer(shape) for _ in range(1 + ahead if pool else 1))
         self._buffer = self._free.popleft()
         self._filled = 0
@@ -125,7 +127,7 @@ class ArrayWriter:
     def _take(self, rows: NDArray[Any]) -> int:
         size = self.shape.chunk_rows
         if self._pool is None and self._filled == 0 and len(rows) >= size and rows.flags.c_contiguous:
-            self._write(encode(rows[:size], self.shape.codec))
+            self._write(self._encode(rows[:size]))
             return size
         count = min(size - self._filled, len(rows))
         self._buffer[self._filled : self._filled + count] = rows[:count]
@@ -137,12 +139,17 @@ class ArrayWriter:
     def _flush(self) -> None:
         self._filled = 0
         if self._pool is None:
-            self._write(encode(self._buffer, self.shape.codec))
+            self._write(self._encode(self._buffer))
             return
         self._encoding.append((self._pool.submit(encode, self._buffer, self.shape.codec), self._buffer))
         if not self._free:
             self._write_oldest()
         self._buffer = self._free.popleft()
+
+    def _encode(self, rows: NDArray[Any]) -> NDArray[np.uint8]:
+        if self._once is None:
+            return encode(rows, self.shape.codec)
+        return self._once(self._chunks, rows, self.shape.codec)
 
     def _write_oldest(self) -> None:
         payload, buffer = self._encoding.popleft()

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 Codec = Literal["none", "lz4", "zstd"]
 CODECS: tuple[Codec, ...] = ("none", "lz4", "zstd")
 CRC_BYTES = 4
+_MOST_KEPT = 4
 BLOSC_HEADER = 16
 """Bytes; its second word is the unpacked size, its fourth the packed one."""
 
@@ -57,6 +58,23 @@ def encode(rows: NDArray[Any], codec: Codec) -> NDArray[np.uint8]:
     if codec == "none":
         return rows.reshape(-1).view(np.uint8)
     return np.frombuffer(blosc.compress(rows, codec.encode(), 1, blosc.BITSHUFFLE), np.uint8)
+
+
+class EncodeOnce:
+    """Packs chunks that come twice, once from either arm, a single time: code and ticks are alike."""
+
+    def __init__(self) -> None:
+        self._packed: dict[tuple[int, bytes], NDArray[np.uint8]] = {}
+
+    def __call__(self, chunk: int, rows: NDArray[Any], codec: Codec) -> NDArray[np.uint8]:
+        """`encode` of the rows of chunk number ``chunk``."""
+        key = chunk, crc32c(rows.data)
+        packed = self._packed.pop(key, None)
+        if packed is None:
+            packed = self._packed[key] = encode(rows, codec)
+            if len(self._packed) > _MOST_KEPT:
+                del self._packed[next(iter(self._packed))]
+        return packed
 
 
 def decode(payload: Buffer, size: int, codec: Codec) -> NDArray[np.uint8]:

@@ -125,6 +125,10 @@ TAG_COLUMNS = (
 )
 
 
+SAME_IN_BOTH_ARMS = ("code_index", "code", "tick", "time")
+"""Arrays whose rows follow from the line's number."""
+
+
 def column_shape(column: Column, spec: RecordingSpec) -> ArrayShape:
     """How ``column`` is cut into pieces. Tags are predictable: packed even where pixels are not."""
     pixels = column.name == "lines"

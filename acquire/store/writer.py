@@ -25,6 +25,7 @@ from acquire.errors import DataError, UsageError
 from acquire.lines import ARMS
 from acquire.store import layout
 from acquire.store.arm_writer import ArmWriter
+from acquire.store.codecs import EncodeOnce
 from acquire.store.files import DISK, Publisher, check_new_path, lock
 from acquire.store.spec import Ending, RunCondition, root_attributes
 from acquire.store.table import event_table, gap_table
@@ -84,7 +85,8 @@ class RecordingWriter:
         self._lock = -1
         threads = 0 if spec.codec == "none" else spec.encoders
         self._pool = ThreadPoolExecutor(threads, "encoder") if threads else None
-        self._arms = {arm: ArmWriter(path / arm, spec, disk, self._pool) for arm in ARMS}
+        once = {name: EncodeOnce() for name in layout.SAME_IN_BOTH_ARMS}
+        self._arms = {arm: ArmWriter(path / arm, spec, disk, self._pool, once) for arm in ARMS}
         self._gaps = gap_table(path)
         self._events = event_table(path)
         self._tables = (self._gaps, self._events)

@@ -7,6 +7,7 @@ tick (S·l + n - 1)·substep_ticks on. A tag that says the same confirms every l
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -88,6 +89,8 @@ class Tagger:
         confirmed any more.
         """
         expected = self._expected(rows[:, 0])
+        if self._all_right(rows, expected):
+            return []
         wrong = (rows != expected).any(axis=1)
         right = np.flatnonzero(~wrong)
         lines = rows[right, 0].astype(np.int64)
@@ -99,6 +102,16 @@ class Tagger:
         self._restarted |= bool(back.any())
         suspects = np.union1d(np.flatnonzero(wrong), right[back])
         return [_mismatch(rows[k], expected[k]) for k in suspects]
+
+    def _all_right(self, rows: NDArray[np.uint64], expected: NDArray[np.uint64]) -> bool:
+        """The common case, at a fraction of the cost: all tags as predicted, each ahead of the one before."""
+        lines = rows[:, 0].tolist()
+        ahead = all(before < line for before, line in pairwise((self._last_line, *lines)))
+        if self._restarted or not ahead or not np.array_equal(rows, expected):
+            return False
+        self._last_line = lines[-1] if lines else self._last_line
+        self.confirmed_end = self._last_line + 1
+        return True
 
     def tag(self, block: LineBlock) -> TaggedBlock:
         """The block with code and time; lines that no tag confirmed so far are flagged."""
