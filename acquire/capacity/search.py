@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from acquire.capacity.load import run_load
-from acquire.errors import DataError
+from acquire.errors import DataError, DeviceError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -66,5 +66,5 @@ def best(trials: list[Trial]) -> Trial | None:
 def _try(load: Load, directory: Path, seconds: float) -> Trial:
     try:
         return Trial(load.line_rate_hz, run_load(load, directory, seconds))
-    except DataError as error:
+    except (DataError, DeviceError) as error:
         return Trial(load.line_rate_hz, None, str(error))

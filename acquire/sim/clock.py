@@ -51,6 +51,7 @@ _POLL_S = 0.002
 """How often a waiter looks for a start; pulses themselves are awaited by their due time."""
 _STOP_POLL_S = 0.008
 """How often it looks for a stop while pulses come: often would be most of what a fast camera costs."""
+_WRITE_S = 1e-5
 _TORN_S = 1.0
 """A write takes microseconds: a sequence that stays odd this long belongs to a writer that died."""
 
@@ -222,7 +223,7 @@ class Wire:
                 train, now_ns = self._known[1], self.clock.monotonic_ns()
                 if self._sequence() == sequence == self._known[0]:
                     return sequence, Reading(train, 0 if train is None else train.issued(now_ns))
-            time.sleep(0)
+            time.sleep(_WRITE_S)  # not 0: a reader in real time would keep the writer from going on
         raise DeviceError("the simulated trigger died while it wrote on the wire")
 
     def _sequence(self) -> int:
