@@ -224,6 +224,11 @@ class StreamConfig(_Model):
     block_lines: int = Field(default=256, ge=1, le=65536, description="lines per camera block and ring slot")
     ring_slots: int = Field(default=64, ge=2, le=4096)
     reopen_s: float = Field(default=2.0, ge=0, le=600, description="wait for a camera that is gone")
+    realtime: bool = Field(
+        default=False,
+        description="grabbers before everything else on the host, where its user may (RLIMIT_RTPRIO); "
+        "not for simulated cameras, which compute",
+    )
 
 
 class RecordingConfig(_Model):

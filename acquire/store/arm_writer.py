@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING
 
 from acquire.errors import DataError
@@ -43,8 +44,13 @@ class ArmWriter:
         return self._first_line + min(array.rows for array in self._arrays.values())
 
     @property
-    def whole_rows(self) -> int:
+    def written_rows(self) -> int:
         """Rows that are on disk in every array, in whole chunks."""
+        return min(array.written_rows for array in self._arrays.values())
+
+    @property
+    def whole_rows(self) -> int:
+        """Of these, what is in the indices of all their shards."""
         return min(array.whole_rows for array in self._arrays.values())
 
     @property
@@ -74,9 +80,15 @@ class ArmWriter:
             array.pad()
 
     def settle(self) -> None:
-        """Wait for what is being encoded, and write it."""
+        """Wait for what is being encoded, write it, and put all that is written into the indices."""
         for array in self._arrays.values():
             array.settle()
+
+    def publish_chunks(self) -> None:
+        """Put what is written into the indices, as far as the disk lets it."""
+        for array in self._arrays.values():
+            with contextlib.suppress(OSError):
+                array.publish()
 
     def sync(self) -> None:
         for array in self._arrays.values():
@@ -86,17 +98,18 @@ class ArmWriter:
         for array in self._arrays.values():
             array.close()
 
-    def publish(self, publisher: Publisher, rows: int) -> dict[str, layout.Document]:
-        """Make ``rows`` rows visible; returns the metadata by path below the recording."""
+    def publish(self, publisher: Publisher, rows: int, *, own: bool) -> dict[str, layout.Document]:
+        """Metadata of ``rows`` rows, by path below the recording; ``own``: what lies in the arm's directory
+        is replaced by it, too.
+        """
         documents = {
             column.name: layout.line_array(column, array.shape, rows)
             for column, array in self._arrays.items()
         }
-        for name, document in documents.items():
-            publisher.replace(self.directory / name / "zarr.json", layout.to_json(document))
         arm = self.directory.name
         group = layout.group_document({"arm": arm, "first_line": self._first_line}, documents)
-        publisher.replace(self.directory / "zarr.json", layout.to_json(group))
+        for name, document in (documents | {"": group}).items() if own else ():
+            publisher.replace(self.directory / name / "zarr.json", layout.to_json(document))
         return {arm: group} | {f"{arm}/{name}": document for name, document in documents.items()}
 
     def _check(self, block: TaggedBlock) -> None:

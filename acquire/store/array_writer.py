@@ -64,14 +64,20 @@ class ArrayWriter:
         self._filled = 0
         self._encoding: deque[tuple[Future[NDArray[np.uint8]], NDArray[Any]]] = deque()
         self._chunks = 0
+        self._published = 0
         self._shard: ShardWriter | None = None
         self._pages = Pages()
         self._unsynced = False
 
     @property
+    def written_rows(self) -> int:
+        """Rows in chunks that are on disk, without what pads the last."""
+        return min(self._chunks * self.shape.chunk_rows, self.rows)
+
+    @property
     def whole_rows(self) -> int:
         """Rows in chunks that are on disk and in their shard's index, without what pads the last."""
-        return min(self._chunks * self.shape.chunk_rows, self.rows)
+        return min(self._published * self.shape.chunk_rows, self.rows)
 
     @property
     def direct(self) -> bool:
@@ -94,9 +100,16 @@ class ArrayWriter:
         self.settle()
 
     def settle(self) -> None:
-        """Wait for the chunks that are being encoded, and write them."""
+        """Wait for the chunks that are being encoded, write them, and publish all of them."""
         while self._encoding:
             self._write_oldest()
+        self.publish()
+
+    def publish(self) -> None:
+        """Put what is written into the index of its shard."""
+        if self._shard is not None:
+            self._shard.publish()
+            self._published = self._chunks
 
     def sync(self) -> None:
         """Force what was written since the last call to the medium."""
@@ -145,12 +158,14 @@ class ArrayWriter:
         self._chunks += 1
 
     def _next_shard(self) -> ShardWriter:
+        self.publish()
         if self._durable:
             self.sync()
         self.close()
         self._shard = None
         key = shard_key(self._chunks // self.shape.shard_chunks, len(self.shape.chunk_shape))
         path = self.directory / key
+        self.directory.stat()  # one that was taken away is a failure, and not made again
         self._disk.make_directory(path.parent, parents=True)
         direct = self.shape.chunk_bytes >= DIRECT_BYTES
         self._shard = ShardWriter(self._disk, path, self.shape.shard_chunks, direct=direct)

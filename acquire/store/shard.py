@@ -1,14 +1,15 @@
 """One shard: a file of chunks of a Zarr v3 array, written whole, one after the other.
 
-The index has one page, so a chunk is published by one small write in place::
+The index has one page, so chunks are published by one small write in place::
 
     0          4096        next multiple of 4096 after chunk 0
     ├ index ┤  ├ chunk 0 │ crc ┤  ├ chunk 1 │ crc ┤ ...
       offset and size of every chunk (uint64, all ones: absent), crc32c of these
 
-A chunk's bytes come first, then its index entry: an index never points at bytes that are not there, and
-what is not in the index does not exist for a reader. Offsets are multiples of the page, for direct I/O; the
-gaps are legal Zarr. zarr-python's own sharding codec rewrites the shard per chunk.
+A chunk's bytes come first, then its entry (at a commit, those of all new chunks at once): an index never
+points at bytes that are not there, and what is not in it does not exist for a reader. Offsets are multiples
+of the page, for direct I/O; the gaps are legal Zarr. zarr-python's own sharding codec rewrites the shard per
+chunk.
 """
 
 from __future__ import annotations
@@ -98,8 +99,12 @@ class ShardWriter:
         self._file = disk.create(path, direct=direct)
         self._in_pages = direct
         self._index = np.full((chunks, 2), ABSENT, np.uint64)
+        self._file.write([pack_index(self._index)], 0)
         self._end = PAGE
         self.chunks = 0
+        """Written."""
+        self.published = 0
+        """Of these, in the index: all that exists for a reader."""
 
     @property
     def full(self) -> bool:
@@ -111,7 +116,7 @@ class ShardWriter:
         return self._file.direct
 
     def append(self, payload: NDArray[np.uint8], pages: Pages) -> int:
-        """Write one encoded chunk, then publish it in the index; returns its size on disk.
+        """Write one encoded chunk, to be published; returns its size on disk.
 
         Page-aligned memory is written from where it is, but for its last page.
         """
@@ -121,10 +126,15 @@ class ShardWriter:
         else:
             self._file.write([payload.data, crc32c(payload.data)], self._end)
         self._index[self.chunks] = self._end, size
-        self._file.write([pack_index(self._index)], 0)
         self.chunks += 1
         self._end += page_up(size)
         return size
+
+    def publish(self) -> None:
+        """Put the chunks that are written into the index; several at once cost as much as one."""
+        if self.published < self.chunks:
+            self._file.write([pack_index(self._index)], 0)
+            self.published = self.chunks
 
     def sync(self) -> None:
         """Force the file's bytes to the medium."""

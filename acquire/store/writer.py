@@ -6,7 +6,8 @@ The order of a commit, each step complete before the next begins::
            → root zarr.json with the metadata of everything: the commit record
 
 A reader that starts at the root therefore sees one consistent, slightly older recording; no length ever
-covers a line that is not on disk, in both arms.
+covers a line that is not on disk, in both arms. What arrays and groups of lines say of themselves, for those
+who open one by itself, is renewed once a second only: at ten commits a second it cost more than the lines.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
@@ -46,6 +48,9 @@ NOT_A_PLACE = (
     errno.EROFS,
 )
 """Why a directory cannot be made where it was asked for; all other reasons are the disk's."""
+
+OWN_INTERVAL_S = 1.0
+"""How much older than the root the metadata of a group or an array opened by itself may be."""
 
 SCRATCH, RESERVE = ".next", ".reserve"
 """Files of a recording that is being written, beside the shards of the first array."""
@@ -88,6 +93,7 @@ class RecordingWriter:
         self._publisher = Publisher(hidden / SCRATCH, disk)
         self._reserve = hidden / RESERVE
         self._committed = 0
+        self._own_due_s = 0.0
         self._failure: str | None = None
         self._closed = False
 
@@ -134,7 +140,7 @@ class RecordingWriter:
             arm.begin(first_line)
         try:
             with self._failing("creating the recording"):
-                self._publish_root(0, self._publish_parts(0))
+                self._publish_root(0, self._publish_parts(0, own=False))  # `prepare` did all that takes time
         except DataError:
             self.close()
             self._disk.remove_tree(self.path)
@@ -147,6 +153,7 @@ class RecordingWriter:
                 arm.create()
             for table in self._tables:
                 table.create(self._disk)
+            self._publish_parts(0, own=True)
             self._disk.reserve(self._reserve, RESERVE_BYTES)
             if self._durable:
                 self._disk.sync_tree(self.path)
@@ -180,7 +187,8 @@ class RecordingWriter:
         self._check_alive()
         with self._failing(f"writing lines of arm {block.arm}"):
             self._arms[block.arm].append(block)
-        if self._whole_rows() - self._committed >= self.spec.commit_lines:
+        written = min(arm.written_rows for arm in self._arms.values())
+        if written - self._committed >= self.spec.commit_lines:
             self.commit()
 
     def add_gap(self, arm: str, first_line: int, count: int, cause: str) -> None:
@@ -214,7 +222,9 @@ class RecordingWriter:
             if self._durable:
                 for arm in self._arms.values():
                     arm.sync()
-            self._publish_root(rows, self._publish_parts(rows))
+            if own := time.monotonic() >= self._own_due_s:
+                self._own_due_s = time.monotonic() + OWN_INTERVAL_S
+            self._publish_root(rows, self._publish_parts(rows, own=own))
 
     def seal(self, condition: RunCondition, end_reason: str, ledger: dict[str, Any]) -> None:
         """Write the lines that wait, pad their chunk with 0, end the recording, and force it to the medium.
@@ -225,10 +235,10 @@ class RecordingWriter:
         self._check_open()
         _check_ledger(ledger)
         with self._failing("sealing"):
-            rows = self._whole_rows() if self._failure else self._pad()
+            rows = self._rescue() if self._failure else self._pad()
             self._disk.remove(self._reserve)
             self._disk.sync_tree(self.path)
-            nodes = self._publish_parts(rows)
+            nodes = self._publish_parts(rows, own=True)
             self._disk.sync_tree(self.path)
             ending = Ending(condition, end_reason, {**ledger, "store": self._ledger(rows)})
             self._publish_root(rows, nodes, ending)
@@ -254,17 +264,26 @@ class RecordingWriter:
     def _whole_rows(self) -> int:
         return min(arm.whole_rows for arm in self._arms.values())
 
+    def _rescue(self) -> int:
+        """After a failure: the rows that are whole."""
+        for arm in self._arms.values():
+            arm.publish_chunks()
+        return self._whole_rows()
+
     def _pad(self) -> int:
         rows = min(arm.next_line for arm in self._arms.values()) - self.spec.first_line
         for arm in self._arms.values():
             arm.pad()
         return rows
 
-    def _publish_parts(self, rows: int) -> dict[str, layout.Document]:
-        """Replace all metadata but the root's; returns it by path below the recording."""
+    def _publish_parts(self, rows: int, *, own: bool) -> dict[str, layout.Document]:
+        """Replace all metadata but the root's; returns it by path below the recording.
+
+        Without ``own``, that of the arms is returned only.
+        """
         nodes: dict[str, layout.Document] = {}
         for arm in self._arms.values():
-            nodes |= arm.publish(self._publisher, rows)
+            nodes |= arm.publish(self._publisher, rows, own=own)
         for table in self._tables:
             table.publish(self._publisher, durable=self._durable)
             nodes |= table.nodes()

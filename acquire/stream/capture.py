@@ -20,12 +20,13 @@ from acquire.errors import AcquireError, DataError, StateError, UsageError
 from acquire.lines import ARMS
 from acquire.stream import grabber, recorder
 from acquire.stream.losses import Cause
-from acquire.stream.messages import Begin, End, Interrupt, Quit, Ready, RunStarted
+from acquire.stream.messages import Begin, End, Extend, Interrupt, Note, Quit, Ready, RunStarted
 from acquire.stream.plan import CaptureStatus
 from acquire.stream.process import Worker
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.shared import Counters
 from acquire.stream.supervisor import RECORDER, Supervisor
+from acquire.stream.window import NOW
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from acquire.clock import ClockFit
     from acquire.store import RecordingSpec
     from acquire.stream.plan import CapturePlan
+    from acquire.stream.window import Window
     from acquire.trigger.base import Trigger
 
 _TAG_RING = RingShape(slots=64, rows=256, width=3, dtype="uint64")
@@ -88,11 +90,13 @@ class Capture:
                 error.add_note(f"while undoing it: {second}")
             raise
 
-    def start(self, path: Path, spec: RecordingSpec, lines: int | None = None) -> None:
-        """Record ``lines`` lines, or until `stop`, to ``path``, from the next line that both arms can give.
+    def start(self, path: Path, spec: RecordingSpec, lines: int | None = None, window: Window = NOW) -> None:
+        """Record ``lines`` lines, or until `stop`, to ``path``.
 
-        ``spec`` tells all but the first line, which the recorder sets. Returns once the recording exists.
-        Raises UsageError or DataError when it cannot be made; nothing has changed then.
+        From the next line that both arms can give, unless ``window`` begins earlier. ``spec`` tells all but
+        the first line, which the recorder sets. Returns once the recording exists. Raises UsageError or
+        DataError when it cannot be made, or when the rings do not hold what the window asks for; nothing
+        has changed then.
         """
         supervisor = self._running("start")
         if supervisor.recording:
@@ -101,7 +105,23 @@ class Capture:
             raise StateError(f"start: the capture has failed ({supervisor.fault})", hint="arm again")
         if lines is not None and lines < 1:
             raise UsageError(f"start with a budget of {lines} lines", possible="1 or more")
-        supervisor.begin(Begin(path, spec, lines))
+        supervisor.begin(Begin(path, spec, lines, window))
+
+    def note(self, kind: str, text: str, line: int | None = None) -> int:
+        """Something happens at ``line``, or at the newest: listed in every recording that holds the line.
+
+        Returns the line. A recording that begins later can still hold it: see `Window`.
+        """
+        self._running("note")
+        if line is None:
+            line = max(ring.newest_line for ring in self._rings.values())
+        self._workers[RECORDER].post(Note(line, kind, text))
+        return line
+
+    def extend(self, line: int) -> None:
+        """Let the recording under way not end before ``line``, unless it is ending already."""
+        self._running("extend")
+        self._workers[RECORDER].post(Extend(line))
 
     def stop(self, reason: str = "stopped") -> None:
         """End the recording at the newest line; `poll` tells when it is sealed. Idempotent."""
@@ -179,7 +199,12 @@ class Capture:
     def _spawn(self) -> None:
         plan = self._plan
         what = recorder.RecorderPlan(
-            plan.run, plan.stages, plan.stall_timeout_s, plan.tag_wait_s, plan.max_skew_lines
+            plan.run,
+            plan.stages,
+            plan.stall_timeout_s,
+            plan.tag_wait_s,
+            plan.max_skew_lines,
+            plan.realtime,
         )
         self._workers[RECORDER] = Worker(
             RECORDER, recorder.record, what, self._rings, self._tags, self._counters[RECORDER]
@@ -199,6 +224,7 @@ class Capture:
             plan.reopen_timeout_s,
             plan.line_period_ns,
             plan.columns.get(arm),
+            plan.realtime,
         )
 
     def _running(self, command: str) -> Supervisor:

@@ -166,6 +166,16 @@ class Session:
         self._told_to_end = True
         self._floor = _worse(self._floor, condition)
 
+    def extend(self, line: int) -> None:
+        """Do not end before ``line``; too late once an arm has all its rows."""
+        if not self.ending:
+            self.end_line = max(self.end_line, line)
+
+    def note(self, kind: str, line: int, text: str) -> None:
+        """List an event of a line in range; others belong to other recordings."""
+        if self.first_line <= line < self.end_line:
+            self._note(kind, line, text)
+
     def mismatches(self, found: list[TagMismatch]) -> None:
         """The trigger contradicts the count of lines; all are counted, the first are listed."""
         for mismatch in found[: max(0, MAX_MISMATCH_EVENTS - self._mismatches)]:
