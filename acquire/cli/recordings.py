@@ -115,7 +115,7 @@ def recover(recording: RecordingArgument, json: JsonFlag = False) -> None:
     )
     typer.echo(f"{done.path}: {done.lines} lines, {what}")
     if done.indices_mended:
-        typer.echo(f"  {done.indices_mended} torn indices were mended")
+        typer.echo(f"  {done.indices_mended} indices of files were mended")
     _print_list("lost, flagged as missing", map(str, done.damage))
 
 

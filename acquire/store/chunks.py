@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.store.codecs import CRC_BYTES, check_size, crc32c, decode
+from acquire.store.codecs import BLOSC_HEADER, CRC_BYTES, check_size, crc32c, decode, stored_size
 from acquire.store.layout import parse_line_array
 from acquire.store.shard import ABSENT, index_bytes, shard_key, unpack_index
 
@@ -72,6 +72,14 @@ class ChunkReader:
         except ValueError as error:
             raise DamagedChunkError(str(error)) from error
         return payload
+
+    def size_at(self, number: int, offset: int) -> int:
+        """Size that a chunk at ``offset`` would have by its own account; 0 where there cannot be one."""
+        try:
+            header = self._source.read_range(self.file(number), offset, BLOSC_HEADER)
+        except OSError:
+            return 0
+        return stored_size(header, self.shape.chunk_bytes, self.shape.codec)
 
     def trouble(self, number: int) -> str | None:
         """What is wrong with a chunk, in words; None: it is there, of the right length and checksum."""

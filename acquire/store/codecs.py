@@ -77,6 +77,14 @@ def check_size(payload: memoryview, size: int, codec: Codec) -> None:
         raise ValueError(f"{len(payload)} bytes that do not make {size}")
 
 
+def stored_size(header: bytes, size: int, codec: Codec) -> int:
+    """Bytes on disk, with checksum, of a chunk of ``size`` bytes that begins so; 0: none does."""
+    if len(header) < BLOSC_HEADER:
+        return size + CRC_BYTES if codec == "none" else 0
+    stored = size if codec == "none" else int(struct.unpack_from("<12xI", header)[0])
+    return stored + CRC_BYTES
+
+
 def crc32c(data: Buffer) -> bytes:
     """Checksum as Zarr stores it: 4 bytes, little-endian."""
     # The library refuses memoryviews, but takes arrays.

@@ -23,21 +23,38 @@ if TYPE_CHECKING:
     from acquire.store.files import Disk
 
 
-def mend_index(disk: Disk, path: Path, reader: ChunkReader, shard: int) -> bool:
-    """Rewrite the index of a shard when its checksum is wrong; says whether it was.
+def mend_index(disk: Disk, path: Path, reader: ChunkReader, shard: int, *, grow: bool) -> bool:
+    """Rewrite the index of a shard when its checksum is wrong; says whether it was changed.
 
-    Replacing an index adds one entry and leaves the others: each entry of a torn one is either right, which
-    its chunk's own checksum tells, or it is none.
+    Replacing an index adds entries and leaves the others: each entry of a torn one is either right, which
+    its chunk's own checksum tells, or it is none. With ``grow``, chunks that were written behind the last
+    one are added, too: a commit would have put them into the index.
     """
     entries, intact = reader.index(shard)
-    if intact:
-        return False
+    first = shard * len(entries)
     mended = np.full_like(entries, ABSENT)
     for slot, (offset, size) in enumerate(entries):
-        if _holds(reader, shard * len(entries) + slot, int(offset), int(size)):
+        if intact or _holds(reader, first + slot, int(offset), int(size)):
             mended[slot] = offset, size
+    if grow:
+        _grow(reader, first, mended)
+    if intact and np.array_equal(mended, entries):
+        return False
     disk.patch(path / reader.shard_file(shard), pack_index(mended), 0)
     return True
+
+
+def _grow(reader: ChunkReader, first: int, entries: NDArray[np.uint64]) -> None:
+    """Add what lies behind the last chunk that ``entries`` know; chunk ``first`` is in slot 0."""
+    present = np.flatnonzero(entries[:, 0] != ABSENT)
+    slot = int(present[-1]) + 1 if len(present) else 0
+    offset = page_up(int(entries[slot - 1].sum())) if slot else PAGE
+    while slot < len(entries):
+        size = reader.size_at(first + slot, offset)
+        if not _holds(reader, first + slot, offset, size):
+            return
+        entries[slot] = offset, size
+        slot, offset = slot + 1, page_up(offset + size)
 
 
 def rewrite_chunk(disk: Disk, path: Path, reader: ChunkReader, chunk: int, rows: NDArray[Any]) -> None:

@@ -47,7 +47,7 @@ class Recovery:
     ----------
     changed : anything at all
     lines, lines_before : rows of each arm that a reader finds
-    indices_mended : files whose index was torn
+    indices_mended : files whose index was torn, or did not know all chunks yet
     damage : lines that are lost, of which array and why
     """
 
@@ -106,7 +106,10 @@ class _Recoverer:
             reader = stream.reader(name)
             directory = self.path / reader.key / "c"
             shards = [int(entry.name) for entry in directory.glob("*") if entry.name.isdigit()]
-            mended += sum(mend_index(self.disk, self.path, reader, shard) for shard in sorted(shards))
+            mended += sum(
+                mend_index(self.disk, self.path, reader, shard, grow=not self.sealed)
+                for shard in sorted(shards)
+            )
         return mended
 
     def _grown(self, scans: dict[str, ArmScan]) -> int:
