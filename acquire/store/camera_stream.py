@@ -134,14 +134,6 @@ class CameraStream:
         return start
 
 
-def child_group(group: zarr.Group, name: str) -> zarr.Group:
-    """The group ``name`` inside ``group``; TypeError when it is something else."""
-    node = group[name]
-    if not isinstance(node, zarr.Group):
-        raise TypeError(f"{name} is not a group")
-    return node
-
-
 def child_array(group: zarr.Group, name: str) -> zarr.Array[Any]:
     """The array ``name`` inside ``group``; TypeError when it is something else."""
     node = group[name]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.store.codecs import CRC_BYTES, crc32c, decode
+from acquire.store.codecs import BLOSC_HEADER, CRC_BYTES, check_size, crc32c, decode, stored_size
 from acquire.store.layout import parse_line_array
 from acquire.store.shard import ABSENT, index_bytes, shard_key, unpack_index
 
@@ -45,24 +45,51 @@ class ChunkReader:
             rows[low - start : high - start] = self.chunk(chunk)[low - chunk * size : high - chunk * size]
         return rows
 
+    @property
+    def chunks(self) -> int:
+        """Chunks that the rows are in."""
+        return -(-self.rows // self.shape.chunk_rows)
+
     def chunk(self, number: int) -> NDArray[Any]:
         """All rows of one chunk, with what pads it. Raises as `read` does."""
-        offset, size = self.entry(number)
-        return self.chunk_at(number, offset, size)
-
-    def chunk_at(self, number: int, offset: int, size: int) -> NDArray[Any]:
-        """Chunk ``number`` from where an index says it is."""
-        data = self._source.read_range(self.file(number), offset, size)
-        if len(data) < size or size <= CRC_BYTES:
-            raise DamagedChunkError(f"{size - len(data)} of {size} bytes are not there")
-        payload, checksum = memoryview(data)[:-CRC_BYTES], data[-CRC_BYTES:]
-        if crc32c(payload) != checksum:
-            raise DamagedChunkError("the checksum is wrong")
+        payload = self.payload(number, *self.entry(number))
         try:
-            samples = decode(payload, self.shape.chunk_bytes, self.shape.codec)
+            samples = decode(payload, self.shape.codec)
         except (ValueError, RuntimeError) as error:
             raise DamagedChunkError(str(error)) from error
         return samples.view(self.shape.dtype).reshape(self.shape.chunk_shape)
+
+    def payload(self, number: int, offset: int, size: int) -> memoryview:
+        """Bytes of chunk ``number`` at ``offset`` of its file; their length and checksum are right."""
+        data = self._source.read_range(self.file(number), offset, size)
+        if len(data) < size or size <= CRC_BYTES:
+            raise DamagedChunkError(f"{size - len(data)} of {size} bytes are not there")
+        payload = memoryview(data)[:-CRC_BYTES]
+        if crc32c(payload) != data[-CRC_BYTES:]:
+            raise DamagedChunkError("the checksum is wrong")
+        try:
+            check_size(payload, self.shape.chunk_bytes, self.shape.codec)
+        except ValueError as error:
+            raise DamagedChunkError(str(error)) from error
+        return payload
+
+    def size_at(self, number: int, offset: int) -> int:
+        """Size that a chunk at ``offset`` would have by its own account; 0 where there cannot be one."""
+        try:
+            header = self._source.read_range(self.file(number), offset, BLOSC_HEADER)
+        except OSError:
+            return 0
+        return stored_size(header, self.shape.chunk_bytes, self.shape.codec)
+
+    def trouble(self, number: int) -> str | None:
+        """What is wrong with a chunk, in words; None: it is there, of the right length and checksum."""
+        try:
+            self.payload(number, *self.entry(number))
+        except (AbsentChunkError, DamagedChunkError) as error:
+            return str(error)
+        except OSError as error:
+            return f"it cannot be read: {error.strerror or error}"
+        return None
 
     def entry(self, number: int) -> tuple[int, int]:
         """Offset and size of a chunk. Raises `AbsentChunkError`; `DamagedChunkError` for a broken index."""
@@ -74,7 +101,7 @@ class ChunkReader:
             raise DamagedChunkError("the index of its file is damaged")
         offset, size = entries[number % self.shape.shard_chunks]
         if ABSENT in (offset, size):
-            raise AbsentChunkError("it is recorded, but not on disk")
+            raise AbsentChunkError("it is not on disk")
         return int(offset), int(size)
 
     def index(self, shard: int) -> tuple[NDArray[np.uint64], bool]:

@@ -5,6 +5,7 @@ What is packed here, plain Zarr unpacks. Every chunk carries a crc32c, since blo
 
 from __future__ import annotations
 
+import struct
 import time
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Literal
@@ -26,7 +27,7 @@ CODECS: tuple[Codec, ...] = ("none", "lz4", "zstd")
 CRC_BYTES = 4
 _MOST_KEPT = 4
 BLOSC_HEADER = 16
-"""Bytes; its second word is the unpacked size, its fourth the packed one."""
+"""Bytes; the second word is the unpacked size, the fourth the packed one."""
 
 blosc.use_threads = False  # its own threads serve one caller at a time; ours are the writer's
 
@@ -77,17 +78,29 @@ class EncodeOnce:
         return packed
 
 
-def decode(payload: Buffer, size: int, codec: Codec) -> NDArray[np.uint8]:
-    """The ``size`` bytes that were packed. Raises ValueError when ``payload`` holds something else."""
-    data = np.frombuffer(memoryview(payload), np.uint8)
-    if codec != "none":
-        if len(data) < BLOSC_HEADER or tuple(data[:BLOSC_HEADER].view("<u4")[[1, 3]]) != (size, len(data)):
-            raise ValueError(f"{len(data)} bytes that do not unpack to {size}")
-        samples: NDArray[np.uint8] = np.frombuffer(blosc.decompress(data), np.uint8)
-        return samples
-    if len(data) != size:
-        raise ValueError(f"{len(data)} bytes instead of {size}")
-    return data
+def decode(payload: Buffer, codec: Codec) -> NDArray[np.uint8]:
+    """The bytes that were packed; `check_size` has agreed with their number."""
+    samples: NDArray[np.uint8] = np.frombuffer(
+        memoryview(payload) if codec == "none" else blosc.decompress(payload), np.uint8
+    )
+    return samples
+
+
+def check_size(payload: memoryview, size: int, codec: Codec) -> None:
+    """Raise ValueError unless ``payload`` is of the length that it says, and unpacks to ``size`` bytes."""
+    have, stored = len(payload), len(payload)
+    if codec != "none" and have >= BLOSC_HEADER:
+        have, stored = struct.unpack_from("<4xI4xI", payload)
+    if (have, stored) != (size, len(payload)):
+        raise ValueError(f"{len(payload)} bytes that do not make {size}")
+
+
+def stored_size(header: bytes, size: int, codec: Codec) -> int:
+    """Bytes on disk, with checksum, of a chunk of ``size`` bytes that begins so; 0: none does."""
+    if len(header) < BLOSC_HEADER:
+        return size + CRC_BYTES if codec == "none" else 0
+    stored = size if codec == "none" else int(struct.unpack_from("<12xI", header)[0])
+    return stored + CRC_BYTES
 
 
 def crc32c(data: Buffer) -> bytes:

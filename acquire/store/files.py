@@ -136,11 +136,10 @@ class Disk:
             os.close(fd)
 
     def patch(self, path: Path, data: Buffer, offset: int) -> None:
-        """Replace bytes of a file that exists, and force them to the medium."""
+        """Replace bytes of a file that exists, or add some behind its end."""
         fd = os.open(path, os.O_WRONLY | os.O_CLOEXEC)
         try:
             write_all(fd, [data], offset)
-            os.fsync(fd)
         finally:
             os.close(fd)
 

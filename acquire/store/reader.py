@@ -6,7 +6,6 @@ open it again to see more. Nothing is read before it is asked for.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,36 +18,18 @@ from acquire.codes import code_from_attrs
 from acquire.errors import DataError, UsageError
 from acquire.geometry import Geometry
 from acquire.lines import ARMS, LineFlag, Segment
-from acquire.store.camera_stream import DAMAGE, CameraStream, child_array, child_group
+from acquire.store.camera_stream import CameraStream
 from acquire.store.layout import line_columns
+from acquire.store.table_reader import read_events, read_gaps
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.store.layout import Document
     from acquire.store.source import Source
+    from acquire.store.table_reader import Event, Gap
 
 UNUSABLE = LineFlag.MISSING | LineFlag.INCOMPLETE
-
-
-@dataclass(frozen=True, slots=True)
-class Gap:
-    """Lines of one arm that were lost."""
-
-    arm: str
-    first_line: int
-    count: int
-    cause: str
-
-
-@dataclass(frozen=True, slots=True)
-class Event:
-    """What happened when, on the trigger's clock."""
-
-    kind: str
-    tick: int
-    line: int
-    text: str
 
 
 class Recording:
@@ -59,7 +40,7 @@ class Recording:
         self.source = source
         self.document = document
         self.attrs: dict[str, Any] = document["attributes"]
-        nodes = document["consolidated_metadata"]["metadata"]
+        self._nodes = nodes = document["consolidated_metadata"]["metadata"]
         columns = [column.name for column in line_columns("any")]
         self.arms = {
             arm: CameraStream(
@@ -107,6 +88,41 @@ class Recording:
     def line_period_ns(self) -> float:
         return int(self.attrs["trigger"]["line_period_ticks"]) * NS_PER_S / self.clock.clock_hz
 
+    @property
+    def substeps(self) -> int:
+        """S."""
+        return int(self.attrs["geometry"]["substeps"])
+
+    @property
+    def dropped(self) -> tuple[tuple[int, int], ...]:
+        """Lines that retention has deleted: first line and count of every stretch."""
+        return tuple((int(first), int(count)) for first, count in self.attrs.get("dropped", ()))
+
+    def dropped_rows(self) -> list[range]:
+        """The same, in rows."""
+        return [range(first - self.first_line, first - self.first_line + n) for first, n in self.dropped]
+
+    def kept_chunks(self) -> list[int]:
+        """Chunks that hold rows and have not been deleted; retention deletes whole ones."""
+        reader = self.arms[ARMS[0]].reader("lines")
+        size, dropped = reader.shape.chunk_rows, self.dropped_rows()
+        return [c for c in range(reader.chunks) if not any(c * size in rows for rows in dropped)]
+
+    def lost_rows(self, arm: str, lines: int | None = None) -> list[range]:
+        """Rows of one arm that are listed in gaps; of the first ``lines`` rows, or of all that there are."""
+        start, end = self.first_line, self.lines if lines is None else lines
+        gaps = [
+            range(gap.first_line - start, min(end, gap.first_line - start + gap.count))
+            for gap in self.gaps
+            if gap.arm == arm
+        ]
+        return [rows for rows in gaps if rows]
+
+    @cached_property
+    def gaps_not_listed(self) -> int:
+        """Gaps for which the table had no room."""
+        return int(self._nodes["gaps"]["attributes"]["not_listed"])
+
     def camera(self, arm: str) -> CameraStream:
         """The arrays of arm ``"a"`` or ``"b"``."""
         if arm not in self.arms:
@@ -121,17 +137,12 @@ class Recording:
     @cached_property
     def gaps(self) -> tuple[Gap, ...]:
         """Lost lines in the order in which they were noticed."""
-        table = _table(self.group, "gaps")
-        first, count = _numbers(table, "first_line"), _numbers(table, "count")
-        return tuple(map(Gap, _words(table, "arm"), first, count, _words(table, "cause")))
+        return read_gaps(self.source, self._nodes)
 
     @cached_property
     def events(self) -> tuple[Event, ...]:
         """What happened, in the order in which it was noted."""
-        table = _table(self.group, "events")
-        texts = [str(text) for text in _column(table, "text")]
-        ticks, lines = _numbers(table, "tick"), _numbers(table, "line")
-        return tuple(map(Event, _words(table, "kind"), ticks, lines, texts))
+        return read_events(self.source, self._nodes)
 
     def cut(self, first_line: int, lines: int) -> Segment:
         """The segment of ``lines`` lines from the trigger's line ``first_line`` on.
@@ -179,6 +190,7 @@ class Recording:
             "simulated": bool(self.attrs.get("simulated", False)),
             "cameras": self.attrs["cameras"],
             "ledger": self.attrs["ledger"],
+            "durability": self.attrs.get("durability", {}),
             "versions": self.attrs["versions"],
         }
 
@@ -228,32 +240,3 @@ class Recording:
                 f"the recording's attributes describe ({wrong.sum()} of {len(wrong)} lines disagree)",
                 hint="lines from before or after; the lines themselves are intact",
             )
-
-
-def _table(group: zarr.Group, name: str) -> zarr.Group:
-    try:
-        return child_group(group, name)
-    except DAMAGE as error:
-        raise DataError(f"table {name} cannot be read: {error}") from error
-
-
-def _column(table: zarr.Group, name: str) -> NDArray[Any]:
-    try:
-        return np.asarray(child_array(table, name)[:])
-    except DAMAGE as error:
-        raise DataError(f"table {table.path}/{name} cannot be read: {error}") from error
-
-
-def _numbers(table: zarr.Group, name: str) -> list[int]:
-    return [int(value) for value in _column(table, name)]
-
-
-def _words(table: zarr.Group, name: str) -> list[str]:
-    """A column of CF flag values as their meanings."""
-    try:
-        attributes = child_array(table, name).attrs
-        values: Any = attributes["flag_values"]
-        by_value = dict(zip(values, str(attributes["flag_meanings"]).split(), strict=True))
-        return [by_value[value] for value in _numbers(table, name)]
-    except DAMAGE as error:
-        raise DataError(f"table {table.path}/{name} cannot be read: {error!r}") from error
