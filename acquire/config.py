@@ -159,10 +159,13 @@ class TriggerConfig(_Model):
 class CameraConfig(_Model):
     """One camera. DN = black level + responsivity · Y, with Y of Eq. (1)."""
 
-    driver: Literal["simulated", "gentl-simulated", "gige-simulated", "harvesters", "aravis"] = Field(
-        default="simulated",
-        description="'harvesters': through the maker's GenTL producer; 'aravis': GigE and USB3 Vision; "
-        "'gentl-simulated', 'gige-simulated': simulated cameras through either",
+    driver: Literal["simulated", "pattern", "gentl-simulated", "gige-simulated", "harvesters", "aravis"] = (
+        Field(
+            default="simulated",
+            description="'harvesters': through the maker's GenTL producer; 'aravis': GigE and USB3 Vision; "
+            "'gentl-simulated', 'gige-simulated': simulated cameras through either; "
+            "'pattern': stored lines in place of the scene, at any rate, for loads",
+        )
     )
     serial: str = "simulated"
     model: str = Field(default="", description="what the camera must be; absent: any")
@@ -233,6 +236,11 @@ class StreamConfig(_Model):
         default=None, gt=0, description="of lines from the past that the ring holds, instead of ring_slots"
     )
     reopen_s: float = Field(default=2.0, ge=0, le=600, description="wait for a camera that is gone")
+    realtime: bool = Field(
+        default=False,
+        description="grabbers before everything else on the host, where its user may (RLIMIT_RTPRIO); "
+        "not for simulated cameras, which compute",
+    )
 
 
 class RecordingConfig(_Model):

@@ -27,13 +27,22 @@ def register(app: typer.Typer) -> None:
         app.command(rich_help_panel="Capture")(command)
 
 
-def arm(socket: SocketOption = None, json: JsonFlag = False) -> None:
+def arm(
+    force: Annotated[
+        bool, typer.Option("--force", help="Even where this host is too slow for the configured rate.")
+    ] = False,
+    socket: SocketOption = None,
+    json: JsonFlag = False,
+) -> None:
     """Start trigger and cameras; nothing is written yet.
+
+    The daemon measures first what ring, codec and disk sustain here (a second; valid for ten minutes), and
+    refuses, exit code 2, where that is less than what is configured.
 
     Example: [bold]acquire arm[/]
     """
     with _daemon(socket) as daemon:
-        _show(daemon.arm(), json)
+        _show(daemon.arm(force=force), json)
 
 
 def start(
@@ -139,6 +148,7 @@ def _show(status: Status, json: bool) -> None:
             "run": status.run_id,
             "recording": _recording(status),
             "last": _last(status.last),
+            "sustains": _capacity(status),
             "possible": ", ".join(status.possible) or "wait until it is idle",
         }
     )
@@ -155,6 +165,14 @@ def _recording(status: Status) -> str | None:
         f"{now.path}, {now.recorded_lines}{budget} lines from line {now.first_line} on, "
         f"{now.committed_lines} readable"
     )
+
+
+def _capacity(status: Status) -> str | None:
+    found = status.capacity
+    if found is None or found.warning is not None:
+        return None if found is None else f"WARNING: {found.warning}"
+    sustained, configured = quantity(found.sustained_hz or 0, "Hz"), quantity(found.line_rate_hz, "Hz")
+    return f"lines at {sustained} (the {found.limit} allows least); configured {configured}"
 
 
 def _last(last: LastRecording | None) -> str | None:

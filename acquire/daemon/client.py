@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Self
 import httpx
 from pydantic import ValidationError
 
-from acquire.daemon.messages import ErrorMessage, StartRequest, Status
+from acquire.daemon.messages import ArmRequest, ErrorMessage, StartRequest, Status
 from acquire.daemon.states import State
 from acquire.errors import AcquireError, NoDaemonError, StateError, UsageError
 
@@ -57,9 +57,9 @@ class Client:
         """What the daemon is doing; answered at once, whatever it is busy with."""
         return self._call("GET", "status", STATUS_TIMEOUT_S)
 
-    def arm(self) -> Status:
-        """idle → armed: cameras and trigger run, nothing is written."""
-        return self._call("POST", "arm")
+    def arm(self, *, force: bool = False) -> Status:
+        """idle → armed: cameras and trigger run, nothing is written. ``force``: however slow the host."""
+        return self._call("POST", "arm", body=ArmRequest(force=force).model_dump())
 
     def start(
         self,

@@ -16,6 +16,7 @@ from starlette.exceptions import HTTPException
 from acquire import __version__
 from acquire.daemon.messages import (
     HTTP_STATUS,
+    ArmRequest,
     ErrorMessage,
     MarkRequest,
     StartRequest,
@@ -38,7 +39,7 @@ class Commands(Protocol):
     """What the API controls."""
 
     def status(self) -> Status: ...
-    def arm(self) -> None: ...
+    def arm(self, request: ArmRequest) -> None: ...
     def start(self, request: StartRequest) -> None: ...
     def mark(self, text: str) -> None: ...
     def stop(self) -> None: ...
@@ -63,8 +64,8 @@ def build_app(service: Commands, run: Callable[[Callable[[], None]], Awaitable[N
         return service.status()
 
     @app.post("/arm", summary="idle → armed")
-    async def arm() -> Status:
-        await run(service.arm)
+    async def arm(request: ArmRequest | None = None) -> Status:
+        await run(lambda: service.arm(request or ArmRequest()))
         return service.status()
 
     @app.post("/start", summary="armed → recording")

@@ -20,6 +20,12 @@ class _Message(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+class ArmRequest(_Message):
+    """How to arm."""
+
+    force: bool = Field(default=False, description="even where the host is too slow for the configured rate")
+
+
 class StartRequest(_Message):
     """Where to record, and how much."""
 
@@ -134,6 +140,16 @@ class LastRecording(_Message):
     end_reason: str | None
 
 
+class CapacityStatus(_Message):
+    """What this host sustains, as measured before the run was armed; line rates of both arms."""
+
+    line_rate_hz: float = Field(description="configured")
+    sustained_hz: float | None = Field(default=None, description="null: could not be measured")
+    limit: str | None = Field(default=None, description="what allows least")
+    limits_hz: dict[str, float] = Field(default={}, description="ring, codec, recorder, processors")
+    warning: str | None = None
+
+
 class Status(_Message):
     """What the daemon is doing, and how well."""
 
@@ -150,6 +166,7 @@ class Status(_Message):
     arms: dict[str, ArmStatus]
     last: LastRecording | None
     fault: str | None
+    capacity: CapacityStatus | None = None
 
 
 class ErrorMessage(_Message):

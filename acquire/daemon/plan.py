@@ -119,6 +119,7 @@ def capture_plan(config: RigConfig, rig: Rig, run_id: str) -> CapturePlan:
         stall_timeout_s=max(STALL_S, config.stream.reopen_s + 1.0),
         reopen_timeout_s=config.stream.reopen_s,
         columns=config.columns,
+        realtime=config.stream.realtime,
         line_period_ns=1e9 / config.line_rate_hz / config.simulation.speed,
     )
 

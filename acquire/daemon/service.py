@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from acquire import __version__
 from acquire.daemon.events import StandingOrder, budget_lines, window_of
-from acquire.daemon.messages import LastRecording, RecordingStatus, Status
+from acquire.daemon.messages import ArmRequest, LastRecording, RecordingStatus, Status
 from acquire.daemon.plan import default_path
 from acquire.daemon.report import Rates, arm_statuses, delivered_lines
 from acquire.daemon.states import Event, State, after, commands
@@ -30,13 +30,14 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from acquire.config import RigConfig
-    from acquire.daemon.messages import StartRequest
+    from acquire.daemon.messages import CapacityStatus, StartRequest
     from acquire.stream import Window
     from acquire.stream.messages import Note
 
 DRAIN_TIMEOUT_S = 30.0
 """From the last line's number to the sealed recording; more is a fault."""
 POLL_S = 0.05
+ARM = ArmRequest()
 
 log = logging.getLogger("acquire.daemon")
 
@@ -56,12 +57,20 @@ class Run(Protocol):
     def close(self) -> None: ...
 
 
+class Prove(Protocol):
+    """What the service needs of `acquire.daemon.proof.Proof`."""
+
+    def __call__(self, *, force: bool) -> CapacityStatus: ...
+
+
 class Service:
     """One instrument, at most one run at a time. See the module for who may call what."""
 
-    def __init__(self, config: RigConfig, open_run: Callable[[], Run]) -> None:
+    def __init__(self, config: RigConfig, open_run: Callable[[], Run], prove: Prove | None = None) -> None:
         self._config = config
         self._open_run = open_run
+        self._prove = prove
+        self._capacity: CapacityStatus | None = None
         self._hurried = threading.Event()
         self._born = time.monotonic()
         self._state = State.IDLE
@@ -90,9 +99,13 @@ class Service:
 
     # ---- commands
 
-    def arm(self) -> None:
-        """idle → armed. Raises what the devices refuse with; the state is idle then."""
+    def arm(self, request: ArmRequest = ARM) -> None:
+        """idle → armed. Raises what the devices refuse with, and UsageError where the host is too slow for
+        them and that is not forced; the state is idle then.
+        """
         with self._doing(Event.ARM):
+            if self._prove is not None:
+                self._capacity = self._prove(force=request.force)
             run = self._open_run()
             run.arm()
             self._run, self._seen, self._rates = run, CaptureStatus(), Rates()
@@ -314,6 +327,7 @@ class Service:
             arms=arm_statuses(self._seen, self._rates),
             last=self._last,
             fault=self._fault,
+            capacity=self._capacity,
         )
 
     def _recording(self) -> RecordingStatus | None:

@@ -212,7 +212,12 @@ class Capture:
     def _spawn(self) -> None:
         plan = self._plan
         what = recorder.RecorderPlan(
-            plan.run, plan.stages, plan.stall_timeout_s, plan.tag_wait_s, plan.max_skew_lines
+            plan.run,
+            plan.stages,
+            plan.stall_timeout_s,
+            plan.tag_wait_s,
+            plan.max_skew_lines,
+            plan.realtime,
         )
         self._workers[RECORDER] = Worker(
             RECORDER, recorder.record, what, self._rings, self._tags, self._counters[RECORDER], self._others()
@@ -239,6 +244,7 @@ class Capture:
             plan.reopen_timeout_s,
             plan.line_period_ns,
             plan.columns.get(arm),
+            plan.realtime,
         )
 
     def _running(self, command: str) -> Supervisor:

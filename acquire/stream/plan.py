@@ -47,6 +47,7 @@ class CapturePlan:
     reopen_timeout_s : how long a camera that is gone is waited for; less than ``stall_timeout_s``, or the
         arm counts as stalled first
     line_period_ns : by the trigger's clock; 0: not told
+    realtime : grabbers run before everything else on the host, where that is allowed
     columns : compact layout: arm → first column and the one after the last, on the one camera that
         ``openers["a"]`` opens; empty: a camera per arm
     ring_reserve : slots that hold no history: see `RingShape`
@@ -66,6 +67,7 @@ class CapturePlan:
     reopen_timeout_s: float = 2.0
     line_period_ns: float = 0.0
     columns: dict[str, tuple[int, int]] = field(default_factory=dict)
+    realtime: bool = False
     ring_reserve: int = 2
     watch: WatchPlan | None = None
 

@@ -39,7 +39,7 @@ from acquire.stream.messages import (
     Refused,
     RunStarted,
 )
-from acquire.stream.process import OwnerGone
+from acquire.stream.process import OwnerGone, become_important
 from acquire.stream.session import Session
 from acquire.stream.stalls import Arm, find_stall
 from acquire.stream.tagger import Tagger
@@ -79,6 +79,7 @@ class RecorderPlan:
     stall_timeout_s: float
     tag_wait_s: float
     max_skew_lines: int
+    realtime: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +103,8 @@ def record(
 
     ``others``: what ``trigger`` and ``watcher`` count, where there is one.
     """
+    if plan.realtime:
+        become_important()  # not in real time: it computes, and must not keep the grabbers waiting
     with ThreadPoolExecutor(1, thread_name_prefix="store") as disk:
         recorder = Recorder(mailbox, plan, rings, tags, counters, disk, Witness(others))
         mailbox.post(Ready())
