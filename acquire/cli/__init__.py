@@ -16,6 +16,7 @@ import sys
 import typer
 
 from acquire.cli import (
+    bench,
     camera,
     config,
     control,
@@ -31,7 +32,20 @@ from acquire.cli import (
 from acquire.cli.output import print_error
 from acquire.errors import EXIT_INTERRUPTED, AcquireError, UsageError
 
-MODULES = (demo, serve, control, recordings, reconstruct, simulate, replay, config, devices, trigger, camera)
+MODULES = (
+    demo,
+    serve,
+    control,
+    recordings,
+    reconstruct,
+    simulate,
+    replay,
+    config,
+    devices,
+    trigger,
+    camera,
+    bench,
+)
 """Modules of commands, in the order of the help; each has ``register(app)``. New groups are added here."""
 
 app = typer.Typer(

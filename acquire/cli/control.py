@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from acquire.cli.durations import seconds
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, quantity
 from acquire.errors import DataError, UsageError
 
 if TYPE_CHECKING:
     from acquire.daemon.client import Client
-    from acquire.daemon.messages import LastRecording, Status
+    from acquire.daemon.messages import CheckStatus, LastRecording, Status
 
 SocketOption = Annotated[
     Path | None, typer.Option("--socket", envvar="ACQUIRE_SOCKET", help="The daemon's control socket.")
@@ -22,17 +23,26 @@ DAMAGED = ("INCOMPLETE", "ABORTED", None)
 
 
 def register(app: typer.Typer) -> None:
-    for command in (arm, start, stop, disarm, status):
+    for command in (arm, start, mark, stop, disarm, status):
         app.command(rich_help_panel="Capture")(command)
 
 
-def arm(socket: SocketOption = None, json: JsonFlag = False) -> None:
+def arm(
+    force: Annotated[
+        bool, typer.Option("--force", help="Even where this host is too slow for the configured rate.")
+    ] = False,
+    socket: SocketOption = None,
+    json: JsonFlag = False,
+) -> None:
     """Start trigger and cameras; nothing is written yet.
+
+    The daemon measures first what ring, codec and disk sustain here (a second; valid for ten minutes), and
+    refuses, exit code 2, where that is less than what is configured.
 
     Example: [bold]acquire arm[/]
     """
     with _daemon(socket) as daemon:
-        _show(daemon.arm(), json)
+        _show(daemon.arm(force=force), json)
 
 
 def start(
@@ -40,16 +50,37 @@ def start(
         Path | None, typer.Argument(metavar="[RECORDING]", help="New recording; else named by rig and time.")
     ] = None,
     lines: Annotated[int | None, typer.Option(help="Stop after so many lines.")] = None,
-    duration: Annotated[float | None, typer.Option(help="Stop after so many seconds.")] = None,
+    duration: Annotated[
+        float | None, typer.Option(parser=seconds, metavar="TIME", help="Stop after 5s, 500ms, 2min.")
+    ] = None,
+    pre: Annotated[
+        float | None, typer.Option(parser=seconds, metavar="TIME", help="Of that, from before: see the ring.")
+    ] = None,
+    post: Annotated[
+        float | None, typer.Option(parser=seconds, metavar="TIME", help="Stop so long after this command.")
+    ] = None,
     socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Record from the next line on, until stopped or for a number of lines or seconds.
+    """Record from the next line on, or from before it; until stopped, or for some lines or time.
 
-    Example: [bold]acquire start run.zarr --lines 100000[/]
+    Example: [bold]acquire start run.zarr --lines 100000[/], or [bold]acquire start --pre 2s --post 1s[/]
     """
     with _daemon(socket) as daemon:
-        _show(daemon.start(path, lines=lines, duration_s=duration), json)
+        _show(daemon.start(path, lines=lines, duration_s=duration, pre_s=pre or 0.0, post_s=post), json)
+
+
+def mark(
+    text: Annotated[str, typer.Argument(help="What happens, in your words.")] = "",
+    socket: SocketOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Note that something happens now. While armed it starts a recording, where the rig's [events] say so.
+
+    Example: [bold]acquire mark "the valve opens"[/]
+    """
+    with _daemon(socket) as daemon:
+        _show(daemon.mark(text), json)
 
 
 def stop(socket: SocketOption = None, json: JsonFlag = False) -> None:
@@ -117,6 +148,7 @@ def _show(status: Status, json: bool) -> None:
             "run": status.run_id,
             "recording": _recording(status),
             "last": _last(status.last),
+            "sustains": _capacity(status),
             "possible": ", ".join(status.possible) or "wait until it is idle",
         }
     )
@@ -135,6 +167,14 @@ def _recording(status: Status) -> str | None:
     )
 
 
+def _capacity(status: Status) -> str | None:
+    found = status.capacity
+    if found is None or found.warning is not None:
+        return None if found is None else f"WARNING: {found.warning}"
+    sustained, configured = quantity(found.sustained_hz or 0, "Hz"), quantity(found.line_rate_hz, "Hz")
+    return f"lines at {sustained} (the {found.limit} allows least); configured {configured}"
+
+
 def _last(last: LastRecording | None) -> str | None:
     if last is None:
         return None
@@ -142,12 +182,24 @@ def _last(last: LastRecording | None) -> str | None:
 
 
 def _show_arms(status: Status) -> None:
-    columns = ("arm", "rate", "delivered", "preroll", "recorded", "missing", "lost", "ring", "peak", "drops")
+    columns = (
+        *("arm", "rate", "delivered", "preroll", "recorded", "missing", "lost", "ring", "peak", "drops"),
+        *("code", "ledger"),
+    )
     rows = []
     for name, arm in status.arms.items():
         lost = ", ".join(f"{cause} {lines}" for cause, lines in arm.lost.items() if lines) or "0"
         counts = (arm.delivered, arm.preroll, arm.recorded, arm.missing)
         ring = (f"{arm.ring.fill}/{arm.ring.slots}", arm.ring.peak, arm.ring.drops)
-        rows.append((name, quantity(arm.rate_hz, "Hz"), *counts, lost, *ring))
+        account = "-" if arm.ledger is None else "balances" if arm.ledger.balanced else "DOES NOT BALANCE"
+        rows.append((name, quantity(arm.rate_hz, "Hz"), *counts, lost, *ring, _check(arm.check), account))
     typer.echo()
     print_table(columns, rows)
+
+
+def _check(check: CheckStatus | None) -> str:
+    """What the lines say of the light's code."""
+    if check is None:
+        return "-"
+    verdict = check.verdict.replace("_", " ")
+    return f"{verdict} {check.shift:+d}" if check.shift else verdict

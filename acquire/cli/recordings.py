@@ -1,4 +1,4 @@
-"""``acquire ls | info | cut``: recordings on disk; no daemon needed."""
+"""``acquire ls | info | cut | verify | recover``: recordings on disk; no daemon needed."""
 
 from __future__ import annotations
 
@@ -10,12 +10,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, quantity
+from acquire.cli.progress import stage_progress
 from acquire.errors import AcquireError, DataError, UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from acquire.lines import Segment
+    from acquire.store import Verification
 
 RecordingArgument = Annotated[Path, typer.Argument(metavar="RECORDING", help="A directory NAME.zarr.")]
+
+LISTED = 20
+"""Damaged stretches that are printed; --json has all of them."""
 
 CELL_CHARACTERS = 72
 """What a table shows of an error; --json has all of it."""
@@ -23,7 +30,7 @@ CELL_CHARACTERS = 72
 
 def register(app: typer.Typer) -> None:
     app.command("ls", rich_help_panel="Recordings")(list_recordings)
-    for command in (info, cut):
+    for command in (info, verify, recover, cut):
         app.command(rich_help_panel="Recordings")(command)
 
 
@@ -69,6 +76,49 @@ def info(recording: RecordingArgument, json: JsonFlag = False) -> None:
         print_table(("arm", "first lost line", "lines", "cause"), rows)
 
 
+def verify(recording: RecordingArgument, json: JsonFlag = False) -> None:
+    """Read all of a recording: is every line there and intact, do numbering, gaps and ledger agree?
+
+    Ends with 6 where something is lost or damaged, and says which lines.
+
+    Example: [bold]acquire verify run.zarr[/]
+    """
+    from acquire.store import verify as verify_recording
+
+    with stage_progress("verifying") as progress:
+        found = verify_recording(recording, progress)
+    if json:
+        print_json(found.to_dict())
+    else:
+        _print_verification(found)
+    if not found.intact:
+        raise typer.Exit(DataError.exit_code)
+
+
+def recover(recording: RecordingArgument, json: JsonFlag = False) -> None:
+    """Seal a recording whose writer was killed or lost its power; nothing that was committed is cut off.
+
+    Lines that are not intact on disk are flagged as missing and listed. A second time changes nothing.
+
+    Example: [bold]acquire recover run.zarr[/]
+    """
+    from acquire.store import recover as recover_recording
+
+    with stage_progress("recovering") as progress:
+        done = recover_recording(recording, progress=progress)
+    if json:
+        print_json(done.to_dict())
+        return
+    added = done.lines - done.lines_before
+    what = (
+        f"sealed; {added} lines were on disk that no commit listed" if done.changed else "nothing to recover"
+    )
+    typer.echo(f"{done.path}: {done.lines} lines, {what}")
+    if done.indices_mended:
+        typer.echo(f"  {done.indices_mended} indices of files were mended")
+    _print_list("lost, flagged as missing", map(str, done.damage))
+
+
 def cut(
     recording: RecordingArgument,
     first_line: Annotated[int, typer.Option(help="The trigger's number of the first line.")],
@@ -91,6 +141,24 @@ def cut(
         print_json(facts)
     else:
         typer.echo(f"{out}: lines {first_line} to {first_line + lines - 1}, {quantity(size, 'B')}")
+
+
+def _print_verification(found: Verification) -> None:
+    verdict = "intact" if found.intact else "DAMAGED"
+    size = quantity(found.bytes, "B")
+    typer.echo(f"{found.path}: {verdict}; {found.state}, {found.lines} lines, {size}")
+    _print_list("not intact on disk", map(str, found.damage))
+    _print_list("contradictions", found.contradictions)
+    _print_list("note", found.notes)
+
+
+def _print_list(title: str, items: Iterable[str]) -> None:
+    """Some items under a title; those that are too many are counted."""
+    listed = list(items)
+    for item in listed[:LISTED]:
+        typer.echo(f"  {title}: {item}")
+    if len(listed) > LISTED:
+        typer.echo(f"  {title}: and {len(listed) - LISTED} more; --json has them all")
 
 
 def _may_be_one(path: Path) -> bool:
@@ -147,10 +215,20 @@ def _readable(facts: dict[str, Any]) -> dict[str, Any]:
         "code": ", ".join(f"{key} {value}" for key, value in facts["code"].items()),
         "clock": f"{facts['clock']['clock_hz']} Hz, UTC known to {facts['clock']['uncertainty_ns']} ns",
         "size": quantity(facts["bytes"], "B"),
+        "at risk": _at_risk(facts["durability"]),
         "lost lines": ", ".join(f"{arm} {count}" for arm, count in facts["lost_lines"].items()),
         "simulated": "yes" if facts["simulated"] else "no",
         "written by": f"acquire {facts['versions']['acquire']}",
     }
+
+
+def _at_risk(durability: dict[str, Any]) -> str | None:
+    """What a crash can cost, of a recording that says so."""
+    if not durability:
+        return None
+    kill, power = durability["kill_lines"], durability["power_lines"]
+    at_power = f"at most {power} lines" if power is not None else "what the system has not written back"
+    return f"kill -9: at most {kill} lines; power loss: {at_power} (fsync at {durability['fsync']})"
 
 
 def _utc(time_ns: int | None) -> str:

@@ -20,6 +20,12 @@ class _Message(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+class ArmRequest(_Message):
+    """How to arm."""
+
+    force: bool = Field(default=False, description="even where the host is too slow for the configured rate")
+
+
 class StartRequest(_Message):
     """Where to record, and how much."""
 
@@ -32,11 +38,20 @@ class StartRequest(_Message):
     duration_s: float | None = Field(
         default=None, gt=0, le=1e9, allow_inf_nan=False, description="budget in seconds instead of lines"
     )
+    pre_s: float = Field(
+        default=0.0, ge=0, le=1e6, allow_inf_nan=False, description="of it, from before the request"
+    )
+    post_s: float | None = Field(
+        default=None, gt=0, le=1e9, allow_inf_nan=False, description="to record after the request, as budget"
+    )
 
     @model_validator(mode="after")
     def _one_budget(self) -> StartRequest:
-        if self.lines is not None and self.duration_s is not None:
-            raise ValueError("lines and duration_s are two ways to say the same: give one")
+        given = [name for name in ("lines", "duration_s", "post_s") if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise ValueError(f"{' and '.join(given)} are ways to say the same: give one")
+        if self.duration_s is not None and self.pre_s >= self.duration_s:
+            raise ValueError("pre_s is a part of duration_s: give a smaller one")
         if self.path is not None and not self.path.is_absolute():
             raise ValueError(f"path {str(self.path)!r} is not absolute: the daemon has another directory")
         return self
@@ -50,6 +65,12 @@ class StartRequest(_Message):
         return path
 
 
+class MarkRequest(_Message):
+    """What happens now, in the operator's words."""
+
+    text: str = Field(default="", max_length=400)
+
+
 class RingStatus(_Message):
     """Fill of the ring between a camera and the recorder, in slots."""
 
@@ -57,6 +78,28 @@ class RingStatus(_Message):
     fill: int
     peak: int
     drops: int = Field(description="blocks that found no free slot")
+    history: int = Field(default=0, description="slots from the past that a recording can begin with")
+
+
+class LedgerStatus(_Message):
+    """Every pulse since arm: issued = preroll + stored + discarded + lost + waiting + pending."""
+
+    issued: int = Field(description="by the trigger, as far as tags and lines tell")
+    preroll: int = Field(description="exposed before the run's start")
+    stored: int = Field(description="in recordings")
+    discarded: int = Field(description="in none, since nobody asked for them")
+    lost: dict[str, int] = Field(description="cause → lines")
+    waiting: int = Field(description="in the ring")
+    pending: int = Field(description="in camera or driver")
+    balanced: bool
+
+
+class CheckStatus(_Message):
+    """What the lines say of the light's code."""
+
+    verdict: str = Field(description="verified, shifted, inverted, wrong_code, dark or unknown")
+    shift: int = Field(description="sub-steps by which the lines are late")
+    checked_line: int = Field(description="the line after the last that was looked at")
 
 
 class ArmStatus(_Message):
@@ -74,6 +117,8 @@ class ArmStatus(_Message):
     missing: int = Field(description="those of them that hold no line")
     rate_hz: float = Field(description="lines per second over the last seconds")
     ring: RingStatus
+    ledger: LedgerStatus | None = None
+    check: CheckStatus | None = Field(default=None, description="null: the rig does not check")
 
 
 class RecordingStatus(_Message):
@@ -95,6 +140,16 @@ class LastRecording(_Message):
     end_reason: str | None
 
 
+class CapacityStatus(_Message):
+    """What this host sustains, as measured before the run was armed; line rates of both arms."""
+
+    line_rate_hz: float = Field(description="configured")
+    sustained_hz: float | None = Field(default=None, description="null: could not be measured")
+    limit: str | None = Field(default=None, description="what allows least")
+    limits_hz: dict[str, float] = Field(default={}, description="ring, codec, recorder, processors")
+    warning: str | None = None
+
+
 class Status(_Message):
     """What the daemon is doing, and how well."""
 
@@ -111,6 +166,7 @@ class Status(_Message):
     arms: dict[str, ArmStatus]
     last: LastRecording | None
     fault: str | None
+    capacity: CapacityStatus | None = None
 
 
 class ErrorMessage(_Message):

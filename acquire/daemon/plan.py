@@ -8,8 +8,10 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
+from acquire.daemon.watching import watch_plan
 from acquire.store import RecordingSpec
-from acquire.stream import Capture, CapturePlan
+from acquire.stream import NOW, Capture, CapturePlan
+from acquire.stream.messages import Note
 from acquire.trigger.base import TriggerRun
 
 if TYPE_CHECKING:
@@ -17,7 +19,7 @@ if TYPE_CHECKING:
 
     from acquire.config import RigConfig
     from acquire.rig import Rig
-    from acquire.stream import CaptureStatus
+    from acquire.stream import CaptureStatus, Window
 
 
 STALL_S = 3.0
@@ -38,9 +40,21 @@ class Run:
         """Cameras and trigger run; on failure everything is undone and the first error raised."""
         self._capture.arm()
 
-    def start(self, path: Path, lines: int | None) -> None:
+    def start(self, path: Path, lines: int | None, window: Window = NOW) -> None:
         """Record to ``path``. Raises UsageError where it cannot be, before anything is touched."""
-        self._capture.start(path, self._spec(), lines)
+        self._capture.start(path, self._spec(), lines, window)
+
+    def mark(self, text: str) -> Note:
+        """An event of the operator's, at the newest line."""
+        return Note(self._capture.note("mark", text), "mark", text)
+
+    def extend(self, line: int) -> None:
+        """Let the recording under way not end before ``line``."""
+        self._capture.extend(line)
+
+    def events(self) -> list[Note]:
+        """What trigger and lines have told since the last call."""
+        return self._capture.take_events()
 
     def stop(self, reason: str) -> None:
         """End the recording at the newest line; ``reason`` is recorded."""
@@ -97,12 +111,15 @@ def capture_plan(config: RigConfig, rig: Rig, run_id: str) -> CapturePlan:
         pixels=config.geometry.stages,
         dtype=config.cameras.a.dtype,
         block_lines=config.stream.block_lines,
-        ring_slots=config.stream.ring_slots,
+        ring_slots=config.ring_slots,
+        ring_reserve=config.ring_reserve,
+        watch=watch_plan(config),
         white_dn=config.cameras.a.white_dn,
         openers=rig.openers(),
         stall_timeout_s=max(STALL_S, config.stream.reopen_s + 1.0),
         reopen_timeout_s=config.stream.reopen_s,
         columns=config.columns,
+        realtime=config.stream.realtime,
         line_period_ns=1e9 / config.line_rate_hz / config.simulation.speed,
     )
 

@@ -5,8 +5,12 @@ Downwards: `writer` · `reader` · `video`; `arm_writer` · `camera_stream` one 
 """
 
 from acquire.store.camera_stream import CameraStream
-from acquire.store.reader import Event, Gap, Recording, format_of, open_recording
+from acquire.store.opening import format_of, open_recording
+from acquire.store.reader import Recording
+from acquire.store.recover import Recovery, recover
 from acquire.store.spec import FORMAT, RecordingSpec, RunCondition
+from acquire.store.table_reader import Event, Gap
+from acquire.store.verify import Verification, verify
 from acquire.store.video import VideoFile, open_video, write_video
 from acquire.store.writer import RecordingWriter
 
@@ -18,10 +22,14 @@ __all__ = [
     "Recording",
     "RecordingSpec",
     "RecordingWriter",
+    "Recovery",
     "RunCondition",
+    "Verification",
     "VideoFile",
     "format_of",
     "open_recording",
     "open_video",
+    "recover",
+    "verify",
     "write_video",
 ]

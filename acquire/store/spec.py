@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -14,7 +14,9 @@ import acquire
 from acquire.codes import code_from_attrs
 from acquire.errors import UsageError
 from acquire.lines import ARMS
-from acquire.store.shard import MAX_CHUNK_BYTES, MAX_SHARD_CHUNKS, Codec
+from acquire.store.array_writer import ENCODED_AHEAD
+from acquire.store.codecs import CODECS, Codec
+from acquire.store.shard import MAX_CHUNK_BYTES, MAX_SHARD_CHUNKS
 
 if TYPE_CHECKING:
     from acquire.clock import ClockFit
@@ -43,6 +45,23 @@ class RunCondition(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class Durability:
+    """What is lost at worst, in lines of either arm that both had delivered to the writer.
+
+    Attributes
+    ----------
+    fsync : when bytes are forced to the medium
+    kill_lines : when the writer's process is killed and the recording recovered: the chunk that fills, and
+        those that are being packed
+    power_lines : when the machine loses power; None: as many as the system had not written back
+    """
+
+    fsync: str
+    kill_lines: int
+    power_lines: int | None
+
+
+@dataclass(frozen=True, slots=True)
 class RecordingSpec:
     """Everything that is known when a recording begins; refuses with UsageError what cannot be recorded.
 
@@ -58,7 +77,9 @@ class RecordingSpec:
     extra : further attributes (``scene``, ``effects``, ``simulated`` ...)
     chunk_lines, shard_chunks : lines per chunk; chunks per file
     codec : of the pixels
+    encoders : threads that pack chunks, where there is a codec
     fsync : force bytes to the medium at every ``"commit"``, or only at the ``"seal"``
+    commit_lines : lines on disk that may wait for their commit; a whole number of chunks is best
     layout : of the instrument: ``dual``, ``compact``, ``emulated``, ``interline``
     """
 
@@ -78,7 +99,9 @@ class RecordingSpec:
     chunk_lines: int = 4096
     shard_chunks: int = 64
     codec: Codec = "none"
+    encoders: int = 2
     fsync: Literal["commit", "seal"] = "seal"
+    commit_lines: int = 2**16
     layout: str = "dual"
 
     def __post_init__(self) -> None:
@@ -90,10 +113,17 @@ class RecordingSpec:
     def line_dtype(self) -> np.dtype[Any]:
         return np.dtype(self.dtype).newbyteorder("<")
 
+    @property
+    def durability(self) -> Durability:
+        """What this recording can lose."""
+        held = self.chunk_lines * (1 if self.codec == "none" else 1 + ENCODED_AHEAD)
+        committed = self.commit_lines + held if self.fsync == "commit" else None
+        return Durability(self.fsync, held, committed)
+
     def _check_choices(self) -> None:
         choices = {
             "dtype": ("uint8", "uint16"),
-            "codec": ("none", "lz4", "zstd"),
+            "codec": CODECS,
             "fsync": ("commit", "seal"),
             "layout": ("dual", "compact"),
         }
@@ -111,6 +141,8 @@ class RecordingSpec:
             "first_line": (0, 2**63 - 1),
             "substep_ticks": (1, 2**32),
             "shard_chunks": (1, MAX_SHARD_CHUNKS),
+            "encoders": (1, 64),
+            "commit_lines": (1, 2**40),
             "chunk_lines": (1, MAX_CHUNK_BYTES // max(8, self.pixels * self.line_dtype.itemsize)),
         }
         for name, (low, high) in limits.items():
@@ -176,6 +208,7 @@ def _own_attributes(spec: RecordingSpec, ending: Ending | None) -> dict[str, Any
         "clock": spec.clock.to_attrs(),
         "cameras": spec.cameras,
         "config": spec.config,
+        "durability": asdict(spec.durability),
         "versions": {
             "acquire": acquire.__version__,
             "python": platform.python_version(),

@@ -23,7 +23,7 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 
 from acquire.errors import DataError, UsageError
 from acquire.store.camera_stream import DAMAGE, child_array
-from acquire.store.files import check_new_path, sync_directory, sync_tree
+from acquire.store.files import DISK, check_new_path
 from acquire.store.layout import group_document, to_json
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ def write_video(
         _write(partial, video, time_ns, attributes)
         check_new_path(path)
         partial.rename(path)
-        sync_directory(path.parent)
+        DISK.sync_directory(path.parent)
     except OSError as error:
         raise DataError(f"{path} cannot be written: {error.strerror}", hint="another disk") from error
     finally:
@@ -158,4 +158,4 @@ def _write(path: Path, video: NDArray[Any], time_ns: NDArray[np.int64], attribut
     # Consolidated by hand: zarr-python warns of its own, and xarray warns where there is none.
     nodes = {name: json.loads((path / name / "zarr.json").read_bytes()) for name in ("0", "time")}
     (path / "zarr.json").write_bytes(to_json(group_document(attributes, nodes)))
-    sync_tree(path)
+    DISK.sync_tree(path)

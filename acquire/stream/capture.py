@@ -18,14 +18,17 @@ from typing import TYPE_CHECKING, Any
 
 from acquire.errors import AcquireError, DataError, StateError, UsageError
 from acquire.lines import ARMS
-from acquire.stream import grabber, recorder
+from acquire.stream import grabber, recorder, watcher
+from acquire.stream.ledger import Counted, account
 from acquire.stream.losses import Cause
-from acquire.stream.messages import Begin, End, Interrupt, Quit, Ready, RunStarted
+from acquire.stream.messages import Begin, End, Extend, Interrupt, Note, Quit, Ready, RunStarted
 from acquire.stream.plan import CaptureStatus
 from acquire.stream.process import Worker
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.shared import Counters
 from acquire.stream.supervisor import RECORDER, Supervisor
+from acquire.stream.window import NOW
+from acquire.stream.witness import TRIGGER, TRIGGER_COUNTERS, WATCHER
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -33,7 +36,9 @@ if TYPE_CHECKING:
 
     from acquire.clock import ClockFit
     from acquire.store import RecordingSpec
+    from acquire.stream.ledger import ArmLedger
     from acquire.stream.plan import CapturePlan
+    from acquire.stream.window import Window
     from acquire.trigger.base import Trigger
 
 _TAG_RING = RingShape(slots=64, rows=256, width=3, dtype="uint64")
@@ -64,11 +69,12 @@ class Capture:
         self._tags: Ring | None = None
         self._counters: dict[str, Counters] = {}
         self._left_over = dict.fromkeys(ARMS, 0)
+        self._pulses: int | None = None
         self._workers: dict[str, Worker] = {}
         self._supervisor: Supervisor | None = None
         self._memory = threading.Lock()
         self._final: CaptureStatus | None = None
-        self._used = self._closed = False
+        self._used = self._closed = self._emptied = False
 
     def arm(self, timeout_s: float = 20.0) -> None:
         """Start everything; lines flow and are discarded.
@@ -88,11 +94,13 @@ class Capture:
                 error.add_note(f"while undoing it: {second}")
             raise
 
-    def start(self, path: Path, spec: RecordingSpec, lines: int | None = None) -> None:
-        """Record ``lines`` lines, or until `stop`, to ``path``, from the next line that both arms can give.
+    def start(self, path: Path, spec: RecordingSpec, lines: int | None = None, window: Window = NOW) -> None:
+        """Record ``lines`` lines, or until `stop`, to ``path``.
 
-        ``spec`` tells all but the first line, which the recorder sets. Returns once the recording exists.
-        Raises UsageError or DataError when it cannot be made; nothing has changed then.
+        From the next line that both arms can give, unless ``window`` begins earlier. ``spec`` tells all but
+        the first line, which the recorder sets. Returns once the recording exists. Raises UsageError or
+        DataError when it cannot be made, or when the rings do not hold what the window asks for; nothing
+        has changed then.
         """
         supervisor = self._running("start")
         if supervisor.recording:
@@ -101,7 +109,27 @@ class Capture:
             raise StateError(f"start: the capture has failed ({supervisor.fault})", hint="arm again")
         if lines is not None and lines < 1:
             raise UsageError(f"start with a budget of {lines} lines", possible="1 or more")
-        supervisor.begin(Begin(path, spec, lines))
+        supervisor.begin(Begin(path, spec, lines, window))
+
+    def note(self, kind: str, text: str, line: int | None = None) -> int:
+        """Something happens at ``line``, or at the newest: listed in every recording that holds the line.
+
+        Returns the line. A recording that begins later can still hold it: see `Window`.
+        """
+        self._running("note")
+        if line is None:
+            line = max(ring.newest_line for ring in self._rings.values())
+        self._workers[RECORDER].post(Note(line, kind, text))
+        return line
+
+    def take_events(self) -> list[Note]:
+        """What the trigger's inputs and the lines have told since the last call; marks are not among it."""
+        return self._running("take_events").take_events()
+
+    def extend(self, line: int) -> None:
+        """Let the recording under way not end before ``line``, unless it is ending already."""
+        self._running("extend")
+        self._workers[RECORDER].post(Extend(line))
 
     def stop(self, reason: str = "stopped") -> None:
         """End the recording at the newest line; `poll` tells when it is sealed. Idempotent."""
@@ -152,6 +180,8 @@ class Capture:
         for name, arms in self._plan.grabbers.items():
             facts = self._workers[name].expect(Ready, deadline).facts
             cameras |= dict.fromkeys(arms, facts)
+        if WATCHER in self._workers:
+            self._workers[WATCHER].expect(Ready, deadline)
         self.cameras = cameras
         self._trigger_used = True
         self._trigger.prepare(self._plan.run)
@@ -172,6 +202,9 @@ class Capture:
     def _make_memory(self) -> None:
         self._tags = Ring("tags", _TAG_RING)
         self._counters[RECORDER] = Counters(recorder.COUNTERS)
+        self._counters[TRIGGER] = Counters(TRIGGER_COUNTERS)
+        if self._plan.watch is not None:
+            self._counters[WATCHER] = Counters(watcher.COUNTERS)
         for arm in ARMS:
             self._rings[arm] = Ring(arm, self._plan.ring_shape)
             self._counters[arm] = Counters(grabber.COUNTERS)
@@ -179,14 +212,26 @@ class Capture:
     def _spawn(self) -> None:
         plan = self._plan
         what = recorder.RecorderPlan(
-            plan.run, plan.stages, plan.stall_timeout_s, plan.tag_wait_s, plan.max_skew_lines
+            plan.run,
+            plan.stages,
+            plan.stall_timeout_s,
+            plan.tag_wait_s,
+            plan.max_skew_lines,
+            plan.realtime,
         )
         self._workers[RECORDER] = Worker(
-            RECORDER, recorder.record, what, self._rings, self._tags, self._counters[RECORDER]
+            RECORDER, recorder.record, what, self._rings, self._tags, self._counters[RECORDER], self._others()
         )
+        if plan.watch is not None:
+            self._workers[WATCHER] = Worker(
+                WATCHER, watcher.watch, plan.watch, self._rings, self._counters[WATCHER]
+            )
         for name, arms in plan.grabbers.items():
             tasks = [(self._grabber_plan(arm), self._rings[arm], self._counters[arm]) for arm in arms]
             self._workers[name] = Worker(f"grabber {name}", grabber.grab, *tasks)
+
+    def _others(self) -> dict[str, Counters]:
+        return {name: self._counters[name] for name in (TRIGGER, WATCHER) if name in self._counters}
 
     def _grabber_plan(self, arm: str) -> grabber.GrabberPlan:
         plan = self._plan
@@ -199,6 +244,7 @@ class Capture:
             plan.reopen_timeout_s,
             plan.line_period_ns,
             plan.columns.get(arm),
+            plan.realtime,
         )
 
     def _running(self, command: str) -> Supervisor:
@@ -211,6 +257,7 @@ class Capture:
     def _look(self, supervisor: Supervisor) -> CaptureStatus:
         began, sealed, counters = supervisor.began, supervisor.sealed, self._counters[RECORDER]
         status = CaptureStatus(
+            accounts={arm: self._account(arm, supervisor) for arm in ARMS},
             ring={arm: self._ring_counts(arm) for arm in ARMS},
             lines={arm: self._line_counts(arm, began=began is not None) for arm in ARMS},
             fault=supervisor.fault,
@@ -235,18 +282,50 @@ class Capture:
         counts["drops"] = counts.pop("dropped_blocks")
         return counts
 
-    def _line_counts(self, arm: str, *, began: bool) -> dict[str, Any]:
-        grabbed, recorded = self._counters[arm], self._counters[RECORDER]
-        lost = {
+    def _lost(self, arm: str) -> dict[str, int]:
+        grabbed = self._counters[arm]
+        return {
             str(Cause.CAMERA): grabbed[Cause.CAMERA],
             str(Cause.RING_FULL): self._rings[arm].statistics().dropped_lines,
             **{str(cause): grabbed[cause] for cause in grabber.CAMERA_CAUSES[1:] if grabbed[cause]},
         }
+
+    def _account(self, arm: str, supervisor: Supervisor) -> ArmLedger:
+        """Counts are read against the way of the lines: what one knows of, the next has counted."""
+        recorded, ring = self._counters[RECORDER], self._rings[arm]
+        stored, discarded = recorded[f"stored_{arm}"], recorded[f"discarded_{arm}"] + self._left_over[arm]
+        lost = self._lost(arm)
+        next_line = max(self._counters[arm]["next_line"], ring.newest_line)
+        depth = self._plan.depth_lines
+        next_line = next_line if self._counters[arm]["delivered"] else -depth
+        known = max(supervisor.pulses, self._counters[TRIGGER]["pulses"], next_line + depth)
+        counted = Counted(
+            pulses=known if self._pulses is None else self._pulses,
+            next_line=next_line,
+            depth=depth,
+            stored=stored,
+            discarded=discarded,
+            lost=lost,
+            room=ring.shape.slots * ring.shape.rows,
+            block=ring.shape.rows,
+        )
+        return account(counted, closed=self._emptied)
+
+    def _check(self, arm: str) -> dict[str, Any]:
+        if WATCHER not in self._counters:
+            return {}
+        seen = self._counters[WATCHER]
+        verdict = str(watcher.VERDICTS[seen[f"verdict_{arm}"]])
+        return {"verdict": verdict, **{name: seen[f"{name}_{arm}"] for name in ("shift", "checked_line")}}
+
+    def _line_counts(self, arm: str, *, began: bool) -> dict[str, Any]:
+        grabbed, recorded = self._counters[arm], self._counters[RECORDER]
         return {
             "delivered": grabbed["delivered"],
             "preroll": grabbed["preroll"],
             "discarded": recorded[f"discarded_{arm}"] + self._left_over[arm],
-            "lost": lost,
+            "lost": self._lost(arm),
+            "check": self._check(arm),
             "recorded": recorded[f"rows_{arm}"] if began else 0,
             "missing": recorded[f"missing_{arm}"] if began else 0,
             "reopened": grabbed["reopened"],
@@ -269,7 +348,7 @@ class Capture:
 
     def _end_trigger(self) -> None:
         if self._trigger_used:
-            self._trigger.stop()
+            self._pulses = self._trigger.stop()
 
     def _end_workers(self, deadline: float) -> None:
         deadline = max(deadline, time.monotonic() + _LEAST_END_S)
@@ -283,6 +362,7 @@ class Capture:
         """Nobody will take what the last of the grabbers left."""
         for arm, ring in self._rings.items():
             self._left_over[arm] = ring.empty()
+        self._emptied = True
 
     def _end_memory(self) -> None:
         with self._memory:

@@ -23,6 +23,7 @@ from acquire.lines import LineFlag
 from acquire.stream.lineclock import LineClock
 from acquire.stream.losses import Cause, Loss, LossLog
 from acquire.stream.messages import Ready
+from acquire.stream.process import become_urgent
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -52,7 +53,8 @@ class GrabberPlan:
 
     A jump of the camera's count by more than ``max_jump_lines`` is a broken count, not a loss. A camera that
     is gone is waited for as long as ``reopen_timeout_s``; ``line_period_ns`` is the trigger's. ``columns``
-    are the arm's on a camera that has both arms, None on one of its own.
+    are the arm's on a camera that has both arms, None on one of its own. ``realtime``: it runs before
+    everything else on the host, where that is allowed.
     """
 
     arm: str
@@ -63,6 +65,7 @@ class GrabberPlan:
     reopen_timeout_s: float = 0.0
     line_period_ns: float = 0.0
     columns: tuple[int, int] | None = None
+    realtime: bool = False
 
 
 def grab(mailbox: Mailbox, *arms: tuple[GrabberPlan, Ring, Counters]) -> None:
@@ -71,10 +74,11 @@ def grab(mailbox: Mailbox, *arms: tuple[GrabberPlan, Ring, Counters]) -> None:
     Several ``arms`` fall on one camera, each on columns of its own.
     """
     plan = arms[0][0]
+    urgent = plan.realtime and become_urgent()  # first: threads of a driver are as urgent as who starts them
     camera = plan.opener()
     intakes = [Intake(*arm) for arm in arms]
     try:
-        facts = {**camera.settings(), "identity": asdict(camera.identify())}
+        facts = {**camera.settings(), "identity": asdict(camera.identify()), "realtime": urgent}
         camera.arm()
         mailbox.post(Ready(facts))
         while True:

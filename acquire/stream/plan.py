@@ -13,7 +13,12 @@ from acquire.stream.ring import RingShape
 if TYPE_CHECKING:
     from acquire.camera.base import CameraOpener
     from acquire.store import RunCondition
+    from acquire.stream.ledger import ArmLedger
+    from acquire.stream.watcher import WatchPlan
     from acquire.trigger.base import TriggerRun
+
+OBSERVERS = 2
+"""Readers of a ring that nobody waits for: the watcher is the first, a preview can be the second."""
 
 MAX_SUBSTEPS = 8
 """A line's code is recorded in one byte."""
@@ -42,8 +47,11 @@ class CapturePlan:
     reopen_timeout_s : how long a camera that is gone is waited for; less than ``stall_timeout_s``, or the
         arm counts as stalled first
     line_period_ns : by the trigger's clock; 0: not told
+    realtime : grabbers run before everything else on the host, where that is allowed
     columns : compact layout: arm → first column and the one after the last, on the one camera that
         ``openers["a"]`` opens; empty: a camera per arm
+    ring_reserve : slots that hold no history: see `RingShape`
+    watch : what is looked for in the lines while they pass; None: nothing
     """
 
     run: TriggerRun
@@ -59,6 +67,9 @@ class CapturePlan:
     reopen_timeout_s: float = 2.0
     line_period_ns: float = 0.0
     columns: dict[str, tuple[int, int]] = field(default_factory=dict)
+    realtime: bool = False
+    ring_reserve: int = 2
+    watch: WatchPlan | None = None
 
     def __post_init__(self) -> None:
         if tuple(sorted(self.openers)) != ARMS:
@@ -83,7 +94,9 @@ class CapturePlan:
 
     @property
     def ring_shape(self) -> RingShape:
-        return RingShape(self.ring_slots, self.block_lines, self.pixels, self.dtype)
+        return RingShape(
+            self.ring_slots, self.block_lines, self.pixels, self.dtype, OBSERVERS, self.ring_reserve
+        )
 
     @property
     def grabbers(self) -> dict[str, tuple[str, ...]]:
@@ -121,7 +134,9 @@ class CaptureStatus:
         cause, since arm; and of the latest recording ``recorded`` rows, of which ``missing``. After
         `close`: delivered = preroll + lost["ring_full"] + discarded + recorded − missing. Also how often
         the camera was ``reopened``, and its ``clock``: the latest stamp (line, its time by the camera) and
-        how much faster it runs than the trigger's, in parts per billion; all 0 where it tells no time
+        how much faster it runs than the trigger's, in parts per billion; all 0 where it tells no time. The
+        ``check`` of the code, where it is made: verdict, shift, and the line after the last looked at
+    accounts : arm → what became of every pulse since arm
     fault : what failed first, or None
     """
 
@@ -137,3 +152,4 @@ class CaptureStatus:
     condition: RunCondition | None = None
     end_reason: str | None = None
     ledger: dict[str, Any] = field(default_factory=dict)
+    accounts: dict[str, ArmLedger] = field(default_factory=dict)

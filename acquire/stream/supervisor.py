@@ -4,15 +4,18 @@ they are silent.
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
+from collections import deque
 from typing import TYPE_CHECKING
 
 from acquire.errors import AcquireError, DeviceError, TriggerError
 from acquire.lines import ARMS
-from acquire.stream.messages import Began, Failed, Interrupt, Refused, Sealed
+from acquire.stream.messages import Began, Checked, Failed, Interrupt, Note, Refused, Sealed
 from acquire.stream.stalls import Excess, Heartbeat
 from acquire.stream.tagger import tag_rows
+from acquire.stream.witness import TRIGGER, TRIGGER_COUNTERS, WATCHER
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -29,6 +32,8 @@ RECORDER = "recorder"
 _TAG_WAIT_S = 0.02
 _ANSWER_S = 20.0
 _JOIN_S = 5.0
+_MOST_EVENTS = 1024
+_ASK_EVERY_S = 1.0
 
 
 class Supervisor:
@@ -64,9 +69,12 @@ class Supervisor:
         self._cameras = {arm: Heartbeat(counters[arm], "delivered") for arm in ARMS}
         self._arms_of = grabbers or {arm: (arm,) for arm in ARMS}
         self._excess = {arm: Excess(counters[arm], margin_lines) for arm in ARMS if margin_lines is not None}
+        self._counters = counters
+        self._ask_s = 0.0
         self._newest_pulse: int | None = None
         self._refused: Refused | None = None
         self._trigger_lost = False
+        self._events: deque[Note] = deque(maxlen=_MOST_EVENTS)
         self._dead: set[str] = set()
         self._last_words: dict[str, str] = {}
         self._news = threading.Condition()
@@ -77,6 +85,11 @@ class Supervisor:
     def recording(self) -> bool:
         """A recording is open, as far as the living can tell."""
         return self.began is not None and self.sealed is None and RECORDER not in self._dead
+
+    @property
+    def pulses(self) -> int:
+        """Issued by the trigger, as far as its tags tell."""
+        return 0 if self._newest_pulse is None else self._newest_pulse + 1
 
     def start(self) -> None:
         self._thread.start()
@@ -105,6 +118,15 @@ class Supervisor:
             self._fail(f"recorder: no answer within {_ANSWER_S:g} s")
         raise DeviceError(f"start: {self.fault}")
 
+    def happened(self, note: Note) -> None:
+        """Tell the recorder, and whoever asks with `take_events`."""
+        self._events.append(note)
+        self._workers[RECORDER].post(note)
+
+    def take_events(self) -> list[Note]:
+        """What happened since the last call; the latest, if it was too much."""
+        return [self._events.popleft() for _ in range(len(self._events))]
+
     def wait_sealed(self, deadline: float) -> bool:
         """Until the recording is closed, or cannot be any more, or the monotonic ``deadline``."""
         with self._news:
@@ -121,6 +143,7 @@ class Supervisor:
     def _turn(self) -> None:
         begun = time.monotonic()
         tags = self._take_tags()
+        self._ask_trigger(begun)
         for name, worker in self._workers.items():
             self._hear(name, worker)
         if self.fault is None:
@@ -140,10 +163,22 @@ class Supervisor:
             return []
         if tags:
             self._newest_pulse = tags[-1].line
+        for event in self._trigger.events():
+            self.happened(Note(event.line, event.kind, f"tick {event.tick}"))
         rows = self._tags.shape.rows
         for at in range(0, len(tags), rows):
             self._pass_on(tags[at : at + rows])
         return tags
+
+    def _ask_trigger(self, now_s: float) -> None:
+        """Publish what the trigger counts; one that cannot answer fails when it is asked for tags."""
+        if self._trigger_lost or now_s < self._ask_s:
+            return
+        self._ask_s = now_s + _ASK_EVERY_S
+        with contextlib.suppress(AcquireError):
+            counts = self._trigger.statistics()
+            for name in TRIGGER_COUNTERS:
+                self._counters[TRIGGER][name] = int(counts.get(name, 0))
 
     def _pass_on(self, tags: list[LineTag]) -> None:
         """To the recorder; should it be too late to take them, later tags confirm the same lines."""
@@ -184,7 +219,16 @@ class Supervisor:
             self._note(name, message)
         if death and name not in self._dead:
             self._dead.add(name)
+            if name == WATCHER:
+                self._lose_watcher(self._last_words.get(name, death))
+                return
             self._fail(f"{worker.name}: {self._last_words.get(name, death)}", name)
+
+    def _lose_watcher(self, why: str) -> None:
+        """Lines come and are recorded all the same; what it said last does not hold for them."""
+        for arm in ARMS:
+            self._counters[WATCHER][f"verdict_{arm}"] = 0
+        self.happened(Note((self._newest_pulse or 0) + 1, "unwatched", f"watcher: {why}"))
 
     def _note(self, name: str, message: object) -> None:
         with self._news:
@@ -195,6 +239,10 @@ class Supervisor:
                     self._refused = message
                 case Sealed():
                     self.sealed = message
+                case Note():
+                    self.happened(message)
+                case Checked(first_line, _, text):
+                    self.happened(Note(first_line, "code_check", text))
                 case Failed(error):
                     # Those of a defect begin with the process's name already.
                     self._last_words[name] = str(error).removeprefix(f"{self._workers[name].name}: ")

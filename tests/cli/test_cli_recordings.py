@@ -216,3 +216,35 @@ def test_cut_outside_says_what_is_there(cli: Cli, recording: Path, tmp_path: Pat
     assert answer.code == 2
     assert "possible: lines 100 to 163" in answer.err
     assert not (tmp_path / "c.npz").exists()
+
+
+def test_verify_says_which_lines_are_lost_and_ends_with_6(cli: Cli, recording: Path) -> None:
+    answer = cli("verify", recording)
+    assert (answer.code, answer.out.split("; ")[0]) == (0, f"{recording}: intact")
+    (recording / "b" / "tick" / "c" / "0").unlink()
+    answer = cli("verify", recording)
+    assert answer.code == 6
+    assert "not intact on disk: b/tick: lines 100 to 163: it is not on disk" in answer.out
+    found = cli("verify", recording, "--json")
+    assert (found.code, found.json["damage"][0]["count"]) == (6, 64)
+
+
+def test_recover_seals_what_its_writer_left(cli: Cli, tmp_path: Path) -> None:
+    path = tmp_path / "left.zarr"
+    with RecordingWriter.create(path, spec()) as writer:
+        for arm in ARMS:
+            writer.append(block(arm, range(0)))
+    answer = cli("recover", path)
+    assert (answer.code, answer.err) == (0, "")
+    assert "64 lines, sealed; 64 lines were on disk that no commit listed" in answer.out
+    assert cli("recover", path).out == f"{path}: 64 lines, nothing to recover\n"
+    assert cli("recover", path, "--json").json["changed"] is False
+    assert "INTERRUPTED" in cli("info", path).out
+    assert cli("verify", path).code == 0
+
+
+def test_info_states_what_can_be_lost(cli: Cli, recording: Path) -> None:
+    assert (
+        "kill -9: at most 16 lines; power loss: what the system has not written back"
+        in cli("info", recording).out
+    )
