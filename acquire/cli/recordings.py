@@ -1,4 +1,4 @@
-"""``acquire ls | info | cut | verify | recover``: recordings on disk; no daemon needed."""
+"""``acquire ls | info | cut | hold | verify | recover``: recordings on disk; no daemon needed."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ CELL_CHARACTERS = 72
 
 def register(app: typer.Typer) -> None:
     app.command("ls", rich_help_panel="Recordings")(list_recordings)
-    for command in (info, verify, recover, cut):
+    for command in (info, verify, recover, hold, cut):
         app.command(rich_help_panel="Recordings")(command)
 
 
@@ -117,6 +117,28 @@ def recover(recording: RecordingArgument, json: JsonFlag = False) -> None:
     if done.indices_mended:
         typer.echo(f"  {done.indices_mended} indices of files were mended")
     _print_list("lost, flagged as missing", map(str, done.damage))
+
+
+def hold(
+    recording: RecordingArgument,
+    first_line: Annotated[int, typer.Option(help="The trigger's number of the first line.")],
+    lines: Annotated[int, typer.Option(help="How many lines; they may be still to come.")],
+    why: Annotated[str, typer.Option(help="A word for those who wonder.")] = "",
+    json: JsonFlag = False,
+) -> None:
+    """Keep lines of an endless recording, with what reconstruction needs around them, from being dropped.
+
+    Ends with 6 where some of them are gone already; the others are held.
+
+    Example: [bold]acquire hold run.zarr --first-line 2000 --lines 5000 --why flash[/]
+    """
+    from acquire.store import hold as hold_lines
+
+    held = hold_lines(recording, first_line, lines, why)
+    if json:
+        print_json({"path": str(recording), "first_line": held.first_line, "lines": held.count, "why": why})
+    else:
+        typer.echo(f"{recording}: lines {first_line} to {first_line + lines - 1} are held")
 
 
 def cut(
@@ -208,6 +230,8 @@ def _readable(facts: dict[str, Any]) -> dict[str, Any]:
         "state": f"{facts['state']}, {facts['run_condition'] or 'no condition yet'}",
         "end": facts["end_reason"],
         "lines": f"{lines} ({first} to {first + lines - 1})" if lines else "0",
+        "dropped": _stretches(facts["dropped"]),
+        "held": _stretches(facts["holds"]),
         "duration": f"{facts['duration_s']:.6f} s at {quantity(facts['line_rate_hz'], 'Hz')}",
         "started": _utc(facts["start_ns"]),
         "geometry": f"M = {sizes['stages']}, S = {sizes['substeps']}, {sizes['pixels']} pixels",
@@ -220,6 +244,13 @@ def _readable(facts: dict[str, Any]) -> dict[str, Any]:
         "simulated": "yes" if facts["simulated"] else "no",
         "written by": f"acquire {facts['versions']['acquire']}",
     }
+
+
+def _stretches(stretches: list[list[Any]]) -> str | None:
+    """Stretches of lines, at most some of them."""
+    shown = [f"{first} to {first + count - 1}" for first, count, *_ in stretches[:LISTED]]
+    more = [f"and {len(stretches) - LISTED} more"] if len(stretches) > LISTED else []
+    return ", ".join(shown + more) or None
 
 
 def _at_risk(durability: dict[str, Any]) -> str | None:

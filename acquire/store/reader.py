@@ -98,6 +98,14 @@ class Recording:
         """Lines that retention has deleted: first line and count of every stretch."""
         return tuple((int(first), int(count)) for first, count in self.attrs.get("dropped", ()))
 
+    @property
+    def first_available_line(self) -> int:
+        """The first line that retention has left."""
+        line = self.first_line
+        for first, count in sorted(self.dropped):
+            line = first + count if first == line else line
+        return line
+
     def dropped_rows(self) -> list[range]:
         """The same, in rows."""
         return [range(first - self.first_line, first - self.first_line + n) for first, n in self.dropped]
@@ -179,9 +187,12 @@ class Recording:
             **{key: self.attrs[key] for key in keys},
             "first_line": self.first_line,
             "lines": lines,
+            "first_available_line": self.first_available_line,
+            "dropped": [list(stretch) for stretch in self.dropped],
+            "holds": self.attrs.get("holds", []),
             "duration_s": lines * period_ns / NS_PER_S,
             "line_rate_hz": NS_PER_S / period_ns,
-            "start_ns": int(self.arms["a"].read("time", 0, 1)[0]) if lines else None,
+            "start_ns": self._start_ns(),
             "dtype": self.arms["a"].dtype.name,
             "bytes": self.source.total_bytes(),
             "gaps": len(self.gaps),
@@ -194,8 +205,20 @@ class Recording:
             "versions": self.attrs["versions"],
         }
 
+    def _start_ns(self) -> int | None:
+        """When the first line that there is was read out."""
+        row = self.first_available_line - self.first_line
+        return int(self.arms[ARMS[0]].read("time", row, row + 1)[0]) if row < self.lines else None
+
     def _rows(self, first_line: int, lines: int) -> tuple[int, int]:
         start = first_line - self.first_line
+        for first, count in self.dropped:
+            if lines > 0 and first < first_line + lines and first_line < first + count:
+                raise DataError(
+                    f"{self}: lines {first} to {first + count - 1} were dropped by retention",
+                    possible=f"lines {self.first_available_line} to {self.first_line + self.lines - 1}",
+                    hint="`acquire hold` keeps lines while a recording is being written",
+                )
         if lines < 1 or start < 0 or start + lines > self.lines:
             have = (
                 f"lines {self.first_line} to {self.first_line + self.lines - 1}"

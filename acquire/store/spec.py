@@ -20,6 +20,7 @@ from acquire.store.shard import MAX_CHUNK_BYTES, MAX_SHARD_CHUNKS
 
 if TYPE_CHECKING:
     from acquire.clock import ClockFit
+    from acquire.store.retention import Retention
 
 FORMAT = "acquire-recording/1"
 
@@ -80,6 +81,8 @@ class RecordingSpec:
     encoders : threads that pack chunks, where there is a codec
     fsync : force bytes to the medium at every ``"commit"``, or only at the ``"seal"``
     commit_lines : lines on disk that may wait for their commit; a whole number of chunks is best
+    retention : what of an endless recording is kept; None: everything
+    reserve_bytes : of the disk that are left free: the recording should end when nothing else is left
     layout : of the instrument: ``dual``, ``compact``, ``emulated``, ``interline``
     """
 
@@ -102,6 +105,8 @@ class RecordingSpec:
     encoders: int = 2
     fsync: Literal["commit", "seal"] = "seal"
     commit_lines: int = 2**16
+    retention: Retention | None = None
+    reserve_bytes: int = 2**28
     layout: str = "dual"
 
     def __post_init__(self) -> None:
@@ -143,6 +148,7 @@ class RecordingSpec:
             "shard_chunks": (1, MAX_SHARD_CHUNKS),
             "encoders": (1, 64),
             "commit_lines": (1, 2**40),
+            "reserve_bytes": (0, 2**60),
             "chunk_lines": (1, MAX_CHUNK_BYTES // max(8, self.pixels * self.line_dtype.itemsize)),
         }
         for name, (low, high) in limits.items():

@@ -6,6 +6,7 @@ import errno
 import json
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from acquire.cli.recordings import CELL_CHARACTERS
 from acquire.clock import ClockFit
 from acquire.codes import PrbsCode
 from acquire.lines import ARMS, LineFlag, TaggedBlock
-from acquire.store import RecordingSpec, RecordingWriter, RunCondition, open_recording, write_video
+from acquire.store import RecordingSpec, RecordingWriter, Retention, RunCondition, open_recording, write_video
 
 Cli = Callable[..., Any]
 M, S, FIRST, LINES = 4, 2, 100, 64
@@ -248,3 +249,21 @@ def test_info_states_what_can_be_lost(cli: Cli, recording: Path) -> None:
         "kill -9: at most 16 lines; power loss: what the system has not written back"
         in cli("info", recording).out
     )
+
+
+def test_hold_keeps_lines_of_a_recording_that_grows(cli: Cli, tmp_path: Path) -> None:
+    path = tmp_path / "endless.zarr"
+    policy = Retention(max_age_lines=16, margin_lines=4)
+    with RecordingWriter.create(path, replace(spec(), retention=policy, shard_chunks=1)) as writer:
+        answer = cli("hold", path, "--first-line", FIRST, "--lines", 10, "--why", "flash")
+        assert answer.out == f"{path}: lines {FIRST} to {FIRST + 9} are held\n"
+        for arm in ARMS:
+            writer.append(block(arm, range(0)))
+        writer.commit()
+        shown = cli("info", path).out
+        assert "116 to 147" in shown
+        assert f"{FIRST} to {FIRST + 9}" in shown
+        answer = cli("hold", path, "--first-line", 120, "--lines", 1)
+        assert (answer.code, "gone already" in answer.err) == (6, True)
+        assert cli("cut", path, "--first-line", 120, "--lines", 5, "--out", tmp_path / "c.npz").code == 6
+        assert cli("cut", path, "--first-line", FIRST, "--lines", 5, "--out", tmp_path / "c.npz").code == 0
