@@ -230,6 +230,8 @@ def _readable(facts: dict[str, Any]) -> dict[str, Any]:
         "state": f"{facts['state']}, {facts['run_condition'] or 'no condition yet'}",
         "end": facts["end_reason"],
         "lines": f"{lines} ({first} to {first + lines - 1})" if lines else "0",
+        "continues": _outage(facts["segment"]),
+        "segments": ", ".join(facts["segments"]) or None,
         "dropped": _stretches(facts["dropped"]),
         "held": _stretches(facts["holds"]),
         "duration": f"{facts['duration_s']:.6f} s at {quantity(facts['line_rate_hz'], 'Hz')}",
@@ -244,6 +246,15 @@ def _readable(facts: dict[str, Any]) -> dict[str, Any]:
         "simulated": "yes" if facts["simulated"] else "no",
         "written by": f"acquire {facts['versions']['acquire']}",
     }
+
+
+def _outage(segment: dict[str, Any] | None) -> str | None:
+    """What a further segment follows, and what is lost between."""
+    if segment is None:
+        return None
+    outage = segment["outage"]
+    lines = "numbering began anew" if outage["lines"] is None else f"{outage['lines']} lines"
+    return f"{segment['of']} after line {outage['after_line']}; outage: {lines}, {outage['cause']}"
 
 
 def _stretches(stretches: list[list[Any]]) -> str | None:

@@ -10,6 +10,7 @@ from acquire.store.files import measure_disk
 from acquire.store.opening import format_of, open_recording
 from acquire.store.reader import Recording
 from acquire.store.recover import Recovery, recover
+from acquire.store.resume import Continuation, next_segment
 from acquire.store.retention import Hold, Retention, hold
 from acquire.store.spec import FORMAT, RecordingSpec, RunCondition
 from acquire.store.table_reader import Event, Gap
@@ -22,6 +23,7 @@ __all__ = [
     "CameraStream",
     "Codec",
     "CodecChoice",
+    "Continuation",
     "Event",
     "Gap",
     "Hold",
@@ -37,6 +39,7 @@ __all__ = [
     "format_of",
     "hold",
     "measure_disk",
+    "next_segment",
     "open_recording",
     "open_video",
     "recover",

@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
     from typing_extensions import Buffer
 
+SCRATCH = ".next"
+"""Where new metadata of a recording is prepared, beside the shards of its first array."""
+
 NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
 """What a file system without locks answers; some network disks are such."""
 

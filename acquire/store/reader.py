@@ -23,6 +23,8 @@ from acquire.store.layout import line_columns
 from acquire.store.table_reader import read_events, read_gaps
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from acquire.store.layout import Document
@@ -35,9 +37,13 @@ UNUSABLE = LineFlag.MISSING | LineFlag.INCOMPLETE
 class Recording:
     """One recording, opened for reading; `open_recording` makes it."""
 
-    def __init__(self, source: Source, document: Document) -> None:
-        """``document`` is the root's zarr.json. Raises one of `camera_stream.DAMAGE` where it is damaged."""
+    def __init__(self, source: Source, document: Document, opener: Callable[[Source], Recording]) -> None:
+        """``document`` is the root's zarr.json; ``opener`` opens further segments.
+
+        Raises one of `camera_stream.DAMAGE` where the document is damaged.
+        """
         self.source = source
+        self._opener = opener
         self.document = document
         self.attrs: dict[str, Any] = document["attributes"]
         self._nodes = nodes = document["consolidated_metadata"]["metadata"]
@@ -110,6 +116,18 @@ class Recording:
         """The same, in rows."""
         return [range(first - self.first_line, first - self.first_line + n) for first, n in self.dropped]
 
+    @cached_property
+    def segments(self) -> tuple[Recording, ...]:
+        """Recordings that continue this one after an outage, in order. Raises DataError for a damaged one."""
+        return tuple(self._opener(self.source.beside(name)) for name in self.attrs.get("segments", ()))
+
+    def end_ns(self) -> int | None:
+        """UTC at which the line after the last is read out; None without lines."""
+        if not self.lines:
+            return None
+        last = int(self.arms[ARMS[0]].read("time", self.lines - 1, self.lines)[0])
+        return last + round(self.line_period_ns)
+
     def kept_chunks(self) -> list[int]:
         """Chunks that hold rows and have not been deleted; retention deletes whole ones."""
         reader = self.arms[ARMS[0]].reader("lines")
@@ -159,6 +177,8 @@ class Recording:
         Raises UsageError for lines that are not there, and DataError when the file is damaged or the code
         that the attributes describe is not the one recorded with the lines.
         """
+        if (segment := self._segment_with(first_line)) is not None:
+            return segment.cut(first_line, lines)
         start, stop = self._rows(first_line, lines)
         geometry = self.geometry_for(lines)
         if (pixels := self.arms["a"].pixels) != geometry.stages:
@@ -195,6 +215,8 @@ class Recording:
             "start_ns": self._start_ns(),
             "dtype": self.arms["a"].dtype.name,
             "bytes": self.source.total_bytes(),
+            "segment": self.attrs.get("segment"),
+            "segments": self.attrs.get("segments", []),
             "gaps": len(self.gaps),
             "lost_lines": {arm: sum(gap.count for gap in self.gaps if gap.arm == arm) for arm in ARMS},
             "events": len(self.events),
@@ -204,6 +226,12 @@ class Recording:
             "durability": self.attrs.get("durability", {}),
             "versions": self.attrs["versions"],
         }
+
+    def _segment_with(self, line: int) -> Recording | None:
+        """The further segment that has a line which is not here."""
+        if line < self.first_line + self.lines:
+            return None
+        return next((s for s in self.segments if s.first_line <= line < s.first_line + s.lines), None)
 
     def _start_ns(self) -> int | None:
         """When the first line that there is was read out."""

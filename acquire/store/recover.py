@@ -19,14 +19,14 @@ import numpy as np
 
 from acquire.lines import ARMS, LineFlag
 from acquire.store import layout
-from acquire.store.files import DISK, Publisher, locked
+from acquire.store.files import DISK, SCRATCH, Publisher, locked
 from acquire.store.mend import mend_index, rewrite_chunk
 from acquire.store.opening import open_recording
 from acquire.store.retention import HOLDS, delete_shard
 from acquire.store.scan import COLUMNS, ArmScan, Damage, covered, missing_rows, real_rows, runs, scan
 from acquire.store.spec import RunCondition
 from acquire.store.table import event_table, gap_table
-from acquire.store.writer import RESERVE, SCRATCH
+from acquire.store.writer import RESERVE
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -21,12 +21,13 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
 
-from acquire.errors import DataError, UsageError
+from acquire.errors import DataError, StateError, UsageError
 from acquire.lines import ARMS
 from acquire.store import layout
 from acquire.store.arm_writer import ArmWriter
 from acquire.store.codecs import EncodeOnce
-from acquire.store.files import DISK, Publisher, check_new_path, lock
+from acquire.store.files import DISK, SCRATCH, Publisher, check_new_path, lock
+from acquire.store.resume import list_segment
 from acquire.store.retention import Keeper
 from acquire.store.room import RoomWatch
 from acquire.store.spec import Ending, RunCondition, root_attributes
@@ -56,8 +57,8 @@ NOT_A_PLACE = (
 OWN_INTERVAL_S = 1.0
 """How much older than the root the metadata of a group or an array opened by itself may be."""
 
-SCRATCH, RESERVE = ".next", ".reserve"
-"""Files of a recording that is being written, beside the shards of the first array."""
+RESERVE = ".reserve"
+"""Of a recording that is being written, beside the shards of the first array."""
 
 RESERVE_BYTES = 2**20
 """Kept free for the metadata of the end: more than the tables and the root take."""
@@ -153,7 +154,9 @@ class RecordingWriter:
         try:
             with self._failing("creating the recording"):
                 self._publish_root(0, self._publish_parts(0, own=False))  # `prepare` did all that takes time
-        except DataError:
+                if self.spec.continues is not None:
+                    list_segment(self.path, self.spec.continues, self._disk)
+        except (DataError, StateError):
             self.close()
             self._disk.remove_tree(self.path)
             raise
