@@ -1,4 +1,4 @@
-"""``acquire ls | info | cut | hold | verify | recover``: recordings on disk; no daemon needed."""
+"""``acquire ls | info | cut | verify | recover | hold | upload``: recordings, here or at URLs; no daemon."""
 
 from __future__ import annotations
 
@@ -17,7 +17,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from acquire.lines import Segment
-    from acquire.store import Verification
+    from acquire.store import Mirrored, Verification
+
+PlaceArgument = Annotated[
+    str, typer.Argument(metavar="RECORDING", help="A directory NAME.zarr, or its URL: s3://bucket/NAME.zarr.")
+]
 
 RecordingArgument = Annotated[Path, typer.Argument(metavar="RECORDING", help="A directory NAME.zarr.")]
 
@@ -30,7 +34,7 @@ CELL_CHARACTERS = 72
 
 def register(app: typer.Typer) -> None:
     app.command("ls", rich_help_panel="Recordings")(list_recordings)
-    for command in (info, verify, recover, hold, cut):
+    for command in (info, verify, recover, hold, upload, cut):
         app.command(rich_help_panel="Recordings")(command)
 
 
@@ -53,7 +57,7 @@ def list_recordings(
         print_table(("recording", "lines", "duration", "size", "state", "started (UTC)"), map(_row, found))
 
 
-def info(recording: RecordingArgument, json: JsonFlag = False) -> None:
+def info(recording: PlaceArgument, json: JsonFlag = False) -> None:
     """What a recording holds: geometry, code, clock, losses, how it ended.
 
     Example: [bold]acquire info run.zarr[/]
@@ -76,7 +80,7 @@ def info(recording: RecordingArgument, json: JsonFlag = False) -> None:
         print_table(("arm", "first lost line", "lines", "cause"), rows)
 
 
-def verify(recording: RecordingArgument, json: JsonFlag = False) -> None:
+def verify(recording: PlaceArgument, json: JsonFlag = False) -> None:
     """Read all of a recording: is every line there and intact, do numbering, gaps and ledger agree?
 
     Ends with 6 where something is lost or damaged, and says which lines.
@@ -141,8 +145,34 @@ def hold(
         typer.echo(f"{recording}: lines {first_line} to {first_line + lines - 1} are held")
 
 
-def cut(
+def upload(
     recording: RecordingArgument,
+    url: Annotated[str, typer.Argument(help="s3://bucket/NAME.zarr, or whatever fsspec reaches.")],
+    follow: Annotated[bool, typer.Option("--follow", help="Go on until the recording is sealed.")] = False,
+    json: JsonFlag = False,
+) -> None:
+    """Copy a recording to a remote store, also while it grows; one that was interrupted goes on where it was.
+
+    Lines that are not copied yet are held: retention of an endless recording leaves them alone.
+
+    Example: [bold]acquire upload run.zarr s3://bucket/run.zarr --follow[/]
+    """
+    from acquire.store import mirror
+
+    def report(done: Mirrored) -> None:
+        if not json:
+            typer.echo(f"{url}: {done.lines} lines, {quantity(done.bytes, 'B')} copied", err=True)
+
+    done = mirror(recording, url, follow=follow, report=report)
+    if json:
+        print_json(done.to_dict())
+    else:
+        state = "sealed" if done.sealed else "still growing"
+        typer.echo(f"{url}: {done.lines} lines, {state}; {quantity(done.bytes, 'B')} copied now")
+
+
+def cut(
+    recording: PlaceArgument,
     first_line: Annotated[int, typer.Option(help="The trigger's number of the first line.")],
     lines: Annotated[int, typer.Option(help="How many lines.")],
     out: Annotated[Path, typer.Option(metavar="FILE.npz", help="New file.")],

@@ -7,6 +7,7 @@ Downwards: `writer` · `reader` · `video`; `arm_writer` · `camera_stream` one 
 from acquire.store.camera_stream import CameraStream
 from acquire.store.codecs import Codec, CodecChoice, choose_codec
 from acquire.store.files import measure_disk
+from acquire.store.mirror import Mirrored, mirror
 from acquire.store.opening import format_of, open_recording
 from acquire.store.reader import Recording
 from acquire.store.recover import Recovery, recover
@@ -27,6 +28,7 @@ __all__ = [
     "Event",
     "Gap",
     "Hold",
+    "Mirrored",
     "Recording",
     "RecordingSpec",
     "RecordingWriter",
@@ -39,6 +41,7 @@ __all__ = [
     "format_of",
     "hold",
     "measure_disk",
+    "mirror",
     "next_segment",
     "open_recording",
     "open_video",

@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 
     from acquire.store.files import Disk
 
+ALL_LINES = 2**62
+COPY = "0-copy.json"
+
 HOLDS = ".holds"
 """Directory of the files of `hold`, where no Zarr reader lists names."""
 
@@ -100,6 +103,16 @@ def hold(path: Path, first_line: int, count: int, why: str = "", disk: Disk = DI
                 possible="the others are held",
             )
     return held
+
+
+def keep_from(path: Path, line: int, disk: Disk = DISK) -> None:
+    """Hold every line from ``line`` on, those to come included; a later call replaces an earlier one."""
+    text = json.dumps({"first_line": line, "count": ALL_LINES, "why": "not copied yet"}).encode()
+    try:
+        disk.make_directory(_holds(path), parents=True)
+        Publisher(_holds(path) / ".copy", disk).replace(_holds(path) / COPY, text, durable=True)
+    except OSError as error:
+        raise DataError(f"{path}: lines cannot be held: {error.strerror}") from error
 
 
 def holds_of(path: Path) -> list[Hold]:

@@ -1,4 +1,4 @@
-"""Where a recording is read from: named parts of bytes below one place, on a local disk."""
+"""Where a recording is read from: named parts of bytes below one place, on a local disk or far away."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from acquire.store.files import tree_bytes
+from acquire.store.remote import RemoteSource, is_url
 
 if TYPE_CHECKING:
     from zarr.abc.store import Store
@@ -76,5 +77,7 @@ class LocalSource:
 
 
 def source_of(place: Path | str) -> Source:
-    """The source for a path."""
+    """The source for a path, or for a URL. Raises UsageError for a URL that cannot be one."""
+    if is_url(place):
+        return RemoteSource(str(place))
     return LocalSource(Path(place))

@@ -267,3 +267,16 @@ def test_hold_keeps_lines_of_a_recording_that_grows(cli: Cli, tmp_path: Path) ->
         assert (answer.code, "gone already" in answer.err) == (6, True)
         assert cli("cut", path, "--first-line", 120, "--lines", 5, "--out", tmp_path / "c.npz").code == 6
         assert cli("cut", path, "--first-line", FIRST, "--lines", 5, "--out", tmp_path / "c.npz").code == 0
+
+
+def test_recordings_at_urls(cli: Cli, recording: Path, tmp_path: Path) -> None:
+    url = f"memory://{tmp_path.name}/one.zarr"
+    answer = cli("upload", recording, url)
+    assert (answer.code, "64 lines, sealed" in answer.out) == (0, True)
+    assert cli("upload", recording, url, "--json").json["shards"] == 0
+    assert url in cli("info", url).out
+    assert cli("verify", url).code == 0
+    out = tmp_path / "far.npz"
+    assert cli("cut", url, "--first-line", 110, "--lines", 20, "--out", out).code == 0
+    with np.load(out) as saved:
+        assert np.array_equal(saved["lines"], open_recording(recording).cut(110, 20).lines)
