@@ -5,6 +5,7 @@ Unknown keys are refused. An error names the file, the key, what stood there and
 
 from __future__ import annotations
 
+import math
 import os
 import tomllib
 from pathlib import Path
@@ -14,6 +15,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from acquire.codes import TAPS, Code, ConstantCode, PrbsCode, mix_seed
 from acquire.errors import ConfigError
+from acquire.event_config import EventsConfig
 from acquire.geometry import Geometry
 from acquire.scene_config import SceneConfig, SceneFile, VideoSceneConfig, anchored
 
@@ -27,6 +29,10 @@ PIXEL_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16}
 GentlModule = Literal["remote", "interface", "device", "stream", "system"]
 """Where a camera's features are: in the camera itself, or in a module of the host's side."""
 
+RING_RESERVE_SHARE = 4
+"""Of the ring's slots, one part in so many stays free for the cameras while a recording takes the past."""
+EVENT_DELAY_S = 0.5
+"""Between an event and the recording that it starts."""
 MAX_RING_BYTES = 4 * 2**30
 """Pixels that may wait in the ring of one arm."""
 
@@ -225,7 +231,10 @@ class StreamConfig(_Model):
     """The capture path between camera and disk."""
 
     block_lines: int = Field(default=256, ge=1, le=65536, description="lines per camera block and ring slot")
-    ring_slots: int = Field(default=64, ge=2, le=4096)
+    ring_slots: int = Field(default=64, ge=2, le=2**16)
+    ring_seconds: float | None = Field(
+        default=None, gt=0, description="of lines from the past that the ring holds, instead of ring_slots"
+    )
     reopen_s: float = Field(default=2.0, ge=0, le=600, description="wait for a camera that is gone")
     realtime: bool = Field(
         default=False,
@@ -303,23 +312,35 @@ class RigConfig(_Model):
     cameras: CamerasConfig
     stream: StreamConfig = StreamConfig()
     recording: RecordingConfig = RecordingConfig()
+    events: EventsConfig = EventsConfig()
     control: ControlConfig = Field(default_factory=ControlConfig)
     simulation: SimulationConfig
 
     @model_validator(mode="after")
     def _ring_fits(self) -> RigConfig:
         """Lines wait for their tag in the ring, of which half must stay free for the cameras."""
-        lines = self.stream.ring_slots * self.stream.block_lines
+        lines = self.ring_slots * self.stream.block_lines
         pixel_bytes = 1 if self.cameras.a.dtype == "uint8" else 2
         if (size := lines * self.geometry.stages * pixel_bytes) > MAX_RING_BYTES:
             raise ValueError(
-                f"stream.ring_slots x stream.block_lines = {lines} lines of {self.geometry.stages} pixels "
+                f"stream.{self._ring_keys} = {lines} lines of {self.geometry.stages} pixels "
                 f"are {size} bytes of memory per arm; possible: up to {MAX_RING_BYTES}"
             )
         if self.trigger.tag_every_lines > lines // 2:
             raise ValueError(
                 f"trigger.tag_every_lines = {self.trigger.tag_every_lines}; possible: 1 to {lines // 2}, "
-                "half of what a ring holds (stream.ring_slots x stream.block_lines)"
+                f"half of what a ring holds (stream.{self._ring_keys})"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _past_fits(self) -> RigConfig:
+        """An event is noticed, and its recording created, while the ring goes on."""
+        longest_s = self.history_s - EVENT_DELAY_S * self.simulation.speed
+        if self.events.sources and self.events.pre_s > longest_s:
+            raise ValueError(
+                f"events.pre_s = {self.events.pre_s:g}; possible: up to {max(0.0, longest_s):.3g}, "
+                f"since the ring holds {self.history_s:.3g} s; a longer one: stream.ring_seconds"
             )
         return self
 
@@ -338,6 +359,30 @@ class RigConfig(_Model):
             return {}
         starts = {"a": self.cameras.a.first_column, "b": self.cameras.b.first_column}
         return {arm: (start, start + self.geometry.stages) for arm, start in starts.items()}
+
+    @property
+    def ring_slots(self) -> int:
+        """Slots of the ring of one arm."""
+        seconds = self.stream.ring_seconds
+        if seconds is None:
+            return self.stream.ring_slots
+        past = math.ceil(seconds * self.line_rate_hz / self.stream.block_lines) + 1
+        return past + max(2, math.ceil(past / (RING_RESERVE_SHARE - 1)))
+
+    @property
+    def ring_reserve(self) -> int:
+        """Those of them that do not serve as history."""
+        return max(2, self.ring_slots // RING_RESERVE_SHARE)
+
+    @property
+    def history_s(self) -> float:
+        """Seconds of lines from the past that a full ring holds for certain."""
+        slots = self.ring_slots - self.ring_reserve - 1
+        return max(0, slots) * self.stream.block_lines / self.line_rate_hz
+
+    @property
+    def _ring_keys(self) -> str:
+        return "ring_slots x stream.block_lines" if self.stream.ring_seconds is None else "ring_seconds"
 
     @property
     def line_period_ticks(self) -> int:

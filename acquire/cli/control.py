@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from acquire.cli.durations import seconds
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, quantity
 from acquire.errors import DataError, UsageError
 
@@ -22,7 +23,7 @@ DAMAGED = ("INCOMPLETE", "ABORTED", None)
 
 
 def register(app: typer.Typer) -> None:
-    for command in (arm, start, stop, disarm, status):
+    for command in (arm, start, mark, stop, disarm, status):
         app.command(rich_help_panel="Capture")(command)
 
 
@@ -49,16 +50,37 @@ def start(
         Path | None, typer.Argument(metavar="[RECORDING]", help="New recording; else named by rig and time.")
     ] = None,
     lines: Annotated[int | None, typer.Option(help="Stop after so many lines.")] = None,
-    duration: Annotated[float | None, typer.Option(help="Stop after so many seconds.")] = None,
+    duration: Annotated[
+        float | None, typer.Option(parser=seconds, metavar="TIME", help="Stop after 5s, 500ms, 2min.")
+    ] = None,
+    pre: Annotated[
+        float | None, typer.Option(parser=seconds, metavar="TIME", help="Of that, from before: see the ring.")
+    ] = None,
+    post: Annotated[
+        float | None, typer.Option(parser=seconds, metavar="TIME", help="Stop so long after this command.")
+    ] = None,
     socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Record from the next line on, until stopped or for a number of lines or seconds.
+    """Record from the next line on, or from before it; until stopped, or for some lines or time.
 
-    Example: [bold]acquire start run.zarr --lines 100000[/]
+    Example: [bold]acquire start run.zarr --lines 100000[/], or [bold]acquire start --pre 2s --post 1s[/]
     """
     with _daemon(socket) as daemon:
-        _show(daemon.start(path, lines=lines, duration_s=duration), json)
+        _show(daemon.start(path, lines=lines, duration_s=duration, pre_s=pre or 0.0, post_s=post), json)
+
+
+def mark(
+    text: Annotated[str, typer.Argument(help="What happens, in your words.")] = "",
+    socket: SocketOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Note that something happens now. While armed it starts a recording, where the rig's [events] say so.
+
+    Example: [bold]acquire mark "the valve opens"[/]
+    """
+    with _daemon(socket) as daemon:
+        _show(daemon.mark(text), json)
 
 
 def stop(socket: SocketOption = None, json: JsonFlag = False) -> None:

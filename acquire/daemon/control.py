@@ -18,6 +18,7 @@ from acquire.daemon.messages import (
     HTTP_STATUS,
     ArmRequest,
     ErrorMessage,
+    MarkRequest,
     StartRequest,
     Status,
     error_body,
@@ -40,6 +41,7 @@ class Commands(Protocol):
     def status(self) -> Status: ...
     def arm(self, request: ArmRequest) -> None: ...
     def start(self, request: StartRequest) -> None: ...
+    def mark(self, text: str) -> None: ...
     def stop(self) -> None: ...
     def disarm(self) -> None: ...
 
@@ -69,6 +71,11 @@ def build_app(service: Commands, run: Callable[[Callable[[], None]], Awaitable[N
     @app.post("/start", summary="armed → recording")
     async def start(request: StartRequest) -> Status:
         await run(lambda: service.start(request))
+        return service.status()
+
+    @app.post("/mark", summary="armed or recording: an event at the newest line")
+    async def mark(request: MarkRequest) -> Status:
+        await run(lambda: service.mark(request.text))
         return service.status()
 
     @app.post("/stop", summary="recording → draining → idle; returns once the recording is sealed")

@@ -38,11 +38,20 @@ class StartRequest(_Message):
     duration_s: float | None = Field(
         default=None, gt=0, le=1e9, allow_inf_nan=False, description="budget in seconds instead of lines"
     )
+    pre_s: float = Field(
+        default=0.0, ge=0, le=1e6, allow_inf_nan=False, description="of it, from before the request"
+    )
+    post_s: float | None = Field(
+        default=None, gt=0, le=1e9, allow_inf_nan=False, description="to record after the request, as budget"
+    )
 
     @model_validator(mode="after")
     def _one_budget(self) -> StartRequest:
-        if self.lines is not None and self.duration_s is not None:
-            raise ValueError("lines and duration_s are two ways to say the same: give one")
+        given = [name for name in ("lines", "duration_s", "post_s") if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise ValueError(f"{' and '.join(given)} are ways to say the same: give one")
+        if self.duration_s is not None and self.pre_s >= self.duration_s:
+            raise ValueError("pre_s is a part of duration_s: give a smaller one")
         if self.path is not None and not self.path.is_absolute():
             raise ValueError(f"path {str(self.path)!r} is not absolute: the daemon has another directory")
         return self
@@ -54,6 +63,12 @@ class StartRequest(_Message):
         if "\0" in text or text != text.encode(errors="replace").decode():
             raise ValueError(f"path {text!r} is not UTF-8, or has a NUL")
         return path
+
+
+class MarkRequest(_Message):
+    """What happens now, in the operator's words."""
+
+    text: str = Field(default="", max_length=400)
 
 
 class RingStatus(_Message):

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from acquire.daemon.storage import choose_for, storage_settings
 from acquire.store import RecordingSpec
 from acquire.stream import Capture, CapturePlan
+from acquire.stream.messages import Note
 from acquire.trigger.base import TriggerRun
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from acquire.config import RigConfig
     from acquire.rig import Rig
     from acquire.store import Codec, CodecChoice
-    from acquire.stream import CaptureStatus
+    from acquire.stream import CaptureStatus, Window
 
 
 STALL_S = 3.0
@@ -51,9 +52,21 @@ class Run:
             self._choice = choose_for(self._config)
         self._capture.arm()
 
-    def start(self, path: Path, lines: int | None) -> None:
+    def start(self, path: Path, lines: int | None, window: Window) -> None:
         """Record to ``path``. Raises UsageError where it cannot be, before anything is touched."""
-        self._capture.start(path, self._spec(), lines)
+        self._capture.start(path, self._spec(), lines, window)
+
+    def mark(self, text: str) -> Note:
+        """An event of the operator's, at the newest line."""
+        return Note(self._capture.note("mark", text), "mark", text)
+
+    def extend(self, line: int) -> None:
+        """Let the recording under way not end before ``line``."""
+        self._capture.extend(line)
+
+    def events(self) -> list[Note]:
+        """What trigger and lines have told since the last call."""
+        return self._capture.take_events()
 
     def stop(self, reason: str) -> None:
         """End the recording at the newest line; ``reason`` is recorded."""
@@ -108,7 +121,8 @@ def capture_plan(config: RigConfig, rig: Rig, run_id: str) -> CapturePlan:
         pixels=config.geometry.stages,
         dtype=config.cameras.a.dtype,
         block_lines=config.stream.block_lines,
-        ring_slots=config.stream.ring_slots,
+        ring_slots=config.ring_slots,
+        ring_reserve=config.ring_reserve,
         white_dn=config.cameras.a.white_dn,
         openers=rig.openers(),
         stall_timeout_s=max(STALL_S, config.stream.reopen_s + 1.0),

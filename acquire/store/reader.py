@@ -184,6 +184,8 @@ class Recording:
         if (pixels := self.arms["a"].pixels) != geometry.stages:
             raise UsageError(f"cut of lines with {pixels} pixels", possible=f"M = {geometry.stages} pixels")
         arms = self.arms.values()
+        for stream in arms:
+            stream.expect(start, stop)
         samples = np.stack([stream.read("lines", start, stop) for stream in arms])
         flags = np.stack([stream.read("flags", start, stop) for stream in arms])
         return Segment(

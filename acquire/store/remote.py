@@ -51,6 +51,9 @@ class RemoteSource:
             data: bytes = self._fs.cat_file(self._path(key), start=start, end=start + size)
             return data
 
+    def expect(self, key: str, start: int, size: int) -> None:
+        """Nothing is fetched ahead."""
+
     def size(self, key: str) -> int:
         with _as_os_errors():
             return int(self._fs.info(self._path(key))["size"])

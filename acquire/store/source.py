@@ -25,6 +25,9 @@ class Source(Protocol):
     def read_range(self, key: str, start: int, size: int) -> bytes:
         """Bytes ``start .. start + size - 1`` of one part, fewer where it ends earlier."""
 
+    def expect(self, key: str, start: int, size: int) -> None:
+        """These bytes will be read soon: a hint, which may begin to fetch them."""
+
     def size(self, key: str) -> int:
         """Bytes of one part."""
 
@@ -57,6 +60,13 @@ class LocalSource:
         fd = os.open(self.path / key, os.O_RDONLY | os.O_CLOEXEC)
         try:
             return os.pread(fd, size, start)
+        finally:
+            os.close(fd)
+
+    def expect(self, key: str, start: int, size: int) -> None:
+        fd = os.open(self.path / key, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            os.posix_fadvise(fd, start, size, os.POSIX_FADV_WILLNEED)
         finally:
             os.close(fd)
 

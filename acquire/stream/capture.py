@@ -118,6 +118,10 @@ class Capture:
         self._workers[RECORDER].post(Note(line, kind, text))
         return line
 
+    def take_events(self) -> list[Note]:
+        """What the trigger's inputs and the lines have told since the last call; marks are not among it."""
+        return self._running("take_events").take_events()
+
     def extend(self, line: int) -> None:
         """Let the recording under way not end before ``line``, unless it is ending already."""
         self._running("extend")

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from acquire.store import RunCondition
     from acquire.trigger.base import TriggerRun
 
+OBSERVERS = 2
+"""Readers of a ring that nobody waits for: the watcher is the first, a preview can be the second."""
+
 MAX_SUBSTEPS = 8
 """A line's code is recorded in one byte."""
 
@@ -45,6 +48,7 @@ class CapturePlan:
     realtime : grabbers run before everything else on the host, where that is allowed
     columns : compact layout: arm → first column and the one after the last, on the one camera that
         ``openers["a"]`` opens; empty: a camera per arm
+    ring_reserve : slots that hold no history: see `RingShape`
     """
 
     run: TriggerRun
@@ -61,6 +65,7 @@ class CapturePlan:
     line_period_ns: float = 0.0
     columns: dict[str, tuple[int, int]] = field(default_factory=dict)
     realtime: bool = False
+    ring_reserve: int = 2
 
     def __post_init__(self) -> None:
         if tuple(sorted(self.openers)) != ARMS:
@@ -85,7 +90,9 @@ class CapturePlan:
 
     @property
     def ring_shape(self) -> RingShape:
-        return RingShape(self.ring_slots, self.block_lines, self.pixels, self.dtype)
+        return RingShape(
+            self.ring_slots, self.block_lines, self.pixels, self.dtype, OBSERVERS, self.ring_reserve
+        )
 
     @property
     def grabbers(self) -> dict[str, tuple[str, ...]]:

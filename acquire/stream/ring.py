@@ -56,31 +56,35 @@ _SEQUENCE, _FIRST_LINE, _COUNT, _TIME_NS, _LOSS_COUNT, _LOSSES = range(6)
 _HEADER_WORDS = 32
 _PAGE_BYTES = 4096
 _CAUSES = tuple(Cause)
-_LEAST_RESERVE = 2
-_RESERVE_SHARE = 4
-"""Of the slots, one part in so many is not history."""
+LEAST_RESERVE = 2
 
 
 @dataclass(frozen=True, slots=True)
 class RingShape:
-    """``slots`` slots of up to ``rows`` rows of ``width`` samples of ``dtype``; room for ``observers``."""
+    """``slots`` slots of up to ``rows`` rows of ``width`` samples of ``dtype``; room for ``observers``.
+
+    ``reserve`` slots are no history: they stay free for the producer while the reader begins with the past.
+    """
 
     slots: int
     rows: int
     width: int
     dtype: str
     observers: int = 0
+    reserve: int = 2
 
     def __post_init__(self) -> None:
         if min(self.slots, self.rows, self.width) < 1:
             raise UsageError(
                 f"ring of {self.slots} slots of {self.rows} x {self.width}", possible="1 or more"
             )
+        if self.reserve < LEAST_RESERVE:
+            raise UsageError(f"ring with a reserve of {self.reserve}", possible=f"{LEAST_RESERVE} or more")
 
     @property
     def history_slots(self) -> int:
         """Most slots that can be taken back."""
-        return max(0, self.slots - max(_LEAST_RESERVE, self.slots // _RESERVE_SHARE))
+        return max(0, self.slots - self.reserve)
 
     @property
     def control_words(self) -> int:

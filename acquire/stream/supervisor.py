@@ -6,11 +6,12 @@ from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from typing import TYPE_CHECKING
 
 from acquire.errors import AcquireError, DeviceError, TriggerError
 from acquire.lines import ARMS
-from acquire.stream.messages import Began, Failed, Interrupt, Refused, Sealed
+from acquire.stream.messages import Began, Failed, Interrupt, Note, Refused, Sealed
 from acquire.stream.stalls import Excess, Heartbeat
 from acquire.stream.tagger import tag_rows
 
@@ -29,6 +30,7 @@ RECORDER = "recorder"
 _TAG_WAIT_S = 0.02
 _ANSWER_S = 20.0
 _JOIN_S = 5.0
+_MOST_EVENTS = 1024
 
 
 class Supervisor:
@@ -67,6 +69,7 @@ class Supervisor:
         self._newest_pulse: int | None = None
         self._refused: Refused | None = None
         self._trigger_lost = False
+        self._events: deque[Note] = deque(maxlen=_MOST_EVENTS)
         self._dead: set[str] = set()
         self._last_words: dict[str, str] = {}
         self._news = threading.Condition()
@@ -105,6 +108,15 @@ class Supervisor:
             self._fail(f"recorder: no answer within {_ANSWER_S:g} s")
         raise DeviceError(f"start: {self.fault}")
 
+    def happened(self, note: Note) -> None:
+        """Tell the recorder, and whoever asks with `take_events`."""
+        self._events.append(note)
+        self._workers[RECORDER].post(note)
+
+    def take_events(self) -> list[Note]:
+        """What happened since the last call; the latest, if it was too much."""
+        return [self._events.popleft() for _ in range(len(self._events))]
+
     def wait_sealed(self, deadline: float) -> bool:
         """Until the recording is closed, or cannot be any more, or the monotonic ``deadline``."""
         with self._news:
@@ -140,6 +152,8 @@ class Supervisor:
             return []
         if tags:
             self._newest_pulse = tags[-1].line
+        for event in self._trigger.events():
+            self.happened(Note(event.line, event.kind, f"tick {event.tick}"))
         rows = self._tags.shape.rows
         for at in range(0, len(tags), rows):
             self._pass_on(tags[at : at + rows])

@@ -49,10 +49,10 @@ class Watching:
 class RingMachine(RuleBasedStateMachine):
     """Producer, reader and observers do what they may in any order, against the list of all blocks."""
 
-    @initialize(slots=st.integers(2, 12))
-    def make(self, slots: int) -> None:
-        self.slots = slots
-        self.ring = Ring("model", replace(SHAPE, slots=slots, observers=OBSERVERS))
+    @initialize(slots=st.integers(1, 12), reserve=st.integers(2, 5))
+    def make(self, slots: int, reserve: int) -> None:
+        self.slots, self.reserve = slots, reserve
+        self.ring = Ring("model", replace(SHAPE, slots=slots, observers=OBSERVERS, reserve=reserve))
         self.observers = [Observer(self.ring, number) for number in range(OBSERVERS)]
         self.watching = [Watching() for _ in range(OBSERVERS)]
         self.blocks: list[tuple[int, int, tuple[Loss, ...]]] = []
@@ -71,7 +71,7 @@ class RingMachine(RuleBasedStateMachine):
 
     @property
     def oldest(self) -> int:
-        return max(0, self.head - max(0, self.slots - max(2, self.slots // 4)))
+        return max(0, self.head - max(0, self.slots - self.reserve))
 
     def whole(self, number: int) -> bool:
         return number > self.claimed - self.slots
@@ -239,7 +239,7 @@ def test_doorbell_rings_until_hushed(ring: Ring) -> None:
 
 
 def test_history_is_taken_back_from_the_line_that_is_asked_for() -> None:
-    ring = Ring("history", RingShape(slots=16, rows=10, width=1, dtype="uint8"))
+    ring = Ring("history", RingShape(slots=16, rows=10, width=1, dtype="uint8", reserve=4))
     for block in range(40):
         assert ring.claim() is not None
         ring.commit(10 * block, 10)
@@ -264,6 +264,8 @@ def test_history_is_taken_back_from_the_line_that_is_asked_for() -> None:
 def test_impossible_shapes_and_losses_are_refused(ring: Ring) -> None:
     with pytest.raises(UsageError, match="0 slots"):
         RingShape(0, 1, 1, "uint8")
+    with pytest.raises(UsageError, match="reserve of 1"):
+        RingShape(4, 1, 1, "uint8", reserve=1)
     with pytest.raises(UsageError, match="observer 0"):
         Observer(ring, 0)
     ring.claim()

@@ -24,7 +24,7 @@ def make_ring() -> Iterator[Callable[..., Ring]]:
 
     def make(name: str, blocks: int, lost: range = range(0)) -> Ring:
         """A ring through which ``blocks`` blocks of 10 lines went but for those in ``lost``."""
-        ring = Ring(name, RingShape(slots=16, rows=10, width=1, dtype="uint8"))
+        ring = Ring(name, RingShape(slots=16, rows=10, width=1, dtype="uint8", reserve=4))
         made.append(ring)
         losses = [Loss(10 * lost.start, 10 * len(lost), Cause.CAMERA)] if lost else []
         for block in range(blocks):
