@@ -45,6 +45,15 @@ class ChunkReader:
             rows[low - start : high - start] = self.chunk(chunk)[low - chunk * size : high - chunk * size]
         return rows
 
+    def expect(self, start: int, stop: int) -> None:
+        """Rows ``start .. stop - 1`` will be read soon: disks do better when they know all of it at once."""
+        size = self.shape.chunk_rows
+        for chunk in range(start // size, -(-stop // size)):
+            try:
+                self._source.expect(self.file(chunk), *self.entry(chunk))
+            except (AbsentChunkError, DamagedChunkError, OSError):
+                return  # reading it says what is wrong
+
     @property
     def chunks(self) -> int:
         """Chunks that the rows are in."""
