@@ -120,6 +120,7 @@ def reconstruct(
     bandwidth: float = BANDWIDTH,
     iterations: int | None = None,
     tv_weight: float | None = None,
+    stop: Callable[[], bool] | None = None,
 ) -> Reconstruction:
     """Reconstruct the voxels X′ of a segment at N_m = ``spatial_merge``, T_m = ``temporal_merge`` (Eq. 5).
 
@@ -132,6 +133,7 @@ def reconstruct(
     solver : ``"admm"`` (default) or ``"twist"``, the paper's, which knows neither bandwidth nor sign
     bandwidth : share of the frames' Nyquist frequency that the video may hold (ADMM)
     iterations, tv_weight : in place of the preset's and the solver's
+    stop : asked after every iteration; once it says so, the best so far is the result
 
     Raises
     ------
@@ -144,7 +146,7 @@ def reconstruct(
     segment.geometry.check_merge(spatial_merge, temporal_merge)
     problem = pose(segment, spatial_merge, temporal_merge, hold_out=HOLD_OUT if solver == "admm" else 0.0)
     work = (_admm if solver == "admm" else _twist)(segment, problem, request)
-    done = _iterate(work, request, started, progress)
+    done = _iterate(work, request, started, progress, stop)
     predicted = work.operator.forward(work.iterate.theta) / np.float32(problem.norm)
     return Reconstruction(
         video=work.video(problem.scale),
@@ -206,7 +208,11 @@ def _twist(segment: Segment, problem: Problem, request: Request) -> _Work:
 
 
 def _iterate(
-    work: _Work, request: Request, started: float, progress: Callable[[Progress], None] | None
+    work: _Work,
+    request: Request,
+    started: float,
+    progress: Callable[[Progress], None] | None,
+    stop: Callable[[], bool] | None,
 ) -> int:
     """Iterate to the end or as far as the budget allows; the iterations made."""
     first = time.perf_counter()
@@ -215,6 +221,8 @@ def _iterate(
         now = time.perf_counter()
         if progress is not None:
             progress(Progress(iteration, request.iterations, now - started))
+        if stop is not None and stop():
+            break
         per_iteration = (now - first) / iteration
         if request.budget_s is not None and now - started + per_iteration > request.budget_s:
             break

@@ -7,7 +7,7 @@ Downwards: `writer` · `reader` · `video`; `arm_writer` · `camera_stream` one 
 from acquire.store.camera_stream import CameraStream
 from acquire.store.reader import Event, Gap, Recording, format_of, open_recording
 from acquire.store.spec import FORMAT, RecordingSpec, RunCondition
-from acquire.store.video import VideoFile, open_video, write_video
+from acquire.store.video import VideoFile, VideoWriter, open_video, write_video
 from acquire.store.writer import RecordingWriter
 
 __all__ = [
@@ -20,6 +20,7 @@ __all__ = [
     "RecordingWriter",
     "RunCondition",
     "VideoFile",
+    "VideoWriter",
     "format_of",
     "open_recording",
     "open_video",
