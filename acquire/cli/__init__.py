@@ -22,6 +22,7 @@ from acquire.cli import (
     demo,
     reconstruct,
     recordings,
+    render,
     replay,
     serve,
     simulate,
@@ -30,7 +31,7 @@ from acquire.cli import (
 from acquire.cli.output import print_error
 from acquire.errors import EXIT_INTERRUPTED, AcquireError, UsageError
 
-MODULES = (demo, serve, control, recordings, reconstruct, simulate, replay, config, trigger, camera)
+MODULES = (demo, serve, control, recordings, reconstruct, render, simulate, replay, config, trigger, camera)
 """Modules of commands, in the order of the help; each has ``register(app)``. New groups are added here."""
 
 app = typer.Typer(
