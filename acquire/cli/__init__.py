@@ -20,18 +20,34 @@ from acquire.cli import (
     config,
     control,
     demo,
+    paper,
     reconstruct,
     recordings,
     render,
     replay,
     serve,
     simulate,
+    tradeoff,
     trigger,
 )
 from acquire.cli.output import print_error
 from acquire.errors import EXIT_INTERRUPTED, AcquireError, UsageError
 
-MODULES = (demo, serve, control, recordings, reconstruct, render, simulate, replay, config, trigger, camera)
+MODULES = (
+    demo,
+    serve,
+    control,
+    recordings,
+    reconstruct,
+    render,
+    simulate,
+    paper,
+    tradeoff,
+    replay,
+    config,
+    trigger,
+    camera,
+)
 """Modules of commands, in the order of the help; each has ``register(app)``. New groups are added here."""
 
 app = typer.Typer(
