@@ -69,7 +69,9 @@ def reconstruct(
     ends: Annotated[
         str | None, typer.Option(help="trusted, or whole: also what is sampled in part at the ends.")
     ] = None,
-    preset: Annotated[str, typer.Option(help="fast or balanced.")] = "balanced",
+    preset: Annotated[
+        str | None, typer.Option(help="fast or balanced; else balanced, or what --budget learned.")
+    ] = None,
     solver: Annotated[str, typer.Option(help="admm, or twist: the paper's.")] = "admm",
     budget: Annotated[float | None, typer.Option(metavar="SECONDS", help="Stop iterating in time.")] = None,
     iterations: Annotated[int | None, typer.Option(help="Instead of the preset's.")] = None,
@@ -106,7 +108,8 @@ def reconstruct(
         save_plan=save_plan,
         ends=ends,
         preview=preview,
-        options=Options(preset, solver, iterations, budget),  # type: ignore[arg-type]  # checked there
+        preset=preset,
+        options=Options("balanced", solver, iterations, budget),  # type: ignore[arg-type]  # checked there
     )
     prepared = prepare(opened, asked)
     if prepared.plan is not None and not json:

@@ -12,6 +12,7 @@ from acquire.cli.progress import stage_progress
 from acquire.config import check_plan, load_plan
 from acquire.errors import UsageError
 from acquire.recon.segments import Stream, Stretch, Voxels
+from acquire.reconstruct.learned import choose, recall
 from acquire.reconstruct.select import Selection, along_plan, by_lines, by_time, in_voxels
 from acquire.store.files import check_new_path
 
@@ -44,6 +45,7 @@ class Asked:
     save_plan: Path | None
     ends: str | None
     preview: bool
+    preset: str | None
     options: Options
 
 
@@ -58,6 +60,26 @@ class Prepared:
 
 def prepare(recording: Recording, asked: Asked) -> Prepared:
     """What is to be done. UsageError and ConfigError for what cannot be."""
+    prepared = _requests(recording, asked)
+    if asked.preview:
+        return prepared
+    preset = asked.preset or _learned(prepared) or prepared.options.preset
+    options = replace(prepared.options, preset=preset)  # type: ignore[arg-type]  # checked where it is used
+    return replace(prepared, options=options)
+
+
+def _learned(prepared: Prepared) -> str | None:
+    """The preset that gets furthest in the budget, as `acquire tradeoff` found out; None where it did not."""
+    options = prepared.options
+    if options.budget_s is None:
+        return None
+    known = [each for each in recall() if each.solver == options.solver]
+    grids = [request.grid for request in prepared.requests.values()]
+    found = choose(known, options.budget_s, sum(grid.frames * grid.side**2 for grid in grids))
+    return None if found is None else found.preset
+
+
+def _requests(recording: Recording, asked: Asked) -> Prepared:
     if asked.ends not in ENDS:
         raise UsageError(f"--ends {asked.ends}", possible="trusted, whole")
     if (asked.plan is not None) + bool(asked.segments) + asked.auto + asked.preview > 1:

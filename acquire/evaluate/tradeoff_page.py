@@ -33,6 +33,7 @@ METRICS = (
     ("frequency_error_hz", "frequency error (Hz)", True),
 )
 """Name, label, and whether its axis is logarithmic."""
+DASHES = {"fast": "--", "balanced": "-"}
 MARKERS = {"fast": "o", "balanced": "s", "best": "D"}
 
 
@@ -104,8 +105,9 @@ def _curve(ax: Axes, run: Run, name: str, colour: str) -> None:
     if not points:
         return
     times, values = ([each[i] for each in points] for i in (0, 1))
-    dash = "-" if run.preset == "balanced" else "--" if run.preset == "fast" else ":"
-    ax.plot(times, values, dash, color=colour, lw=1.4, label=f"{run.solver} {run.preset}")
+    ax.plot(
+        times, values, DASHES.get(run.preset, ":"), color=colour, lw=1.4, label=f"{run.solver} {run.preset}"
+    )
     ax.plot(times[-1], values[-1], MARKERS.get(run.preset, "o"), color=colour, ms=6)
 
 

@@ -180,7 +180,9 @@ def _cluster(address: str) -> Iterator[Cluster]:
     except ModuleNotFoundError as error:
         raise UsageError("--dask without dask.distributed", hint="pip install 'tdi-acquire[dask]'") from error
     try:
-        client = Client(address, timeout=SCHEDULER_TIMEOUT_S, set_as_default=False)
+        client = Client(  # type: ignore[no-untyped-call]
+            address, timeout=SCHEDULER_TIMEOUT_S, set_as_default=False
+        )
     except (OSError, ValueError) as error:
         raise UsageError(
             f"no Dask scheduler answers on {address}: {error}", possible="tcp://HOST:8786"
