@@ -17,6 +17,7 @@ from acquire.codes import TAPS, Code, ConstantCode, PrbsCode, mix_seed
 from acquire.errors import ConfigError
 from acquire.event_config import CheckConfig, EventsConfig
 from acquire.geometry import Geometry
+from acquire.plan_config import ReconstructionPlan
 from acquire.scene_config import SceneConfig, SceneFile, VideoSceneConfig, anchored
 
 if TYPE_CHECKING:
@@ -459,6 +460,17 @@ def load_scene(name: str | Path) -> SceneConfig:
     if path.suffix != ".toml":
         return VideoSceneConfig(kind="video", title=path.name, path=path.resolve())
     return anchored(_validate(SceneFile, _read(path), path).root, path.parent)
+
+
+def load_plan(name: str | Path) -> ReconstructionPlan:
+    """Read and validate the plan of a combinatorial reconstruction."""
+    path = find(name)
+    return check_plan(_read(path), path)
+
+
+def check_plan(table: dict[str, Any], origin: str | Path) -> ReconstructionPlan:
+    """The plan that a table describes; ``origin`` is where its mistakes are to be mended."""
+    return _validate(ReconstructionPlan, table, Path(origin))
 
 
 def _read(path: Path) -> dict[str, Any]:

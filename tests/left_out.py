@@ -1,4 +1,4 @@
-"""Tests that need a compiler or genicam are left out where there is none, and the summary says so."""
+"""Tests that need a compiler, genicam or Dask are left out where there is none, and the summary says so."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ MISSING = {
     "needs_aravis": not _have_aravis() and "Aravis' library",
     "needs_gige_camera": not (_have_aravis() and which(FAKE_GIGE)) and f"Aravis and {FAKE_GIGE}",
     "needs_compiler": not (compiler() and _HAVE_GENICAM) and "a C compiler and the genicam package",
+    "needs_dask": importlib.util.find_spec("distributed") is None and "dask.distributed",
     "needs_genicam": not _HAVE_GENICAM and "the genicam package",
 }
 _left_out: Counter[str] = Counter()
@@ -36,6 +37,7 @@ _left_out: Counter[str] = Counter()
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "needs_compiler: builds the simulated GenTL producer")
+    config.addinivalue_line("markers", "needs_dask: spreads work over a Dask cluster")
     config.addinivalue_line("markers", "needs_genicam: loads a GenTL producer")
     config.addinivalue_line("markers", "needs_aravis: loads Aravis' shared library")
     config.addinivalue_line("markers", "needs_gige_camera: runs Aravis' GigE Vision camera on loopback")

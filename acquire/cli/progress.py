@@ -24,3 +24,12 @@ def stage_progress(title: str) -> Iterator[Callable[[int, int], None]]:
             bars.update(task, completed=done, total=total)
 
         yield advance
+
+
+@contextmanager
+def told() -> Iterator[Callable[[str], None]]:
+    """A line that says what is being done; the function given takes the words."""
+    from rich.console import Console
+
+    with Console(stderr=True).status("") as status:
+        yield status.update

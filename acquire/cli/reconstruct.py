@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from acquire.cli.output import JsonFlag, print_facts, print_json, print_warning
+from acquire.cli.interrupts import first_interrupt_asks
+from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, print_warning
 from acquire.cli.progress import stage_progress
 from acquire.cli.recordings import RecordingArgument
+from acquire.errors import EXIT_INTERRUPTED, UsageError
 
 if TYPE_CHECKING:
-    from typing import Any
+    from acquire.plan_config import ReconstructionPlan
+    from acquire.reconstruct import Options, Outcome, Request
+    from acquire.store import Recording
 
 
 DOUBTFUL_PREDICTION = 0.3
 """Good reconstructions predict within a tenth; a wrong code or swapped arms come to half and more."""
+
+PROGRESS_STEPS = 1000
 
 
 def register(app: typer.Typer) -> None:
@@ -25,70 +31,191 @@ def register(app: typer.Typer) -> None:
 
 def reconstruct(
     recording: RecordingArgument,
-    out: Annotated[Path, typer.Option(metavar="VIDEO", help="New video, a directory NAME.zarr.")],
+    out: Annotated[
+        Path | None, typer.Option(metavar="VIDEO", help="New video, a directory NAME.zarr.")
+    ] = None,
     first_line: Annotated[
         int | None, typer.Option(help="The trigger's number; else the recording's first.")
     ] = None,
-    lines: Annotated[int, typer.Option(help="How many lines, L_R.")] = 263,
+    lines: Annotated[int | None, typer.Option(help="How many lines, L_R; else all that follow.")] = None,
+    begin: Annotated[
+        str | None,
+        typer.Option("--from", metavar="TIME", help="Its begin: 52ms after the first line, or UTC."),
+    ] = None,
+    end: Annotated[str | None, typer.Option("--to", metavar="TIME", help="Its end.")] = None,
     spatial_merge: Annotated[
         int, typer.Option("--spatial-merge", "--nm", help="N_m, voxel side in fine pixels.")
     ] = 3,
     temporal_merge: Annotated[
         int, typer.Option("--temporal-merge", "--tm", help="T_m, sub-steps per frame.")
     ] = 1,
-    preset: Annotated[str, typer.Option(help="fast or balanced.")] = "balanced",
+    voxels: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NMxTM", help="Instead, repeatable: each a video of the same lines."),
+    ] = None,
+    plan: Annotated[
+        str | None, typer.Option(metavar="FILE", help="Sub-segments with voxels of their own (TOML).")
+    ] = None,
+    segment: Annotated[
+        list[str] | None,
+        typer.Option(metavar="LENGTH:NMxTM", help="The same here, repeatable: 712:3x4, 1.1ms:1x230, :3x4."),
+    ] = None,
+    auto: Annotated[
+        bool, typer.Option("--auto", help="Propose the plan from the lines, and say why.")
+    ] = False,
+    save_plan: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the plan that was proposed.")
+    ] = None,
+    ends: Annotated[
+        str | None, typer.Option(help="trusted, or whole: also what is sampled in part at the ends.")
+    ] = None,
+    preset: Annotated[
+        str | None, typer.Option(help="fast or balanced; else balanced, or what --budget learned.")
+    ] = None,
     solver: Annotated[str, typer.Option(help="admm, or twist: the paper's.")] = "admm",
     budget: Annotated[float | None, typer.Option(metavar="SECONDS", help="Stop iterating in time.")] = None,
+    iterations: Annotated[int | None, typer.Option(help="Instead of the preset's.")] = None,
+    preview: Annotated[bool, typer.Option("--preview", help="Coarse, in a second or two.")] = False,
+    workers: Annotated[int | None, typer.Option(help="Processes at once; else one per core.")] = None,
+    dask: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="On a Dask cluster: tcp://HOST:8786.")
+    ] = None,
     json: JsonFlag = False,
 ) -> None:
     """Reconstruct a stretch of a recording as a video (OME-Zarr), with voxels chosen now.
 
-    Example: [bold]acquire reconstruct run.zarr --out video.zarr --first-line 4000 --nm 3 --tm 1[/]
+    Ctrl-C keeps the best result so far.
+
+    Example: [bold]acquire reconstruct run.zarr --out video.zarr --from 52ms --to 57.98ms --nm 3 --tm 1[/]
     """
-    from acquire.recon import reconstruct as solve
-    from acquire.reconstruct import save_reconstruction
+    from acquire.cli.reconstruct_request import Asked, prepare
+    from acquire.reconstruct import Options
     from acquire.store import open_recording
     from acquire.store.files import check_new_path
 
-    check_new_path(out)
+    if out is None and not auto:
+        raise UsageError("reconstruct without --out", possible="--out NAME.zarr")
     opened = open_recording(recording)
-    segment = opened.cut(opened.first_line if first_line is None else first_line, lines)
-    with stage_progress(f"reconstructing {out.name}") as advance:
-        result = solve(
-            segment,
-            spatial_merge,
-            temporal_merge,
-            preset,  # type: ignore[arg-type]  # checked there, with what is possible
-            budget,
-            lambda step: advance(step.iteration, step.iterations),
-            solver=solver,  # type: ignore[arg-type]
-        )
-    provenance = save_reconstruction(out, result, opened, segment, spatial_merge)
-    if json:
-        print_json({"path": str(out), "shape": result.video.shape, **provenance})
+    asked = Asked(
+        first_line=first_line,
+        lines=lines,
+        begin=begin,
+        end=end,
+        voxels=tuple(voxels or [f"{spatial_merge}x{temporal_merge}"]),
+        plan=plan,
+        segments=tuple(segment or ()),
+        auto=auto,
+        save_plan=save_plan,
+        ends=ends,
+        preview=preview,
+        preset=preset,
+        options=Options("balanced", solver, iterations, budget),  # type: ignore[arg-type]  # checked there
+    )
+    prepared = prepare(opened, asked)
+    if prepared.plan is not None and not json:
+        _print_plan(prepared.plan)
+    if out is None:
         return
-    print_facts(_readable(out, provenance, result.video.shape))
-    if result.quality.prediction > DOUBTFUL_PREDICTION:
-        print_warning(
-            f"samples kept from the solver are predicted with an error of {result.quality.prediction:.0%}: "
-            "do not trust the video before code, arms and losses are checked"
+    paths = [_beside(out, suffix) for suffix in prepared.requests]
+    for path in paths:
+        check_new_path(path)
+    outcomes = []
+    for path, request in zip(paths, prepared.requests.values(), strict=True):
+        outcomes.append(_run(opened, request, path, prepared.options, workers, dask))
+        if outcomes[-1].interrupted:
+            break
+    _report(outcomes, json=json)
+    if any(outcome.interrupted for outcome in outcomes):
+        raise typer.Exit(EXIT_INTERRUPTED)
+
+
+def _beside(out: Path, suffix: str) -> Path:
+    """NAME.zarr as NAME-1x820.zarr."""
+    return out.with_name(f"{out.stem}-{suffix}{out.suffix}") if suffix else out
+
+
+def _run(
+    recording: Recording,
+    request: Request,
+    path: Path,
+    options: Options,
+    workers: int | None,
+    cluster: str | None,
+) -> Outcome:
+    from acquire.reconstruct import Watcher, combine, open_pool
+
+    tasks = len(request.stretches)
+    with first_interrupt_asks() as interrupted, stage_progress(f"reconstructing {path.name}") as advance:
+        watcher = Watcher(
+            tasks,
+            lambda done, of: advance(round(PROGRESS_STEPS * done), PROGRESS_STEPS * of),
+            interrupted.is_set,
         )
+        with open_pool(tasks, workers, cluster, watcher) as pool:
+            return combine(recording, request, path, options, pool, watcher)
 
 
-def _iterations(facts: dict[str, Any]) -> str:
-    done, asked = facts["iterations"], facts["iterations_asked"]
-    return f"{done} iterations" if done == asked else f"{done} of {asked} iterations (stopped by the budget)"
+def _report(outcomes: list[Outcome], *, json: bool) -> None:
+    if json:
+        facts = [{"path": str(each.path), "shape": each.shape, **each.provenance} for each in outcomes]
+        print_json(facts[0] if len(facts) == 1 else facts)
+        return
+    for outcome in outcomes:
+        print_facts(_readable(outcome))
+        if len(outcome.provenance["segments"]) > 1:
+            typer.echo()
+            _print_segments(outcome.provenance["segments"])
+        prediction = outcome.provenance["quality"]["prediction"]
+        if prediction is not None and prediction > DOUBTFUL_PREDICTION:
+            print_warning(
+                f"samples kept from the solver are predicted with an error of {prediction:.0%}: "
+                "do not trust the video before code, arms and losses are checked"
+            )
 
 
-def _readable(out: Path, facts: dict[str, Any], shape: tuple[int, ...]) -> dict[str, Any]:
+def _readable(outcome: Outcome) -> dict[str, Any]:
+    facts = outcome.provenance
     first, end = facts["trusted"]
-    quality = facts["quality"]
-    prediction = quality["prediction"]
+    quality, prediction = facts["quality"], facts["quality"]["prediction"]
+    done, of = len(facts["segments"]), facts["segments_asked"]
     return {
-        "video": f"{out}, {' × '.join(map(str, shape))} (time, row, column)",
-        "trusted": f"frames {first} to {end - 1}" if end > first else "none: fewer lines than stages",
+        "video": f"{outcome.path}, {' × '.join(map(str, outcome.shape))} (time, row, column)",
+        "interrupted": f"holds {done} of {of} sub-segments, the last as far as it came"
+        if outcome.interrupted
+        else None,
+        "trusted": f"frames {first} to {end - 1}" if end > first else "none: every frame is sampled in part",
         "solver": f"{facts['solver']}, {_iterations(facts)}, {facts['seconds']:.1f} s",
         "misfit": f"{quality['misfit']:.2%} of the samples' RMS",
         "prediction": None if prediction is None else f"{prediction:.2%} at samples kept from the solver",
         "coverage": f"{quality['coverage']:.2%} of the samples usable",
     }
+
+
+def _iterations(facts: dict[str, Any]) -> str:
+    done, asked = facts["iterations"], facts["iterations_asked"]
+    return f"{done} iterations" if done == asked else f"{done} of {asked} iterations"
+
+
+def _print_segments(segments: list[dict[str, Any]]) -> None:
+    rows = [
+        (
+            part["name"] or number,
+            f"{part['spatial_merge']}x{part['temporal_merge']}",
+            part["end_substep"] - part["begin_substep"],
+            f"{part['first_line']} to {part['first_line'] + part['lines'] - 1}",
+            part["iterations"],
+            f"{part['seconds']:.1f}",
+            f"{part['quality']['misfit']:.2%}",
+        )
+        for number, part in enumerate(segments, 1)
+    ]
+    print_table(("segment", "voxels", "sub-steps kept", "lines", "iterations", "seconds", "misfit"), rows)
+
+
+def _print_plan(plan: ReconstructionPlan) -> None:
+    rows = [
+        (part.name or number, part.length, f"{part.spatial_merge}x{part.temporal_merge}", part.why)
+        for number, part in enumerate(plan.segments, 1)
+    ]
+    print_table(("segment", "length", "voxels", "because"), rows)
+    typer.echo()

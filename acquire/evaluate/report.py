@@ -75,6 +75,11 @@ def write_report(result: DemoResult, directory: Path) -> Path:
 
 def render_page(summary: dict[str, Any], pictures: dict[str, Path]) -> str:
     """The page as text: ``summary`` and the pictures (name -> PNG or WebP file), which it takes in."""
+    return fill_template("report.html.j2", summary, pictures)
+
+
+def fill_template(template: str, facts: dict[str, Any], pictures: dict[str, Path]) -> str:
+    """A page out of a template of ours; the pictures become ``images`` by the same names, inside the page."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("acquire.evaluate"),
         autoescape=True,
@@ -84,7 +89,7 @@ def render_page(summary: dict[str, Any], pictures: dict[str, Path]) -> str:
     )
     environment.filters |= {"num": number, "hz": hertz}
     images = {name: data_uri(path) for name, path in pictures.items()}
-    return environment.get_template("report.html.j2").render(**summary, images=images)
+    return environment.get_template(template).render(**facts, images=images)
 
 
 def data_uri(path: Path) -> str:

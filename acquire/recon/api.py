@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -120,6 +121,8 @@ def reconstruct(
     bandwidth: float = BANDWIDTH,
     iterations: int | None = None,
     tv_weight: float | None = None,
+    stop: Callable[[], bool] | None = None,
+    observe: Callable[[Callable[[], NDArray[np.float32]]], None] | None = None,
 ) -> Reconstruction:
     """Reconstruct the voxels X′ of a segment at N_m = ``spatial_merge``, T_m = ``temporal_merge`` (Eq. 5).
 
@@ -132,6 +135,8 @@ def reconstruct(
     solver : ``"admm"`` (default) or ``"twist"``, the paper's, which knows neither bandwidth nor sign
     bandwidth : share of the frames' Nyquist frequency that the video may hold (ADMM)
     iterations, tv_weight : in place of the preset's and the solver's
+    stop : asked after every iteration; once it says so, the best so far is the result
+    observe : called after every iteration with a function that gives the video as it is now
 
     Raises
     ------
@@ -144,7 +149,8 @@ def reconstruct(
     segment.geometry.check_merge(spatial_merge, temporal_merge)
     problem = pose(segment, spatial_merge, temporal_merge, hold_out=HOLD_OUT if solver == "admm" else 0.0)
     work = (_admm if solver == "admm" else _twist)(segment, problem, request)
-    done = _iterate(work, request, started, progress)
+    seen = partial(work.video, problem.scale)
+    done = _iterate(work, request, started, _Watchers(progress, stop, observe and partial(observe, seen)))
     predicted = work.operator.forward(work.iterate.theta) / np.float32(problem.norm)
     return Reconstruction(
         video=work.video(problem.scale),
@@ -205,16 +211,36 @@ def _twist(segment: Segment, problem: Problem, request: Request) -> _Work:
     return _Work(iterate, operator, basis, parameters, floor=-np.inf)
 
 
+@dataclass(frozen=True, slots=True)
+class _Watchers:
+    """Who looks on while a solver iterates."""
+
+    progress: Callable[[Progress], None] | None
+    stop: Callable[[], bool] | None
+    observe: Callable[[], None] | None
+
+    def call(self, progress: Progress) -> bool:
+        """Tell everybody; whether to stop."""
+        if self.progress is not None:
+            self.progress(progress)
+        if self.observe is not None:
+            self.observe()
+        return self.stop is not None and self.stop()
+
+
 def _iterate(
-    work: _Work, request: Request, started: float, progress: Callable[[Progress], None] | None
+    work: _Work,
+    request: Request,
+    started: float,
+    watchers: _Watchers,
 ) -> int:
     """Iterate to the end or as far as the budget allows; the iterations made."""
     first = time.perf_counter()
     for iteration in range(1, request.iterations + 1):
         work.iterate.step()
         now = time.perf_counter()
-        if progress is not None:
-            progress(Progress(iteration, request.iterations, now - started))
+        if watchers.call(Progress(iteration, request.iterations, now - started)):
+            break
         per_iteration = (now - first) / iteration
         if request.budget_s is not None and now - started + per_iteration > request.budget_s:
             break

@@ -16,7 +16,7 @@ from acquire.store.retention import Hold, Retention, hold
 from acquire.store.spec import FORMAT, RecordingSpec, RunCondition
 from acquire.store.table_reader import Event, Gap
 from acquire.store.verify import Verification, verify
-from acquire.store.video import VideoFile, open_video, write_video
+from acquire.store.video import VideoFile, VideoWriter, open_video, write_video
 from acquire.store.writer import RecordingWriter
 
 __all__ = [
@@ -37,6 +37,7 @@ __all__ = [
     "RunCondition",
     "Verification",
     "VideoFile",
+    "VideoWriter",
     "choose_codec",
     "format_of",
     "hold",

@@ -134,7 +134,7 @@ class RecordingSpec:
             "dtype": ("uint8", "uint16"),
             "codec": CODECS,
             "fsync": ("commit", "seal"),
-            "layout": ("dual", "compact"),
+            "layout": ("dual", "compact", "emulated", "interline"),
         }
         for name, allowed in choices.items():
             if getattr(self, name) not in allowed:

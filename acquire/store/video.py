@@ -5,6 +5,9 @@
     NAME.zarr/   attributes: ome (axes t, y, x with units, scale), provenance
       0          (t, y, x)
       time       (t) int64, UTC of each frame
+      quality    (t) float32, where it is known: relative error of prediction of each frame's lines
+
+`VideoWriter` takes the frames as they come, for videos longer than memory; `write_video` writes one at once.
 """
 
 from __future__ import annotations
@@ -13,6 +16,7 @@ import json
 import math
 import os
 import shutil
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -27,13 +31,17 @@ from acquire.store.files import DISK, check_new_path
 from acquire.store.layout import group_document, to_json
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Iterator, Mapping
+    from types import TracebackType
 
     from numpy.typing import NDArray
 
 FORMAT = "acquire-video/1"
 CHUNK_BYTES = 4 * 2**20
 DTYPES = ("uint8", "uint16", "float32")
+
+COLUMN_CHUNK = 65536
+"""Time stamps in a chunk."""
 
 TIME_ATTRIBUTES: dict[str, Any] = {
     "standard_name": "time",
@@ -42,14 +50,29 @@ TIME_ATTRIBUTES: dict[str, Any] = {
     "calendar": "proleptic_gregorian",
 }
 
+QUALITY_ATTRIBUTES: dict[str, Any] = {
+    "long_name": "relative RMS error with which the lines that see the frame are predicted",
+    "units": "1",
+}
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VideoFile:
-    """A video on disk: ``video`` (t, y, x) is read when it is sliced, ``time_ns`` (t,) int64 UTC."""
+    """A video on disk: ``video`` (t, y, x) is read when it is sliced, ``time_ns`` (t,) int64 UTC.
+
+    ``quality`` (t,) float32 where it was written; 0 is best.
+    """
 
     video: zarr.Array[Any]
     time_ns: NDArray[np.int64]
     attrs: dict[str, Any]
+    quality: NDArray[np.float32] | None = None
+
+    @property
+    def interval_ns(self) -> float:
+        """Duration of a frame."""
+        scale = self.attrs["ome"]["multiscales"][0]["datasets"][0]["coordinateTransformations"][0]["scale"]
+        return float(scale[0]) * 1e9
 
 
 def write_video(
@@ -68,23 +91,89 @@ def write_video(
     ratios are known. The image appears whole or not at all. UsageError for what cannot be written, before
     anything is touched; DataError when the disk refuses.
     """
-    check_new_path(path)
     _check(video, time_ns, pixel_size, frame_interval_ns, provenance)
-    attributes = {
-        "format": FORMAT,
-        "ome": _ome(path.stem, (frame_interval_ns * 1e-9, pixel_size, pixel_size), pixel_unit),
-        "provenance": dict(provenance),
-    }
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        _write(partial, video, time_ns, attributes)
+    rows, columns = video.shape[1:]
+    with VideoWriter(
+        path, (rows, columns), video.dtype, pixel_size, frame_interval_ns, pixel_unit=pixel_unit
+    ) as writer:
+        writer.append(video, time_ns)
+        writer.finish(provenance)
+
+
+class VideoWriter:
+    """A video that grows: beside its name until `finish`, and then whole at its name.
+
+    Leaving the ``with`` block without `finish` leaves nothing. One thread at a time.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        shape: tuple[int, int],
+        dtype: np.dtype[Any],
+        pixel_size: float,
+        frame_interval_ns: float,
+        *,
+        pixel_unit: str | None = "micrometer",
+        quality: bool = False,
+    ) -> None:
         check_new_path(path)
-        partial.rename(path)
-        DISK.sync_directory(path.parent)
-    except OSError as error:
-        raise DataError(f"{path} cannot be written: {error.strerror}", hint="another disk") from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        self._path, self._partial = path, path.with_name(f".{path.name}.{os.getpid()}.partial")
+        self._ome = _ome(path.stem, (frame_interval_ns * 1e-9, pixel_size, pixel_size), pixel_unit)
+        with _told(path):
+            self._group = zarr.create_group(self._partial, zarr_format=3)
+            self._image = _image(self._group, shape, dtype)
+            self._columns = {"time": _column(self._group, "time", "int64", TIME_ATTRIBUTES)}
+            if quality:
+                self._columns["quality"] = _column(self._group, "quality", "float32", QUALITY_ATTRIBUTES)
+        self._chunk: list[tuple[NDArray[Any], ...]] = []
+        self.frames = 0
+
+    def append(
+        self, video: NDArray[Any], time_ns: NDArray[np.int64], quality: NDArray[np.float32] | None = None
+    ) -> None:
+        """The next frames (t, y, x). Whole chunks go to the disk; DataError when it refuses."""
+        columns = (time_ns,) if quality is None else (time_ns, quality)
+        self._chunk.append((video, *columns))
+        self.frames += len(video)
+        if sum(len(part[0]) for part in self._chunk) >= self._image.chunks[0]:
+            self._flush(whole_chunks=True)
+
+    def finish(self, provenance: Mapping[str, Any]) -> None:
+        """The video appears under its name. UsageError for one without frames."""
+        if not self.frames:
+            raise UsageError(f"{self._path}: a video without a frame")
+        _check_provenance(provenance)
+        self._flush(whole_chunks=False)
+        attributes = {"format": FORMAT, "ome": self._ome, "provenance": dict(provenance)}
+        with _told(self._path):
+            # Consolidated by hand: zarr-python warns of its own, and xarray warns where there is none.
+            names = ("0", *self._columns)
+            nodes = {n: json.loads((self._partial / n / "zarr.json").read_bytes()) for n in names}
+            (self._partial / "zarr.json").write_bytes(to_json(group_document(attributes, nodes)))
+            DISK.sync_tree(self._partial)
+            check_new_path(self._path)
+            self._partial.rename(self._path)
+            DISK.sync_directory(self._path.parent)
+
+    def _flush(self, *, whole_chunks: bool) -> None:
+        arrays = [np.concatenate(parts) for parts in zip(*self._chunk, strict=True)]
+        chunk, waiting = self._image.chunks[0], len(arrays[0])
+        count = waiting // chunk * chunk if whole_chunks else waiting
+        first = self._image.shape[0]
+        with _told(self._path):
+            for array, values in zip((self._image, *self._columns.values()), arrays, strict=True):
+                array.resize((first + count, *array.shape[1:]))
+                array[first:] = values[:count]
+        self._chunk = [tuple(values[count:] for values in arrays)]
+
+    def __enter__(self) -> VideoWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        shutil.rmtree(self._partial, ignore_errors=True)
 
 
 def open_video(path: Path | str) -> VideoFile:
@@ -98,7 +187,8 @@ def open_video(path: Path | str) -> VideoFile:
         if attributes.get("format") != FORMAT:
             raise DataError(f"{path} is not a video of ours: format {attributes.get('format')!r}")
         time_ns = np.asarray(child_array(group, "time")[:], np.int64)
-        return VideoFile(child_array(group, "0"), time_ns, attributes)
+        quality = np.asarray(child_array(group, "quality")[:]) if "quality" in group else None
+        return VideoFile(child_array(group, "0"), time_ns, attributes, quality)
     except DAMAGE as error:
         raise DataError(f"{path} is not a video, or is damaged: {error}") from error
 
@@ -117,6 +207,10 @@ def _check(
     for name, value in (("pixel size", pixel_size), ("frame interval", frame_interval_ns)):
         if not (math.isfinite(value) and value > 0):
             raise UsageError(f"video with {name} {value}", possible="a finite number above 0")
+    _check_provenance(provenance)
+
+
+def _check_provenance(provenance: Mapping[str, Any]) -> None:
     try:
         json.dumps(dict(provenance), allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -133,29 +227,34 @@ def _ome(name: str, scale: tuple[float, float, float], pixel_unit: str | None) -
     return {"version": "0.5", "multiscales": [{"name": name, "axes": axes, "datasets": datasets}]}
 
 
-def _write(path: Path, video: NDArray[Any], time_ns: NDArray[np.int64], attributes: dict[str, Any]) -> None:
-    group = zarr.create_group(path, zarr_format=3)
-    frames = max(1, CHUNK_BYTES // video[0].nbytes)
-    image = group.create_array(
+def _image(group: zarr.Group, shape: tuple[int, int], dtype: np.dtype[Any]) -> zarr.Array[Any]:
+    frames = max(1, CHUNK_BYTES // (shape[0] * shape[1] * dtype.itemsize))
+    return group.create_array(
         "0",
-        shape=video.shape,
-        dtype=video.dtype,
-        chunks=(min(frames, len(video)), *video.shape[1:]),
+        shape=(0, *shape),
+        dtype=dtype,
+        chunks=(frames, *shape),
         compressors=[BloscCodec(cname="zstd", clevel=3, shuffle="bitshuffle"), Crc32cCodec()],
         dimension_names=("t", "y", "x"),
     )
-    image[:] = video
-    time = group.create_array(
-        "time",
-        shape=time_ns.shape,
-        dtype="int64",
-        chunks=time_ns.shape,
+
+
+def _column(group: zarr.Group, name: str, dtype: str, attributes: dict[str, Any]) -> zarr.Array[Any]:
+    return group.create_array(
+        name,
+        shape=(0,),
+        dtype=dtype,
+        chunks=(COLUMN_CHUNK,),
         compressors=[Crc32cCodec()],
         dimension_names=("t",),
-        attributes=TIME_ATTRIBUTES,
+        attributes=attributes,
     )
-    time[:] = time_ns
-    # Consolidated by hand: zarr-python warns of its own, and xarray warns where there is none.
-    nodes = {name: json.loads((path / name / "zarr.json").read_bytes()) for name in ("0", "time")}
-    (path / "zarr.json").write_bytes(to_json(group_document(attributes, nodes)))
-    DISK.sync_tree(path)
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    """What the disk refuses, in words."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(f"{path} cannot be written: {error.strerror}", hint="another disk") from error

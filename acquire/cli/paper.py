@@ -1,0 +1,68 @@
+"""``acquire paper``: the paper's figures from simulated recordings, in one page."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from acquire.cli.output import JsonFlag, print_json, print_table
+from acquire.cli.progress import told
+from acquire.errors import UsageError
+
+NAMES = ("fig6", "fig7", "fig8", "fig9", "fig10", "fig11")
+
+
+def register(app: typer.Typer) -> None:
+    app.command(rich_help_panel="Simulation")(paper)
+
+
+def paper(
+    figures: Annotated[
+        list[str] | None, typer.Argument(metavar="[FIGURE...]", help=f"{', '.join(NAMES)}; else all.")
+    ] = None,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="New directory.")] = Path("acquire-paper"),
+    preset: Annotated[str, typer.Option(help="As of acquire reconstruct.")] = "balanced",
+    solver: Annotated[str, typer.Option(help="admm, or twist: the paper's.")] = "admm",
+    budget: Annotated[float | None, typer.Option(metavar="SECONDS", help="For each reconstruction.")] = None,
+    seed: Annotated[int, typer.Option(help="Of the exposure code.")] = 1,
+    json: JsonFlag = False,
+) -> None:
+    """Record, reconstruct and draw figures of the paper, beside what it says of them.
+
+    Example: [bold]acquire paper fig9[/]
+    """
+    chosen = list(dict.fromkeys(figures or NAMES))
+    if wrong := [name for name in chosen if name not in NAMES]:
+        raise UsageError(f"figure {wrong[0]}", possible=", ".join(NAMES))
+    from acquire.evaluate.paper import Studio, make
+    from acquire.evaluate.paper.page import draw, summarise, write_page
+    from acquire.reconstruct import Options
+    from acquire.store.files import check_new_path
+
+    check_new_path(out)
+    out.mkdir()
+    options = Options(preset, solver, None, budget)  # type: ignore[arg-type]  # checked there
+    made: list[dict[str, Any]] = []
+    pictures: dict[str, Path] = {}
+    with told() as say:
+        for name in chosen:
+            studio = Studio(out, options, seed, lambda text, name=name: say(f"{name}: {text}"))  # type: ignore[misc]
+            figure = make(name, studio)
+            pictures |= draw(figure, out)
+            made.append(summarise(figure))
+            page = write_page(
+                made, pictures, studio, f"acquire {shlex.join(sys.argv[1:])}", datetime.now(UTC)
+            )
+    if json:
+        print_json({"page": str(page), "figures": made})
+        return
+    for each in made:
+        typer.echo(f"Fig. {each['name'][3:]}  {each['title']}")
+        print_table(("", "the paper", "here"), [tuple(row.values()) for row in each["rows"]])
+        typer.echo()
+    typer.echo(f"page  {page}")

@@ -1,0 +1,194 @@
+"""What ``acquire reconstruct`` was asked for, in words, as requests that can be carried out."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+from acquire.cli.progress import stage_progress
+from acquire.config import check_plan, load_plan
+from acquire.errors import UsageError
+from acquire.recon.segments import Stream, Stretch, Voxels
+from acquire.reconstruct.learned import choose, recall
+from acquire.reconstruct.select import Selection, along_plan, by_lines, by_time, in_voxels
+from acquire.store.files import check_new_path
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from acquire.plan_config import ReconstructionPlan
+    from acquire.reconstruct import Options, Request
+    from acquire.store import Recording
+
+PREVIEW_ITERATIONS = 15
+PREVIEW_MERGE = 4
+PREVIEW_LINES = 320
+NS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
+ENDS = {None: None, "trusted": False, "whole": True}
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """The options of the command, as given."""
+
+    first_line: int | None
+    lines: int | None
+    begin: str | None
+    end: str | None
+    voxels: tuple[str, ...]
+    plan: str | None
+    segments: tuple[str, ...]
+    auto: bool
+    save_plan: Path | None
+    ends: str | None
+    preview: bool
+    preset: str | None
+    options: Options
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """A request for each video, by what is added to its name; the plan where there is one."""
+
+    requests: dict[str, Request]
+    options: Options
+    plan: ReconstructionPlan | None = None
+
+
+def prepare(recording: Recording, asked: Asked) -> Prepared:
+    """What is to be done. UsageError and ConfigError for what cannot be."""
+    prepared = _requests(recording, asked)
+    if asked.preview:
+        return prepared
+    preset = asked.preset or _learned(prepared) or prepared.options.preset
+    options = replace(prepared.options, preset=preset)  # type: ignore[arg-type]  # checked where it is used
+    return replace(prepared, options=options)
+
+
+def _learned(prepared: Prepared) -> str | None:
+    """The preset that gets furthest in the budget, as `acquire tradeoff` found out; None where it did not."""
+    options = prepared.options
+    if options.budget_s is None:
+        return None
+    known = [each for each in recall() if each.solver == options.solver]
+    grids = [request.grid for request in prepared.requests.values()]
+    found = choose(known, options.budget_s, sum(grid.frames * grid.side**2 for grid in grids))
+    return None if found is None else found.preset
+
+
+def _requests(recording: Recording, asked: Asked) -> Prepared:
+    if asked.ends not in ENDS:
+        raise UsageError(f"--ends {asked.ends}", possible="trusted, whole")
+    if (asked.plan is not None) + bool(asked.segments) + asked.auto + asked.preview > 1:
+        raise UsageError("a plan, segments, --auto and --preview together", possible="one of them")
+    selection, whole = _select(recording, asked), ENDS[asked.ends]
+    if asked.preview:
+        coarse, voxels = _coarse(selection)
+        options = replace(asked.options, preset="fast", iterations=PREVIEW_ITERATIONS)
+        return Prepared({"": in_voxels(coarse, voxels, whole_ends=whole, longest=1 << 62)}, options)
+    plan = _plan(recording, selection, asked)
+    if plan is not None:
+        if asked.save_plan is not None:
+            _write_plan(asked.save_plan, plan)
+        return Prepared({"": along_plan(selection, plan, _substep_s(recording))}, asked.options, plan)
+    kinds = [parse_voxels(text) for text in asked.voxels]
+    requests = [in_voxels(selection, kind, whole_ends=whole) for kind in kinds]
+    names = [str(kind) if len(kinds) > 1 else "" for kind in kinds]
+    return Prepared(dict(zip(names, requests, strict=True)), asked.options)
+
+
+def parse_voxels(text: str) -> Voxels:
+    """``3x4`` is N_m = 3, T_m = 4."""
+    found = re.fullmatch(r"(\d+)[x×](\d+)", text)
+    if found is None:
+        raise UsageError(f"voxels {text!r}", possible="NMxTM, as 3x1 or 1x820")
+    return Voxels(int(found[1]), int(found[2]))
+
+
+def parse_segment(text: str) -> dict[str, float]:
+    """``712:3x4`` are lines, ``1.1ms:1x230`` a time, ``:3x4`` the rest; as a plan file's table."""
+    length, _, kind = text.rpartition(":")
+    voxels = parse_voxels(kind)
+    table: dict[str, float] = {
+        "spatial_merge": voxels.spatial_merge,
+        "temporal_merge": voxels.temporal_merge,
+    }
+    if length.isdigit():
+        table["lines"] = int(length)
+    elif length:
+        table["seconds"] = parse_duration_ns(length) * 1e-9
+    return table
+
+
+def parse_duration_ns(text: str) -> int:
+    """``52ms``, ``0.052 s``, ``300us``."""
+    found = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)\s*(ns|us|ms|s)", text)
+    if found is None:
+        raise UsageError(f"time {text!r}", possible="52ms, 0.052s, 300us")
+    return round(float(found[1]) * NS[found[2]])
+
+
+def _select(recording: Recording, asked: Asked) -> Selection:
+    timed = asked.begin is not None or asked.end is not None
+    if not timed:
+        return by_lines(recording, asked.first_line, asked.lines)
+    if asked.first_line is not None or asked.lines is not None:
+        raise UsageError("lines and times together", possible="--first-line and --lines, or --from and --to")
+    return by_time(recording, _after_ns(recording, asked.begin), _after_ns(recording, asked.end))
+
+
+def _after_ns(recording: Recording, text: str | None) -> int | None:
+    """A time as nanoseconds after the read-out of the recording's first line begins."""
+    if text is None:
+        return None
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        return parse_duration_ns(text)
+    first_ns = int(recording.arms["a"].read("time", 0, 1)[0])
+    since = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)) - datetime.fromtimestamp(0, UTC)
+    return (since.days * 86_400 + since.seconds) * NS["s"] + since.microseconds * NS["us"] - first_ns
+
+
+def _coarse(selection: Selection) -> tuple[Selection, Voxels]:
+    """The selection, no longer than a preview is, and voxels that make it short work."""
+    stream = selection.stream
+    if selection.begin is not None or selection.end is not None:
+        begin, end = selection.extent(Voxels(1, 1), Voxels(1, 1), whole=False)
+        lines = stream.sub_segment(Stretch(begin, end, Voxels(1, 1)))
+        stream = Stream(stream.stages, stream.substeps, lines.first_line, lines.first_line + lines.lines)
+    stop = min(stream.end_line, stream.first_line + PREVIEW_LINES)
+    short = Stream(stream.stages, stream.substeps, stream.first_line, stop)
+    side = min(2 * stream.substeps, stream.geometry(1).size)
+    return Selection(short), Voxels(side, PREVIEW_MERGE)
+
+
+def _plan(recording: Recording, selection: Selection, asked: Asked) -> ReconstructionPlan | None:
+    if asked.auto:
+        from acquire.reconstruct.propose import propose
+
+        with stage_progress("looking for what changes") as advance:
+            return propose(recording, selection, whole=asked.ends == "whole", progress=advance)
+    if asked.plan is not None:
+        return load_plan(asked.plan)
+    if not asked.segments:
+        return None
+    ends = {} if asked.ends is None else {"ends": asked.ends}
+    return check_plan({"segments": [parse_segment(text) for text in asked.segments], **ends}, "--segment")
+
+
+def _write_plan(path: Path, plan: ReconstructionPlan) -> None:
+    """As TOML, whose strings and numbers are JSON's."""
+    check_new_path(path)
+    text = [f"{key} = {json.dumps(value)}" for key, value in plan.model_dump(exclude={"segments"}).items()]
+    for part in plan.segments:
+        text += ["", "[[segments]]"]
+        text += [f"{key} = {json.dumps(value)}" for key, value in part.model_dump(exclude_none=True).items()]
+    path.write_text("\n".join(text) + "\n", encoding="utf-8")
+
+
+def _substep_s(recording: Recording) -> float:
+    return recording.line_period_ns / recording.geometry_for(1).substeps * 1e-9

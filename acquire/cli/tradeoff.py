@@ -1,0 +1,150 @@
+"""``acquire tradeoff``: what accuracy costs in time, and what `--budget` learns from it."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from acquire.cli.output import JsonFlag, print_json, print_table
+from acquire.cli.progress import stage_progress, told
+from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from acquire.evaluate.tradeoff import Run
+    from acquire.reconstruct.learned import Learned
+    from acquire.simulate import Study
+    from acquire.store import Recording
+
+LINES, FIRST_LINE = 263, 200
+
+
+def register(app: typer.Typer) -> None:
+    app.command(rich_help_panel="Simulation")(tradeoff)
+
+
+def tradeoff(
+    source: Annotated[str, typer.Argument(metavar="SCENE|RECORDING", help="A scene file, or NAME.zarr.")],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="New directory.")] = Path("acquire-tradeoff"),
+    voxels: Annotated[list[str] | None, typer.Option(metavar="NMxTM", help="Repeatable; else 3x1.")] = None,
+    solver: Annotated[list[str] | None, typer.Option(help="Repeatable; else every solver.")] = None,
+    preset: Annotated[list[str] | None, typer.Option(help="Repeatable; else every preset.")] = None,
+    first_line: Annotated[int | None, typer.Option(help="Of the segment.")] = None,
+    lines: Annotated[int, typer.Option(help="How many lines, L_R.")] = LINES,
+    budget: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="At most so long for each run.")
+    ] = None,
+    learn: Annotated[bool, typer.Option(help="Keep it for --budget of acquire reconstruct.")] = True,
+    json: JsonFlag = False,
+) -> None:
+    """Draw accuracy against wall time for every solver, preset and kind of voxels, iteration by iteration.
+
+    Example: [bold]acquire tradeoff scene-leds --voxels 3x1 --voxels 3x4[/]
+    """
+    from acquire.cli.reconstruct_request import parse_voxels
+    from acquire.evaluate.tradeoff import Judge, measure, table
+    from acquire.evaluate.tradeoff_page import write_page
+    from acquire.recon.api import ITERATIONS
+    from acquire.reconstruct.learned import remember
+    from acquire.store.files import check_new_path
+
+    kinds = [parse_voxels(text) for text in voxels or ["3x1"]]
+    cases = [
+        (each, kind)
+        for each in solver or list(ITERATIONS)
+        for kind in preset or list(ITERATIONS.get(each, {"": 0}))
+    ]
+    for each, kind in cases:
+        if kind not in ITERATIONS.get(each, {}):
+            have = "; ".join(f"{name}: {', '.join(presets)}" for name, presets in ITERATIONS.items())
+            raise UsageError(f"solver {each} with preset {kind or '-'}", possible=have)
+    check_new_path(out)
+    recording, study = _opened(source, out, (first_line or FIRST_LINE) + lines)
+    segment = recording.cut(_first(recording, first_line, lines), lines)
+    judge, runs = Judge.of(recording, segment), []
+    for shape in kinds:
+        for each, kind in cases:
+            with stage_progress(f"{each} {kind} {shape}") as advance:
+                runs.append(measure(judge, each, kind, shape, budget, advance))  # type: ignore[arg-type]
+    command = f"acquire {shlex.join(sys.argv[1:])}"
+    page = write_page(runs, study, out, Path(source).stem, command, datetime.now(UTC))
+    kept = remember(_lessons(runs)) if learn else None
+    if json:
+        print_json({"page": str(page), "learned": kept and str(kept), "rows": table(runs)})
+        return
+    _print(runs)
+    typer.echo(f"\npage     {page}")
+    if kept is not None:
+        typer.echo(f"learned  {kept}")
+
+
+def _first(recording: Recording, first_line: int | None, lines: int) -> int:
+    if first_line is not None:
+        return first_line
+    return recording.first_line + max(0, min(FIRST_LINE, recording.lines - lines))
+
+
+def _opened(source: str, out: Path, lines: int) -> tuple[Recording, Study | None]:
+    """The recording, made where a scene is given; what the scene's effects are worth."""
+    from acquire.config import load_rig, load_scene
+    from acquire.simulate import bench_of, simulate, study
+    from acquire.store import open_recording
+
+    if (Path(source) / "zarr.json").exists():
+        recording = open_recording(Path(source))
+        out.mkdir()
+        return recording, None
+    scene = load_scene(source)
+    rig = load_rig(scene.rig)
+    out.mkdir()
+    with told() as say:
+        say(f"recording {source}")
+        simulate(rig, scene, out / "recording.zarr", lines)
+        if not scene.effects:
+            return open_recording(out / "recording.zarr"), None
+        say("leaving out one effect after the other")
+        return open_recording(out / "recording.zarr"), study(bench_of(rig, scene), rig.code.build())
+
+
+def _lessons(runs: list[Run]) -> list[Learned]:
+    from acquire.reconstruct.learned import Learned
+
+    return [
+        Learned(
+            run.solver,
+            run.preset,
+            run.voxels.spatial_merge,
+            run.voxels.temporal_merge,
+            run.voxel_count,
+            run.end.seconds,
+            run.end.psnr_db,
+        )
+        for run in runs
+        if run.end.psnr_db is not None
+    ]
+
+
+def _print(runs: list[Run]) -> None:
+    def text(value: float | None, digits: int) -> str:
+        return "-" if value is None else f"{value:.{digits}f}"
+
+    rows = [
+        (
+            str(run.voxels),
+            run.solver,
+            run.preset,
+            str(run.end.iteration),
+            text(run.end.seconds, 2),
+            text(run.end.psnr_db, 2),
+            text(run.end.ssim, 3),
+            text(run.end.amplitude_error, 3),
+            text(run.end.frequency_error_hz, 2),
+        )
+        for run in runs
+    ]
+    titles = ("voxels", "solver", "preset", "iterations", "seconds", "PSNR", "SSIM", "amplitude", "Hz off")
+    print_table(titles, rows)

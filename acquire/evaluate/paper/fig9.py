@@ -1,0 +1,137 @@
+"""Fig. 9: Scene #1, four LEDs, three of them sinusoids of 5, 2.5 and 1 kHz."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.evaluate.curves import CurveComparison, compare_curve, region_mean
+from acquire.evaluate.figures import SOLVER_COLOURS, THEORY
+from acquire.evaluate.metrics import psnr, ssim
+from acquire.evaluate.paper.drawing import canvas, strips
+from acquire.evaluate.paper.studio import PaperFigure, Picture, Row, scene_of, true_voxels
+from acquire.sim.leds import LedScene
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+    from acquire.evaluate.paper.studio import Studio
+    from acquire.lines import Segment
+
+FIRST_LINE, LINES = 1733, 263
+INNER = 0.9
+DETAIL_MS = 1.2
+
+
+def figure(studio: Studio) -> PaperFigure:
+    """Lines from 52 ms to 59.89 ms, frames from 52 ms to 57.98 ms."""
+    recording = studio.record("scene-leds", FIRST_LINE + LINES)
+    segment = recording.cut(FIRST_LINE, LINES)
+    result = studio.solve(segment, 3, 1, "Scene #1")
+    trusted, first = segment.geometry.trusted, segment.geometry.substeps * FIRST_LINE
+    video = result.video[trusted]
+    truth = true_voxels(recording, first, segment.geometry.span, 3, 1)[trusted]
+    scene = scene_of(recording)
+    assert isinstance(scene, LedScene)
+    light = scene.intensity(first + trusted.start, len(video))
+    masks = scene.masks.reshape(-1, 64, 3, 64, 3).mean(axis=(2, 4)) >= INNER
+    measured = [region_mean(video, mask) for mask in masks]
+    curves = [
+        compare_curve(led.name, theory, found, segment.substep_ns * 1e-9)
+        for led, theory, found in zip(scene.leds, light, measured, strict=True)
+    ]
+    start_ms = FIRST_LINE * 0.03
+    times = start_ms + np.arange(len(video)) * 0.01
+    picks = 250 + np.arange(6) * 17
+    numbers = {"psnr_db": psnr(video, truth), "ssim": ssim(video, truth)}
+    return PaperFigure(
+        name="fig9",
+        title="Scene #1: four LEDs",
+        text="263 lines of both cameras, 52 ms to 59.89 ms after the start; 598 frames of 64 × 64 voxels, "
+        "10 µs apart, 52 ms to 57.98 ms.",
+        pictures=(
+            Picture("lines", _lines(segment, start_ms), "(a) what the two cameras recorded."),
+            Picture(
+                "frames",
+                strips(
+                    (("ours", video[picks]), ("truth", truth[picks])),
+                    [f"#{frame}  {times[frame]:.2f} ms" for frame in picks],
+                    float(truth.max()),
+                ),
+                "(b) frames over one period of the circle.",
+            ),
+            Picture(
+                "curves", _curves(times, light, measured, curves), "(c) mean light of each shape over time."
+            ),
+        ),
+        rows=(
+            Row(
+                "video",
+                "64 × 64 × 598, 52 to 57.98 ms",
+                f"64 × 64 × {len(video)}, {times[0]:.2f} to {times[-1]:.2f} ms",
+            ),
+            *(_row(curve) for curve in curves),
+            Row(
+                "distortion of the circle",
+                "slight, from saturation",
+                f"{curves[2].measured.distortion:.1%} (true {curves[2].theory.distortion:.1%})",
+            ),
+            Row(
+                "accuracy",
+                "–",
+                f"{numbers['psnr_db']:.1f} dB, SSIM {numbers['ssim']:.3f} in {result.seconds:.1f} s",
+            ),
+        ),
+        seconds=dict(studio.seconds),
+        numbers=numbers,
+        movie=video[100:400:2],
+        movie_ms=0.02,
+    )
+
+
+def _row(curve: CurveComparison) -> Row:
+    if curve.constant:
+        return Row(f"{curve.name}: constant", "constant", f"level × {curve.level_ratio or 0:.3f}")
+    return Row(
+        f"{curve.name}: {curve.theory.frequency_hz:.0f} Hz",
+        "same frequency as theory",
+        f"{curve.measured.frequency_hz:.1f} Hz, amplitude × {curve.amplitude_ratio or 0:.2f}",
+    )
+
+
+def _lines(segment: Segment, start_ms: float) -> Figure:
+    drawing = canvas(3.6)
+    axes = drawing.subplots(1, 2, sharey=True)
+    extent = (-0.5, 63.5, start_ms + LINES * 0.03, start_ms)
+    for ax, lines, name in zip(axes, segment.lines, "AB", strict=True):
+        ax.imshow(lines, cmap="gray", aspect="auto", extent=extent)
+        ax.set(title=f"camera {name}", xlabel="pixel of the line")
+        ax.grid(visible=False)
+    axes[0].set_ylabel("time (ms)")
+    return drawing
+
+
+def _curves(
+    times: NDArray[Any],
+    light: NDArray[Any],
+    measured: list[NDArray[np.float64]],
+    curves: list[CurveComparison],
+) -> Figure:
+    drawing = canvas(5.4)
+    axes = drawing.subplots(len(curves), 2, sharex="col", width_ratios=[2.4, 1])
+    middle = times[len(times) // 2]
+    for pair, theory, found, curve in zip(axes, light, measured, curves, strict=True):
+        for ax in pair:
+            ax.plot(times, theory, color=THEORY, lw=3, label="theory")
+            ax.plot(times, found, color=SOLVER_COLOURS[0], lw=1.1, label="ours")
+            ax.set_ylim(0, 1.08)
+        pair[0].set_ylabel(curve.name, fontweight="bold")
+        pair[1].set_xlim(middle - DETAIL_MS / 2, middle + DETAIL_MS / 2)
+        pair[1].tick_params(labelleft=False)
+    axes[0, 0].set_xlim(times[0], times[-1])
+    for ax in axes[-1]:
+        ax.set_xlabel("time (ms)")
+    drawing.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper right", ncols=2)
+    return drawing

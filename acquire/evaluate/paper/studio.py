@@ -1,0 +1,169 @@
+"""What every figure of the paper needs: recordings of scenes, reconstructions and the truth."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.config import RigConfig, load_plan, load_rig, load_scene
+from acquire.recon import reconstruct
+from acquire.recon.segments import Voxels
+from acquire.reconstruct import Options, Watcher, along_plan, combine, in_voxels, open_pool
+from acquire.reconstruct.select import Selection, by_lines
+from acquire.scene_config import OpticsConfig, SceneFile
+from acquire.sim.voxels import truth
+from acquire.simulate import bench_of, simulate
+from acquire.store import open_recording, open_video
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+    from acquire.lines import Segment
+    from acquire.recon import Reconstruction
+    from acquire.reconstruct import Outcome
+    from acquire.sim.scene import Scene
+    from acquire.store import Recording
+
+TRUE_PEAK = 1.0
+"""Light of the scenes at their brightest."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A line of a figure's table."""
+
+    what: str
+    paper: str
+    ours: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Picture:
+    """A drawing, with what it shows in words."""
+
+    name: str
+    drawing: Figure
+    caption: str
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PaperFigure:
+    """A figure of the paper as we have it.
+
+    ``movie`` (t, row, column) is shown as an animation, ``movie_ms`` the time from one of its frames to the
+    next.
+    """
+
+    name: str
+    title: str
+    text: str
+    pictures: tuple[Picture, ...]
+    rows: tuple[Row, ...]
+    seconds: dict[str, float]
+    numbers: dict[str, float] = field(default_factory=dict)
+    movie: NDArray[Any] | None = None
+    movie_ms: float = 1.0
+
+
+@dataclass(slots=True)
+class Studio:
+    """Makes recordings in ``directory`` and reconstructs them; ``say`` is told what is being done."""
+
+    directory: Path
+    options: Options = field(default_factory=Options)
+    seed: int = 1
+    say: Callable[[str], object] = lambda _: None
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    def record(self, scene_name: str, lines: int, *, interline: bool = False) -> Recording:
+        """A new recording of a built-in scene with its rig, and this studio's exposure code.
+
+        ``interline`` looks at it with whole steps of charge instead, the baseline of Fig. 6.
+        """
+        name = f"{scene_name}-interline" if interline else scene_name
+        self.say(f"recording {name}")
+        scene = load_scene(scene_name)
+        if interline:
+            optics = OpticsConfig(layout="interline")
+            scene = scene.model_copy(update={"optics": optics, "rig": "rig-interline"})
+        rig = load_rig(scene.rig, {"code.seed": self.seed})
+        path = self.directory / f"{name}.zarr"
+        simulate(rig, scene, path, lines)
+        return open_recording(path)
+
+    def solve(self, segment: Segment, spatial_merge: int, temporal_merge: int, what: str) -> Reconstruction:
+        """Reconstruct a segment by the studio's options; the time it takes is noted under ``what``."""
+        self.say(f"reconstructing {what}")
+        options = self.options
+        result = reconstruct(
+            segment,
+            spatial_merge,
+            temporal_merge,
+            options.preset,
+            options.budget_s,
+            solver=options.solver,
+            iterations=options.iterations,
+        )
+        self.seconds[what] = result.seconds
+        return result
+
+    def stitch(self, recording: Recording, plan_name: str, first_line: int, what: str) -> Outcome:
+        """Reconstruct along a built-in plan from a line on, sub-segments side by side."""
+        self.say(f"reconstructing {what}")
+        plan = load_plan(plan_name)
+        substep_s = recording.line_period_ns / recording.geometry_for(1).substeps * 1e-9
+        request = along_plan(by_lines(recording, first_line), plan, substep_s)
+        began = time.perf_counter()
+        watcher = Watcher(len(request.stretches))
+        with open_pool(len(request.stretches), watch=watcher) as pool:
+            outcome = combine(
+                recording, request, self.directory / f"{plan_name}.zarr", self.options, pool, watcher
+            )
+        self.seconds[what] = time.perf_counter() - began
+        return outcome
+
+    def stitch_evenly(
+        self, recording: Recording, selection: Selection, voxels: Voxels, pieces: int, what: str
+    ) -> Outcome:
+        """Reconstruct a selection in ``pieces`` equal sub-segments."""
+        self.say(f"reconstructing {what}")
+        begin, end = selection.extent(voxels, voxels, whole=False)
+        request = in_voxels(selection, voxels, longest=-(-(end - begin) // pieces))
+        began = time.perf_counter()
+        watcher = Watcher(len(request.stretches))
+        with open_pool(len(request.stretches), watch=watcher) as pool:
+            outcome = combine(
+                recording,
+                request,
+                self.directory / f"{what.split(maxsplit=1)[0]}-video.zarr",
+                self.options,
+                pool,
+                watcher,
+            )
+        self.seconds[what] = time.perf_counter() - began
+        return outcome
+
+
+def scene_of(recording: Recording) -> Scene:
+    """The scene as the recording describes it, as fine as its cameras can tell."""
+    rig = RigConfig.model_validate(recording.attrs["config"])
+    return bench_of(rig, SceneFile.model_validate(recording.attrs["scene"]).root).fine_scene()
+
+
+def true_voxels(
+    recording: Recording, first_substep: int, count: int, spatial_merge: int, temporal_merge: int
+) -> NDArray[np.float32]:
+    """The truth about ``count`` sub-steps of a recording, in voxels."""
+    return truth(scene_of(recording), first_substep, count, spatial_merge, temporal_merge)
+
+
+def read(outcome: Outcome) -> NDArray[np.float32]:
+    """The whole of a video that was written."""
+    return np.asarray(open_video(outcome.path).video[:], np.float32)

@@ -1,0 +1,186 @@
+"""Videos as people watch them: MP4, GIF, WebP, or one PNG sheet of frames; several side by side.
+
+Every panel shows the frame of its own video at the common time, so that other voxels of the same lines (a
+selective reconstruction) run together. Grey is linear from 0 to ``peak``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import chain
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from acquire.errors import UsageError
+from acquire.evaluate.animation import write_webp
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from acquire.store import VideoFile
+
+BAR_PX, GAP_PX = 26, 8
+PAPER, WORDS, SOFT = "#12181f", "#ffffff", "#cbd2d9"
+PEAK_QUANTILE = 0.999
+SHEET_COLUMNS = 6
+SUFFIXES = (".mp4", ".gif", ".webp", ".png")
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """How a rendering looks. ``panel_px`` is the height of a panel, ``peak`` white (None: from the video)."""
+
+    panel_px: int = 384
+    peak: float | None = None
+    fps: float = 25.0
+    label: bool = True
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Panel:
+    """One video of a rendering."""
+
+    name: str
+    file: VideoFile
+
+    def at(self, time_ns: int) -> NDArray[Any]:
+        """The frame that is shown at a time."""
+        index = int(np.searchsorted(self.file.time_ns, time_ns, "right")) - 1
+        frame: NDArray[Any] = np.asarray(self.file.video[min(max(index, 0), self.file.video.shape[0] - 1)])
+        return frame
+
+
+def common_times(panels: Sequence[Panel], count: int) -> NDArray[np.int64]:
+    """At most ``count`` instants, equally spaced, at which frames of the finest panel begin and all have one.
+
+    UsageError when the videos have no time in common.
+    """
+    finest = min(panels, key=lambda panel: panel.file.interval_ns).file.time_ns
+    begin = max(int(panel.file.time_ns[0]) for panel in panels)
+    end = min(panel.file.time_ns[-1] + panel.file.interval_ns for panel in panels)
+    times = finest[(finest >= begin) & (finest < end)]
+    if not len(times):
+        raise UsageError("videos side by side that have no time in common")
+    step = -(-len(times) // max(1, count))
+    chosen: NDArray[np.int64] = times[::step]
+    return chosen
+
+
+def render(
+    panels: Sequence[Panel],
+    path: Path,
+    look: Look,
+    count: int,
+    progress: Callable[[int, int], object] | None = None,
+) -> int:
+    """Write ``count`` frames or fewer, as ``path``'s suffix says; the number of them.
+
+    UsageError for a suffix that is none of `SUFFIXES`, or for MP4 without the extra it needs.
+    """
+    if path.suffix.lower() not in SUFFIXES:
+        raise UsageError(f"rendering to {path.name}", possible=", ".join(SUFFIXES))
+    times = common_times(panels, count)
+    peaks = [look.peak or _peak(panel) for panel in panels]
+    pictures = _pictures(panels, times, peaks, look, progress)
+    match path.suffix.lower():
+        case ".png":
+            _sheet(list(pictures)).save(path)
+        case ".mp4":
+            _write_mp4(path, pictures, look.fps)
+        case ".webp":
+            write_webp(path, list(pictures), round(1000 / look.fps))
+        case ".gif":
+            first, *rest = pictures
+            duration = round(1000 / look.fps)
+            first.save(path, save_all=True, append_images=rest, duration=duration, loop=0, optimize=False)
+    return len(times)
+
+
+def _pictures(
+    panels: Sequence[Panel],
+    times: NDArray[np.int64],
+    peaks: Sequence[float],
+    look: Look,
+    progress: Callable[[int, int], object] | None,
+) -> Iterator[Image.Image]:
+    start = int(times[0])
+    for number, time_ns in enumerate(times.tolist()):
+        stamp = f"{(time_ns - start) / 1e6:.3f} ms" if look.label else ""
+        yield _picture(panels, [panel.at(time_ns) for panel in panels], peaks, look, stamp)
+        if progress is not None:
+            progress(number + 1, len(times))
+
+
+def _picture(
+    panels: Sequence[Panel], frames: Sequence[NDArray[Any]], peaks: Sequence[float], look: Look, stamp: str
+) -> Image.Image:
+    greys = [grey(frame, peak, look.panel_px) for frame, peak in zip(frames, peaks, strict=True)]
+    bar = BAR_PX if look.label else 0
+    top = bar if len(panels) > 1 else 0
+    width = sum(each.width for each in greys) + GAP_PX * (len(greys) - 1)
+    picture = Image.new("RGB", (width + width % 2, top + look.panel_px + bar), PAPER)
+    draw, font, left = ImageDraw.Draw(picture), ImageFont.load_default(15), 0
+    for panel, each in zip(panels, greys, strict=True):
+        picture.paste(each, (left, top))
+        if top:
+            draw.text((left + 6, top / 2), panel.name, fill=WORDS, font=font, anchor="lm")
+        left += each.width + GAP_PX
+    if bar:
+        draw.text((6, picture.height - bar / 2), stamp, fill=SOFT, font=font, anchor="lm")
+    return picture
+
+
+def grey(frame: NDArray[Any], peak: float, height_px: int) -> Image.Image:
+    """A frame (row, column) as an 8-bit picture: 0 black, ``peak`` white; pixels stay square and sharp."""
+    rows, columns = frame.shape
+    values = np.clip(np.rint(frame * (255 / peak)), 0, 255).astype(np.uint8)
+    enlarge = height_px >= 3 * rows
+    resample = Image.Resampling.NEAREST if enlarge else Image.Resampling.LANCZOS
+    width = round(height_px * columns / rows)
+    return Image.fromarray(values).resize((width + width % 2, height_px), resample)
+
+
+def _peak(panel: Panel) -> float:
+    """White of a video: nearly its brightest voxel, from a few frames."""
+    frames = panel.file.video.shape[0]
+    some = np.unique(np.linspace(0, frames - 1, 12).astype(int))
+    values = np.stack([np.asarray(panel.file.video[int(index)]) for index in some])
+    return float(np.quantile(values, PEAK_QUANTILE)) or 1.0
+
+
+def _sheet(pictures: list[Image.Image]) -> Image.Image:
+    columns = min(SHEET_COLUMNS, len(pictures))
+    rows = -(-len(pictures) // columns)
+    width, height = pictures[0].size
+    sheet = Image.new("RGB", (columns * (width + GAP_PX) - GAP_PX, rows * (height + GAP_PX) - GAP_PX), PAPER)
+    for number, picture in enumerate(pictures):
+        row, column = divmod(number, columns)
+        sheet.paste(picture, (column * (width + GAP_PX), row * (height + GAP_PX)))
+    return sheet
+
+
+def _write_mp4(path: Path, pictures: Iterator[Image.Image], fps: float) -> None:
+    try:
+        import av
+    except ModuleNotFoundError as error:
+        raise UsageError(
+            f"rendering to {path.name} without PyAV",
+            possible=", ".join(suffix for suffix in SUFFIXES if suffix != ".mp4"),
+            hint="pip install 'tdi-acquire[video]'",
+        ) from error
+    from fractions import Fraction
+
+    first = next(pictures)
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000))
+        stream.pix_fmt, stream.options = "yuv420p", {"crf": "18"}
+        # the codec halves the colours' resolution: it wants even sizes
+        stream.width, stream.height = (side - side % 2 for side in first.size)
+        for picture in chain([first], pictures):
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(np.asarray(picture))))
+        container.mux(stream.encode())

@@ -1,0 +1,83 @@
+"""Model of a plan file: the sub-segments of a combinatorial reconstruction, each with its own voxels.
+
+::
+
+    fade_substeps = 48
+
+    [[segments]]                 # one after the other, from the beginning of what is reconstructed
+    name = "A"
+    substeps = 2136              # or lines = 712, or seconds = 1.187e-3
+    spatial_merge = 3
+    temporal_merge = 4
+
+    [[segments]]
+    name = "B"
+    spatial_merge = 1            # the last may leave its length open: all that is left
+    temporal_merge = 230
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from acquire.effect_config import FrozenModel
+
+FADE_SUBSTEPS = 32
+"""To either side of a seam: over this, one sub-segment becomes the next."""
+
+
+class SegmentPlan(FrozenModel):
+    """One sub-segment: how long it is, and its voxels."""
+
+    name: str = ""
+    substeps: int | None = Field(default=None, ge=1)
+    lines: int | None = Field(default=None, ge=1)
+    seconds: float | None = Field(default=None, gt=0)
+    spatial_merge: int = Field(ge=1, description="N_m, side of a voxel in fine pixels")
+    temporal_merge: int = Field(ge=1, description="T_m, sub-steps of a voxel")
+    why: str = Field(default="", description="for people; `--auto` says here what it saw")
+
+    @model_validator(mode="after")
+    def _one_length(self) -> SegmentPlan:
+        given = [key for key in ("substeps", "lines", "seconds") if getattr(self, key) is not None]
+        if len(given) > 1:
+            raise ValueError(f"one of substeps, lines and seconds, not {' and '.join(given)}")
+        return self
+
+    @property
+    def is_open(self) -> bool:
+        """All that is left."""
+        return self.substeps is None and self.lines is None and self.seconds is None
+
+    @property
+    def length(self) -> str:
+        """For people."""
+        given = (("lines", self.lines), ("sub-steps", self.substeps), ("s", self.seconds))
+        return next((f"{value:g} {unit}" for unit, value in given if value is not None), "the rest")
+
+    def length_substeps(self, substeps_per_line: int, substep_s: float) -> int | None:
+        """Its length, to whole sub-steps; None where it is open."""
+        if self.lines is not None:
+            return self.lines * substeps_per_line
+        return self.substeps if self.seconds is None else max(1, round(self.seconds / substep_s))
+
+
+class ReconstructionPlan(FrozenModel):
+    """The whole of a plan file."""
+
+    title: str = ""
+    ends: Literal["trusted", "whole"] = Field(
+        default="trusted", description="whole: also what the first and the last lines sample in part"
+    )
+    fade_substeps: int = Field(default=FADE_SUBSTEPS, ge=0, le=1_000_000)
+    segments: tuple[SegmentPlan, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _only_the_last_is_open(self) -> ReconstructionPlan:
+        names = [segment.name or f"segment {i}" for i, segment in enumerate(self.segments[:-1])]
+        still_open = [name for name, segment in zip(names, self.segments, strict=False) if segment.is_open]
+        if still_open:
+            raise ValueError(f"{', '.join(still_open)}: only the last segment may leave its length open")
+        return self

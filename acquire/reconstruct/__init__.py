@@ -1,0 +1,34 @@
+"""From a recording on disk to a video on disk, whatever its length.
+
+::
+
+    select    lines, times or a plan ──▶ Request: stretches on one grid
+    combine   Request ──▶ sub-segments ──▶ pool ──▶ stitched in order ──▶ video
+    pools     where sub-segments are solved: here, in processes, on a cluster
+    work      one sub-segment: cut, solve, bring to the grid
+    single    a reconstruction that is already in memory
+
+Memory is bounded by what the pool works on; the recording is read and the video written piece by piece.
+"""
+
+from acquire.reconstruct.combine import Outcome, Watcher, combine
+from acquire.reconstruct.pools import Pool, open_pool
+from acquire.reconstruct.select import Request, along_plan, by_lines, by_time, in_voxels
+from acquire.reconstruct.single import describe, save_reconstruction
+from acquire.reconstruct.work import Options
+
+__all__ = [
+    "Options",
+    "Outcome",
+    "Pool",
+    "Request",
+    "Watcher",
+    "along_plan",
+    "by_lines",
+    "by_time",
+    "combine",
+    "describe",
+    "in_voxels",
+    "open_pool",
+    "save_reconstruction",
+]

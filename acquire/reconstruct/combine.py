@@ -1,0 +1,224 @@
+"""Combinatorial reconstruction: sub-segments solved side by side, stitched in order, written as they come."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from concurrent.futures import CancelledError, wait
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire import __version__
+from acquire.errors import AcquireError
+from acquire.recon.segments import Stitcher
+from acquire.reconstruct.work import Task
+from acquire.store import VideoWriter
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
+    from concurrent.futures import Future
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from acquire.recon.segments import SubSegment
+    from acquire.reconstruct.pools import Pool
+    from acquire.reconstruct.select import Request
+    from acquire.reconstruct.work import Options, Part
+    from acquire.store import Recording
+
+LOOK_S = 0.1
+"""How often the one who waits looks at the progress and at Ctrl-C."""
+LEAST_BUDGET_S = 0.05
+QUALITY_KEYS = ("misfit", "prediction", "coverage")
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What was written. ``interrupted``: less than what was asked for."""
+
+    path: Path
+    shape: tuple[int, int, int]
+    interrupted: bool
+    provenance: dict[str, Any]
+
+
+class Watcher:
+    """Passes the progress on, and says when to stop: ``stopped`` once it was.
+
+    ``progress`` takes (tasks done, of how many); ``stop`` is asked often and answers at once.
+    """
+
+    def __init__(
+        self,
+        tasks: int,
+        progress: Callable[[float, int], object] | None = None,
+        stop: Callable[[], bool] | None = None,
+    ) -> None:
+        self.tasks, self._progress, self._stop = tasks, progress, stop
+        self.stopped = False
+
+    def __call__(self, done: float) -> bool:
+        if self._progress is not None:
+            self._progress(done, self.tasks)
+        if self._stop is not None and self._stop():
+            self.stopped = True
+        return self.stopped
+
+
+def combine(
+    recording: Recording, request: Request, path: Path, options: Options, pool: Pool, watcher: Watcher
+) -> Outcome:
+    """Reconstruct the stretches of a request and write their video.
+
+    When the watcher says stop, what was solved so far is written, marked as interrupted; DataError and
+    whatever a sub-segment raises leave nothing.
+    """
+    began, grid = time.monotonic(), request.grid
+    segments = request.stream.arrange(request.stretches, request.fade)
+    tasks = [Task(str(recording.path), segment, grid, options) for segment in segments]
+    clock = _Clock.of(recording, request)
+    stitcher, parts = Stitcher(grid), []
+    with VideoWriter(
+        path,
+        (grid.side, grid.side),
+        np.dtype(np.float32),
+        float(grid.voxels.spatial_merge),
+        clock.substep_ns * grid.voxels.temporal_merge,
+        pixel_unit=None,
+        quality=True,
+    ) as writer:
+        for part, task, following in _solved(tasks, pool, watcher):
+            video, error = stitcher.add(task.segment, (part.video, part.error), following)
+            if len(video):
+                begins = grid.edges(slice(writer.frames, writer.frames + len(video)))[:-1]
+                writer.append(video, clock.time_ns(begins), error)
+            parts.append(part)
+        facts = describe_parts(recording, request, [part.facts for part in parts], options)
+        facts["state"] = "interrupted" if watcher.stopped else "complete"
+        facts["seconds"] = round(time.monotonic() - began, 3)
+        facts["trusted"] = _trusted_frames(request, writer.frames)
+        writer.finish(facts)
+    return Outcome(path, (writer.frames, grid.side, grid.side), watcher.stopped, facts)
+
+
+def _solved(
+    tasks: Sequence[Task], pool: Pool, watcher: Watcher
+) -> Iterator[tuple[Part, Task, SubSegment | None]]:
+    """Solved tasks in order, each with the sub-segment after it; ends early when the watcher stops."""
+    budget, submitted = _Budget(tasks, pool.workers), 0
+    waiting: deque[Future[Part]] = deque()
+    for index, task in enumerate(tasks):
+        while submitted < len(tasks) and len(waiting) <= pool.workers and not watcher.stopped:
+            waiting.append(pool.submit(budget.limit(tasks[submitted], len(tasks) - index)))
+            submitted += 1
+        if not waiting or (part := _result(waiting, pool, watcher)) is None:
+            return
+        yield part, task, tasks[index + 1].segment if index + 1 < len(tasks) else None
+
+
+def _result(waiting: deque[Future[Part]], pool: Pool, watcher: Watcher) -> Part | None:
+    """The first of those that wait; None when it was cancelled."""
+    future = waiting.popleft()
+    try:
+        while not wait([future], LOOK_S).done:
+            if watcher(pool.share_done()):
+                pool.stop()
+                for each in (future, *waiting):
+                    each.cancel()
+        watcher(pool.share_done())
+        return future.result()
+    except CancelledError:
+        return None
+    except BrokenProcessPool as error:
+        raise AcquireError(
+            "a process that solved a sub-segment ended by itself", hint="--workers 1: it may lack memory"
+        ) from error
+
+
+class _Budget:
+    """Shares what is left of the time among what is left to solve."""
+
+    def __init__(self, tasks: Sequence[Task], workers: int) -> None:
+        self._workers = workers
+        seconds = tasks[0].options.budget_s
+        self._deadline = None if seconds is None else time.monotonic() + seconds
+
+    def limit(self, task: Task, left: int) -> Task:
+        """The task with its share, where ``left`` are not done; at least a little, so that it ends well."""
+        if self._deadline is None:
+            return task
+        rounds = -(-left // self._workers)
+        share = (self._deadline - time.monotonic()) / rounds
+        return replace(task, options=replace(task.options, budget_s=max(share, LEAST_BUDGET_S)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Clock:
+    """UTC of a sub-step: that of the stream's first line, and from there on."""
+
+    first_substep: int
+    first_ns: int
+    substep_ns: float
+
+    @classmethod
+    def of(cls, recording: Recording, request: Request) -> _Clock:
+        stream = request.stream
+        row = stream.first_line - recording.first_line
+        read_out_ns = int(recording.arms["a"].read("time", row, row + 1)[0])
+        first = stream.substeps * stream.first_line + stream.geometry(1).readout_substep
+        return cls(first, read_out_ns, recording.line_period_ns / stream.substeps)
+
+    def time_ns(self, substeps: NDArray[np.int64]) -> NDArray[np.int64]:
+        """UTC at which sub-steps begin."""
+        offset: NDArray[np.int64] = np.rint((substeps - self.first_substep) * self.substep_ns).astype(
+            np.int64
+        )
+        return self.first_ns + offset
+
+
+def describe_parts(
+    recording: Recording, request: Request, parts: Sequence[dict[str, Any]], options: Options
+) -> dict[str, Any]:
+    """Where the video comes from and how good it is, as JSON: as a whole, and each sub-segment."""
+    names, reasons = request.names or ("",) * len(parts), request.reasons or ("",) * len(parts)
+    segments = [
+        {"name": name, "why": why, **part} for name, why, part in zip(names, reasons, parts, strict=False)
+    ]
+    voxels = request.grid.voxels
+    return {
+        "recording": str(recording.path),
+        "run_id": recording.attrs["run_id"],
+        "first_line": min(part["first_line"] for part in parts),
+        "lines": max(part["first_line"] + part["lines"] for part in parts)
+        - min(part["first_line"] for part in parts),
+        "first_substep": request.grid.begin,
+        "spatial_merge": voxels.spatial_merge,
+        "temporal_merge": voxels.temporal_merge,
+        "solver": options.solver,
+        "preset": options.preset,
+        "budget_s": options.budget_s,
+        "iterations": sum(part["iterations"] for part in parts),
+        "iterations_asked": sum(part["iterations_asked"] for part in parts),
+        "quality": {key: _rms([part["quality"][key] for part in parts]) for key in QUALITY_KEYS},
+        "segments": segments,
+        "segments_asked": len(request.stretches),
+        "versions": {"acquire": __version__},
+    }
+
+
+def _rms(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.sqrt(np.mean(np.square(known)))) if known else None
+
+
+def _trusted_frames(request: Request, frames: int) -> list[int]:
+    """First frame that is sampled in full, and the one after the last."""
+    T_m, begin = request.grid.voxels.temporal_merge, request.grid.begin
+    low, high = (edge - begin for edge in request.trusted)
+    stop = -(-high // T_m) if request.trusted[1] >= request.grid.end else high // T_m
+    first = min(frames, -(-low // T_m))
+    return [first, max(first, min(frames, stop))]

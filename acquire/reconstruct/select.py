@@ -1,0 +1,143 @@
+"""What of a recording is reconstructed: lines or times, in one kind of voxels or along a plan."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from acquire.errors import UsageError
+from acquire.plan_config import FADE_SUBSTEPS
+from acquire.recon.segments import Grid, Stream, Stretch, Voxels, split
+
+if TYPE_CHECKING:
+    from acquire.plan_config import ReconstructionPlan
+    from acquire.store import Recording
+
+SPANS_PER_SEGMENT = 4
+"""Sub-steps that a sub-segment keeps where nobody says otherwise, in n: a third of its lines is overlap."""
+VOXELS_PER_SEGMENT = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """Sub-steps ``begin`` to ``end`` (None: as far as it goes) out of the lines of ``stream``."""
+
+    stream: Stream
+    begin: int | None = None
+    end: int | None = None
+
+    def extent(self, first: Voxels, last: Voxels, *, whole: bool) -> tuple[int, int]:
+        """As asked, or as `Stream.extent`; UsageError for times that the lines do not show."""
+        low, high = self.stream.extent(first, last, whole=whole)
+        begin, end = low if self.begin is None else self.begin, high if self.end is None else self.end
+        if not low <= begin < end <= high:
+            raise UsageError(f"sub-steps {begin} to {end}, counted from line 0", possible=f"{low} to {high}")
+        return begin, end
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """Stretches of a stream that follow one another, and the grid of their common video.
+
+    ``trusted`` are the sub-steps that are sampled in full; ``names`` and ``reasons`` are the stretches'.
+    """
+
+    stream: Stream
+    stretches: tuple[Stretch, ...]
+    grid: Grid
+    trusted: tuple[int, int]
+    fade: int = FADE_SUBSTEPS
+    names: tuple[str, ...] = ()
+    reasons: tuple[str, ...] = ()
+
+
+def stream_of(recording: Recording) -> Stream:
+    """All lines of a recording."""
+    geometry = recording.geometry_for(1)
+    first = recording.first_line
+    return Stream(geometry.stages, geometry.substeps, first, first + recording.lines)
+
+
+def by_lines(recording: Recording, first_line: int | None = None, lines: int | None = None) -> Selection:
+    """These lines and no other. UsageError for lines that are not there."""
+    whole = stream_of(recording)
+    first = whole.first_line if first_line is None else first_line
+    end = whole.end_line if lines is None else first + lines
+    if not whole.first_line <= first < end <= whole.end_line:
+        have = f"lines {whole.first_line} to {whole.end_line - 1}" if recording.lines else "no lines yet"
+        raise UsageError(f"lines {first} to {end - 1} of {recording.path}", possible=have)
+    return Selection(Stream(whole.stages, whole.substeps, first, end))
+
+
+def by_time(recording: Recording, begin_ns: int | None, end_ns: int | None) -> Selection:
+    """The video from ``begin_ns`` to ``end_ns`` after the first line's read-out, from all lines it needs."""
+    stream = stream_of(recording)
+    return Selection(stream, _substep(recording, begin_ns), _substep(recording, end_ns))
+
+
+def in_voxels(
+    selection: Selection, voxels: Voxels, *, whole_ends: bool | None = None, longest: int | None = None
+) -> Request:
+    """All of a selection in one kind of voxels, in sub-segments of at most ``longest`` sub-steps.
+
+    Voxels as long as two passes of the scene are sampled by every row wherever they lie: they are kept at
+    the ends too, unless ``whole_ends`` says otherwise.
+    """
+    stream = selection.stream
+    size = stream.geometry(1).size
+    stream.geometry(1).check_merge(voxels.spatial_merge, voxels.temporal_merge)
+    whole = voxels.temporal_merge >= 2 * size if whole_ends is None else whole_ends
+    begin, end = selection.extent(voxels, voxels, whole=whole)
+    default = max(SPANS_PER_SEGMENT * size, VOXELS_PER_SEGMENT * voxels.temporal_merge)
+    stretches = tuple(split(begin, end, voxels, longest or default))
+    return Request(stream, stretches, Grid.finest(stretches, size), _trusted(stream, begin, end))
+
+
+def along_plan(
+    selection: Selection, plan: ReconstructionPlan, substep_s: float, grid: Voxels | None = None
+) -> Request:
+    """The sub-segments of a plan, one after the other from the selection's beginning.
+
+    UsageError for a plan that is longer than what there is.
+    """
+    stream = selection.stream
+    geometry = stream.geometry(1)
+    voxels = [Voxels(part.spatial_merge, part.temporal_merge) for part in plan.segments]
+    for each in voxels:
+        geometry.check_merge(each.spatial_merge, each.temporal_merge)
+    begin, end = selection.extent(voxels[0], voxels[-1], whole=plan.ends == "whole")
+    stretches, edge = [], begin
+    for part, each in zip(plan.segments, voxels, strict=True):
+        length = part.length_substeps(geometry.substeps, substep_s)
+        if edge + (length or 1) > end:
+            missing = f"{part.name or 'a segment'} to sub-step {edge + (length or 1) - begin}"
+            raise UsageError(f"plan with {missing}", possible=f"{end - begin} sub-steps in all")
+        stop = end if length is None else edge + length
+        stretches.append(Stretch(edge, stop, stream.evened(each, stop - edge)))
+        edge = stop
+    return Request(
+        stream,
+        tuple(stretches),
+        Grid.finest(stretches, geometry.size, grid),
+        _trusted(stream, begin, edge),
+        plan.fade_substeps,
+        tuple(part.name for part in plan.segments),
+        tuple(part.why for part in plan.segments),
+    )
+
+
+def _trusted(stream: Stream, begin: int, end: int) -> tuple[int, int]:
+    """What of ``begin`` to ``end`` every row samples; empty where nothing is."""
+    origin, trusted = stream.substeps * stream.first_line, stream.geometry().trusted
+    low, high = max(begin, origin + trusted.start), min(end, origin + trusted.stop)
+    return (low, high) if high > low else (begin, begin)
+
+
+def _substep(recording: Recording, after_ns: int | None) -> int | None:
+    """The sub-step that begins ``after_ns`` after the read-out of the recording's first line begins."""
+    if after_ns is None:
+        return None
+    geometry = recording.geometry_for(1)
+    substep_ns = recording.line_period_ns / geometry.substeps
+    first = geometry.substeps * recording.first_line + geometry.readout_substep
+    return first + round(after_ns / substep_ns)

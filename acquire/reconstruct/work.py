@@ -1,0 +1,111 @@
+"""One sub-segment, from the recording on disk to frames on the common grid: what a worker is sent to do."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from acquire.recon import reconstruct
+from acquire.recon.reliability import frame_error
+from acquire.store import open_recording
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.recon import Progress
+    from acquire.recon.api import Preset, Solver
+    from acquire.recon.segments import Grid, SubSegment
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How to solve; see `acquire.recon.reconstruct`. ``budget_s`` is for all that is asked for."""
+
+    preset: Preset = "balanced"
+    solver: Solver = "admm"
+    iterations: int | None = None
+    budget_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """A sub-segment of a recording, and the grid on which its frames are wanted. Picklable."""
+
+    recording: str
+    segment: SubSegment
+    grid: Grid
+    options: Options
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Part:
+    """A solved sub-segment: ``video`` (t, y, x) and ``error`` (t,) on the grid, and how it went."""
+
+    video: NDArray[np.float32]
+    error: NDArray[np.float32]
+    facts: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def finished(self) -> bool:
+        """It was not stopped before its time."""
+        return bool(self.facts["iterations"] == self.facts["iterations_asked"])
+
+
+class Watch(Protocol):
+    """Who looks on while a task is solved."""
+
+    def advance(self, share: float) -> None:
+        """``share`` of the task was done since the last call."""
+
+    def stopped(self) -> bool:
+        """The best so far is wanted now."""
+        ...
+
+
+def solve(task: Task, watch: Watch) -> Part:
+    """Cut, reconstruct, bring to the grid. Raises what `Recording.cut` and `reconstruct` raise."""
+    segment, options, voxels = task.segment, task.options, task.segment.voxels
+    lines = open_recording(Path(task.recording)).cut(segment.first_line, segment.lines)
+
+    def advanced(progress: Progress) -> None:
+        watch.advance(1 / progress.iterations)
+
+    result = reconstruct(
+        lines,
+        voxels.spatial_merge,
+        voxels.temporal_merge,
+        options.preset,
+        options.budget_s,
+        advanced,
+        solver=options.solver,
+        iterations=options.iterations,
+        stop=watch.stopped,
+    )
+    watch.advance(1 - result.iterations / result.iterations_asked)
+    error = frame_error(lines, result.video, voxels.spatial_merge, voxels.temporal_merge)
+    substeps = lines.geometry.substeps
+    return Part(
+        video=task.grid.resample(result.video, segment, substeps),
+        error=task.grid.resample_time(error, segment, substeps),
+        facts={
+            "first_line": segment.first_line,
+            "lines": segment.lines,
+            "begin_substep": segment.begin,
+            "end_substep": segment.end,
+            "spatial_merge": voxels.spatial_merge,
+            "temporal_merge": voxels.temporal_merge,
+            "iterations": result.iterations,
+            "iterations_asked": result.iterations_asked,
+            "seconds": round(result.seconds, 3),
+            "parameters": result.parameters,
+            "quality": {name: _json(value) for name, value in asdict(result.quality).items()},
+        },
+    )
+
+
+def _json(value: Any) -> Any:
+    """JSON knows no NaN."""
+    return None if isinstance(value, float) and not np.isfinite(value) else value

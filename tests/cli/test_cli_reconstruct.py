@@ -1,0 +1,222 @@
+"""``acquire reconstruct | render | paper | tradeoff`` as a user types them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from acquire.config import load_rig
+from acquire.scene_config import LedConfig, LedSceneConfig, SineDrive
+from acquire.simulate import simulate
+from acquire.store import open_video
+
+Cli = Callable[..., Any]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    rig = load_rig("rig-demo", {"geometry.stages": 12, "geometry.substeps": 2})
+    drive = SineDrive(waveform="sine", frequency_hz=500.0, low=0.1)
+    led = LedConfig(name="x", shape="square", row=0.5, column=0.5, size=0.5, drive=drive)
+    path = tmp_path_factory.mktemp("r") / "run.zarr"
+    simulate(rig, LedSceneConfig(kind="leds", title="one LED", leds=(led,)), path, 300)
+    return path
+
+
+def test_lines_and_times(cli: Cli, recording: Path, tmp_path: Path) -> None:
+    answer = cli(
+        "reconstruct",
+        recording,
+        "--out",
+        tmp_path / "a.zarr",
+        "--first-line",
+        20,
+        "--lines",
+        100,
+        "--nm",
+        2,
+        "--json",
+    )
+    assert answer.code == 0, answer.err
+    assert (answer.json["first_line"], answer.json["lines"]) == (20, 100)
+    assert answer.json["shape"] == [177, 12, 12]
+    answer = cli(
+        "reconstruct", recording, "--out", tmp_path / "b.zarr", "--from", "1ms", "--to", "2ms", "--nm", 2
+    )
+    assert answer.code == 0, answer.err
+    video = open_video(tmp_path / "b.zarr")
+    assert video.video.shape == (100, 12, 12)
+    start = open_video(tmp_path / "a.zarr").time_ns[0] - 20 * 20_000
+    assert video.time_ns[0] - start == 1_000_000
+
+
+def test_several_voxels_side_by_side(cli: Cli, recording: Path, tmp_path: Path) -> None:
+    words = ("--lines", 120, "--voxels", "1x66", "--voxels", "2x3", "--preset", "fast")
+    assert cli("reconstruct", recording, "--out", tmp_path / "v.zarr", *words).code == 0
+    slow, fast = tmp_path / "v-1x66.zarr", tmp_path / "v-2x3.zarr"
+    assert open_video(slow).video.shape[1:] == (24, 24)
+    assert open_video(fast).video.shape[1:] == (12, 12)
+    answer = cli("render", slow, fast, "--out", tmp_path / "both.png", "--frames", 3)
+    assert answer.code == 0, answer.err
+    with Image.open(tmp_path / "both.png") as sheet:
+        assert sheet.width > 6 * 190
+
+
+def test_a_plan_on_the_command_line(cli: Cli, recording: Path, tmp_path: Path) -> None:
+    words = ("--segment", "40:2x2", "--segment", "1ms:1x30", "--segment", ":2x2", "--workers", 1, "--json")
+    answer = cli("reconstruct", recording, "--out", tmp_path / "v.zarr", "--lines", 200, *words)
+    assert answer.code == 0, answer.err
+    lengths = [part["end_substep"] - part["begin_substep"] for part in answer.json["segments"]]
+    assert lengths[:2] == [80, 100]
+    assert open_video(tmp_path / "v.zarr").attrs["provenance"]["segments"][1]["spatial_merge"] == 1
+
+
+def test_a_proposed_plan_is_written_and_read_again(cli: Cli, recording: Path, tmp_path: Path) -> None:
+    answer = cli("reconstruct", recording, "--auto", "--lines", 150, "--save-plan", tmp_path / "plan.toml")
+    assert answer.code == 0, answer.err
+    assert "unseen samples are predicted" in answer.out
+    again = cli(
+        "reconstruct",
+        recording,
+        "--lines",
+        150,
+        "--plan",
+        tmp_path / "plan.toml",
+        "--out",
+        tmp_path / "v.zarr",
+    )
+    assert again.code == 0, again.err
+
+
+def test_a_preview_is_coarse(cli: Cli, recording: Path, tmp_path: Path) -> None:
+    answer = cli("reconstruct", recording, "--out", tmp_path / "v.zarr", "--preview", "--json")
+    assert answer.code == 0, answer.err
+    assert answer.json["shape"][1:] == [6, 6]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--lines", 10_000), "possible: lines 0 to 299"),
+        (("--from", "1h"), "52ms"),
+        (("--voxels", "3"), "NMxTM"),
+        (("--lines", 50, "--from", "1ms"), "--from and --to"),
+        (("--segment", ":2x2", "--segment", "5:2x2"), "only the last segment"),
+        (("--plan", "nothing.toml"), "does not exist"),
+        (("--ends", "half"), "trusted, whole"),
+        (("--lines", 5), "more than 12 lines"),
+        (("--preset", "perfect"), "balanced"),
+    ],
+)
+def test_what_cannot_be_is_refused(cli: Cli, recording: Path, tmp_path: Path, words: Any, said: str) -> None:
+    answer = cli("reconstruct", recording, "--out", tmp_path / "v.zarr", *words)
+    assert answer.code == 2
+    assert said in answer.err.lower() or said in answer.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_budget_takes_what_was_learned(
+    cli: Cli, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    words = ("--voxels", "2x1", "--solver", "admm", "--lines", 100, "--json")
+    answer = cli("tradeoff", recording, "--out", tmp_path / "t", *words)
+    assert answer.code == 0, answer.err
+    assert {row["preset"] for row in answer.json["rows"]} >= {"fast", "balanced"}
+    assert (tmp_path / "t" / "index.html").exists()
+    lessons = json.loads((tmp_path / "cache" / "acquire" / "tradeoff.json").read_text())["learned"]
+    for lesson in lessons:
+        lesson["seconds"] = 1.0 if lesson["preset"] == "fast" else 50.0
+    document = {"version": 1, "learned": lessons}
+    (tmp_path / "cache" / "acquire" / "tradeoff.json").write_text(json.dumps(document))
+    words = ("--nm", 2, "--lines", 100, "--budget", 5, "--json")
+    answer = cli("reconstruct", recording, "--out", tmp_path / "v.zarr", *words)
+    assert answer.json["preset"] == "fast"
+
+
+def test_fig_9_from_scene_to_page(cli: Cli, tmp_path: Path) -> None:
+    answer = cli("paper", "fig9", "--out", tmp_path / "p", "--budget", 2, "--json")
+    assert answer.code == 0, answer.err
+    (figure,) = answer.json["figures"]
+    rows = {row["what"]: row["ours"] for row in figure["rows"]}
+    assert rows["video"] == "64 × 64 × 598, 51.99 to 57.96 ms"
+    assert figure["numbers"]["psnr_db"] > 12
+    page = (tmp_path / "p" / "index.html").read_text()
+    assert page.count("data:image/png") == 3
+    assert "data:image/webp" in page
+    assert json.loads((tmp_path / "p" / "summary.json").read_text())["figures"][0]["rows"] == figure["rows"]
+
+
+def test_an_unknown_figure_is_refused(cli: Cli, tmp_path: Path) -> None:
+    answer = cli("paper", "fig12", "--out", tmp_path / "p")
+    assert answer.code == 2
+    assert "fig6, fig7, fig8, fig9, fig10, fig11" in answer.err
+    assert not (tmp_path / "p").exists()
+
+
+@pytest.fixture
+def cluster(tmp_path: Path) -> Iterator[str]:
+    """A scheduler and two workers, processes of their own; its address."""
+    file = tmp_path / "scheduler.json"
+    common = ["--scheduler-file", str(file), "--no-dashboard"]
+    commands = [["scheduler", "--host", "127.0.0.1", "--port", "0", *common]]
+    commands += [["worker", "--nthreads", "1", "--no-nanny", "--host", "127.0.0.1", *common]] * 2
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-m", "dask", *command],
+            cwd=tmp_path,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        for command in commands
+    ]
+    try:
+        deadline = time.monotonic() + 60
+        while not file.exists() or not file.stat().st_size:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        yield json.loads(file.read_text())["address"]
+    finally:
+        for process in reversed(processes):  # workers first: they would look for their scheduler for long
+            process.terminate()
+            try:
+                process.wait(timeout=10)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+@pytest.mark.needs_dask
+def test_no_cluster_where_one_was_named(recording: Path, tmp_path: Path) -> None:
+    words = ["reconstruct", str(recording), "--out", str(tmp_path / "v.zarr"), "--dask", "tcp://127.0.0.1:9"]
+    ended = subprocess.run(
+        [sys.executable, "-m", "acquire", *words], capture_output=True, text=True, timeout=100, check=False
+    )
+    assert ended.returncode == 2
+    assert "no Dask scheduler answers on tcp://127.0.0.1:9" in ended.stderr
+
+
+@pytest.mark.needs_dask
+def test_a_cluster_gives_what_this_machine_gives(cluster: str, recording: Path, tmp_path: Path) -> None:
+    common = [sys.executable, "-m", "acquire", "reconstruct", str(recording), "--nm", "2", "--preset", "fast"]
+    words = ["--segment", "100:2x1", "--segment", ":2x1"]
+    for name, where in (("here", ["--workers", "1"]), ("there", ["--dask", cluster])):
+        ended = subprocess.run(
+            [*common, *words, *where, "--out", str(tmp_path / f"{name}.zarr")],
+            capture_output=True,
+            text=True,
+            timeout=100,
+            check=False,
+        )
+        assert ended.returncode == 0, ended.stderr
+    here, there = (open_video(tmp_path / f"{name}.zarr").video[:] for name in ("here", "there"))
+    np.testing.assert_allclose(here, there, atol=1e-3)

@@ -1,0 +1,62 @@
+"""Movies, animations and sheets of real videos on disk; several run on one clock."""
+
+from __future__ import annotations
+
+import av
+import numpy as np
+import pytest
+from PIL import Image
+
+from acquire.errors import UsageError
+from acquire.evaluate.rendering import Look, Panel, common_times, render
+from acquire.store import open_video, write_video
+
+START = np.int64(1_700_000_000_000_000_000)
+
+
+def panel(tmp_path, name, frames, interval_ns, side=12, begin=0):
+    video = np.zeros((frames, side, side), np.float32)
+    video[np.arange(frames), 0, np.arange(frames) % side] = 1
+    video[:, side // 2 :, :] = 0.5
+    path = tmp_path / f"{name}.zarr"
+    write_video(path, video, START + begin + np.arange(frames) * interval_ns, 1.0, interval_ns, {})
+    return Panel(name, open_video(path))
+
+
+def test_a_sheet_shows_frames_and_times(tmp_path):
+    render([panel(tmp_path, "a", 10, 1000)], tmp_path / "s.png", Look(panel_px=48), 4)
+    with Image.open(tmp_path / "s.png") as sheet:
+        values = np.asarray(sheet.convert("L"))
+    assert values.shape[1] >= 4 * 48
+    assert set(np.unique(values[30:44, 2:44])) == {128}  # the lower half of the first frame, 0.5 of white
+
+
+def test_a_movie_has_the_frames_that_were_asked_for(tmp_path):
+    shown = render([panel(tmp_path, "a", 50, 1000)], tmp_path / "m.mp4", Look(panel_px=96), 25)
+    with av.open(tmp_path / "m.mp4") as movie:
+        frames = [frame.to_ndarray(format="gray") for frame in movie.decode(video=0)]
+    assert len(frames) == shown == 25
+    assert abs(int(frames[3][80, 50]) - 128) < 12
+
+
+@pytest.mark.parametrize("suffix", [".gif", ".webp"])
+def test_animations(tmp_path, suffix):
+    render([panel(tmp_path, "a", 6, 1000)], tmp_path / f"m{suffix}", Look(panel_px=48), 6)
+    with Image.open(tmp_path / f"m{suffix}") as animation:
+        assert animation.n_frames == 6
+
+
+def test_panels_of_other_intervals_share_the_clock(tmp_path):
+    fast, slow = panel(tmp_path, "fast", 40, 1000), panel(tmp_path, "slow", 5, 10_000, begin=-3000)
+    times = common_times([fast, slow], 1000)
+    assert len(times) == 40
+    shown = [int(slow.at(int(time))[0].argmax()) for time in times]
+    assert shown == [(i + 3) // 10 for i in range(40)]
+
+
+def test_what_cannot_be_rendered_is_refused(tmp_path):
+    one = panel(tmp_path, "a", 5, 1000)
+    with pytest.raises(UsageError, match=r"\.mp4"):
+        render([one], tmp_path / "m.avi", Look(), 5)
+    with pytest.raises(UsageError, match="no time in common"):
+        render([one, panel(tmp_path, "b", 5, 1000, begin=10**9)], tmp_path / "m.gif", Look(), 5)

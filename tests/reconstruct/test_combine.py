@@ -1,0 +1,160 @@
+"""Sub-segments solved one by one and side by side become one video on disk."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from acquire.errors import UsageError
+from acquire.plan_config import ReconstructionPlan
+from acquire.recon.segments import Voxels
+from acquire.reconstruct import Options, Watcher, along_plan, by_lines, by_time, combine, in_voxels, open_pool
+from acquire.scene_config import LedSceneConfig
+from acquire.sim.scenes import build_scene
+from acquire.sim.voxels import truth
+from acquire.store import open_recording, open_video
+
+QUICK = Options(preset="fast")
+
+
+def run(recording_path, request, path, options=QUICK, workers=1, stop=None):
+    recording = open_recording(recording_path)
+    watcher = Watcher(len(request.stretches), stop=stop)
+    with open_pool(len(request.stretches), workers, watch=watcher) as pool:
+        return combine(recording, request, path, options, pool, watcher)
+
+
+@pytest.fixture
+def request_of_three(recording_path):
+    selection = by_lines(open_recording(recording_path), 20, 300)
+    return in_voxels(selection, Voxels(2, 1), longest=200)
+
+
+def test_a_long_stretch_is_stitched_from_pieces(recording_path, request_of_three, tmp_path):
+    outcome = run(recording_path, request_of_three, tmp_path / "v.zarr")
+    video = open_video(tmp_path / "v.zarr")
+    recording = open_recording(recording_path)
+    begin, end = request_of_three.grid.begin, request_of_three.grid.end
+    assert len(outcome.provenance["segments"]) == 3
+    assert video.video.shape == (end - begin, 12, 12) == outcome.shape
+    assert outcome.provenance["trusted"] == [0, end - begin]
+    assert (np.diff(video.time_ns) == round(video.interval_ns)).all()
+    # the first frame that 300 lines sample in full carries the read-out time of the first of them
+    assert video.time_ns[0] == recording.camera("a").time_ns[20]
+    assert np.isfinite(video.quality).all()
+    scene = build_scene(LedSceneConfig.model_validate(recording.attrs["scene"]), 24, 1e-5)
+    expected = truth(scene, begin, end - begin, 2)
+    error = video.video[:] - expected
+    assert np.sqrt(np.mean(error**2)) < 0.1 * expected.max()
+    # across a seam, frames change as they do elsewhere
+    steps = np.sqrt(np.mean(np.diff(video.video[:], axis=0) ** 2, axis=(1, 2)))
+    seams = [stretch.begin - begin for stretch in request_of_three.stretches[1:]]
+    assert max(steps[seam - 33 : seam + 33].max() for seam in seams) < 1.5 * np.quantile(steps, 0.95)
+
+
+def test_processes_give_what_one_gives(recording_path, request_of_three, tmp_path):
+    run(recording_path, request_of_three, tmp_path / "one.zarr")
+    run(recording_path, request_of_three, tmp_path / "two.zarr", workers=2)
+    one, two = (open_video(tmp_path / name).video[:] for name in ("one.zarr", "two.zarr"))
+    np.testing.assert_allclose(one, two, atol=1e-3)
+
+
+def test_a_plan_brings_different_voxels_to_one_grid(recording_path, tmp_path):
+    plan = ReconstructionPlan.model_validate(
+        {
+            "segments": [
+                {"name": "fast", "substeps": 150, "spatial_merge": 2, "temporal_merge": 3},
+                {"name": "fine", "lines": 50, "spatial_merge": 1, "temporal_merge": 30},
+                {"name": "rest", "spatial_merge": 2, "temporal_merge": 3},
+            ]
+        }
+    )
+    selection = by_lines(open_recording(recording_path), 20, 250)
+    request = along_plan(selection, plan, 1e-5)
+    outcome = run(recording_path, request, tmp_path / "v.zarr")
+    fast, fine, rest = outcome.provenance["segments"]
+    assert [part["name"] for part in (fast, fine, rest)] == ["fast", "fine", "rest"]
+    assert fine["begin_substep"] == fast["end_substep"] == request.grid.begin + 150
+    assert fine["temporal_merge"] == 34  # three that fill 100 sub-steps
+    assert outcome.shape[1:] == (24, 24)
+    video = open_video(tmp_path / "v.zarr").video[:]
+    frames = slice(52, 60)  # inside "fine": held over its voxels
+    assert np.ptp(video[frames], axis=0).max() < 1e-6
+
+
+def test_times_ask_for_the_lines_they_need(recording_path):
+    recording = open_recording(recording_path)
+    request = in_voxels(by_time(recording, 1_000_000, 3_000_000), Voxels(2, 1))
+    assert request.grid.frames == 200
+    segment = request.stream.arrange(request.stretches)[0]
+    read_out = recording.camera("a").time_ns
+    assert read_out[segment.first_line] - read_out[0] <= 1_000_000
+    with pytest.raises(UsageError, match="possible: 23 to"):
+        in_voxels(by_time(recording, 0, 10**12), Voxels(2, 1))
+
+
+def test_what_was_solved_before_a_stop_is_kept_and_marked(recording_path, request_of_three, tmp_path):
+    calls = iter(range(10_000))
+    outcome = run(recording_path, request_of_three, tmp_path / "v.zarr", stop=lambda: next(calls) > 60)
+    video = open_video(tmp_path / "v.zarr")
+    assert outcome.interrupted
+    assert video.attrs["provenance"]["state"] == "interrupted"
+    assert 0 < video.video.shape[0] < request_of_three.grid.frames
+    assert len(video.time_ns) == video.video.shape[0] == len(video.quality)
+
+
+def test_a_budget_is_shared(recording_path, request_of_three, tmp_path):
+    options = Options(preset="balanced", iterations=100_000, budget_s=1.5)
+    began = time.monotonic()
+    outcome = run(recording_path, request_of_three, tmp_path / "v.zarr", options)
+    assert time.monotonic() - began < 20
+    assert all(part["iterations"] < 100_000 for part in outcome.provenance["segments"])
+    assert not outcome.interrupted
+
+
+def test_a_failing_sub_segment_leaves_nothing(recording_path, request_of_three, tmp_path):
+    with pytest.raises(UsageError, match="solver"):
+        run(recording_path, request_of_three, tmp_path / "v.zarr", Options(solver="magic"), workers=2)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_keeps_the_best_so_far(recording_path, tmp_path):
+    """The command itself, in a process of its own, with its workers."""
+    words = ["reconstruct", recording_path, "--out", tmp_path / "v.zarr", "--nm", 2, "--workers", 2, "--json"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "acquire", *map(str, words), "--iterations", "1000000"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    ) as process:
+        deadline = time.monotonic() + 60
+        while not _has_worked(process.pid):
+            assert time.monotonic() < deadline
+            assert process.poll() is None
+            time.sleep(0.05)
+        os.killpg(process.pid, signal.SIGINT)
+        out, error = process.communicate(timeout=60)
+    assert process.returncode == 130, error
+    facts = json.loads(out)
+    assert facts["state"] == "interrupted"
+    assert facts["segments"][0]["iterations"] < 1_000_000
+    assert open_video(tmp_path / "v.zarr").attrs["provenance"]["state"] == "interrupted"
+    assert [path.name for path in tmp_path.iterdir()] == ["v.zarr"]
+
+
+def _has_worked(pid: int) -> bool:
+    """A process below it has computed for a while: it is past its imports."""
+    import psutil
+
+    try:
+        below = psutil.Process(pid).children(recursive=True)
+        return sum(each.cpu_times().user > 6 for each in below) > 0
+    except psutil.NoSuchProcess:
+        return False

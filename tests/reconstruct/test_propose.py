@@ -1,0 +1,32 @@
+"""A plan from the lines alone: what rests is told from what changes."""
+
+from __future__ import annotations
+
+from acquire.reconstruct import by_lines
+from acquire.reconstruct.propose import propose
+from acquire.scene_config import ConstantDrive, LedConfig, LedSceneConfig, SineDrive
+from acquire.simulate import simulate
+from acquire.store import open_recording
+
+
+def scene(drive):
+    led = LedConfig(name="l", shape="square", row=0.5, column=0.5, size=0.6, drive=drive)
+    return LedSceneConfig(kind="leds", title="one", leds=(led,))
+
+
+def test_a_scene_at_rest_gets_fine_pixels_and_long_frames(rig, tmp_path):
+    simulate(rig, scene(ConstantDrive(waveform="constant", level=0.7)), tmp_path / "r.zarr", 120)
+    recording = open_recording(tmp_path / "r.zarr")
+    plan = propose(recording, by_lines(recording))
+    assert {part.spatial_merge for part in plan.segments} == {1}
+    assert all(part.temporal_merge >= 24 for part in plan.segments)
+    assert "a still" in plan.segments[0].why
+
+
+def test_a_scene_that_flickers_gets_short_frames(rig, tmp_path):
+    drive = SineDrive(waveform="sine", frequency_hz=2000.0, low=0.05)
+    simulate(rig, scene(drive), tmp_path / "r.zarr", 120)
+    recording = open_recording(tmp_path / "r.zarr")
+    plan = propose(recording, by_lines(recording))
+    assert max(part.temporal_merge for part in plan.segments) <= 16
+    assert plan.segments[-1].is_open
