@@ -31,6 +31,9 @@ if TYPE_CHECKING:
     from acquire.store.source import Source
     from acquire.store.table_reader import Event, Gap
 
+CUT_COLUMNS = ("lines", "flags", "code", "code_index", "time")
+"""Arrays that a segment is made of."""
+
 UNUSABLE = LineFlag.MISSING | LineFlag.INCOMPLETE
 
 
@@ -184,8 +187,11 @@ class Recording:
         if (pixels := self.arms["a"].pixels) != geometry.stages:
             raise UsageError(f"cut of lines with {pixels} pixels", possible=f"M = {geometry.stages} pixels")
         arms = self.arms.values()
-        for stream in arms:
-            stream.expect(start, stop)
+        expected = [stream.reader(name) for stream in arms for name in CUT_COLUMNS]
+        for reader in expected:
+            reader.expect_index(start, stop)
+        for reader in expected:
+            reader.expect(start, stop)
         samples = np.stack([stream.read("lines", start, stop) for stream in arms])
         flags = np.stack([stream.read("flags", start, stop) for stream in arms])
         return Segment(
