@@ -19,7 +19,9 @@ from acquire.errors import DataError, UsageError
 from acquire.geometry import Geometry
 from acquire.lines import ARMS, LineFlag, Segment
 from acquire.store.camera_stream import CameraStream
+from acquire.store.files import DISK
 from acquire.store.layout import line_columns
+from acquire.store.source import LocalSource
 from acquire.store.table_reader import read_events, read_gaps
 
 if TYPE_CHECKING:
@@ -230,10 +232,19 @@ class Recording:
             "events": len(self.events),
             "simulated": bool(self.attrs.get("simulated", False)),
             "cameras": self.attrs["cameras"],
+            "disk": self._disk_facts(),
             "ledger": self.attrs["ledger"],
             "durability": self.attrs.get("durability", {}),
             "versions": self.attrs["versions"],
         }
+
+    def _disk_facts(self) -> dict[str, float] | None:
+        """While it grows here: bytes free, bytes per second that it takes, seconds until the disk is full."""
+        if self.state == "sealed" or not isinstance(self.source, LocalSource) or not self.lines:
+            return None
+        free = DISK.free_bytes(self.source.path)
+        rate = self.source.total_bytes() * NS_PER_S / (self.lines * self.line_period_ns)
+        return {"free_bytes": free, "bytes_per_s": rate, "seconds_to_full": free / rate}
 
     def _segment_with(self, line: int) -> Recording | None:
         """The further segment that has a line which is not here."""
