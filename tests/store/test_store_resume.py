@@ -29,7 +29,7 @@ def bytes_of(path):
 
 
 def resume(path, first_line, lines, **changes):
-    place, spec = next_segment(path, make_spec(**changes), cause="power lost")
+    place, spec = next_segment(path, make_spec(run_id="run-of-today", **changes), cause="power lost")
     writer = RecordingWriter.prepare(place, spec)
     writer.begin(first_line)
     with writer:
@@ -76,10 +76,8 @@ def test_a_trigger_that_began_anew_is_told(killed):
     assert open_recording(killed).cut(1000, 40).first_line == 1000
 
 
-@pytest.mark.parametrize(
-    "changes", [{"run_id": "other"}, {"pixels": 16}, {"dtype": "uint8"}, {"layout": "compact"}]
-)
-def test_another_run_is_not_a_segment(killed, changes):
+@pytest.mark.parametrize("changes", [{"pixels": 16}, {"dtype": "uint8"}, {"layout": "compact"}])
+def test_lines_of_another_kind_are_no_segment(killed, changes):
     recover(killed)
     with pytest.raises(UsageError, match="resuming"):
         next_segment(killed, make_spec(**changes))
