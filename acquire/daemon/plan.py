@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from acquire.store import RecordingSpec
-from acquire.stream import Capture, CapturePlan
+from acquire.stream import NOW, Capture, CapturePlan
 from acquire.stream.messages import Note
 from acquire.trigger.base import TriggerRun
 
@@ -39,7 +39,7 @@ class Run:
         """Cameras and trigger run; on failure everything is undone and the first error raised."""
         self._capture.arm()
 
-    def start(self, path: Path, lines: int | None, window: Window) -> None:
+    def start(self, path: Path, lines: int | None, window: Window = NOW) -> None:
         """Record to ``path``. Raises UsageError where it cannot be, before anything is touched."""
         self._capture.start(path, self._spec(), lines, window)
 

@@ -123,6 +123,7 @@ class CaptureStatus:
     recording : a recording is being written
     draining : its last line is known
     done : the latest recording is closed; ``condition``, ``end_reason`` and ``ledger`` are final
+    path : of the latest recording; another than was asked for, when its recorder was killed and replaced
     first_line : the trigger's number of its row 0, or None before the first recording
     recorded_lines, committed_lines : rows that both arms have; rows that a reader finds
     ring : arm → slots, fill, peak, drops (blocks), dropped_lines, all since arm
@@ -137,6 +138,7 @@ class CaptureStatus:
     recording: bool = False
     draining: bool = False
     done: bool = False
+    path: str | None = None
     first_line: int | None = None
     recorded_lines: int = 0
     committed_lines: int = 0
