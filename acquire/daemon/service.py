@@ -331,6 +331,7 @@ class Service:
             last=self._last,
             fault=self._fault,
             capacity=self._capacity,
+            processes={} if self._run is None else self._seen.pids,
         )
 
     def _recording(self) -> RecordingStatus | None:

@@ -269,6 +269,7 @@ class Capture:
             ring={arm: self._ring_counts(arm) for arm in ARMS},
             lines={arm: self._line_counts(arm, began=began is not None) for arm in ARMS},
             fault=supervisor.fault,
+            pids={name: pid for name, pid in self.pids.items() if pid is not None},
         )
         if began is None:
             return status

@@ -133,6 +133,7 @@ class CaptureStatus:
         the camera was ``reopened``, and its ``clock``: the latest stamp (line, its time by the camera) and
         how much faster it runs than the trigger's, in parts per billion; all 0 where it tells no time
     fault : what failed first, or None
+    pids : process numbers: of the recorder, and of each grabber
     """
 
     recording: bool = False
@@ -145,6 +146,7 @@ class CaptureStatus:
     ring: dict[str, dict[str, int]] = field(default_factory=dict)
     lines: dict[str, dict[str, Any]] = field(default_factory=dict)
     fault: str | None = None
+    pids: dict[str, int] = field(default_factory=dict)
     condition: RunCondition | None = None
     end_reason: str | None = None
     ledger: dict[str, Any] = field(default_factory=dict)

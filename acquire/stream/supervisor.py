@@ -212,6 +212,7 @@ class Supervisor:
                 self._loop.revive()
                 for arm in self._arms_of.get(name, ()):
                     self._cameras[arm].revive()
+                    self._counters[RECORDER].add(f"awaited_{arm}", 1)
 
     def _watch_counts(self, now_s: float) -> None:
         pulse = self._newest_pulse
