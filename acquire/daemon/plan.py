@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from acquire.daemon.storage import choose_for, storage_settings
 from acquire.store import RecordingSpec, next_segment
-from acquire.stream import Capture, CapturePlan
+from acquire.stream import NOW, Capture, CapturePlan
 from acquire.stream.messages import Note
 from acquire.trigger.base import TriggerRun
 
@@ -52,7 +52,7 @@ class Run:
             self._choice = choose_for(self._config)
         self._capture.arm()
 
-    def start(self, path: Path, lines: int | None, window: Window, *, resume: bool = False) -> Path:
+    def start(self, path: Path, lines: int | None, window: Window = NOW, *, resume: bool = False) -> Path:
         """Record to ``path``, or, to ``resume`` what is there, to a segment beside it; says where.
 
         Raises UsageError where it cannot be, before anything is touched.

@@ -76,9 +76,8 @@ def next_segment(path: Path, spec: RecordingSpec, cause: str = "interrupted") ->
         raise UsageError(f"resuming {path}: it is not sealed", hint=f"acquire recover {last}")
     number = len(segments) + 1
     follows = Continuation(path.name, number, last.first_line + last.lines, last.end_ns(), cause)
-    return path.with_name(f"{path.stem}-{number}{path.suffix}"), replace(
-        spec, run_id=str(first.attrs["run_id"]), continues=follows
-    )
+    place = path.with_name(f"{path.stem}-{number}{path.suffix}")
+    return place, replace(spec, run_id=str(first.attrs["run_id"]), continues=follows)
 
 
 def list_segment(segment: Path, follows: Continuation, disk: Disk = DISK) -> None:

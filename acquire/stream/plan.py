@@ -123,6 +123,7 @@ class CaptureStatus:
     recording : a recording is being written
     draining : its last line is known
     done : the latest recording is closed; ``condition``, ``end_reason`` and ``ledger`` are final
+    path : of the latest recording; another than was asked for, when its recorder was killed and replaced
     first_line : the trigger's number of its row 0, or None before the first recording
     recorded_lines, committed_lines : rows that both arms have; rows that a reader finds
     ring : arm → slots, fill, peak, drops (blocks), dropped_lines, all since arm
@@ -132,17 +133,20 @@ class CaptureStatus:
         the camera was ``reopened``, and its ``clock``: the latest stamp (line, its time by the camera) and
         how much faster it runs than the trigger's, in parts per billion; all 0 where it tells no time
     fault : what failed first, or None
+    pids : process numbers: of the recorder, and of each grabber
     """
 
     recording: bool = False
     draining: bool = False
     done: bool = False
+    path: str | None = None
     first_line: int | None = None
     recorded_lines: int = 0
     committed_lines: int = 0
     ring: dict[str, dict[str, int]] = field(default_factory=dict)
     lines: dict[str, dict[str, Any]] = field(default_factory=dict)
     fault: str | None = None
+    pids: dict[str, int] = field(default_factory=dict)
     condition: RunCondition | None = None
     end_reason: str | None = None
     ledger: dict[str, Any] = field(default_factory=dict)
