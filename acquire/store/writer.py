@@ -29,7 +29,7 @@ from acquire.store.codecs import EncodeOnce
 from acquire.store.files import DISK, SCRATCH, Publisher, check_new_path, lock
 from acquire.store.pages import keep_freed_memory
 from acquire.store.resume import list_segment
-from acquire.store.retention import Keeper
+from acquire.store.retention import Keeper, release
 from acquire.store.room import RoomWatch
 from acquire.store.spec import Ending, RunCondition, root_attributes
 from acquire.store.table import event_table, gap_table
@@ -279,7 +279,7 @@ class RecordingWriter:
             ending = Ending(condition, end_reason, {**ledger, "store": self._ledger(rows)})
             self._publish_root(rows, nodes, ending)
             if self._keeper is not None:
-                self._keeper.finish()
+                release(self.path, self._disk)
             self._disk.sync_directory(self.path.parent)
         self.close()
 
