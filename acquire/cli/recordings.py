@@ -114,9 +114,8 @@ def recover(recording: RecordingArgument, json: JsonFlag = False) -> None:
         print_json(done.to_dict())
         return
     added = done.lines - done.lines_before
-    what = (
-        f"sealed; {added} lines were on disk that no commit listed" if done.changed else "nothing to recover"
-    )
+    found = f"; {added} lines were on disk that no commit listed" if added else ""
+    what = f"recovered and sealed{found}" if done.changed else "nothing to recover"
     typer.echo(f"{done.path}: {done.lines} lines, {what}")
     if done.indices_mended:
         typer.echo(f"  {done.indices_mended} indices of files were mended")
