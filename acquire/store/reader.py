@@ -1,7 +1,7 @@
 """Reading recordings: what they say about themselves, and segments cut out of them for reconstruction.
 
 A `Recording` is a snapshot: of one that is still growing it shows what was committed when it was opened;
-open it again to see more. Nothing is read before it is asked for.
+`refreshed` shows more. Nothing is read before it is asked for.
 """
 
 from __future__ import annotations
@@ -75,6 +75,10 @@ class Recording:
 
     def _open(self) -> zarr.Group:
         return self.group
+
+    def refreshed(self) -> Recording:
+        """The recording as it is now: of one that is growing, what was committed since."""
+        return self._opener(self.source)
 
     @property
     def state(self) -> str:

@@ -69,6 +69,16 @@ def test_a_killed_recording_goes_on_in_segments(killed):
     assert all(verify(path).intact for path in (killed, second, third))
 
 
+def test_a_growing_recording_is_refreshed(tmp_path):
+    with RecordingWriter.create(tmp_path / "run.zarr", make_spec()) as writer:
+        seen = open_recording(tmp_path / "run.zarr")
+        for lines in (32, 64):
+            fill(writer, 32)
+            writer.commit()
+            seen, before = seen.refreshed(), seen
+            assert (before.lines, seen.lines) == (lines - 32, lines)
+
+
 def test_a_trigger_that_began_anew_is_told(killed):
     recover(killed)
     segment = open_recording(resume(killed, 0, 40)).attrs["segment"]
