@@ -2,11 +2,11 @@
 
 ::
 
-    arm, start ─▶ kill a process at a random moment ─▶ somebody takes its place ─▶ … ─▶ stop, or kill the daemon
-               ─▶ recover ─▶ every row is its line, or flagged and listed; nothing that was acknowledged is missing
+    arm, start ─▶ kill a process at random ─▶ another takes its place ─▶ … ─▶ stop, or kill the daemon
+               ─▶ recover ─▶ every row is its line, or flagged and listed; nothing acknowledged is missing
 
-``python tools/kill_storm.py --kills 200`` prints what was killed and what was found. The cameras show a pattern
-without a zero in it, so that a row that was never written shows.
+``python tools/kill_storm.py --kills 200`` prints what was killed and what was found. The cameras show a
+pattern without a zero in it, so that a row that was never written shows.
 """
 
 from __future__ import annotations
@@ -243,7 +243,7 @@ def check_recording(path: Path) -> list[str]:
 
 
 def _check_ledger(book: dict[str, object] | None, lines: int, missing: np.ndarray, arm: str) -> list[str]:
-    """Where the recorder wrote one, it must agree with the rows: a recording that was recovered has its own."""
+    """Where the recorder wrote one, it must agree with the rows."""
     if book is None or "stored" not in book:
         return []
     stored, lost = int(str(book["stored"])), sum(dict(book["missing"]).values())  # type: ignore[call-overload]
