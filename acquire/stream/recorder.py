@@ -273,6 +273,8 @@ class Recorder:
             lines = None if opening.span.end_line is None else opening.span.end_line - first_line
         session = Session(writer, self._tagger, self._blank, first_line, lines)
         window = opening.begin.window
+        if window.padded:
+            session.before = Cause.RECORDER_LOST
         if window.kind:
             self._notes.append(Note(at, window.kind, window.text))
         for note in self._notes:

@@ -103,6 +103,8 @@ class Session:
         self.end_reason = "line budget reached"
         self.books = {arm: Book(first_line) for arm in ARMS}
         self.lost: dict[str, Cause] = {}
+        self.before = Cause.MIXED
+        """Why lines are missing that an arm's first block leaves out without a word."""
         self._writer = writer
         self._tagger = tagger
         self._blank = blank
@@ -143,7 +145,8 @@ class Session:
             return 0
         for loss in block.losses:
             self._miss_until(arm, loss.end_line, loss.cause)
-        self._miss_until(arm, block.first_line, Cause.MIXED)
+        untold = Cause.MIXED if book.stored or book.missing else self.before
+        self._miss_until(arm, block.first_line, untold)
         part = slice(book.next_line - block.first_line, self.end_line - block.first_line)
         if part.stop <= part.start:
             return 0
