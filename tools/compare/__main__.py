@@ -83,7 +83,7 @@ def table(found: dict[str, list[dict[str, Any]]]) -> str:
         for peer, rounds in found.items()
     }
     rows = [
-        "| writer | MB/s | of bare | ours faster by | CPU s/GB | ours needs | slowest append ms | memory MB |",
+        "| writer | MB/s | of bare | ours faster by | CPU s/GB | ours needs | slowest append | memory |",
         "|---|---|---|---|---|---|---|---|",
     ]
     ours, bare = best["acquire"], best["bare"]
@@ -91,7 +91,7 @@ def table(found: dict[str, list[dict[str, Any]]]) -> str:
         rows.append(
             f"| {peer.replace('_', '-')} | {one['rate']:.0f} | {one['rate'] / bare['rate']:.2f}"
             f" | {ours['rate'] / one['rate']:.1f} | {one['cpu']:.2f} | {ours['cpu'] / one['cpu']:.2f}"
-            f" | {one['slowest']:.0f} | {one['memory']:.0f} |"
+            f" | {one['slowest']:.0f} ms | {one['memory']:.0f} MB |"
         )
     return "\n".join(rows)
 
