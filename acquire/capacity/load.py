@@ -79,7 +79,7 @@ class Load:
             ring_slots=config.ring_slots,
             chunk_lines=recording.chunk_lines,
             shard_chunks=recording.shard_chunks,
-            codec=recording.codec,
+            codec="none" if recording.codec == "auto" else recording.codec,
             fsync=recording.fsync,
         )
 

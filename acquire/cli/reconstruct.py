@@ -9,7 +9,7 @@ import typer
 
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_warning
 from acquire.cli.progress import stage_progress
-from acquire.cli.recordings import RecordingArgument
+from acquire.cli.recordings import PlaceArgument
 
 if TYPE_CHECKING:
     from typing import Any
@@ -24,7 +24,7 @@ def register(app: typer.Typer) -> None:
 
 
 def reconstruct(
-    recording: RecordingArgument,
+    recording: PlaceArgument,
     out: Annotated[Path, typer.Option(metavar="VIDEO", help="New video, a directory NAME.zarr.")],
     first_line: Annotated[
         int | None, typer.Option(help="The trigger's number; else the recording's first.")

@@ -48,7 +48,7 @@ class Run(Protocol):
     run_id: str
 
     def arm(self) -> None: ...
-    def start(self, path: Path, lines: int | None, window: Window) -> None: ...
+    def start(self, path: Path, lines: int | None, window: Window, *, resume: bool = False) -> Path: ...
     def mark(self, text: str) -> Note: ...
     def extend(self, line: int) -> None: ...
     def events(self) -> list[Note]: ...
@@ -117,7 +117,7 @@ class Service:
         with self._doing(Event.START):
             rate_hz = self._config.line_rate_hz
             window = window_of(request, rate_hz)
-            self._begin(request.path, budget_lines(request, rate_hz), window)
+            self._begin(request.path, budget_lines(request, rate_hz), window, resume=request.resume)
             self._by_event = False
             self.supervise()
 
@@ -203,10 +203,9 @@ class Service:
         self._rates.look(delivered_lines(self._seen))
         return self._seen
 
-    def _begin(self, path: Path | None, lines: int | None, window: Window) -> None:
+    def _begin(self, path: Path | None, lines: int | None, window: Window, *, resume: bool = False) -> None:
         assert self._run is not None
-        path = path or default_path(self._config)
-        self._run.start(path, lines, window)
+        path = self._run.start(path or default_path(self._config), lines, window, resume=resume)
         if window.post_lines is not None:
             lines = window.pre_lines + window.post_lines
         self._target = path, lines

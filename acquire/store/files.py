@@ -10,18 +10,22 @@ import errno
 import fcntl
 import os
 import shutil
+import time
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from acquire.errors import StateError, UsageError
-from acquire.store.pages import open_direct
+from acquire.store.pages import aligned_bytes, open_direct
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from typing_extensions import Buffer
+
+SCRATCH = ".next"
+"""Where new metadata of a recording is prepared, beside the shards of its first array."""
 
 NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
 """What a file system without locks answers; some network disks are such."""
@@ -179,6 +183,25 @@ class Disk:
 
 DISK = Disk()
 """The one that is used unless told otherwise."""
+
+
+def measure_disk(directory: Path, size: int = 2**27) -> float:
+    """Bytes per second that the disk of ``directory`` takes, past the page cache where that can be.
+
+    Writes ``size`` bytes and deletes them. Raises OSError.
+    """
+    block = aligned_bytes(2**22)
+    path = directory / f".acquire-{os.getpid()}.measure"
+    file = ShardFile(path, direct=True)
+    try:
+        begun = time.perf_counter()
+        for offset in range(0, size, len(block)):
+            file.write_pages([block.data], offset)
+        file.sync()
+        return size / (time.perf_counter() - begun)
+    finally:
+        file.close()
+        path.unlink()
 
 
 def tree_bytes(path: Path) -> int:

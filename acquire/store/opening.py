@@ -31,7 +31,7 @@ def open_source(source: Source) -> Recording:
     document = read_root(source)
     _check_format(source, _format(document))
     try:
-        recording = Recording(source, document)
+        recording = Recording(source, document, open_source)
         _check_complete(recording)
     except (*DAMAGE, UsageError) as error:
         raise DataError(

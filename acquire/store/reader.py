@@ -19,15 +19,22 @@ from acquire.errors import DataError, UsageError
 from acquire.geometry import Geometry
 from acquire.lines import ARMS, LineFlag, Segment
 from acquire.store.camera_stream import CameraStream
+from acquire.store.files import DISK
 from acquire.store.layout import line_columns
+from acquire.store.source import LocalSource
 from acquire.store.table_reader import read_events, read_gaps
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from acquire.store.layout import Document
     from acquire.store.source import Source
     from acquire.store.table_reader import Event, Gap
+
+CUT_COLUMNS = ("lines", "flags", "code", "code_index", "time")
+"""Arrays that a segment is made of."""
 
 UNUSABLE = LineFlag.MISSING | LineFlag.INCOMPLETE
 
@@ -35,9 +42,13 @@ UNUSABLE = LineFlag.MISSING | LineFlag.INCOMPLETE
 class Recording:
     """One recording, opened for reading; `open_recording` makes it."""
 
-    def __init__(self, source: Source, document: Document) -> None:
-        """``document`` is the root's zarr.json. Raises one of `camera_stream.DAMAGE` where it is damaged."""
+    def __init__(self, source: Source, document: Document, opener: Callable[[Source], Recording]) -> None:
+        """``document`` is the root's zarr.json; ``opener`` opens further segments.
+
+        Raises one of `camera_stream.DAMAGE` where the document is damaged.
+        """
         self.source = source
+        self._opener = opener
         self.document = document
         self.attrs: dict[str, Any] = document["attributes"]
         self._nodes = nodes = document["consolidated_metadata"]["metadata"]
@@ -98,9 +109,29 @@ class Recording:
         """Lines that retention has deleted: first line and count of every stretch."""
         return tuple((int(first), int(count)) for first, count in self.attrs.get("dropped", ()))
 
+    @property
+    def first_available_line(self) -> int:
+        """The first line that retention has left."""
+        line = self.first_line
+        for first, count in sorted(self.dropped):
+            line = first + count if first == line else line
+        return line
+
     def dropped_rows(self) -> list[range]:
         """The same, in rows."""
         return [range(first - self.first_line, first - self.first_line + n) for first, n in self.dropped]
+
+    @cached_property
+    def segments(self) -> tuple[Recording, ...]:
+        """Recordings that continue this one after an outage, in order. Raises DataError for a damaged one."""
+        return tuple(self._opener(self.source.beside(name)) for name in self.attrs.get("segments", ()))
+
+    def end_ns(self) -> int | None:
+        """UTC at which the line after the last is read out; None without lines."""
+        if not self.lines:
+            return None
+        last = int(self.arms[ARMS[0]].read("time", self.lines - 1, self.lines)[0])
+        return last + round(self.line_period_ns)
 
     def kept_chunks(self) -> list[int]:
         """Chunks that hold rows and have not been deleted; retention deletes whole ones."""
@@ -151,11 +182,18 @@ class Recording:
         Raises UsageError for lines that are not there, and DataError when the file is damaged or the code
         that the attributes describe is not the one recorded with the lines.
         """
+        if (segment := self._segment_with(first_line)) is not None:
+            return segment.cut(first_line, lines)
         start, stop = self._rows(first_line, lines)
         geometry = self.geometry_for(lines)
         if (pixels := self.arms["a"].pixels) != geometry.stages:
             raise UsageError(f"cut of lines with {pixels} pixels", possible=f"M = {geometry.stages} pixels")
         arms = self.arms.values()
+        expected = [stream.reader(name) for stream in arms for name in CUT_COLUMNS]
+        for reader in expected:
+            reader.expect_index(start, stop)
+        for reader in expected:
+            reader.expect(start, stop)
         samples = np.stack([stream.read("lines", start, stop) for stream in arms])
         flags = np.stack([stream.read("flags", start, stop) for stream in arms])
         return Segment(
@@ -179,23 +217,55 @@ class Recording:
             **{key: self.attrs[key] for key in keys},
             "first_line": self.first_line,
             "lines": lines,
+            "first_available_line": self.first_available_line,
+            "dropped": [list(stretch) for stretch in self.dropped],
+            "holds": self.attrs.get("holds", []),
             "duration_s": lines * period_ns / NS_PER_S,
             "line_rate_hz": NS_PER_S / period_ns,
-            "start_ns": int(self.arms["a"].read("time", 0, 1)[0]) if lines else None,
+            "start_ns": self._start_ns(),
             "dtype": self.arms["a"].dtype.name,
             "bytes": self.source.total_bytes(),
+            "segment": self.attrs.get("segment"),
+            "segments": self.attrs.get("segments", []),
             "gaps": len(self.gaps),
             "lost_lines": {arm: sum(gap.count for gap in self.gaps if gap.arm == arm) for arm in ARMS},
             "events": len(self.events),
             "simulated": bool(self.attrs.get("simulated", False)),
             "cameras": self.attrs["cameras"],
+            "disk": self._disk_facts(),
             "ledger": self.attrs["ledger"],
             "durability": self.attrs.get("durability", {}),
             "versions": self.attrs["versions"],
         }
 
+    def _disk_facts(self) -> dict[str, float] | None:
+        """While it grows here: bytes free, bytes per second that it takes, seconds until the disk is full."""
+        if self.state == "sealed" or not isinstance(self.source, LocalSource) or not self.lines:
+            return None
+        free = DISK.free_bytes(self.source.path)
+        rate = self.source.total_bytes() * NS_PER_S / (self.lines * self.line_period_ns)
+        return {"free_bytes": free, "bytes_per_s": rate, "seconds_to_full": free / rate}
+
+    def _segment_with(self, line: int) -> Recording | None:
+        """The further segment that has a line which is not here."""
+        if line < self.first_line + self.lines:
+            return None
+        return next((s for s in self.segments if s.first_line <= line < s.first_line + s.lines), None)
+
+    def _start_ns(self) -> int | None:
+        """When the first line that there is was read out."""
+        row = self.first_available_line - self.first_line
+        return int(self.arms[ARMS[0]].read("time", row, row + 1)[0]) if row < self.lines else None
+
     def _rows(self, first_line: int, lines: int) -> tuple[int, int]:
         start = first_line - self.first_line
+        for first, count in self.dropped:
+            if lines > 0 and first < first_line + lines and first_line < first + count:
+                raise DataError(
+                    f"{self}: lines {first} to {first + count - 1} were dropped by retention",
+                    possible=f"lines {self.first_available_line} to {self.first_line + self.lines - 1}",
+                    hint="`acquire hold` keeps lines while a recording is being written",
+                )
         if lines < 1 or start < 0 or start + lines > self.lines:
             have = (
                 f"lines {self.first_line} to {self.first_line + self.lines - 1}"

@@ -19,13 +19,14 @@ import numpy as np
 
 from acquire.lines import ARMS, LineFlag
 from acquire.store import layout
-from acquire.store.files import DISK, Publisher, locked
+from acquire.store.files import DISK, SCRATCH, Publisher, locked
 from acquire.store.mend import mend_index, rewrite_chunk
 from acquire.store.opening import open_recording
+from acquire.store.retention import delete_shard, release
 from acquire.store.scan import COLUMNS, ArmScan, Damage, covered, missing_rows, real_rows, runs, scan
 from acquire.store.spec import RunCondition
 from acquire.store.table import event_table, gap_table
-from acquire.store.writer import RESERVE, SCRATCH
+from acquire.store.writer import RESERVE
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -171,7 +172,16 @@ class _Recoverer:
         publisher.replace(self.path / "zarr.json", layout.to_json(document), durable=True)
         for leftover in (SCRATCH, RESERVE):
             self.disk.remove(hidden / leftover)
+        release(self.path, self.disk)
+        for shard in self._dropped_shards():
+            delete_shard(self.disk, self.path, shard)
         self.disk.sync_directory(self.path.parent)
+
+    def _dropped_shards(self) -> list[int]:
+        """Shards that retention had told of, and may have had no time to delete."""
+        size = self.recording.arms[ARMS[0]].reader("lines").shape.shard_rows
+        dropped = self.recording.dropped_rows()
+        return [shard for rows in dropped for shard in range(rows.start // size, rows.stop // size)]
 
     def _tables(
         self, publisher: Publisher, new_gaps: dict[str, list[tuple[int, int, str]]]

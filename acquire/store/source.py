@@ -1,4 +1,4 @@
-"""Where a recording is read from: named parts of bytes below one place, on a local disk."""
+"""Where a recording is read from: named parts of bytes below one place, on a local disk or far away."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 from acquire.store.files import tree_bytes
+from acquire.store.remote import RemoteSource, is_url
 
 if TYPE_CHECKING:
     from zarr.abc.store import Store
@@ -23,6 +24,9 @@ class Source(Protocol):
 
     def read_range(self, key: str, start: int, size: int) -> bytes:
         """Bytes ``start .. start + size - 1`` of one part, fewer where it ends earlier."""
+
+    def expect(self, key: str, start: int, size: int) -> None:
+        """These bytes will be read soon: a hint, which may begin to fetch them."""
 
     def size(self, key: str) -> int:
         """Bytes of one part."""
@@ -59,6 +63,13 @@ class LocalSource:
         finally:
             os.close(fd)
 
+    def expect(self, key: str, start: int, size: int) -> None:
+        fd = os.open(self.path / key, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            os.posix_fadvise(fd, start, size, os.POSIX_FADV_WILLNEED)
+        finally:
+            os.close(fd)
+
     def size(self, key: str) -> int:
         return (self.path / key).stat().st_size
 
@@ -76,5 +87,7 @@ class LocalSource:
 
 
 def source_of(place: Path | str) -> Source:
-    """The source for a path."""
+    """The source for a path, or for a URL. Raises UsageError for a URL that cannot be one."""
+    if is_url(place):
+        return RemoteSource(str(place))
     return LocalSource(Path(place))

@@ -13,6 +13,7 @@ import numpy as np
 import acquire
 from acquire.codes import code_from_attrs
 from acquire.errors import UsageError
+from acquire.geometry import Geometry
 from acquire.lines import ARMS
 from acquire.store.array_writer import ENCODED_AHEAD
 from acquire.store.codecs import CODECS, Codec
@@ -20,6 +21,8 @@ from acquire.store.shard import MAX_CHUNK_BYTES, MAX_SHARD_CHUNKS
 
 if TYPE_CHECKING:
     from acquire.clock import ClockFit
+    from acquire.store.resume import Continuation
+    from acquire.store.retention import Retention
 
 FORMAT = "acquire-recording/1"
 
@@ -80,6 +83,9 @@ class RecordingSpec:
     encoders : threads that pack chunks, where there is a codec
     fsync : force bytes to the medium at every ``"commit"``, or only at the ``"seal"``
     commit_lines : lines on disk that may wait for their commit; a whole number of chunks is best
+    retention : what of an endless recording is kept; None: everything
+    reserve_bytes : of the disk that are left free: the recording should end when nothing else is left
+    continues : what this recording is a further segment of, if it is one
     layout : of the instrument: ``dual``, ``compact``, ``emulated``, ``interline``
     """
 
@@ -102,6 +108,9 @@ class RecordingSpec:
     encoders: int = 2
     fsync: Literal["commit", "seal"] = "seal"
     commit_lines: int = 2**16
+    retention: Retention | None = None
+    reserve_bytes: int = 2**28
+    continues: Continuation | None = None
     layout: str = "dual"
 
     def __post_init__(self) -> None:
@@ -143,6 +152,7 @@ class RecordingSpec:
             "shard_chunks": (1, MAX_SHARD_CHUNKS),
             "encoders": (1, 64),
             "commit_lines": (1, 2**40),
+            "reserve_bytes": (0, 2**60),
             "chunk_lines": (1, MAX_CHUNK_BYTES // max(8, self.pixels * self.line_dtype.itemsize)),
         }
         for name, (low, high) in limits.items():
@@ -180,7 +190,15 @@ class Ending:
 
 def root_attributes(spec: RecordingSpec, ending: Ending | None = None) -> dict[str, Any]:
     """Attributes of the recording's root group; ``ending`` makes it sealed."""
-    return {**spec.extra, **_own_attributes(spec, ending)}
+    segment = {"segment": _segment(spec, spec.continues)} if spec.continues else {}
+    return {**spec.extra, **segment, **_own_attributes(spec, ending)}
+
+
+def _segment(spec: RecordingSpec, continues: Continuation) -> dict[str, Any]:
+    """What the recording continues, now that its first line is known."""
+    readout = Geometry(spec.stages, spec.substeps, 1).readout_substep
+    tick = np.array([(spec.substeps * spec.first_line + readout) * spec.substep_ticks], np.uint64)
+    return continues.to_attrs(spec.first_line, int(spec.clock.time_ns(tick)[0]))
 
 
 def _own_attributes(spec: RecordingSpec, ending: Ending | None) -> dict[str, Any]:

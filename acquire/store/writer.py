@@ -21,12 +21,16 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
 
-from acquire.errors import DataError, UsageError
+from acquire.errors import DataError, StateError, UsageError
 from acquire.lines import ARMS
 from acquire.store import layout
 from acquire.store.arm_writer import ArmWriter
 from acquire.store.codecs import EncodeOnce
-from acquire.store.files import DISK, Publisher, check_new_path, lock
+from acquire.store.files import DISK, SCRATCH, Publisher, check_new_path, lock
+from acquire.store.pages import keep_freed_memory
+from acquire.store.resume import list_segment
+from acquire.store.retention import Keeper, release
+from acquire.store.room import RoomWatch
 from acquire.store.spec import Ending, RunCondition, root_attributes
 from acquire.store.table import event_table, gap_table
 
@@ -36,6 +40,7 @@ if TYPE_CHECKING:
 
     from acquire.lines import TaggedBlock
     from acquire.store.files import Disk
+    from acquire.store.room import Room
     from acquire.store.spec import RecordingSpec
 
 NOT_A_PLACE = (
@@ -53,8 +58,8 @@ NOT_A_PLACE = (
 OWN_INTERVAL_S = 1.0
 """How much older than the root the metadata of a group or an array opened by itself may be."""
 
-SCRATCH, RESERVE = ".next", ".reserve"
-"""Files of a recording that is being written, beside the shards of the first array."""
+RESERVE = ".reserve"
+"""Of a recording that is being written, beside the shards of the first array."""
 
 RESERVE_BYTES = 2**20
 """Kept free for the metadata of the end: more than the tables and the root take."""
@@ -84,6 +89,8 @@ class RecordingWriter:
         self._disk = disk
         self._lock = -1
         threads = 0 if spec.codec == "none" else spec.encoders
+        if threads:
+            keep_freed_memory()
         self._pool = ThreadPoolExecutor(threads, "encoder") if threads else None
         once = {name: EncodeOnce() for name in layout.SAME_IN_BOTH_ARMS}
         self._arms = {arm: ArmWriter(path / arm, spec, disk, self._pool, once) for arm in ARMS}
@@ -94,6 +101,10 @@ class RecordingWriter:
         hidden = path / ARMS[0] / "lines"
         self._publisher = Publisher(hidden / SCRATCH, disk)
         self._reserve = hidden / RESERVE
+        self._keeper: Keeper | None = None
+        self._watch = RoomWatch(disk, path, spec.reserve_bytes)
+        self._looked = self._watch.room
+        self._stuck = False
         self._committed = 0
         self._own_due_s = 0.0
         self._failure: str | None = None
@@ -140,10 +151,15 @@ class RecordingWriter:
         self.spec = replace(self.spec, first_line=first_line)
         for arm in self._arms.values():
             arm.begin(first_line)
+        if self.spec.retention is not None:
+            shard_lines = self.spec.chunk_lines * self.spec.shard_chunks
+            self._keeper = Keeper(self.path, self.spec.retention, shard_lines, first_line, self._disk)
         try:
             with self._failing("creating the recording"):
                 self._publish_root(0, self._publish_parts(0, own=False))  # `prepare` did all that takes time
-        except DataError:
+                if self.spec.continues is not None:
+                    list_segment(self.path, self.spec.continues, self._disk)
+        except (DataError, StateError):
             self.close()
             self._disk.remove_tree(self.path)
             raise
@@ -207,6 +223,8 @@ class RecordingWriter:
         if tick < 0 or line < 0:
             raise UsageError(f"event {kind!r} at tick {tick}, line {line}", possible="0 or more")
         self._events.add({"tick": tick, "line": line, "kind": kind, "text": text})
+        if self._keeper is not None:
+            self._keeper.note(kind, line)
 
     def commit(self) -> None:
         """Make every row that both arms have in whole chunks visible, and all gaps and events.
@@ -219,6 +237,7 @@ class RecordingWriter:
             for arm in self._arms.values():
                 arm.settle()
             rows = self._whole_rows()
+            room = self._watch.look(self.bytes_written)
             if rows == self._committed and not any(table.dirty for table in self._tables):
                 return
             if self._durable:
@@ -226,7 +245,22 @@ class RecordingWriter:
                     arm.sync()
             if own := time.monotonic() >= self._own_due_s:
                 self._own_due_s = time.monotonic() + OWN_INTERVAL_S
-            self._publish_root(rows, self._publish_parts(rows, own=own))
+            self._publish_kept(rows, self._publish_parts(rows, own=own), room)
+
+    @property
+    def room(self) -> Room:
+        """What the disk could still take at the latest commit, and for how long."""
+        return self._watch.room
+
+    @property
+    def nearly_full(self) -> str | None:
+        """Why the recording should be sealed now, while there is room for that; None: it need not.
+
+        With retention the oldest lines go first, and this is said only when nothing is left that may go.
+        """
+        if not self._stuck:
+            return None
+        return f"disk nearly full: {self.spec.reserve_bytes} bytes are kept free"
 
     def seal(self, condition: RunCondition, end_reason: str, ledger: dict[str, Any]) -> None:
         """Write the lines that wait, pad their chunk with 0, end the recording, and force it to the medium.
@@ -244,6 +278,8 @@ class RecordingWriter:
             self._disk.sync_tree(self.path)
             ending = Ending(condition, end_reason, {**ledger, "store": self._ledger(rows)})
             self._publish_root(rows, nodes, ending)
+            if self._keeper is not None:
+                release(self.path, self._disk)
             self._disk.sync_directory(self.path.parent)
         self.close()
 
@@ -291,11 +327,22 @@ class RecordingWriter:
             nodes |= table.nodes()
         return nodes
 
+    def _publish_kept(self, rows: int, nodes: dict[str, layout.Document], room: Room) -> None:
+        """The commit, without the lines that retention lets go; their files are deleted once it is told."""
+        looked, self._looked = self._looked is not room, room
+        going = self._keeper.choose(rows, -room.free_bytes if looked else 0) if self._keeper else []
+        if looked:
+            self._stuck = room.full and not going
+        self._publish_root(rows, nodes)
+        if self._keeper and self._keeper.delete(going):
+            self._publish_root(rows, nodes)
+
     def _publish_root(
         self, rows: int, nodes: dict[str, layout.Document], ending: Ending | None = None
     ) -> None:
         """The commit itself."""
-        root = layout.group_document(root_attributes(self.spec, ending), nodes)
+        kept = self._keeper.attributes() if self._keeper else {}
+        root = layout.group_document({**root_attributes(self.spec, ending), **kept}, nodes)
         durable = self._durable or ending is not None
         self._publisher.replace(self.path / "zarr.json", layout.to_json(root), durable=durable)
         self._committed = rows

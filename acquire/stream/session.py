@@ -44,6 +44,8 @@ class Writer(Protocol):
 
     @property
     def committed_lines(self) -> int: ...
+    @property
+    def nearly_full(self) -> str | None: ...
     def append(self, block: TaggedBlock) -> None: ...
     def add_gap(self, arm: str, first_line: int, count: int, cause: str) -> None: ...
     def add_event(self, kind: str, tick: int, line: int, text: str = "") -> None: ...
@@ -186,8 +188,10 @@ class Session:
         self._mismatches += len(found)
 
     def commit(self) -> None:
-        """Make what is written visible to readers."""
+        """Make what is written visible to readers; a disk that is nearly full ends the recording."""
         self._writer.commit()
+        if (reason := self._writer.nearly_full) is not None and not self._told_to_end:
+            self.end(max(book.next_line for book in self.books.values()), reason, RunCondition.INTERRUPTED)
 
     def close(self, error: Exception | None = None) -> Sealed:
         """Seal the recording; as aborted after a write ``error``, or one now, if the disk still allows it."""

@@ -37,6 +37,7 @@ class MemoryWriter:
     closed: bool = False
     broken: tuple[str, ...] = ()
     committed_lines: int = 0
+    nearly_full: str | None = None
 
     def append(self, block: TaggedBlock) -> None:
         self._refuse("append")
@@ -180,6 +181,22 @@ def test_stop_ends_at_a_line_that_both_reach() -> None:
     assert writer.ending[1] == "stopped"
     assert writer.column("b", "pixels")[-1, 0] == value_of("b", 99)
     assert [event[0] for event in writer.events] == ["started", "stopped"]
+
+
+def test_a_disk_that_is_nearly_full_ends_the_recording() -> None:
+    writer = MemoryWriter()
+    session = make_session(writer)
+    session.take("a", ring_block("a", 0, 30, ()))
+    session.take("b", ring_block("b", 0, 20, ()))
+    session.commit()
+    assert not session.ending
+    writer.nearly_full = "disk nearly full"
+    session.commit()
+    assert (session.ending, session.done) == (True, False)
+    session.take("b", ring_block("b", 20, 10, ()))
+    assert session.done
+    sealed = session.close()
+    assert (sealed.condition, sealed.end_reason) == (RunCondition.INTERRUPTED, "disk nearly full")
 
 
 def test_the_worst_reason_stays() -> None:
