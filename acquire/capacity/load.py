@@ -76,7 +76,7 @@ class Load:
             substeps=config.geometry.substeps,
             stages=config.geometry.stages,
             block_lines=stream.block_lines,
-            ring_slots=stream.ring_slots,
+            ring_slots=config.ring_slots,
             chunk_lines=recording.chunk_lines,
             shard_chunks=recording.shard_chunks,
             codec=recording.codec,

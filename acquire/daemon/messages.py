@@ -100,6 +100,7 @@ class CheckStatus(_Message):
     verdict: str = Field(description="verified, shifted, inverted, wrong_code, dark or unknown")
     shift: int = Field(description="sub-steps by which the lines are late")
     checked_line: int = Field(description="the line after the last that was looked at")
+    lapped: int = Field(description="ring slots that came and went unseen by the check")
 
 
 class ArmStatus(_Message):

@@ -262,6 +262,9 @@ class Service:
             raise DeviceError(f"the devices could not be released in order: {error}") from error
         finally:
             self._seen, self._rates = run.poll(), Rates()
+            for arm, account in self._seen.accounts.items():
+                if not account.balanced:
+                    log.error("the ledger of arm %s does not balance: %s", arm, account)
             self._remember()
             self._publish()
 

@@ -231,7 +231,7 @@ class Capture:
             self._workers[name] = Worker(f"grabber {name}", grabber.grab, *tasks)
 
     def _others(self) -> dict[str, Counters]:
-        return {name: self._counters[name] for name in (TRIGGER, WATCHER) if name in self._counters}
+        return {name: counters for name, counters in self._counters.items() if name != RECORDER}
 
     def _grabber_plan(self, arm: str) -> grabber.GrabberPlan:
         plan = self._plan
@@ -316,7 +316,10 @@ class Capture:
             return {}
         seen = self._counters[WATCHER]
         verdict = str(watcher.VERDICTS[seen[f"verdict_{arm}"]])
-        return {"verdict": verdict, **{name: seen[f"{name}_{arm}"] for name in ("shift", "checked_line")}}
+        return {
+            "verdict": verdict,
+            **{name: seen[f"{name}_{arm}"] for name in ("shift", "checked_line", "lapped")},
+        }
 
     def _line_counts(self, arm: str, *, began: bool) -> dict[str, Any]:
         grabbed, recorded = self._counters[arm], self._counters[RECORDER]

@@ -340,7 +340,7 @@ class Recorder:
 
     def _look_after(self, session: Session) -> None:
         session.doubted = self._witness.doubted()
-        session.trigger = self._witness.trigger()
+        session.trigger, session.cameras = self._witness.trigger(), self._witness.cameras()
         for name, arm in self._arms.items():
             if name in session.lost and not arm.ring.fill:
                 session.give_up(name)

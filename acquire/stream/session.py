@@ -113,6 +113,7 @@ class Session:
     lost : arm → why it will deliver no more
     doubted : arms whose lines contradict the code at the moment: what comes is flagged
     trigger : what the trigger counted while this was recorded
+    cameras : arm → what its camera counted since it was armed
     """
 
     def __init__(
@@ -125,6 +126,7 @@ class Session:
         self.lost: dict[str, Cause] = {}
         self.doubted: set[str] = set()
         self.trigger: dict[str, int] = {}
+        self.cameras: dict[str, dict[str, int]] = {}
         self._writer = writer
         self._tagger = tagger
         self._blank = blank
@@ -284,6 +286,7 @@ class Session:
             "pulses": lines,
             "tag_mismatches": self._mismatches,
             "trigger": self.trigger,
+            "cameras": self.cameras,
             "tainted_by": self._taints(),
             **arms,
         }

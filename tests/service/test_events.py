@@ -189,6 +189,8 @@ def test_light_that_follows_the_code_is_verified_and_every_pulse_has_its_place(t
             assert ledger.issued == 17 + ledger.stored + ledger.discarded + sum(ledger.lost.values())
     assert recording.attrs["ledger"]["tainted_by"] == {}
     assert recording.attrs["ledger"]["trigger"]["tags_missing"] == 0
+    for camera in recording.attrs["ledger"]["cameras"].values():
+        assert camera["next_line"] == camera["delivered"] - camera["preroll"] >= 3000
 
 
 def test_a_level_that_is_crossed_records_by_itself(tmp_path: Path) -> None:
