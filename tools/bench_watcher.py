@@ -31,6 +31,8 @@ from acquire.stream.watcher import COUNTERS, WatchPlan, watch
 BLOCK_LINES = 256
 SLOTS = 512
 CHECK_LINES = 8192
+CODE_DEGREE = 15
+CODE_PERIOD = 2**CODE_DEGREE - 1
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ def main() -> None:
 
 
 def measure(case: Case, seconds: float) -> dict[str, str]:
-    rig = load_rig("rig-demo", {"geometry.stages": case.stages})
+    rig = load_rig("rig-demo", {"geometry.stages": case.stages, "code.degree": CODE_DEGREE})
     lines = simulated(rig, int(seconds * case.line_rate_hz) // BLOCK_LINES * BLOCK_LINES)
     shape = RingShape(SLOTS, BLOCK_LINES, case.stages, "uint16", observers=2)
     rings = {arm: Ring(arm, shape) for arm in ARMS}
@@ -98,15 +100,13 @@ def measure(case: Case, seconds: float) -> dict[str, str]:
 
 
 def simulated(rig: RigConfig, count: int) -> dict[str, np.ndarray]:
-    """Lines of both arms from the run's first line on; b's a line late from the middle on."""
+    """Lines of both arms, of a still scene under a code that repeats; b's a line late from the middle on."""
     cameras = {arm: rig.cameras.arm(arm) for arm in ARMS}
-    bench, code = Bench(load_scene("scene-leds"), rig.geometry, cameras, 1e-5), rig.code.build()
-    lines = {arm: np.empty((count, rig.geometry.stages), np.uint16) for arm in ARMS}
-    for arm, rows in lines.items():
-        camera = bench.camera(arm, code)
-        for at in range(0, count, CHECK_LINES):
-            part = rows[at : at + CHECK_LINES]
-            part[:] = camera.read(at, len(part)).pixels
+    bench, code = Bench(load_scene("scene-usaf"), rig.geometry, cameras, 1e-5), rig.code.build()
+    lines = {}
+    for arm in ARMS:
+        period = bench.camera(arm, code).read(CODE_PERIOD, CODE_PERIOD).pixels
+        lines[arm] = np.tile(period, (-(-count // CODE_PERIOD), 1))[:count]
     lines["b"][count // 2 :] = lines["b"][count // 2 - 1 : -1].copy()
     return lines
 
