@@ -75,7 +75,7 @@ def mark(
     socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Note that something happens now. While armed it starts a recording, where the rig's [events] say so.
+    """Note that something happens now. While armed it starts a recording, where the rig's events say so.
 
     Example: [bold]acquire mark "the valve opens"[/]
     """

@@ -70,7 +70,7 @@ def test_commands_of_a_user(tmp_path: Path) -> None:
         refused = daemon("start", "--pre", "1h")
         assert refused.code == 2
         assert "3.6e+07 lines" not in refused.err
-        assert "which the ring holds now" in refused.err
+        assert "which both rings hold now" in refused.err
         assert "stream.ring_seconds" in refused.err
         with daemon.client() as client:
             deadline = time.monotonic() + PATIENCE_S
