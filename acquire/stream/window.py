@@ -105,7 +105,7 @@ def span(window: Window, lines: int | None, held: Held, line_rate_hz: float) -> 
         has = max(0, held.at - held.from_line)
         raise UsageError(
             f"start with {window.pre_lines} lines ({window.pre_lines / line_rate_hz:.3g} s) from before",
-            possible=f"up to {has} lines ({has / line_rate_hz:.3g} s), which the ring holds now",
+            possible=f"up to {has} lines ({has / line_rate_hz:.3g} s), which both rings hold now",
             hint="wait until the ring is full, or configure a longer one (stream.ring_seconds)",
         )
     first = wanted if window.padded else max(wanted, held.from_line)
