@@ -15,7 +15,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from acquire.codes import TAPS, Code, ConstantCode, PrbsCode, mix_seed
 from acquire.errors import ConfigError
-from acquire.event_config import EventsConfig
+from acquire.event_config import CheckConfig, EventsConfig
 from acquire.geometry import Geometry
 from acquire.scene_config import SceneConfig, SceneFile, VideoSceneConfig, anchored
 
@@ -313,6 +313,7 @@ class RigConfig(_Model):
     stream: StreamConfig = StreamConfig()
     recording: RecordingConfig = RecordingConfig()
     events: EventsConfig = EventsConfig()
+    check: CheckConfig = CheckConfig()
     control: ControlConfig = Field(default_factory=ControlConfig)
     simulation: SimulationConfig
 

@@ -1,4 +1,4 @@
-"""Model of a rig's ``[events]``: what starts a recording by itself, and what it keeps of before and after."""
+"""Models of a rig's ``[events]`` and ``[check]``: what is looked for in the lines while they pass."""
 
 from __future__ import annotations
 
@@ -34,3 +34,15 @@ class EventsConfig(FrozenModel):
         if "threshold" in self.sources and not self.hysteresis_dn < self.level_dn:
             raise ValueError("source 'threshold' needs a level_dn above hysteresis_dn")
         return self
+
+
+class CheckConfig(FrozenModel):
+    """Whether the light follows the code, by the lines themselves. Lines in doubt are flagged, never dropped.
+
+    Each arm's pixels predict the other's energy, so that the arms are checked against each other to the
+    sub-step. Images known to lie off one another by some fine pixels are told here.
+    """
+
+    enable: bool = True
+    registration_a: int = Field(default=0, ge=-64, le=64, description="sub-steps by which arm a shows late")
+    registration_b: int = Field(default=0, ge=-64, le=64, description="sub-steps by which arm b shows late")

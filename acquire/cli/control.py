@@ -13,7 +13,7 @@ from acquire.errors import DataError, UsageError
 
 if TYPE_CHECKING:
     from acquire.daemon.client import Client
-    from acquire.daemon.messages import LastRecording, Status
+    from acquire.daemon.messages import CheckStatus, LastRecording, Status
 
 SocketOption = Annotated[
     Path | None, typer.Option("--socket", envvar="ACQUIRE_SOCKET", help="The daemon's control socket.")
@@ -81,7 +81,7 @@ def mark(
     socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Note that something happens now. While armed it starts a recording, where the rig's [events] say so.
+    """Note that something happens now. While armed it starts a recording, where the rig's events say so.
 
     Example: [bold]acquire mark "the valve opens"[/]
     """
@@ -188,12 +188,24 @@ def _last(last: LastRecording | None) -> str | None:
 
 
 def _show_arms(status: Status) -> None:
-    columns = ("arm", "rate", "delivered", "preroll", "recorded", "missing", "lost", "ring", "peak", "drops")
+    columns = (
+        *("arm", "rate", "delivered", "preroll", "recorded", "missing", "lost", "ring", "peak", "drops"),
+        *("code", "ledger"),
+    )
     rows = []
     for name, arm in status.arms.items():
         lost = ", ".join(f"{cause} {lines}" for cause, lines in arm.lost.items() if lines) or "0"
         counts = (arm.delivered, arm.preroll, arm.recorded, arm.missing)
         ring = (f"{arm.ring.fill}/{arm.ring.slots}", arm.ring.peak, arm.ring.drops)
-        rows.append((name, quantity(arm.rate_hz, "Hz"), *counts, lost, *ring))
+        account = "-" if arm.ledger is None else "balances" if arm.ledger.balanced else "DOES NOT BALANCE"
+        rows.append((name, quantity(arm.rate_hz, "Hz"), *counts, lost, *ring, _check(arm.check), account))
     typer.echo()
     print_table(columns, rows)
+
+
+def _check(check: CheckStatus | None) -> str:
+    """What the lines say of the light's code."""
+    if check is None:
+        return "-"
+    verdict = check.verdict.replace("_", " ")
+    return f"{verdict} {check.shift:+d}" if check.shift else verdict

@@ -89,7 +89,8 @@ class Client:
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(map(str, first["loc"]))
-            raise UsageError(f"start: {where} {first['msg']}".replace("  ", " ")) from error
+            why = first["msg"].removeprefix("Value error, ")
+            raise UsageError(f"start: {where} {why}".replace("  ", " ")) from error
         return self._call("POST", "start", body=request.model_dump(mode="json"))
 
     def mark(self, text: str = "") -> Status:

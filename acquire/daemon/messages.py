@@ -83,6 +83,29 @@ class RingStatus(_Message):
     fill: int
     peak: int
     drops: int = Field(description="blocks that found no free slot")
+    history: int = Field(default=0, description="slots from the past that a recording can begin with")
+
+
+class LedgerStatus(_Message):
+    """Every pulse since arm: issued = preroll + stored + discarded + lost + waiting + pending."""
+
+    issued: int = Field(description="by the trigger, as far as tags and lines tell")
+    preroll: int = Field(description="exposed before the run's start")
+    stored: int = Field(description="in recordings")
+    discarded: int = Field(description="in none, since nobody asked for them")
+    lost: dict[str, int] = Field(description="cause → lines")
+    waiting: int = Field(description="in the ring")
+    pending: int = Field(description="in camera or driver")
+    balanced: bool
+
+
+class CheckStatus(_Message):
+    """What the lines say of the light's code."""
+
+    verdict: str = Field(description="verified, shifted, inverted, wrong_code, dark or unknown")
+    shift: int = Field(description="sub-steps by which the lines are late")
+    checked_line: int = Field(description="the line after the last that was looked at")
+    lapped: int = Field(description="ring slots that came and went unseen by the check")
 
 
 class ArmStatus(_Message):
@@ -100,6 +123,8 @@ class ArmStatus(_Message):
     missing: int = Field(description="those of them that hold no line")
     rate_hz: float = Field(description="lines per second over the last seconds")
     ring: RingStatus
+    ledger: LedgerStatus | None = None
+    check: CheckStatus | None = Field(default=None, description="null: the rig does not check")
 
 
 class RecordingStatus(_Message):

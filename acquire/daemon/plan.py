@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from acquire.daemon.storage import choose_for, storage_settings
+from acquire.daemon.watching import watch_plan
 from acquire.store import RecordingSpec, next_segment
 from acquire.stream import NOW, Capture, CapturePlan
 from acquire.stream.messages import Note
@@ -130,6 +131,7 @@ def capture_plan(config: RigConfig, rig: Rig, run_id: str) -> CapturePlan:
         block_lines=config.stream.block_lines,
         ring_slots=config.ring_slots,
         ring_reserve=config.ring_reserve,
+        watch=watch_plan(config),
         white_dn=config.cameras.a.white_dn,
         openers=rig.openers(),
         stall_timeout_s=max(STALL_S, config.stream.reopen_s + 1.0),

@@ -6,7 +6,7 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING
 
-from acquire.daemon.messages import ArmStatus, RingStatus
+from acquire.daemon.messages import ArmStatus, CheckStatus, LedgerStatus, RingStatus
 
 if TYPE_CHECKING:
     from acquire.stream import CaptureStatus
@@ -50,7 +50,13 @@ def arm_statuses(seen: CaptureStatus, rates: Rates) -> dict[str, ArmStatus]:
             recorded=counts["recorded"],
             missing=counts["missing"],
             rate_hz=rates.of(arm),
-            ring=RingStatus(**{key: seen.ring[arm][key] for key in ("slots", "fill", "peak", "drops")}),
+            ring=_ring(seen.ring[arm]),
+            ledger=LedgerStatus(**seen.accounts[arm].to_dict()) if arm in seen.accounts else None,
+            check=CheckStatus(**counts["check"]) if counts.get("check") else None,
         )
         for arm, counts in seen.lines.items()
     }
+
+
+def _ring(counts: dict[str, int]) -> RingStatus:
+    return RingStatus(**{name: counts[name] for name in RingStatus.model_fields if name in counts})

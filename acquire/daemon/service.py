@@ -81,6 +81,7 @@ class Service:
         self._rates = Rates()
         self._order = StandingOrder(config)
         self._by_event = False
+        self._late: Note | None = None
         self._target: tuple[Path, int | None] | None = None
         self._drain_until = math.inf
         self._last: LastRecording | None = None
@@ -222,11 +223,16 @@ class Service:
             self._by_event = True
         elif self._state is State.RECORDING and self._by_event:
             self._run.extend(self._order.end_line(note))
+        elif self._state is State.DRAINING and self._by_event and self._order.rearm:
+            self._late = self._late or note
 
     def _finish(self) -> None:
         if self._by_event and self._order.rearm and self._seen.done and not self._hurried.is_set():
             self._remember()
             self._go(Event.KEPT, self._last_words())
+            if (late := self._late) is not None:
+                self._late = None
+                self._heed(late)
             return
         self._release()
         if self._seen.condition is RunCondition.ABORTED:
@@ -261,6 +267,9 @@ class Service:
             raise DeviceError(f"the devices could not be released in order: {error}") from error
         finally:
             self._seen, self._rates = run.poll(), Rates()
+            for arm, account in self._seen.accounts.items():
+                if not account.balanced:
+                    log.error("the ledger of arm %s does not balance: %s", arm, account)
             self._remember()
             self._publish()
 

@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 from acquire.errors import AcquireError, DataError, StateError, UsageError
 from acquire.lines import ARMS
-from acquire.stream import grabber, recorder
+from acquire.stream import grabber, recorder, watcher
+from acquire.stream.ledger import Counted, account
 from acquire.stream.losses import Cause
 from acquire.stream.messages import Begin, Extend, Interrupt, Note, Quit, Ready, RunStarted
 from acquire.stream.plan import CaptureStatus
@@ -28,6 +29,7 @@ from acquire.stream.shared import Counters
 from acquire.stream.succession import Succession
 from acquire.stream.supervisor import RECORDER, Supervisor
 from acquire.stream.window import NOW
+from acquire.stream.witness import TRIGGER, TRIGGER_COUNTERS, WATCHER
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -35,8 +37,9 @@ if TYPE_CHECKING:
 
     from acquire.clock import ClockFit
     from acquire.store import RecordingSpec
+    from acquire.stream.ledger import ArmLedger
     from acquire.stream.plan import CapturePlan
-    from acquire.stream.window import NOW, Window
+    from acquire.stream.window import Window
     from acquire.trigger.base import Trigger
 
 _TAG_RING = RingShape(slots=64, rows=256, width=3, dtype="uint64")
@@ -67,11 +70,12 @@ class Capture:
         self._tags: Ring | None = None
         self._counters: dict[str, Counters] = {}
         self._left_over = dict.fromkeys(ARMS, 0)
+        self._pulses: int | None = None
         self._workers: dict[str, Worker] = {}
         self._supervisor: Supervisor | None = None
         self._memory = threading.Lock()
         self._final: CaptureStatus | None = None
-        self._used = self._closed = False
+        self._used = self._closed = self._emptied = False
 
     def arm(self, timeout_s: float = 20.0) -> None:
         """Start everything; lines flow and are discarded.
@@ -177,6 +181,8 @@ class Capture:
         for name, arms in self._plan.grabbers.items():
             facts = self._workers[name].expect(Ready, deadline).facts
             cameras |= dict.fromkeys(arms, facts)
+        if WATCHER in self._workers:
+            self._workers[WATCHER].expect(Ready, deadline)
         self.cameras = cameras
         self._trigger_used = True
         self._trigger.prepare(self._plan.run)
@@ -201,12 +207,19 @@ class Capture:
     def _make_memory(self) -> None:
         self._tags = Ring("tags", _TAG_RING)
         self._counters[RECORDER] = Counters(recorder.COUNTERS)
+        self._counters[TRIGGER] = Counters(TRIGGER_COUNTERS)
+        if self._plan.watch is not None:
+            self._counters[WATCHER] = Counters(watcher.COUNTERS)
         for arm in ARMS:
             self._rings[arm] = Ring(arm, self._plan.ring_shape)
             self._counters[arm] = Counters(grabber.COUNTERS)
 
     def _spawn(self) -> None:
         self._workers[RECORDER] = self._new_recorder()
+        if self._plan.watch is not None:
+            self._workers[WATCHER] = Worker(
+                WATCHER, watcher.watch, self._plan.watch, self._rings, self._counters[WATCHER]
+            )
         for name in self._plan.grabbers:
             self._workers[name] = self._new_grabber(name)
 
@@ -220,7 +233,9 @@ class Capture:
             plan.max_skew_lines,
             plan.realtime,
         )
-        return Worker(RECORDER, recorder.record, what, self._rings, self._tags, self._counters[RECORDER])
+        return Worker(
+            RECORDER, recorder.record, what, self._rings, self._tags, self._counters[RECORDER], self._others()
+        )
 
     def _new_grabber(self, name: str, *, successor: bool = False) -> Worker:
         tasks = [
@@ -230,6 +245,10 @@ class Capture:
         return Worker(f"grabber {name}", grabber.grab, *tasks)
 
     def _next_recorder(self) -> Worker:
+        """What the one before had released and not counted was stored: see `Session.take`."""
+        counters = self._counters[RECORDER]
+        for arm, ring in self._rings.items():
+            counters[f"stored_{arm}"] = ring.released_lines - counters[f"discarded_{arm}"]
         worker = self._new_recorder()
         worker.post(RunStarted(self.clock))
         return worker
@@ -241,6 +260,9 @@ class Capture:
         if not all(self._counters[arm]["stamp_ns"] for arm in arms):
             return None
         return self._new_grabber(name, successor=True)
+
+    def _others(self) -> dict[str, Counters]:
+        return {name: counters for name, counters in self._counters.items() if name != RECORDER}
 
     def _grabber_plan(self, arm: str) -> grabber.GrabberPlan:
         plan = self._plan
@@ -266,6 +288,7 @@ class Capture:
     def _look(self, supervisor: Supervisor) -> CaptureStatus:
         began, sealed, counters = supervisor.began, supervisor.sealed, self._counters[RECORDER]
         status = CaptureStatus(
+            accounts={arm: self._account(arm, supervisor) for arm in ARMS},
             ring={arm: self._ring_counts(arm) for arm in ARMS},
             lines={arm: self._line_counts(arm, began=began is not None) for arm in ARMS},
             fault=supervisor.fault,
@@ -292,9 +315,9 @@ class Capture:
         counts["drops"] = counts.pop("dropped_blocks")
         return counts
 
-    def _line_counts(self, arm: str, *, began: bool) -> dict[str, Any]:
-        grabbed, recorded = self._counters[arm], self._counters[RECORDER]
-        lost = {
+    def _lost(self, arm: str) -> dict[str, int]:
+        grabbed = self._counters[arm]
+        return {
             str(Cause.CAMERA): grabbed[Cause.CAMERA],
             str(Cause.RING_FULL): self._rings[arm].statistics().dropped_lines,
             **{
@@ -303,11 +326,46 @@ class Capture:
                 if grabbed[cause]
             },
         }
+
+    def _account(self, arm: str, supervisor: Supervisor) -> ArmLedger:
+        """Counts are read against the way of the lines: what one knows of, the next has counted."""
+        recorded, ring = self._counters[RECORDER], self._rings[arm]
+        stored, discarded = recorded[f"stored_{arm}"], recorded[f"discarded_{arm}"] + self._left_over[arm]
+        lost = self._lost(arm)
+        next_line = max(self._counters[arm]["next_line"], ring.newest_line)
+        depth = self._plan.depth_lines
+        next_line = next_line if self._counters[arm]["delivered"] else -depth
+        known = max(supervisor.pulses, self._counters[TRIGGER]["pulses"], next_line + depth)
+        counted = Counted(
+            pulses=known if self._pulses is None else self._pulses,
+            next_line=next_line,
+            depth=depth,
+            stored=stored,
+            discarded=discarded,
+            lost=lost,
+            room=ring.shape.slots * ring.shape.rows,
+            block=ring.shape.rows,
+        )
+        return account(counted, closed=self._emptied)
+
+    def _check(self, arm: str) -> dict[str, Any]:
+        if WATCHER not in self._counters:
+            return {}
+        seen = self._counters[WATCHER]
+        verdict = str(watcher.VERDICTS[seen[f"verdict_{arm}"]])
+        return {
+            "verdict": verdict,
+            **{name: seen[f"{name}_{arm}"] for name in ("shift", "checked_line", "lapped")},
+        }
+
+    def _line_counts(self, arm: str, *, began: bool) -> dict[str, Any]:
+        grabbed, recorded = self._counters[arm], self._counters[RECORDER]
         return {
             "delivered": grabbed["delivered"],
             "preroll": grabbed["preroll"],
             "discarded": recorded[f"discarded_{arm}"] + self._left_over[arm],
-            "lost": lost,
+            "lost": self._lost(arm),
+            "check": self._check(arm),
             "recorded": recorded[f"rows_{arm}"] if began else 0,
             "missing": recorded[f"missing_{arm}"] if began else 0,
             "reopened": grabbed["reopened"],
@@ -330,7 +388,7 @@ class Capture:
 
     def _end_trigger(self) -> None:
         if self._trigger_used:
-            self._trigger.stop()
+            self._pulses = self._trigger.stop()
 
     def _end_workers(self, deadline: float) -> None:
         deadline = max(deadline, time.monotonic() + _LEAST_END_S)
@@ -350,6 +408,7 @@ class Capture:
             self._settle_books(self._plan.grabbers.get(name, ()))
         for arm, ring in self._rings.items():
             self._left_over[arm] = ring.empty()
+        self._emptied = True
 
     def _end_memory(self) -> None:
         with self._memory:

@@ -180,6 +180,9 @@ class Intake:
         """Go on for a grabber that died: what comes after its last slot is lost."""
         ring, counters = self._ring, self._counters
         self._next = ring.newest_line
+        counted = sum(counters[cause] for cause in (*CAMERA_CAUSES, Cause.GRABBER_LOST))
+        told = ring.committed_lines + ring.statistics().dropped_lines + counted - self._next
+        counters.add(Cause.GRABBER_LOST, -max(0, told))  # lost before the death, and located after it
         self._clock.take_over(counters["stamp_line"], counters["stamp_ns"], counters["drift_ppb"])
         self._away_for = Cause.GRABBER_LOST
         self.realign()

@@ -6,6 +6,7 @@
     recorder ──▶ owner      Ready, Began | Refused, Sealed
     owner ──▶ grabber       Quit
     grabber ──▶ owner       Ready
+    watcher ──▶ owner       Ready, Checked, Note
     any process ──▶ owner   Failed, then it ends
 """
 
@@ -62,6 +63,15 @@ class Note:
 
     line: int
     kind: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """From ``first_line`` on the lines say something else of the light's code than before, in words."""
+
+    first_line: int
+    doubtful: bool
     text: str
 
 

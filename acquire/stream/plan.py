@@ -13,6 +13,8 @@ from acquire.stream.ring import RingShape
 if TYPE_CHECKING:
     from acquire.camera.base import CameraOpener
     from acquire.store import RunCondition
+    from acquire.stream.ledger import ArmLedger
+    from acquire.stream.watcher import WatchPlan
     from acquire.trigger.base import TriggerRun
 
 OBSERVERS = 2
@@ -49,6 +51,7 @@ class CapturePlan:
     columns : compact layout: arm → first column and the one after the last, on the one camera that
         ``openers["a"]`` opens; empty: a camera per arm
     ring_reserve : slots that hold no history: see `RingShape`
+    watch : what is looked for in the lines while they pass; None: nothing
     """
 
     run: TriggerRun
@@ -66,6 +69,7 @@ class CapturePlan:
     columns: dict[str, tuple[int, int]] = field(default_factory=dict)
     realtime: bool = False
     ring_reserve: int = 2
+    watch: WatchPlan | None = None
 
     def __post_init__(self) -> None:
         if tuple(sorted(self.openers)) != ARMS:
@@ -131,7 +135,9 @@ class CaptureStatus:
         cause, since arm; and of the latest recording ``recorded`` rows, of which ``missing``. After
         `close`: delivered = preroll + lost["ring_full"] + discarded + recorded − missing. Also how often
         the camera was ``reopened``, and its ``clock``: the latest stamp (line, its time by the camera) and
-        how much faster it runs than the trigger's, in parts per billion; all 0 where it tells no time
+        how much faster it runs than the trigger's, in parts per billion; all 0 where it tells no time. The
+        ``check`` of the code, where it is made: verdict, shift, and the line after the last looked at
+    accounts : arm → what became of every pulse since arm
     fault : what failed first, or None
     pids : process numbers: of the recorder, and of each grabber
     """
@@ -150,3 +156,4 @@ class CaptureStatus:
     condition: RunCondition | None = None
     end_reason: str | None = None
     ledger: dict[str, Any] = field(default_factory=dict)
+    accounts: dict[str, ArmLedger] = field(default_factory=dict)

@@ -44,6 +44,7 @@ from acquire.stream.session import Session
 from acquire.stream.stalls import Arm, find_stall
 from acquire.stream.tagger import Tagger
 from acquire.stream.window import Span, hold, span
+from acquire.stream.witness import Witness
 
 if TYPE_CHECKING:
     from acquire.stream.messages import Sealed
@@ -54,12 +55,13 @@ if TYPE_CHECKING:
 
 COUNTERS = (
     *("recorded", "committed", "draining", "rows_a", "rows_b", "missing_a", "missing_b"),
-    *("discarded_a", "discarded_b", "turns", "awaited_a", "awaited_b"),
+    *("discarded_a", "discarded_b", "stored_a", "stored_b", "turns", "awaited_a", "awaited_b"),
 )
 """Of the latest recording: rows in both arms, rows that a reader finds, whether its last line is known; per
 arm the rows written and those of them that are missing. Since armed: per arm the lines taken from its ring
-that no recording holds; turns of the loop, which stand still when it hangs. The owner alone counts how often
-it has seen that an arm's next grabber is only starting: its silence means nothing then."""
+that no recording holds, and those that one does; turns of the loop, which stand still when it hangs. The
+owner alone counts how often it has seen that an arm's next grabber is only starting: its silence means
+nothing then."""
 
 _WAIT_S = 0.02
 _COMMIT_INTERVAL_S = 0.1
@@ -92,13 +94,21 @@ class Opening:
 
 
 def record(
-    mailbox: Mailbox, plan: RecorderPlan, rings: dict[str, Ring], tags: Ring, counters: Counters
+    mailbox: Mailbox,
+    plan: RecorderPlan,
+    rings: dict[str, Ring],
+    tags: Ring,
+    counters: Counters,
+    others: dict[str, Counters],
 ) -> None:
-    """Life of the recorder: empty the rings, write recordings when told to, until told to end."""
+    """Life of the recorder: empty the rings, write recordings when told to, until told to end.
+
+    ``others``: what ``trigger`` and ``watcher`` count, where there is one.
+    """
     if plan.realtime:
         become_important()  # not in real time: it computes, and must not keep the grabbers waiting
     with ThreadPoolExecutor(1, thread_name_prefix="store") as disk:
-        recorder = Recorder(mailbox, plan, rings, tags, counters, disk)
+        recorder = Recorder(mailbox, plan, rings, tags, counters, disk, Witness(others))
         mailbox.post(Ready())
         while recorder.turn():
             recorder.wait()
@@ -115,6 +125,7 @@ class Recorder:
         tags: Ring,
         counters: Counters,
         disk: ThreadPoolExecutor,
+        witness: Witness,
     ) -> None:
         self._mailbox = mailbox
         self._plan = plan
@@ -122,6 +133,7 @@ class Recorder:
         self._tags = tags
         self._counters = counters
         self._disk = disk
+        self._witness = witness
         self._tagger: Tagger | None = None
         self._opening: Opening | None = None
         self._session: Session | None = None
@@ -272,9 +284,15 @@ class Recorder:
             at = opening.span.at
             lines = None if opening.span.end_line is None else opening.span.end_line - first_line
         session = Session(writer, self._tagger, self._blank, first_line, lines)
+        self._witness.begin()
+        session.doubted = self._witness.doubted()
         window = opening.begin.window
+        if window.padded:
+            session.before = Cause.RECORDER_LOST
         if window.kind:
             self._notes.append(Note(at, window.kind, window.text))
+        if doubt := self._witness.doubt():
+            self._notes.append(Note(first_line, "code_check", doubt))
         for note in self._notes:
             session.note(note.kind, note.line, note.text)
         return session
@@ -305,6 +323,7 @@ class Recorder:
                 return taken > 0
             written = self._session.take(name, block) if self._session is not None else 0
             self._counters.add(f"discarded_{name}", len(block.flags) - written)
+            self._counters.add(f"stored_{name}", written)
             arm.ring.release()
         return True
 
@@ -324,6 +343,8 @@ class Recorder:
     # ---- the recording under way
 
     def _look_after(self, session: Session) -> None:
+        session.doubted = self._witness.doubted()
+        session.trigger, session.cameras = self._witness.trigger(), self._witness.cameras()
         for name, arm in self._arms.items():
             if name in session.lost and not arm.ring.fill:
                 session.give_up(name)

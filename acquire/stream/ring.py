@@ -267,6 +267,12 @@ class Ring:
         return int(self._header(head - 1)[_TOTAL]) if head else 0
 
     @property
+    def released_lines(self) -> int:
+        """Lines in the blocks that the reader has released, and not taken back."""
+        tail = self._control[_TAIL]
+        return int(self._header(tail - 1)[_TOTAL]) if tail else 0
+
+    @property
     def history_line(self) -> int:
         """The first line that `lease` can take back, or that waits; `newest_line` where there is none."""
         head = self._control[_HEAD]

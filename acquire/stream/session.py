@@ -7,7 +7,7 @@ deliver any more, and keeps the books: per arm, rows = stored + missing by cause
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -28,6 +28,18 @@ if TYPE_CHECKING:
 
 OPEN_END = 1 << 62
 """End line of a recording without a budget."""
+
+TAINTING = (
+    *("tags_wrong", "tags_repeated"),
+    *("strobe_a_missed", "strobe_a_unexpected", "strobe_b_missed", "strobe_b_unexpected"),
+)
+"""Counts of the trigger that make lines doubtful: a camera that misses a pulse is a line behind after it."""
+
+TAINTING_EVENTS = (
+    *("missed_trigger_a", "missed_trigger_b", "unexpected_strobe_a", "unexpected_strobe_b"),
+    "clock_lost",
+)
+"""Events of the run so far that do so."""
 
 MAX_MISMATCH_EVENTS = 100
 _BEST_FIRST = (
@@ -62,6 +74,7 @@ class Book:
     stored: int = 0
     missing: Counter[Cause] = field(default_factory=Counter)
     unverified: int = 0
+    doubted: int = 0
     incomplete: int = 0
     saturated: int = 0
 
@@ -85,6 +98,7 @@ class Book:
             "stored": self.stored,
             "missing": {str(cause): count for cause, count in self.missing.items()},
             "unverified": self.unverified,
+            "doubted": self.doubted,
             "incomplete": self.incomplete,
             "saturated": self.saturated,
             "balanced": self.balances(lines),
@@ -95,6 +109,13 @@ class Session:
     """See the module. Methods raise what the writer raises; then `close` is what remains.
 
     ``blank`` is (line, pixel) of zeros, the rows of a missing stretch of at most so many lines.
+
+    Attributes
+    ----------
+    lost : arm → why it will deliver no more
+    doubted : arms whose lines contradict the code at the moment: what comes is flagged
+    trigger : what the trigger counted while this was recorded
+    cameras : arm → what its camera counted since it was armed
     """
 
     def __init__(
@@ -105,11 +126,17 @@ class Session:
         self.end_reason = "line budget reached"
         self.books = {arm: Book(first_line) for arm in ARMS}
         self.lost: dict[str, Cause] = {}
+        self.before = Cause.MIXED
+        """Why lines are missing that an arm's first block leaves out without a word."""
+        self.doubted: set[str] = set()
+        self.trigger: dict[str, int] = {}
+        self.cameras: dict[str, dict[str, int]] = {}
         self._writer = writer
         self._tagger = tagger
         self._blank = blank
         self._floor = RunCondition.GOOD
         self._mismatches = 0
+        self._doubts: Counter[str] = Counter()
         self._told_to_end = False
         self._note("started", first_line, "")
 
@@ -145,7 +172,8 @@ class Session:
             return 0
         for loss in block.losses:
             self._miss_until(arm, loss.end_line, loss.cause)
-        self._miss_until(arm, block.first_line, Cause.MIXED)
+        untold = Cause.MIXED if book.stored or book.missing else self.before
+        self._miss_until(arm, block.first_line, untold)
         part = slice(book.next_line - block.first_line, self.end_line - block.first_line)
         if part.stop <= part.start:
             return 0
@@ -174,7 +202,9 @@ class Session:
             self.end_line = max(self.end_line, line)
 
     def note(self, kind: str, line: int, text: str) -> None:
-        """List an event of a line in range; others belong to other recordings."""
+        """List an event of a line in range; others belong to other recordings, but may cast doubt on this."""
+        if kind in TAINTING_EVENTS and line < self.end_line:
+            self._doubts[kind] += 1
         if self.first_line <= line < self.end_line:
             self._note(kind, line, text)
 
@@ -224,25 +254,49 @@ class Session:
 
     def _append(self, block: LineBlock) -> None:
         tagged = self._tagger.tag(block)
+        book = self.books[block.arm]
+        if block.arm in self.doubted:
+            tagged = replace(tagged, flags=tagged.flags | np.uint16(LineFlag.CODE_UNVERIFIED))
+            book.doubted += len(tagged)
         self._writer.append(tagged)
-        self.books[block.arm].store(tagged.flags)
+        book.store(tagged.flags)
 
     def _condition(self) -> RunCondition:
         books = self.books.values()
         lines = self.end_line - self.first_line
         # A recording without a line was stopped before it held anything.
         found = RunCondition.GOOD if lines else RunCondition.INTERRUPTED
-        if self._mismatches or any(book.unverified or book.incomplete for book in books):
+        if self._taints():
             found = _worse(found, RunCondition.TAINTED)
         if any(book.missing or not book.balances(lines) for book in books):
             found = _worse(found, RunCondition.INCOMPLETE)
         return _worse(found, self._floor)
 
+    def _taints(self) -> dict[str, int]:
+        """Reasons to doubt lines that are there → how many times."""
+        reasons = {"tag_mismatches": self._mismatches, **self._doubts}
+        for name in TAINTING:
+            reasons[name] = self.trigger.get(name, 0)
+        for arm, book in self.books.items():
+            reasons |= {
+                f"unconfirmed_{arm}": book.unverified - book.doubted,
+                f"code_contradicted_{arm}": book.doubted,
+                f"incomplete_{arm}": book.incomplete,
+            }
+        return {reason: count for reason, count in reasons.items() if count > 0}
+
     def _ledger(self) -> dict[str, Any]:
         end = min(self.end_line, max(book.next_line for book in self.books.values()))
         lines = end - self.first_line
         arms = {arm: book.to_attrs(lines) for arm, book in self.books.items()}
-        return {"pulses": lines, "tag_mismatches": self._mismatches, **arms}
+        return {
+            "pulses": lines,
+            "tag_mismatches": self._mismatches,
+            "trigger": self.trigger,
+            "cameras": self.cameras,
+            "tainted_by": self._taints(),
+            **arms,
+        }
 
     def _note(self, kind: str, line: int, text: str) -> None:
         self._writer.add_event(kind, int(self._tagger.table(line, 1).tick[0]), line, text)

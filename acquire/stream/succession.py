@@ -5,7 +5,8 @@
     grabber killed   ─▶ another opens the camera; the line it goes on with follows from the time stamps,
                         and what came between is a gap, `Cause.GRABBER_LOST`
     recorder killed  ─▶ another begins a recording beside the one that was cut off, from the first line on
-                        that this one's last commit does not cover, as far as the ring still holds it
+                        that this one's last commit does not cover; what the ring does not hold any more
+                        is a gap, `Cause.RECORDER_LOST`
 
 A process that ended with a word of its own (an error of its camera, a full disk) has said why it cannot go
 on; nobody takes its place.
@@ -84,7 +85,7 @@ def continuation(begin: Begin, first_line: int, committed_lines: int, why: str) 
     at = first_line + committed_lines
     left = None if begin.lines is None else max(1, begin.lines - committed_lines)
     text = f"goes on from {begin.path.name}: its recorder was {why}"
-    window = Window(at, post_lines=left, exact=False, kind="resumed", text=text)
+    window = Window(at, post_lines=left, exact=False, padded=True, kind="resumed", text=text)
     return replace(begin, path=free_name(begin.path), lines=None, window=window)
 
 

@@ -4,6 +4,7 @@ they are silent.
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 from collections import deque
@@ -11,10 +12,11 @@ from typing import TYPE_CHECKING
 
 from acquire.errors import AcquireError, DeviceError, TriggerError
 from acquire.lines import ARMS
-from acquire.stream.messages import Began, End, Failed, Interrupt, Note, Ready, Refused, Sealed
+from acquire.stream.messages import Began, Checked, End, Failed, Interrupt, Note, Ready, Refused, Sealed
 from acquire.stream.stalls import Excess, Heartbeat
 from acquire.stream.succession import Succession, continuation, obituary
 from acquire.stream.tagger import tag_rows
+from acquire.stream.witness import TRIGGER, TRIGGER_COUNTERS, WATCHER
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -33,6 +35,7 @@ _TAG_WAIT_S = 0.02
 _ANSWER_S = 20.0
 _JOIN_S = 5.0
 _MOST_EVENTS = 1024
+_ASK_EVERY_S = 1.0
 
 
 class Supervisor:
@@ -75,6 +78,8 @@ class Supervisor:
         self._cameras = {arm: Heartbeat(counters[arm], "delivered") for arm in ARMS}
         self._arms_of = grabbers or {arm: (arm,) for arm in ARMS}
         self._excess = {arm: Excess(counters[arm], margin_lines) for arm in ARMS if margin_lines is not None}
+        self._counters = counters
+        self._ask_s = 0.0
         self._newest_pulse: int | None = None
         self._refused: Refused | None = None
         self._trigger_lost = False
@@ -94,6 +99,11 @@ class Supervisor:
     def dead(self) -> frozenset[str]:
         """Processes that died, and whose place nobody took."""
         return frozenset(self._dead)
+
+    @property
+    def pulses(self) -> int:
+        """Issued by the trigger, as far as its tags tell."""
+        return 0 if self._newest_pulse is None else self._newest_pulse + 1
 
     def start(self) -> None:
         self._thread.start()
@@ -153,6 +163,7 @@ class Supervisor:
     def _turn(self) -> None:
         begun = time.monotonic()
         tags = self._take_tags()
+        self._ask_trigger(begun)
         for name, worker in self._workers.items():
             self._hear(name, worker)
         if self.fault is None:
@@ -178,6 +189,16 @@ class Supervisor:
         for at in range(0, len(tags), rows):
             self._pass_on(tags[at : at + rows])
         return tags
+
+    def _ask_trigger(self, now_s: float) -> None:
+        """Publish what the trigger counts; one that cannot answer fails when it is asked for tags."""
+        if self._trigger_lost or now_s < self._ask_s:
+            return
+        self._ask_s = now_s + _ASK_EVERY_S
+        with contextlib.suppress(AcquireError):
+            counts = self._trigger.statistics()
+            for name in TRIGGER_COUNTERS:
+                self._counters[TRIGGER][name] = int(counts.get(name, 0))
 
     def _pass_on(self, tags: list[LineTag]) -> None:
         """To the recorder; should it be too late to take them, later tags confirm the same lines."""
@@ -231,6 +252,9 @@ class Supervisor:
             if name not in self._last_words and self._succeed(name, worker, death):
                 return
             self._dead.add(name)
+            if name == WATCHER:
+                self._lose_watcher(self._last_words.get(name, death))
+                return
             self._fail(f"{worker.name}: {self._last_words.get(name, death)}", name)
 
     def _succeed(self, name: str, worker: Worker, death: str) -> bool:
@@ -254,6 +278,12 @@ class Supervisor:
         self.happened(obituary(worker.name, death, max(newest, 0)))
         return True
 
+    def _lose_watcher(self, why: str) -> None:
+        """Lines come and are recorded all the same; what it said last does not hold for them."""
+        for arm in ARMS:
+            self._counters[WATCHER][f"verdict_{arm}"] = 0
+        self.happened(Note((self._newest_pulse or 0) + 1, "unwatched", f"watcher: {why}"))
+
     def _note(self, name: str, message: object) -> None:
         with self._news:
             match message:
@@ -270,6 +300,10 @@ class Supervisor:
                     self._refused = message
                 case Sealed():
                     self.sealed = message
+                case Note():
+                    self.happened(message)
+                case Checked(first_line, _, text):
+                    self.happened(Note(first_line, "code_check", text))
                 case Failed(error):
                     # Those of a defect begin with the process's name already.
                     self._last_words[name] = str(error).removeprefix(f"{self._workers[name].name}: ")

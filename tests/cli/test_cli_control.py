@@ -92,7 +92,7 @@ def test_status_in_words(cli: Cli, answering: Callable[[Status], FakeClient]) ->
     assert "/d/x.zarr, 500 of 900 lines from line 40 on, 256 readable" in out
     assert "process 42" in out
     arm = out.splitlines()[-1].split()
-    assert arm == ["a", "33.3", "kHz", "1000", "65", "500", "1", "camera", "2", "3/64", "9", "0"]
+    assert arm == ["a", "33.3", "kHz", "1000", "65", "500", "1", "camera", "2", "3/64", "9", "0", "-", "-"]
 
 
 def test_status_as_json_is_the_message(cli: Cli, answering: Callable[[Status], FakeClient]) -> None:

@@ -15,6 +15,7 @@ from acquire.daemon.messages import StartRequest
 from acquire.daemon.plan import Run
 from acquire.daemon.service import Service
 from acquire.daemon.states import State
+from acquire.lines import LineFlag
 from acquire.recon import reconstruct
 from acquire.rig import Rig
 from acquire.store import Recording, open_recording
@@ -69,12 +70,13 @@ def test_commands_of_a_user(tmp_path: Path) -> None:
         refused = daemon("start", "--pre", "1h")
         assert refused.code == 2
         assert "3.6e+07 lines" not in refused.err
-        assert "which the ring holds now" in refused.err
+        assert "which both rings hold now" in refused.err
         assert "stream.ring_seconds" in refused.err
         with daemon.client() as client:
             deadline = time.monotonic() + PATIENCE_S
             while client.status().arms["a"].delivered < 3000:
                 assert time.monotonic() < deadline
+                time.sleep(0.05)
         assert daemon("mark", "the valve opens").code == 0
         begun = daemon("start", "pre.zarr", "--pre", "200ms", "--post", "300ms")
         assert begun.code == 0, begun.err
@@ -129,3 +131,92 @@ def test_marks_record_again_and_again_without_being_armed_again(tmp_path: Path) 
             assert (mark.line - recording.first_line, recording.lines) == (2000, 3000)
             assert recording.attrs["run_id"] == run_id
         service.disarm()
+
+
+def scene_with(home: Path, effect: str) -> str:
+    path = home / "scene.toml"
+    path.write_text((builtin_directory() / "scene-leds.toml").read_text() + f"\n[[effects]]\n{effect}\n")
+    return str(path)
+
+
+def until_checked(service: Service) -> dict[str, tuple[str, int]]:
+    """Arm → verdict and shift, once both are told."""
+
+    def checks() -> dict[str, tuple[str, int]]:
+        arms = service.status().arms
+        return {arm: (told.check.verdict, told.check.shift) for arm, told in arms.items() if told.check}
+
+    def known() -> bool:
+        return len(checks()) == 2 and all(verdict != "unknown" for verdict, _ in checks().values())
+
+    until(service, known, "verdicts")
+    return checks()
+
+
+def test_light_that_comes_late_is_told_flagged_and_taints(tmp_path: Path) -> None:
+    scene = scene_with(tmp_path, 'kind = "code_errors"\nlate_substeps = 2')
+    with serving(tmp_path, **{"simulation.scene": scene, "geometry.stages": 16}) as service:
+        service.arm()
+        assert until_checked(service) == {"a": ("shifted", 2), "b": ("shifted", 2)}
+        service.start(StartRequest(path=tmp_path / "r.zarr", lines=2000))
+        until(service, lambda: service.status().state is State.IDLE, "the seal")
+    recording = open_recording(tmp_path / "r.zarr")
+    assert (recording.attrs["run_condition"], recording.attrs["end_reason"]) == (
+        "TAINTED",
+        "line budget reached",
+    )
+    told = recording.attrs["ledger"]["tainted_by"]
+    assert told["code_contradicted_a"] == told["code_contradicted_b"] == 2000
+    for arm in "ab":
+        assert np.all(recording.camera(arm).flags[:] & LineFlag.CODE_UNVERIFIED)
+    assert [event.text for event in recording.events if event.kind == "code_check"] == [
+        "arm a shifted, arm b shifted"
+    ]
+
+
+def test_light_that_follows_the_code_is_verified_and_every_pulse_has_its_place(tmp_path: Path) -> None:
+    with serving(tmp_path, **{"geometry.stages": 16}) as service:
+        service.arm()
+        assert until_checked(service) == {"a": ("verified", 0), "b": ("verified", 0)}
+        service.start(StartRequest(path=tmp_path / "r.zarr", lines=3000, pre_s=0.1))
+        assert all(arm.ledger and arm.ledger.balanced for arm in service.status().arms.values())
+        recording = last_recording(service)
+        for arm in service.status().arms.values():
+            ledger = arm.ledger
+            assert ledger is not None
+            assert ledger.balanced
+            assert (ledger.stored, ledger.waiting, ledger.pending) == (3000, 0, 0)
+            assert ledger.issued == 17 + ledger.stored + ledger.discarded + sum(ledger.lost.values())
+    assert recording.attrs["ledger"]["tainted_by"] == {}
+    assert recording.attrs["ledger"]["trigger"]["tags_missing"] == 0
+    for camera in recording.attrs["ledger"]["cameras"].values():
+        assert camera["next_line"] == camera["delivered"] - camera["preroll"] >= 3000
+
+
+def test_a_level_that_is_crossed_records_by_itself(tmp_path: Path) -> None:
+    """A chopper blade leaves the light free every now and then; recordings begin before it does."""
+    scene = tmp_path / "scene.toml"
+    text = (builtin_directory() / "scene-chopper.toml").read_text()
+    scene.write_text(text.replace("rotation_hz = 2.5", "rotation_hz = 0.4"))
+    settings = {"simulation.scene": str(scene), "check.enable": False}
+    with serving(tmp_path, **settings) as service:
+        service.arm()
+        service.start(StartRequest(path=tmp_path / "plain.zarr", lines=10_000))
+        levels = last_recording(service).camera("a").lines[:].mean(axis=1)
+    smooth = np.convolve(levels, np.ones(64) / 64, "valid")
+    low, high = float(smooth.min()), float(smooth.max())
+    assert high > 2 * low
+    events = {"sources": ["threshold"], "level_dn": (low + high) / 2, "hysteresis_dn": (high - low) / 4}
+    events |= {"pre_s": 0.1, "post_s": 0.05}
+    with serving(
+        tmp_path, **settings, **{f"events.{key}": value for key, value in events.items()}
+    ) as service:
+        service.arm()
+        until(service, lambda: service.status().state is not State.ARMED, "an event")
+        recording = last_recording(service)
+    (event,) = [event for event in recording.events if event.kind == "threshold"][:1]
+    at = event.line - recording.first_line
+    assert event.text == f"arm a above {events['level_dn']:g} DN"
+    assert at == 0.1 * LINE_RATE_HZ
+    lines = recording.camera("a").lines[:].mean(axis=1)
+    assert lines[at - 400 : at - 200].mean() < events["level_dn"] <= lines[at : at + 64].mean()

@@ -20,6 +20,7 @@ from acquire.stream.messages import Began, Begin, End, Refused, RunStarted, Seal
 from acquire.stream.recorder import COUNTERS, Recorder, RecorderPlan
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.shared import Counters
+from acquire.stream.witness import Witness
 from acquire.trigger.base import TriggerRun
 
 ROWS, SLOTS = 16, 4
@@ -82,7 +83,9 @@ class Bed:
         self.post = Post()
         self.disk = SlowDisk()
         plan = RecorderPlan(RUN, STAGES, stall_timeout_s=60.0, tag_wait_s=0.0, max_skew_lines=10_000)
-        self.recorder = Recorder(self.post, plan, self.rings, self.tags, self.counters, self.disk)
+        self.recorder = Recorder(
+            self.post, plan, self.rings, self.tags, self.counters, self.disk, Witness({})
+        )
         self.post.waiting.append(RunStarted(ClockFit(90_000_000, 0, 0)))
         self.line = 0
 

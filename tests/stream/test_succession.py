@@ -137,6 +137,27 @@ def test_a_recorder_that_is_killed_is_replaced_and_no_line_is_lost(run, tmp_path
     assert any(event.kind == "resumed" and "SIGKILL" in event.text for event in two.events)
 
 
+def test_what_the_ring_could_not_hold_meanwhile_is_a_gap(config, tmp_path):
+    short = config.model_copy(update={"stream": config.stream.model_copy(update={"ring_slots": 16})})
+    with Rig(short) as rig:
+        run = Run(short, rig)
+        try:
+            run.arm()
+            run.start(tmp_path / "r.zarr", 30_000)
+            until(lambda: run.poll().committed_lines > 2000)
+            kill(run, "recorder")
+            until(lambda: run.poll().done)
+        finally:
+            run.close()
+    recover(tmp_path / "r.zarr")
+    one, two = (open_recording(tmp_path / name) for name in ("r.zarr", "r-2.zarr"))
+    assert two.first_line <= one.first_line + one.lines
+    assert two.first_line + two.lines == one.first_line + 30_000
+    assert check(tmp_path / "r-2.zarr") <= {"recorder_lost", "ring_full"}
+    assert check(tmp_path / "r.zarr") <= {"ring_full"}  # a ring this short overflows on a busy host as well
+    assert run.poll().condition == "INCOMPLETE"
+
+
 def test_what_is_killed_again_and_again_is_given_up(run, tmp_path, monkeypatch):
     monkeypatch.setattr("acquire.stream.succession.MOST", 1)
     run.start(tmp_path / "r.zarr", None)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -14,8 +16,12 @@ from wired_devices import make_bench, make_spec
 from acquire.errors import UsageError
 from acquire.store import RunCondition
 from acquire.stream.losses import Cause, Loss
+from acquire.stream.messages import Note
 from acquire.stream.ring import Ring, RingShape
+from acquire.stream.threshold import ThresholdPlan
+from acquire.stream.watcher import WatchPlan
 from acquire.stream.window import Held, Window, hold, span
+from acquire.trigger.base import TagEvent
 
 
 @pytest.fixture
@@ -125,7 +131,7 @@ def test_a_recording_begins_before_it_was_asked_for(tmp_path: Path) -> None:
 def test_what_the_ring_does_not_hold_is_refused_with_what_it_does(tmp_path: Path) -> None:
     with armed(make_bench(ring_slots=1024)) as capture:
         until(lambda: capture.poll().lines["b"]["delivered"] > 2000, "history")
-        with pytest.raises(UsageError, match=r"50000 lines \(.* s\) from before.*which the ring holds now"):
+        with pytest.raises(UsageError, match=r"50000 lines \(.* s\) from before.*which both rings hold now"):
             capture.start(tmp_path / "r.zarr", make_spec(), 60_000, Window(pre_lines=50_000))
         assert not any(tmp_path.iterdir())
         capture.start(tmp_path / "r.zarr", make_spec(), 6000, Window(pre_lines=50_000, exact=False))
@@ -149,6 +155,26 @@ def test_recordings_of_one_run_follow_one_another_without_a_hole(tmp_path: Path)
         assert not check_rows(tmp_path / name)[1]["b"].any()
 
 
+def test_what_the_trigger_tells_is_in_the_recording_that_begins_before_it(tmp_path: Path) -> None:
+    """An edge at its input is an event; a camera that missed a pulse makes what follows doubtful."""
+    bench = make_bench(ring_slots=1024)
+    with armed(bench) as capture:
+        until(lambda: capture.poll().lines["b"]["delivered"] > 3000, "history")
+        bench.trigger.told = [TagEvent(2500, 2500 * 2700, "input")]
+        notes: list[Note] = []
+        until(lambda: notes.extend(capture.take_events()) or notes, "the event")
+        assert notes == [Note(2500, "input", "tick 6750000")]
+        capture.start(tmp_path / "r.zarr", make_spec(), 20_000, Window(2500, 1000, exact=False))
+        bench.trigger.told = [TagEvent(2600, 2600 * 2700, "missed_trigger_b")]
+        status = sealed(capture)
+    recording, _ = check_rows(tmp_path / "r.zarr")
+    assert recording.first_line == 1500
+    listed = [(event.kind, event.line) for event in recording.events]
+    assert {("input", 2500), ("missed_trigger_b", 2600)} <= set(listed)
+    assert status.ledger["tainted_by"] == {"missed_trigger_b": 1}
+    assert status.condition is RunCondition.TAINTED
+
+
 def test_an_event_in_a_recording_lets_it_go_on(tmp_path: Path) -> None:
     with armed(make_bench(ring_slots=1024)) as capture:
         capture.start(tmp_path / "r.zarr", make_spec(), 4000)
@@ -159,3 +185,28 @@ def test_an_event_in_a_recording_lets_it_go_on(tmp_path: Path) -> None:
     assert status.first_line is not None
     assert status.first_line + status.recorded_lines == line + 6000
     check_rows(tmp_path / "r.zarr")
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_watcher_that_dies_or_stops_costs_no_line(tmp_path: Path, number: signal.Signals) -> None:
+    threshold = ThresholdPlan("a", 2000.0, 100.0, rising=True, average_lines=1)
+    watch = WatchPlan(None, 512, {"a": 0.0, "b": 0.0}, threshold)
+    with armed(make_bench(ring_slots=1024, watch=watch)) as capture:
+        notes: list[Note] = []
+        until(lambda: notes.extend(capture.take_events()) or len(notes) > 2, "crossings")
+        assert {note.kind for note in notes} == {"threshold"}
+        capture.start(tmp_path / "r.zarr", make_spec(), 20_000, Window(pre_lines=1000, exact=False))
+        watcher = capture.pids["watcher"]
+        assert watcher is not None
+        os.kill(watcher, number)
+        status = sealed(capture)
+        if number is signal.SIGSTOP:
+            os.kill(watcher, signal.SIGCONT)
+    assert (status.condition, status.fault, status.recorded_lines) == (RunCondition.GOOD, None, 20_000)
+    recording, _ = check_rows(tmp_path / "r.zarr")
+    kinds = {event.kind for event in recording.events}
+    assert ("unwatched" in kinds) == (number is signal.SIGKILL)
+    assert "threshold" in kinds
+    for account in capture.poll().accounts.values():
+        assert account.balanced
+        assert account.stored == 20_000

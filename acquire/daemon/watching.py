@@ -1,0 +1,56 @@
+"""From the rig's configuration to what the watcher looks for in the lines."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from acquire.lines import ARMS
+from acquire.stream.lightcheck import Judge
+from acquire.stream.threshold import ThresholdPlan
+from acquire.stream.watcher import WatchPlan
+
+if TYPE_CHECKING:
+    from acquire.config import RigConfig
+
+_CHECK_S = 0.25
+"""Of lines that a check takes, in seconds as they pass: verdicts come within a second."""
+_MOST_LINES = 8192
+_LEAST_SENSORS = 8
+"""A check takes the lines of so many passes over the sensor at least."""
+
+
+def watch_plan(config: RigConfig) -> WatchPlan | None:
+    """None where nothing is looked for: no process is started then."""
+    threshold = threshold_plan(config)
+    judge = judge_of(config) if config.check.enable else None
+    if threshold is None and judge is None:
+        return None
+    passing_hz = config.line_rate_hz * config.simulation.speed
+    lines = max(_LEAST_SENSORS * config.geometry.stages, min(_MOST_LINES, round(_CHECK_S * passing_hz)))
+    black_dn = {arm: config.cameras.arm(arm).black_level_dn for arm in ARMS}
+    return WatchPlan(judge, lines, black_dn, threshold)
+
+
+def judge_of(config: RigConfig) -> Judge:
+    """What the lines must show."""
+    return Judge(
+        stages=config.geometry.stages,
+        substeps=config.geometry.substeps,
+        code=config.code.build(),
+        white_dn=config.cameras.a.white_dn,
+        registration={"a": config.check.registration_a, "b": config.check.registration_b},
+    )
+
+
+def threshold_plan(config: RigConfig) -> ThresholdPlan | None:
+    """The level of the rig's ``[events]``, if it is a source."""
+    events = config.events
+    if "threshold" not in events.sources:
+        return None
+    return ThresholdPlan(
+        arm=events.arm,
+        level_dn=events.level_dn,
+        hysteresis_dn=events.hysteresis_dn,
+        rising=events.edge == "rising",
+        average_lines=events.average_lines,
+    )

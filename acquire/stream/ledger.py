@@ -1,0 +1,83 @@
+"""Every pulse of the trigger has a place: what became of the lines of one arm since it was armed.
+
+::
+
+    issued = preroll + stored + discarded + Σ lost + waiting + pending
+
+``issued``, ``lost`` and ``waiting`` are counted by different parties (trigger, camera and grabber, ring and
+recorder), so that a line which none of them knows of shows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+UNDELIVERED = "undelivered"
+"""Loss at the end of a run: pulses whose lines the camera never gave, as of a block that did not fill."""
+
+
+@dataclass(frozen=True, slots=True)
+class Counted:
+    """What was counted of one arm, in lines.
+
+    Attributes
+    ----------
+    pulses : that the trigger is known to have issued
+    next_line : after the last line that came out of the camera, or was lost before it
+    depth : lines that come before the trigger's line 0
+    stored, discarded : what the recorder took from the ring: in recordings, in none
+    lost : cause → lines
+    room, block : lines that the ring and one of its slots hold at most
+    """
+
+    pulses: int
+    next_line: int
+    depth: int
+    stored: int
+    discarded: int
+    lost: Mapping[str, int]
+    room: int
+    block: int
+
+
+@dataclass(frozen=True, slots=True)
+class ArmLedger:
+    """The account; see the module. ``balanced``: no place holds less than nothing, or more than it can."""
+
+    issued: int
+    preroll: int
+    stored: int
+    discarded: int
+    lost: dict[str, int]
+    waiting: int
+    pending: int
+    balanced: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def account(counted: Counted, *, closed: bool) -> ArmLedger:
+    """The account of a running arm, whose counts are up to a block apart, or of a ``closed`` one: exact.
+
+    A line that came proves its pulse, whatever tags have told so far. Once closed, nothing waits, and what
+    is pending will not come.
+    """
+    read = max(0, counted.next_line + counted.depth)
+    issued = counted.pulses if closed else max(counted.pulses, read)
+    preroll = min(read, counted.depth)
+    lost = {cause: lines for cause, lines in counted.lost.items() if lines}
+    waiting = read - preroll - counted.stored - counted.discarded - sum(lost.values())
+    pending = issued - read
+    if closed:
+        balanced = waiting == 0 and pending >= 0
+        lost |= {UNDELIVERED: pending} if pending > 0 else {}
+        return ArmLedger(issued, preroll, counted.stored, counted.discarded, lost, waiting, 0, balanced)
+    balanced = -counted.block <= waiting <= counted.room + counted.block
+    return ArmLedger(
+        issued, preroll, counted.stored, counted.discarded, lost, max(0, waiting), pending, balanced
+    )

@@ -1,0 +1,185 @@
+"""Does the light follow the code? Held against the lines themselves, by the forward model of Eq. (1).
+
+Summed over its pixels, line ``l`` of an arm is the code seen through the scene's light per row, E * w::
+
+    y(l) = Σ_k E(S·l + k) · h(k)         h = w(row) * (1, … 1)        (S ones: the sub-steps of a line)
+
+and what the light per row is, the *other* arm tells, whose pixels are this arm's rows. So each arm predicts
+how the other's lines go up and down with the code, to the sub-step, for any scene that has contrast; slow
+changes of the scene are taken out by differences from line to line. The correlation of what is predicted with
+what is seen, at all delays, is two Fourier transforms. Its peak, in standard deviations of the correlation
+with a code that has nothing to do with the light, says which of these it is::
+
+    verified     high at delay 0                      dark          no light, or none that follows a code
+    shifted      high elsewhere: by so many sub-steps wrong_code    light follows another code
+    inverted     as high, negative                    unknown       too little contrast to tell
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.codes import Code
+
+CERTAIN = 14.0
+"""Standard deviations from which on a peak is one: of ten thousand delays, the highest by chance has six, or
+nine in a scene that flickers."""
+_BETTER = 40.0
+"""By which the squares of two peaks differ for certain."""
+_MUST_SHOW = 2 * CERTAIN
+"""Where so high a peak is to be expected, its absence is certain."""
+_FLAT = 3.0
+"""Light that varies so many times less than the code would have it follows none."""
+_DARK_SHARE = 0.002
+"""Of the camera's range: less light is none."""
+_NEVER_ZERO = 1e-12
+
+
+class Verdict(StrEnum):
+    """What the lines say of the code: see the module."""
+
+    UNKNOWN = "unknown"
+    VERIFIED = "verified"
+    SHIFTED = "shifted"
+    INVERTED = "inverted"
+    WRONG_CODE = "wrong_code"
+    DARK = "dark"
+
+    @property
+    def doubtful(self) -> bool:
+        """The recorded code is not that of the light."""
+        return self not in (Verdict.UNKNOWN, Verdict.VERIFIED)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """What one arm shows in consecutive lines, above the black level, in DN.
+
+    ``energy`` (line): mean of each line; ``profile`` (pixel): mean of each pixel.
+    """
+
+    energy: NDArray[np.float64]
+    profile: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """The verdict on one arm; ``shift``: sub-steps by which its lines are late; ``peak``: see the module."""
+
+    verdict: Verdict
+    shift: int = 0
+    peak: float = 0.0
+
+    def __str__(self) -> str:
+        name = str(self.verdict).replace("_", " ")
+        return f"{name} by {self.shift:+d} sub-steps" if self.shift else name
+
+
+def explain(found: dict[str, Finding], substeps: int) -> str:
+    """Both arms in words; where they are apart by whole lines, that one of them slipped."""
+    words = ", ".join(f"arm {arm} {finding}" for arm, finding in found.items())
+    a, b = found["a"], found["b"]
+    seen = all(finding.verdict in (Verdict.VERIFIED, Verdict.SHIFTED) for finding in (a, b))
+    apart = b.shift - a.shift
+    if not seen or not apart or apart % substeps:
+        return words
+    return f"{words}: arm b is {abs(apart) // substeps} lines {'behind' if apart > 0 else 'ahead of'} arm a"
+
+
+@dataclass(frozen=True, slots=True)
+class Judge:
+    """Judges the arms of one run.
+
+    Attributes
+    ----------
+    stages, substeps : M, S
+    code : the run's
+    white_dn : the camera's range
+    registration : arm → sub-steps by which its lines are known to show late, as its image lies off
+    """
+
+    stages: int
+    substeps: int
+    code: Code
+    white_dn: int
+    registration: dict[str, int]
+
+    def look(self, first_line: int, sights: dict[str, Sight]) -> dict[str, Finding]:
+        """The verdict on each arm from the same lines of both, ``first_line`` on."""
+        lines = len(sights["a"].energy)
+        reach = min(4096, self.substeps * lines // 4)
+        span = self.stages * self.substeps + self.substeps - 1
+        start = self.substeps * first_line - reach
+        bits = self.code.bits(start, self.substeps * lines + span + 2 * reach)
+        # Camera B's rows are the scene's columns from right to left: each sees the other's pixels that way.
+        others = {"a": sights["b"].profile, "b": sights["a"].profile[::-1]}
+        return {
+            arm: self._judge(sights[arm], others[arm], bits, reach - self.registration.get(arm, 0))
+            for arm in sights
+        }
+
+    def _judge(
+        self, sight: Sight, rows: NDArray[np.float64], bits: NDArray[np.uint8], nominal: int
+    ) -> Finding:
+        least = _DARK_SHARE * self.white_dn
+        light = float(sight.energy.mean())
+        if light < least and bits.any():
+            return Finding(Verdict.DARK)
+        if bits.min() == bits.max() or rows.mean() < least:  # neither code nor the other arm tells anything
+            return Finding(Verdict.UNKNOWN)
+        predicted = predict(rows, bits, self.substeps)
+        predicted *= light / predicted.mean()
+        steps = predicted[self.substeps :] - predicted[: -self.substeps]
+        seen = np.diff(sight.energy)
+        contrast = float(steps.std() / max(seen.std(), _NEVER_ZERO))
+        return _read(_correlate(seen, steps, self.substeps), nominal, contrast, len(seen))
+
+
+def predict(rows: NDArray[np.float64], bits: NDArray[np.uint8], substeps: int) -> NDArray[np.float64]:
+    """Energy of a line that begins at each of the sub-steps of ``bits``, as far as they reach.
+
+    ``rows`` (M,): light of the rows, S of them at a time, in any unit.
+    """
+    response = np.convolve(np.repeat(rows, substeps), np.ones(substeps))
+    size = _transform_size(len(bits))
+    product = np.fft.rfft(bits.astype(np.float64), size) * np.conj(np.fft.rfft(response, size))
+    energy: NDArray[np.float64] = np.fft.irfft(product, size)[: len(bits) - len(response) + 1]
+    return energy
+
+
+def _correlate(seen: NDArray[Any], steps: NDArray[Any], substeps: int) -> NDArray[np.float64]:
+    """Of what is ``seen`` line by line with what is predicted sub-step by sub-step, at each delay."""
+    spread = np.zeros(substeps * len(seen))
+    spread[::substeps] = seen - seen.mean()
+    size = _transform_size(len(steps))
+    product = np.conj(np.fft.rfft(spread, size)) * np.fft.rfft(steps, size)
+    raw = np.fft.irfft(product, size)[: len(steps) - len(spread) + 1]
+    scale = seen.std() * steps.std() * np.sqrt(len(seen))
+    deviations: NDArray[np.float64] = raw / max(scale, _NEVER_ZERO)
+    return deviations
+
+
+def _read(peaks: NDArray[np.float64], nominal: int, contrast: float, lines: int) -> Finding:
+    """``contrast``: how much the light should vary with the code, of how much it does."""
+    at = int(np.abs(peaks).argmax())
+    if peaks[at] ** 2 - peaks[nominal] ** 2 < _BETTER:
+        at = nominal
+    peak, shift = float(peaks[at]), nominal - at
+    if abs(peak) >= CERTAIN:
+        straight = Verdict.SHIFTED if shift else Verdict.VERIFIED
+        return Finding(straight if peak > 0 else Verdict.INVERTED, shift, peak)
+    if contrast > _FLAT:
+        return Finding(Verdict.DARK, 0, peak)
+    certain = min(contrast, 1.0) * np.sqrt(lines) > _MUST_SHOW
+    return Finding(Verdict.WRONG_CODE if certain else Verdict.UNKNOWN, 0, peak)
+
+
+def _transform_size(length: int) -> int:
+    return 1 << (length - 1).bit_length()

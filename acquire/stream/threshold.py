@@ -1,0 +1,57 @@
+"""When what the lines show crosses a level: with hysteresis, so that noise at the level is one event."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_MOST_COLUMNS = 64
+"""That a line's mean is taken over: evenly spaced ones tell enough."""
+
+
+@dataclass(frozen=True, slots=True)
+class ThresholdPlan:
+    """Level of the mean of ``average_lines`` lines of ``arm``; it counts again ``hysteresis_dn`` back."""
+
+    arm: str
+    level_dn: float
+    hysteresis_dn: float
+    rising: bool
+    average_lines: int
+
+
+class Threshold:
+    """Finds the crossings in lines that come block by block. The first lines only say on which side it is."""
+
+    def __init__(self, plan: ThresholdPlan) -> None:
+        self.plan = plan
+        self._beyond: bool | None = None
+
+    def crossings(self, first_line: int, pixels: NDArray[Any]) -> list[int]:
+        """First line of every stretch in ``pixels`` (line, pixel) in which the level is crossed."""
+        plan, sign = self.plan, 1.0 if self.plan.rising else -1.0
+        found = []
+        for number, mean_dn in enumerate(_means(pixels, plan.average_lines)):
+            above = sign * (mean_dn - plan.level_dn)
+            if above >= 0 and self._beyond is False:
+                found.append(first_line + number * plan.average_lines)
+            if above >= 0:
+                self._beyond = True
+            elif self._beyond is None or above < -plan.hysteresis_dn:
+                self._beyond = False
+        return found
+
+
+def _means(pixels: NDArray[Any], lines: int) -> list[float]:
+    """Mean of each ``lines`` lines; of what remains, too."""
+    step = -(-pixels.shape[1] // _MOST_COLUMNS)
+    levels = pixels[:, ::step].mean(axis=1, dtype=np.float32)
+    starts = np.arange(0, len(levels), lines)
+    counts = np.diff(starts, append=len(levels))
+    means: list[float] = (np.add.reduceat(levels, starts) / counts).tolist()
+    return means

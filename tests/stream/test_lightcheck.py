@@ -1,0 +1,148 @@
+"""Verdicts on lines of every built-in kind of scene, whose light follows the code or does not."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import pytest
+
+from acquire.codes import Code, ConstantCode, PrbsCode, mix_seed
+from acquire.config import load_rig, load_scene
+from acquire.forward import DualArm
+from acquire.geometry import Geometry
+from acquire.sim.pipeline import Bench
+from acquire.stream.lightcheck import Finding, Judge, Sight, Verdict, explain, predict
+
+LINES, FIRST = 8192, 1000
+SCENES = {
+    "scene-leds": "rig-demo",
+    "scene-leds-measured": "rig-demo",
+    "scene-leds-emulated": "rig-emulated",
+    "scene-usaf": "rig-fast",
+    "scene-goldfish": "rig-goldfish",
+    "scene-usaf-interline": "rig-interline",
+}
+"""Flickering, noisy, merged, still, moving; S = 1."""
+
+
+@dataclass(frozen=True)
+class Altered:
+    """A code that is not quite the light's."""
+
+    code: Code
+    late: int = 0
+    inverted: bool = False
+
+    def bits(self, start: int, length: int) -> np.ndarray:
+        return self.code.bits(start - self.late, length) ^ self.inverted
+
+    def to_attrs(self) -> dict[str, object]:
+        return self.code.to_attrs()
+
+
+@cache
+def recorded(scene: str) -> tuple[dict[str, np.ndarray], int, int, int, Code]:
+    """Lines of both arms, M, S, white, and the light's code."""
+    rig = load_rig(SCENES[scene])
+    code = rig.code.build()
+    cameras = {arm: rig.cameras.arm(arm) for arm in "ab"}
+    bench = Bench(load_scene(scene), rig.geometry, cameras, rig.trigger.substep_ticks / rig.trigger.clock_hz)
+    lines = {arm: bench.camera(arm, code).read(FIRST, LINES).pixels for arm in "ab"}
+    return lines, rig.geometry.stages, rig.geometry.substeps, rig.cameras.a.white_dn, code
+
+
+def sights(lines: dict[str, np.ndarray]) -> dict[str, Sight]:
+    return {arm: Sight(pixels.mean(axis=1), pixels.mean(axis=0)) for arm, pixels in lines.items()}
+
+
+def verdicts(scene: str, **altered: object) -> dict[str, Finding]:
+    """On lines that are held against another code than the light's."""
+    lines, stages, substeps, white, code = recorded(scene)
+    judge = Judge(stages, substeps, Altered(code, **altered), white, {})
+    return judge.look(FIRST, sights(lines))
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_light_that_follows_the_code_is_verified(scene: str) -> None:
+    for finding in verdicts(scene).values():
+        assert (finding.verdict, finding.shift) == (Verdict.VERIFIED, 0)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("late", [1, -1, 3, -64, 1000])
+def test_a_shift_is_told_to_the_substep(scene: str, late: int) -> None:
+    for finding in verdicts(scene, late=late).values():
+        assert (finding.verdict, finding.shift) == (Verdict.SHIFTED, -late)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_the_wrong_polarity_is_told(scene: str) -> None:
+    for finding in verdicts(scene, inverted=True).values():
+        assert (finding.verdict, finding.shift) == (Verdict.INVERTED, 0)
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_another_code_is_told(scene: str) -> None:
+    for finding in verdicts(scene, late=-(10**6)).values():
+        assert finding.verdict is Verdict.WRONG_CODE
+
+
+@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("slip", [1, -2])
+def test_an_arm_that_slipped_by_lines_is_told_from_the_other(scene: str, slip: int) -> None:
+    lines, stages, substeps, white, code = recorded(scene)
+    slipped = {"a": lines["a"][4:-4], "b": np.roll(lines["b"], slip, axis=0)[4:-4]}
+    found = Judge(stages, substeps, code, white, {}).look(FIRST + 4, sights(slipped))
+    assert found["a"].verdict is Verdict.VERIFIED
+    assert (found["b"].verdict, found["b"].shift) == (Verdict.SHIFTED, slip * substeps)
+    assert explain(found, substeps).endswith(
+        f"arm b is {abs(slip)} lines {'behind' if slip > 0 else 'ahead of'} arm a"
+    )
+
+
+def test_a_known_registration_is_no_shift() -> None:
+    lines, stages, substeps, white, code = recorded("scene-usaf")
+    judge = Judge(stages, substeps, Altered(code, late=-2), white, {"a": 2, "b": 2})
+    assert {finding.verdict for finding in judge.look(FIRST, sights(lines)).values()} == {Verdict.VERIFIED}
+
+
+def test_dark_light_sources_are_told() -> None:
+    lines, stages, substeps, white, code = recorded("scene-usaf")
+    rng = np.random.default_rng(3)
+    judge = Judge(stages, substeps, code, white, {})
+    nothing = {arm: rng.poisson(2.0, pixels.shape) for arm, pixels in lines.items()}
+    daylight = {arm: rng.poisson(pixels.mean(axis=0), pixels.shape) for arm, pixels in lines.items()}
+    one_arm = lines | {"b": nothing["b"]}
+    told = {
+        name: [finding.verdict for finding in judge.look(FIRST, sights(seen)).values()]
+        for name, seen in (("nothing", nothing), ("daylight", daylight), ("one", one_arm))
+    }
+    assert told == {
+        "nothing": [Verdict.DARK, Verdict.DARK],
+        "daylight": [Verdict.DARK, Verdict.DARK],
+        "one": [Verdict.UNKNOWN, Verdict.DARK],
+    }
+
+
+@pytest.mark.parametrize(("value", "verdict"), [(1, Verdict.UNKNOWN), (0, Verdict.UNKNOWN)])
+def test_a_constant_light_tells_nothing_of_a_code(value: int, verdict: Verdict) -> None:
+    lines, stages, substeps, white, _ = recorded("scene-usaf")
+    judge = Judge(stages, substeps, ConstantCode(value), white, {})
+    assert {finding.verdict for finding in judge.look(FIRST, sights(lines)).values()} == {verdict}
+
+
+@pytest.mark.parametrize("substeps", [1, 2, 3])
+def test_the_prediction_is_the_forward_model_s(substeps: int) -> None:
+    """Of a scene that does not change, from the other arm's pixels, up to one factor."""
+    geometry = Geometry(6, substeps, 40)
+    code = PrbsCode(20, mix_seed(1, 20)).bits(0, geometry.span)
+    row = np.repeat(np.random.default_rng(5).random(6), substeps)  # as fine as the other arm's pixels
+    picture = np.outer(row, np.ones(geometry.size))
+    lines = DualArm(geometry, code, dtype=np.float64).forward(
+        np.broadcast_to(picture, geometry.video_shape()).copy()
+    )
+    energy = predict(row[::substeps], code, substeps)[::substeps]
+    seen = lines[0].sum(axis=1)
+    assert np.allclose(energy[: len(seen)] / energy[: len(seen)].sum(), seen / seen.sum())
