@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from acquire.sim.devices import SimulatedCamera
 from acquire.stream.shared import WORD_BYTES, SharedBytes
 
 if TYPE_CHECKING:
-    from acquire.camera.base import Camera, CameraBlock
-    from acquire.sim.devices import SimulatedCamera
-    from acquire.sim.pattern import PatternCameraOpener
+    from acquire.camera.base import Camera, CameraBlock, CameraOpener
 
 
 class Latencies:
@@ -54,7 +53,7 @@ class Latencies:
 class TimedOpener:
     """Opens a camera that notes how late its blocks were when they came to rest in the ring."""
 
-    opener: PatternCameraOpener
+    opener: CameraOpener
     latencies: Latencies
 
     def __call__(self) -> Camera:
@@ -64,7 +63,8 @@ class TimedOpener:
 class TimedCamera:
     """A simulated camera and a stopwatch; see `TimedOpener`."""
 
-    def __init__(self, camera: SimulatedCamera, latencies: Latencies) -> None:
+    def __init__(self, camera: Camera, latencies: Latencies) -> None:
+        assert isinstance(camera, SimulatedCamera)
         self._camera, self._latencies = camera, latencies
 
     def __getattr__(self, name: str) -> Any:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import shutil
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -76,7 +76,7 @@ class Load:
             substeps=config.geometry.substeps,
             stages=config.geometry.stages,
             block_lines=stream.block_lines,
-            ring_slots=stream.ring_slots,
+            ring_slots=config.ring_slots,
             chunk_lines=recording.chunk_lines,
             shard_chunks=recording.shard_chunks,
             codec="none" if recording.codec == "auto" else recording.codec,
@@ -150,7 +150,11 @@ def run_load(load: Load, directory: Path, seconds: float) -> LoadReport:
     model = TriggerModel(wire, CLOCK_HZ, load.speed)
     trigger = TriggerDriver(partial(TwinTransport, model), config)
     try:
-        capture = Capture(_plan(load, wire, latencies), trigger)
+        plan = capture_plan(load, wire)
+        timed: dict[str, CameraOpener] = {
+            arm: TimedOpener(opener, latencies[arm]) for arm, opener in plan.openers.items()
+        }
+        capture = Capture(replace(plan, openers=timed), trigger)
         try:
             capture.arm()
             return _measure(load, capture, path, seconds, latencies)
@@ -215,15 +219,13 @@ def _tag_every(load: Load) -> int:
     return min(load.block_lines, load.ring_slots * load.block_lines // 4)
 
 
-def _plan(load: Load, wire: Wire, latencies: dict[str, Latencies]) -> CapturePlan:
+def capture_plan(load: Load, wire: Wire) -> CapturePlan:
+    """A run whose cameras show patterns at the pulses of ``wire``; its white level is that of the format."""
     geometry = GeometryConfig(stages=load.stages, substeps=load.substeps)
     camera = CameraConfig(pixel_format=_PIXEL_FORMAT[load.dtype])
     openers: dict[str, CameraOpener] = {
-        arm: TimedOpener(
-            PatternCameraOpener(
-                wire, arm, geometry, camera, load.block_lines, load.line_rate_hz, load.pixels
-            ),
-            latencies[arm],
+        arm: PatternCameraOpener(
+            wire, arm, geometry, camera, load.block_lines, load.line_rate_hz, load.pixels
         )
         for arm in ARMS
     }

@@ -59,6 +59,9 @@ def start(
     post: Annotated[
         float | None, typer.Option(parser=seconds, metavar="TIME", help="Stop so long after this command.")
     ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with a sealed RECORDING, in a segment beside it.")
+    ] = False,
     socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
@@ -67,7 +70,10 @@ def start(
     Example: [bold]acquire start run.zarr --lines 100000[/], or [bold]acquire start --pre 2s --post 1s[/]
     """
     with _daemon(socket) as daemon:
-        _show(daemon.start(path, lines=lines, duration_s=duration, pre_s=pre or 0.0, post_s=post), json)
+        status = daemon.start(
+            path, lines=lines, duration_s=duration, pre_s=pre or 0.0, post_s=post, resume=resume
+        )
+        _show(status, json)
 
 
 def mark(
@@ -75,7 +81,7 @@ def mark(
     socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Note that something happens now. While armed it starts a recording, where the rig's [events] say so.
+    """Note that something happens now. While armed it starts a recording, where the rig's events say so.
 
     Example: [bold]acquire mark "the valve opens"[/]
     """

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -114,9 +114,8 @@ def recover(recording: RecordingArgument, json: JsonFlag = False) -> None:
         print_json(done.to_dict())
         return
     added = done.lines - done.lines_before
-    what = (
-        f"sealed; {added} lines were on disk that no commit listed" if done.changed else "nothing to recover"
-    )
+    found = f"; {added} lines were on disk that no commit listed" if added else ""
+    what = f"recovered and sealed{found}" if done.changed else "nothing to recover"
     typer.echo(f"{done.path}: {done.lines} lines, {what}")
     if done.indices_mended:
         typer.echo(f"  {done.indices_mended} indices of files were mended")
@@ -271,6 +270,7 @@ def _readable(facts: dict[str, Any]) -> dict[str, Any]:
         "code": ", ".join(f"{key} {value}" for key, value in facts["code"].items()),
         "clock": f"{facts['clock']['clock_hz']} Hz, UTC known to {facts['clock']['uncertainty_ns']} ns",
         "size": quantity(facts["bytes"], "B"),
+        "disk": _disk(facts["disk"]),
         "at risk": _at_risk(facts["durability"]),
         "lost lines": ", ".join(f"{arm} {count}" for arm, count in facts["lost_lines"].items()),
         "simulated": "yes" if facts["simulated"] else "no",
@@ -292,6 +292,14 @@ def _stretches(stretches: list[list[Any]]) -> str | None:
     shown = [f"{first} to {first + count - 1}" for first, count, *_ in stretches[:LISTED]]
     more = [f"and {len(stretches) - LISTED} more"] if len(stretches) > LISTED else []
     return ", ".join(shown + more) or None
+
+
+def _disk(disk: dict[str, float] | None) -> str | None:
+    """How long a growing recording can go on."""
+    if disk is None:
+        return None
+    free, rate = quantity(disk["free_bytes"], "B"), quantity(disk["bytes_per_s"], "B/s")
+    return f"{free} free, full in {timedelta(seconds=round(disk['seconds_to_full']))} at {rate}"
 
 
 def _at_risk(durability: dict[str, Any]) -> str | None:

@@ -69,11 +69,13 @@ class Client:
         duration_s: float | None = None,
         pre_s: float = 0.0,
         post_s: float | None = None,
+        resume: bool = False,
     ) -> Status:
         """armed → recording. A relative ``path`` is meant from the caller's directory.
 
         ``pre_s`` of the recording are from before the request, as far as the ring holds them; ``post_s`` is
-        another way to say how long it is to go on.
+        another way to say how long it is to go on. With ``resume``, ``path`` is a sealed recording that goes
+        on in a segment beside it.
         """
         try:
             request = StartRequest(
@@ -82,11 +84,13 @@ class Client:
                 duration_s=duration_s,
                 pre_s=pre_s,
                 post_s=post_s,
+                resume=resume,
             )
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(map(str, first["loc"]))
-            raise UsageError(f"start: {where} {first['msg']}".replace("  ", " ")) from error
+            why = first["msg"].removeprefix("Value error, ")
+            raise UsageError(f"start: {where} {why}".replace("  ", " ")) from error
         return self._call("POST", "start", body=request.model_dump(mode="json"))
 
     def mark(self, text: str = "") -> Status:

@@ -44,6 +44,9 @@ class StartRequest(_Message):
     post_s: float | None = Field(
         default=None, gt=0, le=1e9, allow_inf_nan=False, description="to record after the request, as budget"
     )
+    resume: bool = Field(
+        default=False, description="path is a sealed recording: go on with it in a further segment beside it"
+    )
 
     @model_validator(mode="after")
     def _one_budget(self) -> StartRequest:
@@ -52,6 +55,8 @@ class StartRequest(_Message):
             raise ValueError(f"{' and '.join(given)} are ways to say the same: give one")
         if self.duration_s is not None and self.pre_s >= self.duration_s:
             raise ValueError("pre_s is a part of duration_s: give a smaller one")
+        if self.resume and self.path is None:
+            raise ValueError("resume needs the path of the recording to go on with")
         if self.path is not None and not self.path.is_absolute():
             raise ValueError(f"path {str(self.path)!r} is not absolute: the daemon has another directory")
         return self
@@ -100,6 +105,7 @@ class CheckStatus(_Message):
     verdict: str = Field(description="verified, shifted, inverted, wrong_code, dark or unknown")
     shift: int = Field(description="sub-steps by which the lines are late")
     checked_line: int = Field(description="the line after the last that was looked at")
+    lapped: int = Field(description="ring slots that came and went unseen by the check")
 
 
 class ArmStatus(_Message):
@@ -167,6 +173,7 @@ class Status(_Message):
     last: LastRecording | None
     fault: str | None
     capacity: CapacityStatus | None = None
+    processes: dict[str, int] = Field(default={}, description="of the run: name → process number")
 
 
 class ErrorMessage(_Message):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from acquire.daemon.storage import choose_for, storage_settings
 from acquire.daemon.watching import watch_plan
-from acquire.store import RecordingSpec
+from acquire.store import RecordingSpec, next_segment
 from acquire.stream import NOW, Capture, CapturePlan
 from acquire.stream.messages import Note
 from acquire.trigger.base import TriggerRun
@@ -53,9 +53,16 @@ class Run:
             self._choice = choose_for(self._config)
         self._capture.arm()
 
-    def start(self, path: Path, lines: int | None, window: Window = NOW) -> None:
-        """Record to ``path``. Raises UsageError where it cannot be, before anything is touched."""
-        self._capture.start(path, self._spec(), lines, window)
+    def start(self, path: Path, lines: int | None, window: Window = NOW, *, resume: bool = False) -> Path:
+        """Record to ``path``, or, to ``resume`` what is there, to a segment beside it; says where.
+
+        Raises UsageError where it cannot be, before anything is touched.
+        """
+        spec = self._spec()
+        if resume:
+            path, spec = next_segment(path, spec)
+        self._capture.start(path, spec, lines, window)
+        return path
 
     def mark(self, text: str) -> Note:
         """An event of the operator's, at the newest line."""

@@ -13,6 +13,7 @@ import os
 import threading
 import time
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from acquire import __version__
@@ -27,7 +28,6 @@ from acquire.stream import CaptureStatus
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-    from pathlib import Path
 
     from acquire.config import RigConfig
     from acquire.daemon.messages import CapacityStatus, StartRequest
@@ -48,7 +48,7 @@ class Run(Protocol):
     run_id: str
 
     def arm(self) -> None: ...
-    def start(self, path: Path, lines: int | None, window: Window) -> None: ...
+    def start(self, path: Path, lines: int | None, window: Window, *, resume: bool = False) -> Path: ...
     def mark(self, text: str) -> Note: ...
     def extend(self, line: int) -> None: ...
     def events(self) -> list[Note]: ...
@@ -81,6 +81,7 @@ class Service:
         self._rates = Rates()
         self._order = StandingOrder(config)
         self._by_event = False
+        self._late: Note | None = None
         self._target: tuple[Path, int | None] | None = None
         self._drain_until = math.inf
         self._last: LastRecording | None = None
@@ -117,7 +118,7 @@ class Service:
         with self._doing(Event.START):
             rate_hz = self._config.line_rate_hz
             window = window_of(request, rate_hz)
-            self._begin(request.path, budget_lines(request, rate_hz), window)
+            self._begin(request.path, budget_lines(request, rate_hz), window, resume=request.resume)
             self._by_event = False
             self.supervise()
 
@@ -203,10 +204,9 @@ class Service:
         self._rates.look(delivered_lines(self._seen))
         return self._seen
 
-    def _begin(self, path: Path | None, lines: int | None, window: Window) -> None:
+    def _begin(self, path: Path | None, lines: int | None, window: Window, *, resume: bool = False) -> None:
         assert self._run is not None
-        path = path or default_path(self._config)
-        self._run.start(path, lines, window)
+        path = self._run.start(path or default_path(self._config), lines, window, resume=resume)
         if window.post_lines is not None:
             lines = window.pre_lines + window.post_lines
         self._target = path, lines
@@ -223,11 +223,16 @@ class Service:
             self._by_event = True
         elif self._state is State.RECORDING and self._by_event:
             self._run.extend(self._order.end_line(note))
+        elif self._state is State.DRAINING and self._by_event and self._order.rearm:
+            self._late = self._late or note
 
     def _finish(self) -> None:
         if self._by_event and self._order.rearm and self._seen.done and not self._hurried.is_set():
             self._remember()
             self._go(Event.KEPT, self._last_words())
+            if (late := self._late) is not None:
+                self._late = None
+                self._heed(late)
             return
         self._release()
         if self._seen.condition is RunCondition.ABORTED:
@@ -262,6 +267,9 @@ class Service:
             raise DeviceError(f"the devices could not be released in order: {error}") from error
         finally:
             self._seen, self._rates = run.poll(), Rates()
+            for arm, account in self._seen.accounts.items():
+                if not account.balanced:
+                    log.error("the ledger of arm %s does not balance: %s", arm, account)
             self._remember()
             self._publish()
 
@@ -269,6 +277,9 @@ class Service:
         if self._target is None:
             return
         (path, _), self._target = self._target, None
+        if self._seen.path not in (None, str(path)):
+            log.warning("%s was cut off; acquire recover %s seals it", path, path)
+        path = Path(self._seen.path or path)
         self._last = LastRecording(
             path=path,
             lines=self._seen.committed_lines,
@@ -328,6 +339,7 @@ class Service:
             last=self._last,
             fault=self._fault,
             capacity=self._capacity,
+            processes={} if self._run is None else self._seen.pids,
         )
 
     def _recording(self) -> RecordingStatus | None:
@@ -335,7 +347,7 @@ class Service:
             return None
         path, budget = self._target
         return RecordingStatus(
-            path=path,
+            path=Path(self._seen.path or path),
             first_line=self._seen.first_line,
             budget_lines=budget,
             recorded_lines=self._seen.recorded_lines,

@@ -1,7 +1,13 @@
 """Recordings and videos on disk: Zarr v3 that zarr-python, xarray and tensorstore open without us.
 
-Downwards: `writer` · `reader` · `video`; `arm_writer` · `camera_stream` one arm; `table` gaps and events;
-`layout` metadata; `spec` what a recording says of itself; `shard` one growing array; `files` the disk.
+::
+
+    whole recordings   writer                     reader, opening           verify  recover  mirror  video
+      with             retention room resume                                scan    mend
+    one arm            arm_writer                 camera_stream
+    one array          array_writer → shard       chunks                    tables: table, table_reader
+    what is written    spec (attributes), layout (metadata), codecs (bytes)
+    where              files (disk), pages        source → disk | remote (URLs)
 """
 
 from acquire.store.camera_stream import CameraStream

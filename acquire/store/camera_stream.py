@@ -105,11 +105,6 @@ class CameraStream:
         """The chunks of the array ``name``."""
         return self._readers[name]
 
-    def expect(self, start: int, stop: int) -> None:
-        """Rows ``start .. stop - 1`` will be read soon."""
-        for name in ("lines", "flags", "code", "code_index", "time"):
-            self._readers[name].expect(start, stop)
-
     def read(self, name: str, start: int, stop: int) -> NDArray[Any]:
         """Rows ``start .. stop - 1`` of one array; DataError when they are not intact on disk."""
         try:

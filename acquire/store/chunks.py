@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -45,14 +46,19 @@ class ChunkReader:
             rows[low - start : high - start] = self.chunk(chunk)[low - chunk * size : high - chunk * size]
         return rows
 
+    def expect_index(self, start: int, stop: int) -> None:
+        """Rows ``start .. stop - 1`` will be read soon: their indices are fetched meanwhile."""
+        size = self.shape.shard_rows
+        for shard in range(start // size, -(-stop // size)):
+            with suppress(OSError):  # reading it says what is wrong
+                self._source.expect(self.shard_file(shard), 0, index_bytes(self.shape.shard_chunks))
+
     def expect(self, start: int, stop: int) -> None:
-        """Rows ``start .. stop - 1`` will be read soon: disks do better when they know all of it at once."""
+        """The same of the chunks themselves: a disk does best when it knows all of them at once."""
         size = self.shape.chunk_rows
         for chunk in range(start // size, -(-stop // size)):
-            try:
+            with suppress(AbsentChunkError, DamagedChunkError, OSError):
                 self._source.expect(self.file(chunk), *self.entry(chunk))
-            except (AbsentChunkError, DamagedChunkError, OSError):
-                return  # reading it says what is wrong
 
     @property
     def chunks(self) -> int:

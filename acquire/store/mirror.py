@@ -23,7 +23,7 @@ from acquire.store.files import DISK
 from acquire.store.layout import group_document, to_json
 from acquire.store.opening import open_recording
 from acquire.store.remote import RemoteSource
-from acquire.store.retention import keep_from, shard_files
+from acquire.store.retention import keep_from, release, shard_files
 from acquire.store.scan import COLUMNS
 
 if TYPE_CHECKING:
@@ -115,7 +115,9 @@ class Mirror:
             self._publish(recording, lines)
         except OSError as error:
             raise DataError(f"copying {self.path} to {self.target}: {error}") from error
-        if not sealed:
+        if sealed:
+            release(self.path, self._disk)
+        else:
             keep_from(self.path, recording.first_line + lines, self._disk)
         return Mirrored(str(self.target), lines, self._shards, self._bytes, sealed)
 

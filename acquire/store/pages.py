@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 import mmap
 import os
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +17,12 @@ if TYPE_CHECKING:
 
 PAGE = 4096
 """Bytes; alignment of addresses, offsets and lengths that every disk's direct I/O accepts."""
+
+
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+"""Options of glibc's mallopt."""
+KEPT_BYTES = 2**25
+"""Pieces up to this size are kept: the most that glibc allows."""
 
 
 def page_up(size: int) -> int:
@@ -30,6 +38,19 @@ def aligned_bytes(size: int) -> NDArray[np.uint8]:
     memory = np.frombuffer(mmap.mmap(-1, max(PAGE, page_up(size))), np.uint8)
     memory.fill(0)
     return memory
+
+
+@cache
+def keep_freed_memory() -> bool:
+    """Let the C library keep what it is given back, for the rest of this process; False where it cannot.
+
+    Each packed chunk is some MB that are allocated anew: taken from the system and returned every time, their
+    first touch costs a third of the packing.
+    """
+    library = ctypes.CDLL(None)
+    if not hasattr(library, "mallopt"):  # not glibc
+        return False
+    return all(library.mallopt(option, KEPT_BYTES) for option in (M_MMAP_THRESHOLD, M_TRIM_THRESHOLD))
 
 
 def is_aligned(array: NDArray[Any]) -> bool:

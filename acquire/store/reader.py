@@ -1,7 +1,7 @@
 """Reading recordings: what they say about themselves, and segments cut out of them for reconstruction.
 
 A `Recording` is a snapshot: of one that is still growing it shows what was committed when it was opened;
-open it again to see more. Nothing is read before it is asked for.
+`refreshed` shows more. Nothing is read before it is asked for.
 """
 
 from __future__ import annotations
@@ -19,7 +19,9 @@ from acquire.errors import DataError, UsageError
 from acquire.geometry import Geometry
 from acquire.lines import ARMS, LineFlag, Segment
 from acquire.store.camera_stream import CameraStream
+from acquire.store.files import DISK
 from acquire.store.layout import line_columns
+from acquire.store.source import LocalSource
 from acquire.store.table_reader import read_events, read_gaps
 
 if TYPE_CHECKING:
@@ -30,6 +32,9 @@ if TYPE_CHECKING:
     from acquire.store.layout import Document
     from acquire.store.source import Source
     from acquire.store.table_reader import Event, Gap
+
+CUT_COLUMNS = ("lines", "flags", "code", "code_index", "time")
+"""Arrays that a segment is made of."""
 
 UNUSABLE = LineFlag.MISSING | LineFlag.INCOMPLETE
 
@@ -70,6 +75,10 @@ class Recording:
 
     def _open(self) -> zarr.Group:
         return self.group
+
+    def refreshed(self) -> Recording:
+        """The recording as it is now: of one that is growing, what was committed since."""
+        return self._opener(self.source)
 
     @property
     def state(self) -> str:
@@ -184,8 +193,11 @@ class Recording:
         if (pixels := self.arms["a"].pixels) != geometry.stages:
             raise UsageError(f"cut of lines with {pixels} pixels", possible=f"M = {geometry.stages} pixels")
         arms = self.arms.values()
-        for stream in arms:
-            stream.expect(start, stop)
+        expected = [stream.reader(name) for stream in arms for name in CUT_COLUMNS]
+        for reader in expected:
+            reader.expect_index(start, stop)
+        for reader in expected:
+            reader.expect(start, stop)
         samples = np.stack([stream.read("lines", start, stop) for stream in arms])
         flags = np.stack([stream.read("flags", start, stop) for stream in arms])
         return Segment(
@@ -224,10 +236,19 @@ class Recording:
             "events": len(self.events),
             "simulated": bool(self.attrs.get("simulated", False)),
             "cameras": self.attrs["cameras"],
+            "disk": self._disk_facts(),
             "ledger": self.attrs["ledger"],
             "durability": self.attrs.get("durability", {}),
             "versions": self.attrs["versions"],
         }
+
+    def _disk_facts(self) -> dict[str, float] | None:
+        """While it grows here: bytes free, bytes per second that it takes, seconds until the disk is full."""
+        if self.state == "sealed" or not isinstance(self.source, LocalSource) or not self.lines:
+            return None
+        free = DISK.free_bytes(self.source.path)
+        rate = self.source.total_bytes() * NS_PER_S / (self.lines * self.line_period_ns)
+        return {"free_bytes": free, "bytes_per_s": rate, "seconds_to_full": free / rate}
 
     def _segment_with(self, line: int) -> Recording | None:
         """The further segment that has a line which is not here."""

@@ -22,7 +22,7 @@ from acquire.store import layout
 from acquire.store.files import DISK, SCRATCH, Publisher, locked
 from acquire.store.mend import mend_index, rewrite_chunk
 from acquire.store.opening import open_recording
-from acquire.store.retention import HOLDS, delete_shard
+from acquire.store.retention import delete_shard, release
 from acquire.store.scan import COLUMNS, ArmScan, Damage, covered, missing_rows, real_rows, runs, scan
 from acquire.store.spec import RunCondition
 from acquire.store.table import event_table, gap_table
@@ -172,7 +172,7 @@ class _Recoverer:
         publisher.replace(self.path / "zarr.json", layout.to_json(document), durable=True)
         for leftover in (SCRATCH, RESERVE):
             self.disk.remove(hidden / leftover)
-        self.disk.remove_tree(hidden / HOLDS)
+        release(self.path, self.disk)
         for shard in self._dropped_shards():
             delete_shard(self.disk, self.path, shard)
         self.disk.sync_directory(self.path.parent)

@@ -64,7 +64,7 @@ def next_segment(path: Path, spec: RecordingSpec, cause: str = "interrupted") ->
     """Path and specification of the segment that continues the recording at ``path``, to be prepared and
     begun as any other; it is listed in the first once it has begun.
 
-    Raises UsageError unless the recording is sealed and ``spec`` describes the same run and rows alike.
+    Raises UsageError unless the recording is sealed, and ``spec`` describes lines and a code like its own.
     """
     first = open_recording(path)
     if "segment" in first.attrs:
@@ -76,7 +76,8 @@ def next_segment(path: Path, spec: RecordingSpec, cause: str = "interrupted") ->
         raise UsageError(f"resuming {path}: it is not sealed", hint=f"acquire recover {last}")
     number = len(segments) + 1
     follows = Continuation(path.name, number, last.first_line + last.lines, last.end_ns(), cause)
-    return path.with_name(f"{path.stem}-{number}{path.suffix}"), replace(spec, continues=follows)
+    place = path.with_name(f"{path.stem}-{number}{path.suffix}")
+    return place, replace(spec, run_id=str(first.attrs["run_id"]), continues=follows)
 
 
 def list_segment(segment: Path, follows: Continuation, disk: Disk = DISK) -> None:
@@ -92,7 +93,6 @@ def list_segment(segment: Path, follows: Continuation, disk: Disk = DISK) -> Non
 
 def _check_alike(first: Recording, spec: RecordingSpec) -> None:
     asked = {
-        "run_id": spec.run_id,
         "geometry": {"stages": spec.stages, "substeps": spec.substeps, "pixels": spec.pixels},
         "code": spec.code,
         "layout": spec.layout,

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from acquire.errors import DataError, UsageError
 from acquire.lines import ARMS
 from acquire.store.files import DISK, Publisher
-from acquire.store.layout import line_columns
+from acquire.store.layout import PARSE_ERRORS, line_columns
 from acquire.store.opening import open_recording
 from acquire.store.shard import shard_key
 
@@ -82,6 +82,10 @@ def hold(path: Path, first_line: int, count: int, why: str = "", disk: Disk = DI
     if first_line < 0 or count < 1:
         raise UsageError(f"hold of {count} lines from line {first_line}", possible="1 line or more")
     recording = open_recording(path)
+    if recording.state == "sealed":
+        raise UsageError(
+            f"hold of lines of {path}, which is sealed", possible="nothing of it is deleted any more"
+        )
     if first_line + count <= recording.first_line:
         raise UsageError(
             f"hold of lines {first_line} to {first_line + count - 1}", possible=f"{recording.first_line} on"
@@ -119,9 +123,17 @@ def holds_of(path: Path) -> list[Hold]:
     """What `hold` was asked for, of a recording that is being written."""
     found = []
     for file in sorted(_holds(path).glob("[0-9]*.json")):
-        said = json.loads(file.read_bytes())
-        found.append(Hold(int(said["first_line"]), int(said["count"]), str(said["why"])))
+        try:
+            said = json.loads(file.read_bytes())
+            found.append(Hold(int(said["first_line"]), int(said["count"]), str(said["why"])))
+        except PARSE_ERRORS as error:
+            raise DataError(f"{file} is no hold: {error!r}", hint="remove it") from error
     return found
+
+
+def release(path: Path, disk: Disk = DISK) -> None:
+    """Forget all holds of a recording that is sealed: nothing of it is deleted any more."""
+    disk.remove_tree(_holds(path))
 
 
 @dataclass(slots=True)
@@ -137,6 +149,9 @@ class Keeper:
     first_line: int
     disk: Disk
     holds: list[Hold] = field(default_factory=list)
+    """By events."""
+    marked: list[Hold] = field(default_factory=list)
+    """By `hold`, as found at the latest commit."""
     gone: list[range] = field(default_factory=list)
     """Shards that were dropped, as stretches."""
     sizes: dict[int, int] = field(default_factory=dict)
@@ -146,8 +161,12 @@ class Keeper:
         """An event happened at ``line``."""
         if kind in self.policy.hold_events:
             before, after = self.policy.hold_lines
-            first = max(self.first_line, line - before)
-            self.holds.append(Hold(first, line + after - first + 1, kind))
+            first, end = max(self.first_line, line - before), line + after + 1
+            last = self.holds[-1] if self.holds else None
+            if last and last.why == kind and last.first_line <= first <= last.lines.stop:
+                self.holds.pop()
+                first, end = last.first_line, max(end, last.lines.stop)
+            self.holds.append(Hold(first, end - first, kind))
 
     def choose(self, rows: int, missing_bytes: int = 0) -> list[int]:
         """Shards to be dropped now that ``rows`` rows are committed, the oldest first; they count as dropped.
@@ -155,7 +174,8 @@ class Keeper:
         ``missing_bytes`` more than the limits ask for, where the disk is nearly full.
         """
         self._measure(rows)
-        held = [hold.lines for hold in (*self.holds, *holds_of(self.path))]
+        self.marked = holds_of(self.path)
+        held = [hold.lines for hold in (*self.holds, *self.marked)]
         newest = self.first_line + rows
         partly = max(self.sizes.values(), default=0)
         excess = missing_bytes
@@ -191,12 +211,8 @@ class Keeper:
             [self.first_line + rows.start * self.shard_rows, len(rows) * self.shard_rows]
             for rows in self.gone
         ]
-        holds = [[hold.first_line, hold.count, hold.why] for hold in (*self.holds, *holds_of(self.path))]
+        holds = [[hold.first_line, hold.count, hold.why] for hold in (*self.holds, *self.marked)]
         return {"dropped": stretches, "holds": holds}
-
-    def finish(self) -> None:
-        """The recording is sealed: nothing is deleted any more."""
-        self.disk.remove_tree(_holds(self.path))
 
     def _measure(self, rows: int) -> None:
         known = max([-1, *self.sizes, *(rows.stop - 1 for rows in self.gone)])

@@ -69,7 +69,13 @@ def verify(place: Path | str, progress: Callable[[int, int], None] | None = None
     source = source_of(place)
     recording = open_source(source)
     scans = scan(recording, recording.kept_chunks(), progress)
-    damage = tuple(found for arm in scans.values() for found in arm.damages(recording.lines))
+    gone = open_source(source).dropped  # what retention may have deleted meanwhile is no damage
+    damage = tuple(
+        found
+        for arm in scans.values()
+        for found in arm.damages(recording.lines)
+        if not any(first <= found.first_line < first + count for first, count in gone)
+    )
     return Verification(
         path=str(source),
         state=recording.state,

@@ -27,8 +27,9 @@ from acquire.store import layout
 from acquire.store.arm_writer import ArmWriter
 from acquire.store.codecs import EncodeOnce
 from acquire.store.files import DISK, SCRATCH, Publisher, check_new_path, lock
+from acquire.store.pages import keep_freed_memory
 from acquire.store.resume import list_segment
-from acquire.store.retention import Keeper
+from acquire.store.retention import Keeper, release
 from acquire.store.room import RoomWatch
 from acquire.store.spec import Ending, RunCondition, root_attributes
 from acquire.store.table import event_table, gap_table
@@ -88,6 +89,8 @@ class RecordingWriter:
         self._disk = disk
         self._lock = -1
         threads = 0 if spec.codec == "none" else spec.encoders
+        if threads:
+            keep_freed_memory()
         self._pool = ThreadPoolExecutor(threads, "encoder") if threads else None
         once = {name: EncodeOnce() for name in layout.SAME_IN_BOTH_ARMS}
         self._arms = {arm: ArmWriter(path / arm, spec, disk, self._pool, once) for arm in ARMS}
@@ -276,7 +279,7 @@ class RecordingWriter:
             ending = Ending(condition, end_reason, {**ledger, "store": self._ledger(rows)})
             self._publish_root(rows, nodes, ending)
             if self._keeper is not None:
-                self._keeper.finish()
+                release(self.path, self._disk)
             self._disk.sync_directory(self.path.parent)
         self.close()
 

@@ -21,11 +21,12 @@ from acquire.lines import ARMS
 from acquire.stream import grabber, recorder, watcher
 from acquire.stream.ledger import Counted, account
 from acquire.stream.losses import Cause
-from acquire.stream.messages import Begin, End, Extend, Interrupt, Note, Quit, Ready, RunStarted
+from acquire.stream.messages import Begin, Extend, Interrupt, Note, Quit, Ready, RunStarted
 from acquire.stream.plan import CaptureStatus
 from acquire.stream.process import Worker
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.shared import Counters
+from acquire.stream.succession import Succession
 from acquire.stream.supervisor import RECORDER, Supervisor
 from acquire.stream.window import NOW
 from acquire.stream.witness import TRIGGER, TRIGGER_COUNTERS, WATCHER
@@ -137,7 +138,7 @@ class Capture:
         if supervisor.began is None:
             raise StateError("stop: nothing has been recorded", possible="start")
         if supervisor.recording:
-            self._workers[RECORDER].post(End(reason))
+            supervisor.end_recording(reason)
 
     def poll(self) -> CaptureStatus:
         """What is seen at this moment; after `close`, what was seen last."""
@@ -196,6 +197,10 @@ class Capture:
             self._plan.stall_timeout_s,
             self._plan.margin_lines,
             self._plan.grabbers,
+            Succession(
+                {RECORDER: self._next_recorder}
+                | {name: partial(self._next_grabber, name) for name in self._plan.grabbers}
+            ),
         )
         self._supervisor.start()
 
@@ -210,6 +215,15 @@ class Capture:
             self._counters[arm] = Counters(grabber.COUNTERS)
 
     def _spawn(self) -> None:
+        self._workers[RECORDER] = self._new_recorder()
+        if self._plan.watch is not None:
+            self._workers[WATCHER] = Worker(
+                WATCHER, watcher.watch, self._plan.watch, self._rings, self._counters[WATCHER]
+            )
+        for name in self._plan.grabbers:
+            self._workers[name] = self._new_grabber(name)
+
+    def _new_recorder(self) -> Worker:
         plan = self._plan
         what = recorder.RecorderPlan(
             plan.run,
@@ -219,19 +233,36 @@ class Capture:
             plan.max_skew_lines,
             plan.realtime,
         )
-        self._workers[RECORDER] = Worker(
+        return Worker(
             RECORDER, recorder.record, what, self._rings, self._tags, self._counters[RECORDER], self._others()
         )
-        if plan.watch is not None:
-            self._workers[WATCHER] = Worker(
-                WATCHER, watcher.watch, plan.watch, self._rings, self._counters[WATCHER]
-            )
-        for name, arms in plan.grabbers.items():
-            tasks = [(self._grabber_plan(arm), self._rings[arm], self._counters[arm]) for arm in arms]
-            self._workers[name] = Worker(f"grabber {name}", grabber.grab, *tasks)
+
+    def _new_grabber(self, name: str, *, successor: bool = False) -> Worker:
+        tasks = [
+            (replace(self._grabber_plan(arm), successor=successor), self._rings[arm], self._counters[arm])
+            for arm in self._plan.grabbers[name]
+        ]
+        return Worker(f"grabber {name}", grabber.grab, *tasks)
+
+    def _next_recorder(self) -> Worker:
+        """What the one before had released and not counted was stored: see `Session.take`."""
+        counters = self._counters[RECORDER]
+        for arm, ring in self._rings.items():
+            counters[f"stored_{arm}"] = ring.released_lines - counters[f"discarded_{arm}"]
+        worker = self._new_recorder()
+        worker.post(RunStarted(self.clock))
+        return worker
+
+    def _next_grabber(self, name: str) -> Worker | None:
+        """Only a camera that tells time can be numbered again."""
+        arms = self._plan.grabbers[name]
+        self._settle_books(arms)
+        if not all(self._counters[arm]["stamp_ns"] for arm in arms):
+            return None
+        return self._new_grabber(name, successor=True)
 
     def _others(self) -> dict[str, Counters]:
-        return {name: self._counters[name] for name in (TRIGGER, WATCHER) if name in self._counters}
+        return {name: counters for name, counters in self._counters.items() if name != RECORDER}
 
     def _grabber_plan(self, arm: str) -> grabber.GrabberPlan:
         plan = self._plan
@@ -261,6 +292,7 @@ class Capture:
             ring={arm: self._ring_counts(arm) for arm in ARMS},
             lines={arm: self._line_counts(arm, began=began is not None) for arm in ARMS},
             fault=supervisor.fault,
+            pids={name: pid for name, pid in self.pids.items() if pid is not None},
         )
         if began is None:
             return status
@@ -269,6 +301,7 @@ class Capture:
             recording=supervisor.recording,
             draining=supervisor.recording and bool(counters["draining"]),
             done=sealed is not None,
+            path=None if supervisor.path is None else str(supervisor.path),
             first_line=began.first_line,
             recorded_lines=counters["recorded"],
             committed_lines=counters["committed"],
@@ -287,7 +320,11 @@ class Capture:
         return {
             str(Cause.CAMERA): grabbed[Cause.CAMERA],
             str(Cause.RING_FULL): self._rings[arm].statistics().dropped_lines,
-            **{str(cause): grabbed[cause] for cause in grabber.CAMERA_CAUSES[1:] if grabbed[cause]},
+            **{
+                str(cause): grabbed[cause]
+                for cause in (*grabber.CAMERA_CAUSES[1:], Cause.GRABBER_LOST)
+                if grabbed[cause]
+            },
         }
 
     def _account(self, arm: str, supervisor: Supervisor) -> ArmLedger:
@@ -316,7 +353,10 @@ class Capture:
             return {}
         seen = self._counters[WATCHER]
         verdict = str(watcher.VERDICTS[seen[f"verdict_{arm}"]])
-        return {"verdict": verdict, **{name: seen[f"{name}_{arm}"] for name in ("shift", "checked_line")}}
+        return {
+            "verdict": verdict,
+            **{name: seen[f"{name}_{arm}"] for name in ("shift", "checked_line", "lapped")},
+        }
 
     def _line_counts(self, arm: str, *, began: bool) -> dict[str, Any]:
         grabbed, recorded = self._counters[arm], self._counters[RECORDER]
@@ -358,8 +398,14 @@ class Capture:
             worker.post(Quit())
         _run_all(*(partial(worker.end, deadline) for worker in order))
 
+    def _settle_books(self, arms: tuple[str, ...]) -> None:
+        for arm in arms:
+            grabber.settle_books(self._rings[arm], self._counters[arm])
+
     def _empty_rings(self) -> None:
         """Nobody will take what the last of the grabbers left."""
+        for name in self._supervisor.dead if self._supervisor else ():
+            self._settle_books(self._plan.grabbers.get(name, ()))
         for arm, ring in self._rings.items():
             self._left_over[arm] = ring.empty()
         self._emptied = True

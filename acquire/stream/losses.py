@@ -22,6 +22,10 @@ class Cause(StrEnum):
     MISSED_TRIGGER = LossCause.MISSED_TRIGGER.value
     DEVICE_LOST = LossCause.DEVICE_LOST.value
     """What the camera told: see `acquire.camera.base.LossCause`."""
+    GRABBER_LOST = "grabber_lost"
+    """The grabber's process died; another took its place."""
+    RECORDER_LOST = "recorder_lost"
+    """The recorder's process died with the line in its hands; the ring had it no more for the next one."""
     RING_FULL = "ring_full"
     """The recorder was late: the grabber found no free slot."""
     MIXED = "mixed"

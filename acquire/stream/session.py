@@ -115,6 +115,7 @@ class Session:
     lost : arm → why it will deliver no more
     doubted : arms whose lines contradict the code at the moment: what comes is flagged
     trigger : what the trigger counted while this was recorded
+    cameras : arm → what its camera counted since it was armed
     """
 
     def __init__(
@@ -125,8 +126,11 @@ class Session:
         self.end_reason = "line budget reached"
         self.books = {arm: Book(first_line) for arm in ARMS}
         self.lost: dict[str, Cause] = {}
+        self.before = Cause.MIXED
+        """Why lines are missing that an arm's first block leaves out without a word."""
         self.doubted: set[str] = set()
         self.trigger: dict[str, int] = {}
+        self.cameras: dict[str, dict[str, int]] = {}
         self._writer = writer
         self._tagger = tagger
         self._blank = blank
@@ -168,7 +172,8 @@ class Session:
             return 0
         for loss in block.losses:
             self._miss_until(arm, loss.end_line, loss.cause)
-        self._miss_until(arm, block.first_line, Cause.MIXED)
+        untold = Cause.MIXED if book.stored or book.missing else self.before
+        self._miss_until(arm, block.first_line, untold)
         part = slice(book.next_line - block.first_line, self.end_line - block.first_line)
         if part.stop <= part.start:
             return 0
@@ -288,6 +293,7 @@ class Session:
             "pulses": lines,
             "tag_mismatches": self._mismatches,
             "trigger": self.trigger,
+            "cameras": self.cameras,
             "tainted_by": self._taints(),
             **arms,
         }

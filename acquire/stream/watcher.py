@@ -44,6 +44,8 @@ OBSERVER = 0
 
 _CHECK_EVERY_S = 0.5
 _LOOK_S = 0.02
+_TELL_EVERY_S = 0.1
+"""Crossings that follow sooner than this on one that was told are only counted."""
 _MOST_COLUMNS = 128
 _MOST_PROFILE_LINES = 256
 
@@ -85,12 +87,14 @@ class Watcher:
         self._threshold = None if plan.threshold is None else Threshold(plan.threshold)
         self._intakes: dict[str, Intake] = {}
         self._told = dict.fromkeys(ARMS, Finding(Verdict.UNKNOWN))
-        self._next_s = 0.0
+        self._next_s = self._now_s = self._tell_s = 0.0
+        self._untold = 0
         for observer in self._observers.values():
             observer.skip()
 
     def turn(self, now_s: float) -> None:
         """Take what has come; judge when both arms have the lines for it."""
+        self._now_s = now_s
         if self._plan.judge is not None and not self._intakes and now_s >= self._next_s:
             self._begin(now_s)
         for arm, observer in self._observers.items():
@@ -129,10 +133,15 @@ class Watcher:
 
     def _tell(self, crossed: list[int]) -> None:
         for line in crossed:
-            plan = self._plan.threshold
+            if self._now_s < self._tell_s:
+                self._untold += 1
+                continue
+            plan, self._tell_s = self._plan.threshold, self._now_s + _TELL_EVERY_S
             assert plan is not None
-            way = "above" if plan.rising else "below"
-            self._mailbox.post(Note(line, "threshold", f"arm {plan.arm} {way} {plan.level_dn:g} DN"))
+            text = f"arm {plan.arm} {'above' if plan.rising else 'below'} {plan.level_dn:g} DN"
+            more = f", {self._untold} more times before" if self._untold else ""
+            self._untold = 0
+            self._mailbox.post(Note(line, "threshold", text + more))
 
     def _judge(self, judge: Judge | None) -> None:
         assert judge is not None

@@ -33,6 +33,7 @@ class Window:
     pre_lines : to be recorded before that line
     post_lines : to be recorded from that line on; None: as many as the recording's budget says
     exact : refuse where not all of ``pre_lines`` can be had; otherwise take those that there are
+    padded : begin there all the same; lines that the rings do not hold any more are missing
     kind, text : what happened at the line, for the recording's events; "" where nothing did
     """
 
@@ -40,6 +41,7 @@ class Window:
     pre_lines: int = 0
     post_lines: int | None = None
     exact: bool = True
+    padded: bool = False
     kind: str = ""
     text: str = ""
 
@@ -54,6 +56,10 @@ class Window:
     def is_now(self) -> bool:
         """From the next line on, whichever that will be."""
         return self.at is None and not self.pre_lines and self.post_lines is None
+
+
+NOW = Window()
+"""From the next line on."""
 
 
 NOW = Window()
@@ -99,10 +105,10 @@ def span(window: Window, lines: int | None, held: Held, line_rate_hz: float) -> 
         has = max(0, held.at - held.from_line)
         raise UsageError(
             f"start with {window.pre_lines} lines ({window.pre_lines / line_rate_hz:.3g} s) from before",
-            possible=f"up to {has} lines ({has / line_rate_hz:.3g} s), which the ring holds now",
+            possible=f"up to {has} lines ({has / line_rate_hz:.3g} s), which both rings hold now",
             hint="wait until the ring is full, or configure a longer one (stream.ring_seconds)",
         )
-    first = max(wanted, held.from_line)
+    first = wanted if window.padded else max(wanted, held.from_line)
     ends = [first + lines] if lines is not None else []
     ends += [held.at + window.post_lines] if window.post_lines is not None else []
     return Span(first, max(min(ends), first + 1) if ends else None, held.at)

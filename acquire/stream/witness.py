@@ -1,4 +1,4 @@
-"""What others know about the lines that a recording holds: the trigger's counts, the watcher's verdicts.
+"""What others know about the lines of a recording: the trigger's and cameras' counts, the watcher's verdicts.
 
 Both are read from shared memory where they are needed; where there is no trigger to ask, or no watcher, there
 is nothing to doubt.
@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from acquire.lines import ARMS
+from acquire.stream.grabber import CAMERA_CAUSES
 from acquire.stream.watcher import VERDICTS
 
 if TYPE_CHECKING:
@@ -25,13 +26,16 @@ TRIGGER_COUNTERS = (
 """Of a trigger's statistics, those that the ledger needs: pulses issued; tags received, made but not
 received, dropped, lost in the device; strobes by which cameras answer pulses, missed or in excess."""
 
+CAMERA_COUNTS = ("delivered", "preroll", "next_line", "reopened", *CAMERA_CAUSES)
+
 
 class Witness:
-    """See the module; ``others`` maps `TRIGGER` and `WATCHER` to what they count."""
+    """See the module; ``others`` maps `TRIGGER`, `WATCHER` and the arms to what they count."""
 
     def __init__(self, others: Mapping[str, Counters]) -> None:
         self._trigger = others.get(TRIGGER)
         self._watcher = others.get(WATCHER)
+        self._cameras = {arm: others[arm] for arm in ARMS if arm in others}
         self._begun: dict[str, int] = {}
 
     def begin(self) -> None:
@@ -43,6 +47,13 @@ class Witness:
         return {
             name: count if name.startswith("strobe") else count - self._begun.get(name, 0)
             for name, count in self._counts().items()
+        }
+
+    def cameras(self) -> dict[str, dict[str, int]]:
+        """Arm → what its camera gave and lost since it was armed."""
+        return {
+            arm: {str(name): counted[name] for name in CAMERA_COUNTS if counted[name]}
+            for arm, counted in self._cameras.items()
         }
 
     def doubted(self) -> set[str]:

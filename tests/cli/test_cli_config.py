@@ -43,8 +43,11 @@ def test_check(cli: Cli, rig_file: Path) -> None:
         ('scene = "scene-leds.toml"', 'scene = "none.toml"', "none.toml"),
         ("[geometry]", "[geometry", "not TOML"),
         ("speed = 1.0", "speed = inf", "simulation.speed"),
-        ("tag_every_lines = 256", "tag_every_lines = 32768", "trigger.tag_every_lines"),
-        ("= 256\nring_slots = 64", "= 65536\nring_slots = 4096", "stream.ring_slots x stream.block_lines"),
+        ("= 256\nring_seconds = 3.0", "= 128\nring_slots = 2", "trigger.tag_every_lines"),
+        ("= 256\nring_seconds = 3.0", "= 65536\nring_slots = 4096", "stream.ring_slots x stream.block_lines"),
+        ("ring_seconds = 3.0", "ring_seconds = 3e6", "stream.ring_seconds"),
+        ("speed = 1.0", 'speed = 1.0\n[events]\nsources = ["mark"]\npre_s = 2.6', "events.pre_s"),
+        ("speed = 1.0", 'speed = 1.0\n[events]\nsources = ["threshold"]', "level_dn above hysteresis_dn"),
     ],
 )
 def test_bad_files_name_the_key(cli: Cli, rig_file: Path, before: str, after: str, key: str) -> None:

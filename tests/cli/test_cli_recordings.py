@@ -237,7 +237,7 @@ def test_recover_seals_what_its_writer_left(cli: Cli, tmp_path: Path) -> None:
             writer.append(block(arm, range(0)))
     answer = cli("recover", path)
     assert (answer.code, answer.err) == (0, "")
-    assert "64 lines, sealed; 64 lines were on disk that no commit listed" in answer.out
+    assert "64 lines, recovered and sealed; 64 lines were on disk that no commit listed" in answer.out
     assert cli("recover", path).out == f"{path}: 64 lines, nothing to recover\n"
     assert cli("recover", path, "--json").json["changed"] is False
     assert "INTERRUPTED" in cli("info", path).out

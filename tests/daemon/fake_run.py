@@ -72,10 +72,11 @@ class FakeRun:
         self._call("arm")
         self.seen = CALM
 
-    def start(self, path: Path, lines: int | None, window: Window) -> None:
+    def start(self, path: Path, lines: int | None, window: Window, *, resume: bool = False) -> Path:
         self._call("start", path, lines)
         self.window = window
         self.see(recording=True, first_line=40)
+        return path.with_name("segment.zarr") if resume else path
 
     def mark(self, text: str) -> Note:
         self._call("mark", text)

@@ -325,6 +325,20 @@ def test_a_rig_that_rearms_waits_for_the_next_event(tmp_path: Path) -> None:
     assert bed.state is State.IDLE
 
 
+def test_an_event_while_a_recording_is_sealed_is_not_forgotten(tmp_path: Path) -> None:
+    bed = eventful(tmp_path, sources=["input"], rearm=True)
+    bed.run.happened = [Note(9000, "input", "")]
+    bed.service.supervise()
+    bed.run.see(draining=True)
+    bed.service.supervise()
+    assert bed.state is State.DRAINING
+    bed.run.happened = [Note(20_000, "input", ""), Note(20_100, "input", "")]
+    bed.service.supervise()
+    bed.run.seal()
+    bed.service.supervise()
+    assert (bed.state, bed.run.window.at) == (State.RECORDING, 20_000)
+
+
 def test_a_mark_is_only_noted_where_nobody_asked_for_more(bed: Bed) -> None:
     with pytest.raises(StateError, match="cannot mark while idle"):
         bed.service.mark("too early")

@@ -70,7 +70,7 @@ def test_commands_of_a_user(tmp_path: Path) -> None:
         refused = daemon("start", "--pre", "1h")
         assert refused.code == 2
         assert "3.6e+07 lines" not in refused.err
-        assert "which the ring holds now" in refused.err
+        assert "which both rings hold now" in refused.err
         assert "stream.ring_seconds" in refused.err
         with daemon.client() as client:
             deadline = time.monotonic() + PATIENCE_S
@@ -189,6 +189,8 @@ def test_light_that_follows_the_code_is_verified_and_every_pulse_has_its_place(t
             assert ledger.issued == 17 + ledger.stored + ledger.discarded + sum(ledger.lost.values())
     assert recording.attrs["ledger"]["tainted_by"] == {}
     assert recording.attrs["ledger"]["trigger"]["tags_missing"] == 0
+    for camera in recording.attrs["ledger"]["cameras"].values():
+        assert camera["next_line"] == camera["delivered"] - camera["preroll"] >= 3000
 
 
 def test_a_level_that_is_crossed_records_by_itself(tmp_path: Path) -> None:

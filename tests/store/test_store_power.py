@@ -196,7 +196,10 @@ def keeper(step: int):
     return lambda: chance.random() < share
 
 
-@pytest.mark.parametrize(("codec", "first", "stride"), [("none", 0, 2), ("none", 1, 2), ("lz4", 0, 13)])
+@pytest.mark.parametrize(
+    ("codec", "first", "stride"),
+    [("none", 0, 4), ("none", 1, 4), ("none", 2, 4), ("none", 3, 4), ("lz4", 0, 13)],
+)
 def test_power_cut_at_every_step_loses_nothing_that_was_acknowledged(tmp_path, codec, first, stride):
     spec = make_spec(fsync="commit", codec=codec, shard_chunks=2)
     disk = TracedDisk()

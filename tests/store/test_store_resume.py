@@ -29,7 +29,7 @@ def bytes_of(path):
 
 
 def resume(path, first_line, lines, **changes):
-    place, spec = next_segment(path, make_spec(**changes), cause="power lost")
+    place, spec = next_segment(path, make_spec(run_id="run-of-today", **changes), cause="power lost")
     writer = RecordingWriter.prepare(place, spec)
     writer.begin(first_line)
     with writer:
@@ -69,6 +69,16 @@ def test_a_killed_recording_goes_on_in_segments(killed):
     assert all(verify(path).intact for path in (killed, second, third))
 
 
+def test_a_growing_recording_is_refreshed(tmp_path):
+    with RecordingWriter.create(tmp_path / "run.zarr", make_spec()) as writer:
+        seen = open_recording(tmp_path / "run.zarr")
+        for lines in (32, 64):
+            fill(writer, 32)
+            writer.commit()
+            seen, before = seen.refreshed(), seen
+            assert (before.lines, seen.lines) == (lines - 32, lines)
+
+
 def test_a_trigger_that_began_anew_is_told(killed):
     recover(killed)
     segment = open_recording(resume(killed, 0, 40)).attrs["segment"]
@@ -76,10 +86,8 @@ def test_a_trigger_that_began_anew_is_told(killed):
     assert open_recording(killed).cut(1000, 40).first_line == 1000
 
 
-@pytest.mark.parametrize(
-    "changes", [{"run_id": "other"}, {"pixels": 16}, {"dtype": "uint8"}, {"layout": "compact"}]
-)
-def test_another_run_is_not_a_segment(killed, changes):
+@pytest.mark.parametrize("changes", [{"pixels": 16}, {"dtype": "uint8"}, {"layout": "compact"}])
+def test_lines_of_another_kind_are_no_segment(killed, changes):
     recover(killed)
     with pytest.raises(UsageError, match="resuming"):
         next_segment(killed, make_spec(**changes))

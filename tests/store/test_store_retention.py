@@ -214,7 +214,30 @@ def test_limits_that_cannot_be_are_refused(wrong):
 
 
 def test_holds_that_cannot_be_are_refused(path):
-    with RecordingWriter.create(path, spec_of(AGE)):
+    with RecordingWriter.create(path, spec_of(AGE)) as writer:
         for first, count in ((-1, 5), (1000, 0), (10, 20)):
             with pytest.raises(UsageError, match="hold of"):
                 hold(path, first, count)
+        writer.seal(RunCondition.GOOD, "done", {})
+    with pytest.raises(UsageError, match="sealed; possible: nothing of it is deleted"):
+        hold(path, 1000, 5)
+
+
+def test_a_file_that_is_no_hold_is_named(path):
+    with RecordingWriter.create(path, spec_of(AGE)) as writer:
+        hold(path, 1000, 5)
+        (path / "a" / "lines" / ".holds" / "1-2.json").write_text("{")
+        fill(writer, 40)
+        with pytest.raises(DataError, match=r"1-2\.json is no hold"):
+            writer.commit()
+        writer.seal(RunCondition.ABORTED, "no hold", {})
+    assert verify(path).intact
+
+
+def test_events_that_follow_each_other_are_one_hold(path):
+    policy = Retention(max_age_lines=SHARD, hold_lines=(10, 20))
+    keeper = Keeper(path, policy, SHARD, 1000, Disk())
+    for line in (1005, 1030, 1010, 2000, 2001):
+        keeper.note("mark", line)
+    keeper.note("started", 3000)
+    assert [(hold.first_line, hold.count) for hold in keeper.holds] == [(1000, 51), (1990, 32)]

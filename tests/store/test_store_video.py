@@ -65,7 +65,7 @@ def test_without_a_known_pixel_size_space_has_no_unit(tmp_path):
 def test_xarray_opens_a_video(tmp_path):
     video, time_ns = make()
     write_video(tmp_path / "v.zarr", video, time_ns, 5.0, 30_000.0, {})
-    with xarray.open_zarr(tmp_path / "v.zarr") as dataset:
+    with xarray.open_zarr(tmp_path / "v.zarr", chunks=None) as dataset:
         assert dataset["0"].dims == ("t", "y", "x")
         np.testing.assert_array_equal(dataset["time"].values.astype(np.int64), time_ns)
 

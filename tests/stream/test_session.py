@@ -183,6 +183,22 @@ def test_stop_ends_at_a_line_that_both_reach() -> None:
     assert [event[0] for event in writer.events] == ["started", "stopped"]
 
 
+def test_a_disk_that_is_nearly_full_ends_the_recording() -> None:
+    writer = MemoryWriter()
+    session = make_session(writer)
+    session.take("a", ring_block("a", 0, 30, ()))
+    session.take("b", ring_block("b", 0, 20, ()))
+    session.commit()
+    assert not session.ending
+    writer.nearly_full = "disk nearly full"
+    session.commit()
+    assert (session.ending, session.done) == (True, False)
+    session.take("b", ring_block("b", 20, 10, ()))
+    assert session.done
+    sealed = session.close()
+    assert (sealed.condition, sealed.end_reason) == (RunCondition.INTERRUPTED, "disk nearly full")
+
+
 def test_the_worst_reason_stays() -> None:
     session = make_session(MemoryWriter(), lines=1000)
     feed(session, 10, 10)

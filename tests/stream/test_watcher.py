@@ -133,6 +133,17 @@ def test_a_crossing_is_told_with_its_line(beds: list[Bed]) -> None:
     assert notes == [Note(1000 + 4 * ROWS + 64, "threshold", "arm b above 3000 DN")]
 
 
+def test_a_level_that_is_crossed_all_the_time_is_told_now_and_then(beds: list[Bed]) -> None:
+    bed = Bed(ThresholdPlan("b", 3000.0, 100.0, rising=True, average_lines=1))
+    beds.append(bed)
+    bed.lines = {"a": bed.lines["a"], "b": bed.lines["b"].copy()}
+    bed.lines["b"][2 * ROWS : 4 * ROWS : 8] = 4000
+    bed.pass_by(4)
+    notes = [note for note in bed.post.said if isinstance(note, Note)]
+    assert [note.line for note in notes] == [1000 + 2 * ROWS, 1000 + 3 * ROWS]
+    assert notes[1].text == f"arm b above 3000 DN, {ROWS // 8 - 1} more times before"
+
+
 def test_a_light_that_comes_late_is_told_from_the_first_check_on(beds: list[Bed]) -> None:
     bed = Bed(late=-2)
     beds.append(bed)

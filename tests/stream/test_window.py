@@ -131,7 +131,7 @@ def test_a_recording_begins_before_it_was_asked_for(tmp_path: Path) -> None:
 def test_what_the_ring_does_not_hold_is_refused_with_what_it_does(tmp_path: Path) -> None:
     with armed(make_bench(ring_slots=1024)) as capture:
         until(lambda: capture.poll().lines["b"]["delivered"] > 2000, "history")
-        with pytest.raises(UsageError, match=r"50000 lines \(.* s\) from before.*which the ring holds now"):
+        with pytest.raises(UsageError, match=r"50000 lines \(.* s\) from before.*which both rings hold now"):
             capture.start(tmp_path / "r.zarr", make_spec(), 60_000, Window(pre_lines=50_000))
         assert not any(tmp_path.iterdir())
         capture.start(tmp_path / "r.zarr", make_spec(), 6000, Window(pre_lines=50_000, exact=False))

@@ -1,0 +1,141 @@
+"""What the check of the light's code costs, and how soon it notices: ``python tools/bench_watcher.py``.
+
+Lines of a simulated scene go through real rings at the camera's rate, from one process; the watcher looks at
+them in another. Half-way, arm b slips by one line. Printed: cores of the watcher, beside those of the process
+that copies the lines into the rings (one bare copy of every line, and its pace) in the same run; verdicts;
+the time from the slip to the verdict; ring slots that the watcher lost.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from acquire.config import RigConfig, load_rig, load_scene
+from acquire.daemon.watching import judge_of
+from acquire.lines import ARMS
+from acquire.sim.pipeline import Bench
+from acquire.stream.messages import Checked, Ready
+from acquire.stream.process import Worker
+from acquire.stream.ring import Ring, RingShape
+from acquire.stream.shared import Counters
+from acquire.stream.threshold import ThresholdPlan
+from acquire.stream.watcher import COUNTERS, WatchPlan, watch
+
+BLOCK_LINES = 256
+SLOTS = 512
+CHECK_LINES = 8192
+CODE_DEGREE = 15
+CODE_PERIOD = 2**CODE_DEGREE - 1
+
+
+@dataclass(frozen=True)
+class Case:
+    name: str
+    stages: int
+    line_rate_hz: float
+    threshold: bool = False
+
+
+CASES = (
+    Case("64 px x 33 klines/s", 64, 33_333.0),
+    Case("54 px x 600 klines/s", 54, 600_000.0),
+    Case("the same, with a threshold on every line", 54, 600_000.0, threshold=True),
+)
+
+
+def main() -> None:
+    words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    words.add_argument("--seconds", type=float, default=4.0, help="of lines, per case")
+    seconds = words.parse_args().seconds
+    for case in CASES:
+        print(case.name)
+        for name, value in measure(case, seconds).items():
+            print(f"  {name:<40} {value}")
+
+
+def measure(case: Case, seconds: float) -> dict[str, str]:
+    rig = load_rig("rig-demo", {"geometry.stages": case.stages, "code.degree": CODE_DEGREE})
+    lines = simulated(rig, int(seconds * case.line_rate_hz) // BLOCK_LINES * BLOCK_LINES)
+    shape = RingShape(SLOTS, BLOCK_LINES, case.stages, "uint16", observers=2)
+    rings = {arm: Ring(arm, shape) for arm in ARMS}
+    counters = Counters(COUNTERS)
+    threshold = ThresholdPlan("a", 1e9, 1.0, rising=True, average_lines=64) if case.threshold else None
+    check_lines = min(CHECK_LINES, int(case.line_rate_hz / 4))
+    plan = WatchPlan(judge_of(rig), check_lines, {"a": 0.0, "b": 0.0}, threshold)
+    worker = Worker("watcher", watch, plan, rings, counters)
+    context = multiprocessing.get_context("fork")  # the lines need not be copied
+    producer = context.Process(target=produce, args=(rings, lines, case.line_rate_hz))
+    try:
+        worker.expect(Ready, time.monotonic() + 30)
+        before_s, begun_s = cpu_s(worker.pid), time.monotonic()
+        producer.start()
+        told, slip_s = [], begun_s + seconds / 2
+        while producer.is_alive():
+            if isinstance(message := worker.message(0.01), Checked):
+                told.append((time.monotonic(), message))
+        used_s, took_s = cpu_s(worker.pid) - before_s, time.monotonic() - begun_s
+    finally:
+        producer.join()
+        lost = counters["lapped_a"] + counters["lapped_b"]
+        checks = counters["checks_a"]
+        worker.end(time.monotonic() + 5)
+        counters.close()
+        for ring in rings.values():
+            ring.close()
+    slipped = [at - slip_s for at, message in told if message.doubtful]
+    return {
+        "cores, watcher": f"{used_s / took_s:.3f}",
+        "checks": str(checks),
+        "verdicts": "; ".join(message.text for _, message in told),
+        "from the slip to the verdict": f"{slipped[0]:.2f} s" if slipped else "not noticed",
+        "slots lost": str(lost),
+    }
+
+
+def simulated(rig: RigConfig, count: int) -> dict[str, np.ndarray]:
+    """Lines of both arms, of a still scene under a code that repeats; b's a line late from the middle on."""
+    cameras = {arm: rig.cameras.arm(arm) for arm in ARMS}
+    bench, code = Bench(load_scene("scene-usaf"), rig.geometry, cameras, 1e-5), rig.code.build()
+    lines = {}
+    for arm in ARMS:
+        period = bench.camera(arm, code).read(CODE_PERIOD, CODE_PERIOD).pixels
+        lines[arm] = np.tile(period, (-(-count // CODE_PERIOD), 1))[:count]
+    lines["b"][count // 2 :] = lines["b"][count // 2 - 1 : -1].copy()
+    return lines
+
+
+def produce(rings: dict[str, Ring], lines: dict[str, np.ndarray], line_rate_hz: float) -> None:
+    begun_s, used_s = time.monotonic(), time.process_time()
+    for at in range(0, len(lines["a"]), BLOCK_LINES):
+        while time.monotonic() < begun_s + (at + BLOCK_LINES) / line_rate_hz:
+            time.sleep(0.0005)
+        for arm, ring in rings.items():
+            slot = ring.claim()
+            assert slot is not None
+            slot.pixels[:] = lines[arm][at : at + BLOCK_LINES]
+            slot.flags[:] = 0
+            ring.commit(at, BLOCK_LINES)
+            ring.acquire()
+            ring.release()
+    took_s = time.monotonic() - begun_s
+    print(
+        f"  {'cores, copying both arms into the rings':<40} {(time.process_time() - used_s) / took_s:.3f}",
+        flush=True,
+    )
+
+
+def cpu_s(pid: int | None) -> float:
+    """User and system time of a process."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+if __name__ == "__main__":
+    main()

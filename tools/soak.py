@@ -1,0 +1,213 @@
+"""Hours of capture in minutes, with a seeded schedule of faults: does anything grow, where is every line?
+
+::
+
+    pattern cameras, time-compressed ─▶ … armed, recorded, stopped, again and again …
+    meanwhile: a camera goes and comes back · a camera drops blocks · the recorder is stopped for a while
+
+``python tools/soak.py --hours 8 --minutes 4`` simulates 8 hours of lines at 2 kHz. After every cycle memory,
+descriptors and threads of the owner are noted; every recording is read again to the line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import os
+import random
+import shutil
+import signal
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from acquire.camera.base import CameraBlock
+from acquire.capacity.load import Load, capture_plan, recording_spec
+from acquire.config import TriggerConfig
+from acquire.errors import CameraLostError
+from acquire.lines import ARMS
+from acquire.sim.clock import Wire
+from acquire.sim.trigger_model import TriggerModel
+from acquire.sim.twin_links import TwinTransport
+from acquire.stream import Capture
+from acquire.stream.shared import Counters
+from acquire.trigger.driver import TriggerDriver
+from tools.kill_storm import check_recording
+
+if TYPE_CHECKING:
+    from acquire.camera.base import Camera, CameraOpener
+
+CLOCK_HZ = 90_000_000
+SIMULATED_HZ = 2000.0
+FAULTS = ("gone", "drop", "pause")
+CYCLE_S = 4.0
+LONGEST_PAUSE_S = 0.3
+WAIT_S = 60.0
+
+
+@dataclass(frozen=True)
+class FaultyOpener:
+    """Opens a camera on which faults are thrown by hand, through shared memory."""
+
+    opener: CameraOpener
+    faults: Counters
+    arm: str
+
+    def __call__(self) -> Camera:
+        return FaultyCamera(self)  # type: ignore[return-value]
+
+
+class FaultyCamera:
+    """A simulated camera that leaves out a block, or is gone, when it is told to."""
+
+    def __init__(self, given: FaultyOpener) -> None:
+        self._given = given
+        self._camera = given.opener()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._camera, name)
+
+    def next_block(self, timeout_s: float) -> CameraBlock | None:
+        if self._takes("gone"):
+            raise CameraLostError("unplugged")
+        block = self._camera.next_block(timeout_s)
+        if block is not None and self._takes("drop"):
+            self._camera.release(block)
+            return None
+        return block
+
+    def _takes(self, fault: str) -> bool:
+        name = f"{fault}_{self._given.arm}"
+        thrown = bool(self._given.faults[name])
+        self._given.faults[name] = 0
+        return thrown
+
+
+@dataclass
+class Soak:
+    """What was simulated, and what was found."""
+
+    cycles: int = 0
+    lines: int = 0
+    faults: Counter[str] = field(default_factory=Counter)
+    lost: Counter[str] = field(default_factory=Counter)
+    wrong: list[str] = field(default_factory=list)
+    usage: list[tuple[float, int, int]] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        memory, handles, threads = self.usage[min(1, len(self.usage) - 1)]
+        memory_end, handles_end, threads_end = self.usage[-1]
+        hours = self.lines / SIMULATED_HZ / 3600
+        rows = [
+            f"cycles   {self.cycles}, {self.lines} lines of each arm = {hours:.2f} hours",
+            f"faults   {dict(self.faults)}; lines lost to them {dict(self.lost)}",
+            f"memory   {memory:.1f} MB after the first cycles, {memory_end:.1f} MB at the end",
+            f"handles  {handles}, {handles_end}; threads {threads}, {threads_end}",
+            f"wrong    {len(self.wrong)}",
+        ]
+        return "\n".join([*rows, *self.wrong])
+
+
+def soak(home: Path, lines: int, line_rate_hz: float, seed: int) -> Soak:
+    """Simulate ``lines`` lines in cycles of arm, record, stop, each with faults of its own."""
+    chance, found = random.Random(seed), Soak()
+    load = Load(8, "uint16", line_rate_hz, substeps=2, stages=8, block_lines=512, ring_slots=1024)
+    while found.lines < lines:
+        _cycle(home, load, chance, found)
+        found.cycles += 1
+        gc.collect()
+        found.usage.append(_usage())
+    return found
+
+
+def _cycle(home: Path, load: Load, chance: random.Random, found: Soak) -> None:
+    wire, path = Wire(), home / "r.zarr"
+    faults = Counters(tuple(f"{fault}_{arm}" for fault in ("gone", "drop") for arm in ARMS))
+    model = TriggerModel(wire, CLOCK_HZ, load.speed)
+    trigger = TriggerDriver(partial(TwinTransport, model), TriggerConfig(tag_every_lines=load.block_lines))
+    plan = capture_plan(load, wire)
+    openers: dict[str, CameraOpener] = {
+        arm: FaultyOpener(opener, faults, arm) for arm, opener in plan.openers.items()
+    }
+    plan = replace(plan, openers=openers, reopen_timeout_s=20.0, stall_timeout_s=25.0, realtime=False)
+    capture = Capture(plan, trigger)
+    try:
+        capture.arm()
+        capture.start(path, recording_spec(load, capture.clock))
+        _throw(capture, faults, chance, found, time.monotonic() + CYCLE_S)
+        capture.stop("end of the cycle")
+        _until(lambda: capture.poll().done)
+    finally:
+        capture.close()
+        trigger.close()
+        wire.close()
+        faults.close()
+    _examine(capture, path, found)
+    shutil.rmtree(path)
+
+
+def _throw(capture: Capture, faults: Counters, chance: random.Random, found: Soak, until_s: float) -> None:
+    while time.monotonic() < until_s:
+        time.sleep(chance.uniform(0.2, 1.0))
+        fault = chance.choice(FAULTS)
+        found.faults[fault] += 1
+        if fault == "pause":  # as a slow disk does
+            pid = capture.pids["recorder"]
+            assert pid is not None
+            os.kill(pid, signal.SIGSTOP)
+            time.sleep(chance.uniform(0, LONGEST_PAUSE_S))
+            os.kill(pid, signal.SIGCONT)
+        else:
+            faults[f"{fault}_{chance.choice(ARMS)}"] = 1
+
+
+def _examine(capture: Capture, path: Path, found: Soak) -> None:
+    """The books to the line, and every row of the recording."""
+    seen = capture.poll()
+    for name, arm in seen.lines.items():
+        told = arm["preroll"] + arm["lost"]["ring_full"] + arm["discarded"] + arm["recorded"] - arm["missing"]
+        if arm["delivered"] != told:
+            found.wrong.append(f"cycle {found.cycles}: arm {name}: {arm['delivered']} delivered, {told} told")
+        found.lost.update({cause: lines for cause, lines in arm["lost"].items() if lines})
+    if seen.fault:
+        found.wrong.append(f"cycle {found.cycles}: {seen.fault}")
+    found.wrong += [f"cycle {found.cycles}: {text}" for text in check_recording(path)]
+    found.lines += seen.recorded_lines
+
+
+def _usage() -> tuple[float, int, int]:
+    """MB of memory, descriptors, threads of this process."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    handles = sum(1 for _ in Path("/proc/self/fd").iterdir())
+    return pages * os.sysconf("SC_PAGESIZE") / 1e6, handles, threading.active_count()
+
+
+def _until(condition: Any) -> None:
+    deadline = time.monotonic() + WAIT_S
+    while not condition():
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"waited {WAIT_S:g} s")
+        time.sleep(0.02)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--hours", type=float, default=8.0, help="simulated")
+    parser.add_argument("--minutes", type=float, default=4.0, help="real, of recording")
+    parser.add_argument("--seed", type=int, default=1)
+    options = parser.parse_args()
+    lines = round(options.hours * 3600 * SIMULATED_HZ)
+    with tempfile.TemporaryDirectory(prefix="acquire-soak-") as home:
+        found = soak(Path(home), lines, lines / (60 * options.minutes), options.seed)
+    print(found)
+    return 1 if found.wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
