@@ -70,9 +70,9 @@ def reconstruct(
         str | None, typer.Option(help="trusted, or whole: also what is sampled in part at the ends.")
     ] = None,
     preset: Annotated[
-        str | None, typer.Option(help="fast or balanced; else balanced, or what --budget learned.")
+        str | None, typer.Option(help="fast, balanced or best; else balanced, or what --budget learned.")
     ] = None,
-    solver: Annotated[str, typer.Option(help="admm, or twist: the paper's.")] = "admm",
+    solver: Annotated[str, typer.Option(help="admm; twist, the paper's; twist-band.")] = "admm",
     budget: Annotated[float | None, typer.Option(metavar="SECONDS", help="Stop iterating in time.")] = None,
     iterations: Annotated[int | None, typer.Option(help="Instead of the preset's.")] = None,
     preview: Annotated[bool, typer.Option("--preview", help="Coarse, in a second or two.")] = False,

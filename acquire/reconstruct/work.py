@@ -9,14 +9,12 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from acquire.recon import reconstruct
-from acquire.recon.reliability import frame_error
 from acquire.store import open_recording
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from acquire.recon import Progress
-    from acquire.recon.api import Preset, Solver
+    from acquire.recon import Preset, Progress, Solver
     from acquire.recon.segments import Grid, SubSegment
 
 
@@ -48,11 +46,6 @@ class Part:
     error: NDArray[np.float32]
     facts: dict[str, Any] = field(default_factory=dict)
 
-    @property
-    def finished(self) -> bool:
-        """It was not stopped before its time."""
-        return bool(self.facts["iterations"] == self.facts["iterations_asked"])
-
 
 class Watch(Protocol):
     """Who looks on while a task is solved."""
@@ -60,7 +53,7 @@ class Watch(Protocol):
     def advance(self, share: float) -> None:
         """``share`` of the task was done since the last call."""
 
-    def stopped(self) -> bool:
+    def is_set(self) -> bool:
         """The best so far is wanted now."""
         ...
 
@@ -82,14 +75,13 @@ def solve(task: Task, watch: Watch) -> Part:
         advanced,
         solver=options.solver,
         iterations=options.iterations,
-        stop=watch.stopped,
+        stop=watch,
     )
     watch.advance(1 - result.iterations / result.iterations_asked)
-    error = frame_error(lines, result.video, voxels.spatial_merge, voxels.temporal_merge)
     substeps = lines.geometry.substeps
     return Part(
         video=task.grid.resample(result.video, segment, substeps),
-        error=task.grid.resample_time(error, segment, substeps),
+        error=task.grid.resample_time(result.frame_error, segment, substeps),
         facts={
             "first_line": segment.first_line,
             "lines": segment.lines,
@@ -99,7 +91,10 @@ def solve(task: Task, watch: Watch) -> Part:
             "temporal_merge": voxels.temporal_merge,
             "iterations": result.iterations,
             "iterations_asked": result.iterations_asked,
+            "ended": result.ended,
             "seconds": round(result.seconds, 3),
+            "masked": result.masked,
+            "warnings": list(result.warnings),
             "parameters": result.parameters,
             "quality": {name: _json(value) for name, value in asdict(result.quality).items()},
         },

@@ -60,7 +60,7 @@ def test_lines_and_times(cli: Cli, recording: Path, tmp_path: Path) -> None:
 
 
 def test_several_voxels_side_by_side(cli: Cli, recording: Path, tmp_path: Path) -> None:
-    words = ("--lines", 120, "--voxels", "1x66", "--voxels", "2x3", "--preset", "fast")
+    words = ("--lines", 120, "--voxels", "1x66", "--voxels", "2x3", "--iterations", 8)
     assert cli("reconstruct", recording, "--out", tmp_path / "v.zarr", *words).code == 0
     slow, fast = tmp_path / "v-1x66.zarr", tmp_path / "v-2x3.zarr"
     assert open_video(slow).video.shape[1:] == (24, 24)
@@ -72,7 +72,19 @@ def test_several_voxels_side_by_side(cli: Cli, recording: Path, tmp_path: Path) 
 
 
 def test_a_plan_on_the_command_line(cli: Cli, recording: Path, tmp_path: Path) -> None:
-    words = ("--segment", "40:2x2", "--segment", "1ms:1x30", "--segment", ":2x2", "--workers", 1, "--json")
+    words = (
+        "--segment",
+        "40:2x2",
+        "--segment",
+        "1ms:1x30",
+        "--segment",
+        ":2x2",
+        "--workers",
+        1,
+        "--iterations",
+        8,
+        "--json",
+    )
     answer = cli("reconstruct", recording, "--out", tmp_path / "v.zarr", "--lines", 200, *words)
     assert answer.code == 0, answer.err
     lengths = [part["end_substep"] - part["begin_substep"] for part in answer.json["segments"]]
@@ -207,7 +219,17 @@ def test_no_cluster_where_one_was_named(recording: Path, tmp_path: Path) -> None
 
 @pytest.mark.needs_dask
 def test_a_cluster_gives_what_this_machine_gives(cluster: str, recording: Path, tmp_path: Path) -> None:
-    common = [sys.executable, "-m", "acquire", "reconstruct", str(recording), "--nm", "2", "--preset", "fast"]
+    common = [
+        sys.executable,
+        "-m",
+        "acquire",
+        "reconstruct",
+        str(recording),
+        "--nm",
+        "2",
+        "--iterations",
+        "8",
+    ]
     words = ["--segment", "100:2x1", "--segment", ":2x1"]
     for name, where in (("here", ["--workers", "1"]), ("there", ["--dask", cluster])):
         ended = subprocess.run(
@@ -219,4 +241,4 @@ def test_a_cluster_gives_what_this_machine_gives(cluster: str, recording: Path, 
         )
         assert ended.returncode == 0, ended.stderr
     here, there = (open_video(tmp_path / f"{name}.zarr").video[:] for name in ("here", "there"))
-    np.testing.assert_allclose(here, there, atol=1e-3)
+    np.testing.assert_allclose(here, there, atol=1e-2)  # sums in another order

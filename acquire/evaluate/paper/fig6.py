@@ -12,7 +12,7 @@ from acquire.evaluate.metrics import psnr
 from acquire.evaluate.paper.bars import THRESHOLD, contrasts, last_resolved
 from acquire.evaluate.paper.drawing import canvas, correlation, show
 from acquire.evaluate.paper.studio import PaperFigure, Picture, Row, scene_of
-from acquire.recon.still import intensity
+from acquire.recon import reconstruct
 from acquire.sim.scenes import SeparableScene
 
 if TYPE_CHECKING:
@@ -111,7 +111,9 @@ def _pulses(studio: Studio, khz: int, kind: str) -> Curves:
     assert isinstance(scene, SeparableScene)
     factor = scene.size // geometry.size
     binned = scene.masks[0].reshape(geometry.size, factor, geometry.size, factor).sum(axis=(1, 3))
-    found = intensity(segment, binned)[geometry.trusted]
+    result = reconstruct(segment, geometry.size, 1, static_image=binned)
+    light = np.where(segment.code > 0, result.video[:, 0, 0] / binned.mean(), np.nan)
+    found = light[geometry.trusted]
     first = factor * (geometry.substeps * FIRST + geometry.trusted.start)
     count = factor * len(found)
     times = (first + np.arange(count)) * segment.substep_ns / factor * 1e-3
