@@ -44,14 +44,15 @@ def test_lines_and_times(cli: Cli, recording: Path, tmp_path: Path) -> None:
         100,
         "--nm",
         2,
+        "--iterations",
+        8,
         "--json",
     )
     assert answer.code == 0, answer.err
     assert (answer.json["first_line"], answer.json["lines"]) == (20, 100)
     assert answer.json["shape"] == [177, 12, 12]
-    answer = cli(
-        "reconstruct", recording, "--out", tmp_path / "b.zarr", "--from", "1ms", "--to", "2ms", "--nm", 2
-    )
+    times = ("--from", "1ms", "--to", "2ms", "--nm", 2, "--iterations", 8)
+    answer = cli("reconstruct", recording, "--out", tmp_path / "b.zarr", *times)
     assert answer.code == 0, answer.err
     video = open_video(tmp_path / "b.zarr")
     assert video.video.shape == (100, 12, 12)
