@@ -5,6 +5,7 @@ Unknown keys are refused. An error names the file, the key, what stood there and
 
 from __future__ import annotations
 
+import math
 import os
 import tomllib
 from pathlib import Path
@@ -14,6 +15,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from acquire.codes import TAPS, Code, ConstantCode, PrbsCode, mix_seed
 from acquire.errors import ConfigError
+from acquire.event_config import EventsConfig
 from acquire.geometry import Geometry
 from acquire.plan_config import ReconstructionPlan
 from acquire.scene_config import SceneConfig, SceneFile, VideoSceneConfig, anchored
@@ -28,6 +30,10 @@ PIXEL_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16}
 GentlModule = Literal["remote", "interface", "device", "stream", "system"]
 """Where a camera's features are: in the camera itself, or in a module of the host's side."""
 
+RING_RESERVE_SHARE = 4
+"""Of the ring's slots, one part in so many stays free for the cameras while a recording takes the past."""
+EVENT_DELAY_S = 0.5
+"""Between an event and the recording that it starts."""
 MAX_RING_BYTES = 4 * 2**30
 """Pixels that may wait in the ring of one arm."""
 
@@ -154,10 +160,13 @@ class TriggerConfig(_Model):
 class CameraConfig(_Model):
     """One camera. DN = black level + responsivity · Y, with Y of Eq. (1)."""
 
-    driver: Literal["simulated", "gentl-simulated", "gige-simulated", "harvesters", "aravis"] = Field(
-        default="simulated",
-        description="'harvesters': through the maker's GenTL producer; 'aravis': GigE and USB3 Vision; "
-        "'gentl-simulated', 'gige-simulated': simulated cameras through either",
+    driver: Literal["simulated", "pattern", "gentl-simulated", "gige-simulated", "harvesters", "aravis"] = (
+        Field(
+            default="simulated",
+            description="'harvesters': through the maker's GenTL producer; 'aravis': GigE and USB3 Vision; "
+            "'gentl-simulated', 'gige-simulated': simulated cameras through either; "
+            "'pattern': stored lines in place of the scene, at any rate, for loads",
+        )
     )
     serial: str = "simulated"
     model: str = Field(default="", description="what the camera must be; absent: any")
@@ -223,8 +232,29 @@ class StreamConfig(_Model):
     """The capture path between camera and disk."""
 
     block_lines: int = Field(default=256, ge=1, le=65536, description="lines per camera block and ring slot")
-    ring_slots: int = Field(default=64, ge=2, le=4096)
+    ring_slots: int = Field(default=64, ge=2, le=2**16)
+    ring_seconds: float | None = Field(
+        default=None, gt=0, description="of lines from the past that the ring holds, instead of ring_slots"
+    )
     reopen_s: float = Field(default=2.0, ge=0, le=600, description="wait for a camera that is gone")
+    realtime: bool = Field(
+        default=False,
+        description="grabbers before everything else on the host, where its user may (RLIMIT_RTPRIO); "
+        "not for simulated cameras, which compute",
+    )
+
+
+class RetentionConfig(_Model):
+    """What of an endless recording is kept; the oldest lines go first, in whole files."""
+
+    max_gb: float | None = Field(default=None, gt=0, description="that one recording may take of the disk")
+    max_age_s: float | None = Field(default=None, gt=0, description="of lines behind the newest")
+    hold_events: tuple[str, ...] = Field(default=("mark",), description="kinds of events that keep lines")
+    hold_before_s: float = Field(default=2.0, ge=0, description="kept before such an event")
+    hold_after_s: float = Field(default=2.0, ge=0, description="kept after it")
+    segment_lines: int = Field(
+        default=512, ge=1, description="longest segment to be reconstructed; so much is kept around a hold"
+    )
 
 
 class RecordingConfig(_Model):
@@ -233,10 +263,21 @@ class RecordingConfig(_Model):
     directory: Path = Path()
     chunk_lines: int = Field(default=4096, ge=16, le=2**20, description="lines per chunk, and per commit")
     shard_chunks: int = Field(default=64, ge=1, le=255, description="chunks per file")
-    codec: Literal["none", "lz4", "zstd"] = "none"
+    codec: Literal["none", "lz4", "zstd", "auto"] = Field(
+        default="none", description="'auto': the smallest that holds the rate here, measured at arm"
+    )
     fsync: Literal["commit", "seal"] = Field(
         default="seal", description="when bytes are forced to the medium"
     )
+    commit_s: float = Field(
+        default=1.0, gt=0, le=60, description="lines that may wait for a commit, in seconds of the line rate"
+    )
+    reserve_gb: float = Field(
+        default=0.25,
+        ge=0,
+        description="of the disk left free; a recording is sealed before that",
+    )
+    retention: RetentionConfig | None = Field(default=None, description="absent: all is kept")
 
 
 class ControlConfig(_Model):
@@ -272,23 +313,35 @@ class RigConfig(_Model):
     cameras: CamerasConfig
     stream: StreamConfig = StreamConfig()
     recording: RecordingConfig = RecordingConfig()
+    events: EventsConfig = EventsConfig()
     control: ControlConfig = Field(default_factory=ControlConfig)
     simulation: SimulationConfig
 
     @model_validator(mode="after")
     def _ring_fits(self) -> RigConfig:
         """Lines wait for their tag in the ring, of which half must stay free for the cameras."""
-        lines = self.stream.ring_slots * self.stream.block_lines
+        lines = self.ring_slots * self.stream.block_lines
         pixel_bytes = 1 if self.cameras.a.dtype == "uint8" else 2
         if (size := lines * self.geometry.stages * pixel_bytes) > MAX_RING_BYTES:
             raise ValueError(
-                f"stream.ring_slots x stream.block_lines = {lines} lines of {self.geometry.stages} pixels "
+                f"stream.{self._ring_keys} = {lines} lines of {self.geometry.stages} pixels "
                 f"are {size} bytes of memory per arm; possible: up to {MAX_RING_BYTES}"
             )
         if self.trigger.tag_every_lines > lines // 2:
             raise ValueError(
                 f"trigger.tag_every_lines = {self.trigger.tag_every_lines}; possible: 1 to {lines // 2}, "
-                "half of what a ring holds (stream.ring_slots x stream.block_lines)"
+                f"half of what a ring holds (stream.{self._ring_keys})"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _past_fits(self) -> RigConfig:
+        """An event is noticed, and its recording created, while the ring goes on."""
+        longest_s = self.history_s - EVENT_DELAY_S * self.simulation.speed
+        if self.events.sources and self.events.pre_s > longest_s:
+            raise ValueError(
+                f"events.pre_s = {self.events.pre_s:g}; possible: up to {max(0.0, longest_s):.3g}, "
+                f"since the ring holds {self.history_s:.3g} s; a longer one: stream.ring_seconds"
             )
         return self
 
@@ -307,6 +360,30 @@ class RigConfig(_Model):
             return {}
         starts = {"a": self.cameras.a.first_column, "b": self.cameras.b.first_column}
         return {arm: (start, start + self.geometry.stages) for arm, start in starts.items()}
+
+    @property
+    def ring_slots(self) -> int:
+        """Slots of the ring of one arm."""
+        seconds = self.stream.ring_seconds
+        if seconds is None:
+            return self.stream.ring_slots
+        past = math.ceil(seconds * self.line_rate_hz / self.stream.block_lines) + 1
+        return past + max(2, math.ceil(past / (RING_RESERVE_SHARE - 1)))
+
+    @property
+    def ring_reserve(self) -> int:
+        """Those of them that do not serve as history."""
+        return max(2, self.ring_slots // RING_RESERVE_SHARE)
+
+    @property
+    def history_s(self) -> float:
+        """Seconds of lines from the past that a full ring holds for certain."""
+        slots = self.ring_slots - self.ring_reserve - 1
+        return max(0, slots) * self.stream.block_lines / self.line_rate_hz
+
+    @property
+    def _ring_keys(self) -> str:
+        return "ring_slots x stream.block_lines" if self.stream.ring_seconds is None else "ring_seconds"
 
     @property
     def line_period_ticks(self) -> int:

@@ -23,6 +23,7 @@ from acquire.sim.compact import SideBySideOpener
 from acquire.sim.devices import SimulatedCameraOpener, SimulatedOptics
 from acquire.sim.gentl.arms import GentlArms, sensor_width
 from acquire.sim.gige.arms import GigeArms
+from acquire.sim.pattern import PatternCameraOpener
 from acquire.sim.pins import PinPage, PinWire
 from acquire.sim.pipeline import Bench, describe
 from acquire.sim.replay import ReplayCameraOpener, describe_replay
@@ -48,7 +49,7 @@ if TYPE_CHECKING:
     from acquire.trigger.base import Trigger
     from acquire.trigger.transports import Transport
 
-SIMULATED_CAMERAS = ("simulated", "gentl-simulated", "gige-simulated")
+SIMULATED_CAMERAS = ("simulated", "pattern", "gentl-simulated", "gige-simulated")
 """Drivers of cameras that only a simulated trigger, or the compiled gateware, can pulse."""
 
 
@@ -80,17 +81,21 @@ class Rig:
     def _opener(self, arm: str) -> CameraOpener:
         if self.config.simulation.replay is not None:
             return _replay_opener(self.config, self._wire, arm)
+        opener: CameraOpener
         match self.config.cameras.arm(arm).driver:
             case "harvesters":
-                return HarvestersOpener(spec_of(self.config, arm))
+                opener = HarvestersOpener(spec_of(self.config, arm))
             case "aravis":
-                return AravisOpener(spec_of(self.config, arm))
+                opener = AravisOpener(spec_of(self.config, arm))
             case "gentl-simulated":
-                return self._gentl.opener(arm, self._sensor)
+                opener = self._gentl.opener(arm, self._sensor)
             case "gige-simulated":
-                return self._gige.opener(arm, self._sensor)
+                opener = self._gige.opener(arm, self._sensor)
             case "simulated":
-                return self._sensor(arm)
+                opener = self._sensor(arm)
+            case "pattern":
+                opener = _pattern_opener(self.config, self._pulses(arm), arm)
+        return opener
 
     def _sensor(self, arm: str) -> CameraOpener:
         """The model of the arm's camera, in the process that opens it."""
@@ -238,6 +243,17 @@ def _camera_opener(
     optics = SimulatedOptics(arm, config.geometry, scene)
     return SimulatedCameraOpener(
         wire, optics, config.cameras.arm(arm), config.stream.block_lines, config.line_rate_hz
+    )
+
+
+def _pattern_opener(config: RigConfig, wire: Wire | PinWire, arm: str) -> CameraOpener:
+    return PatternCameraOpener(
+        wire,
+        arm,
+        config.geometry,
+        config.cameras.arm(arm),
+        config.stream.block_lines,
+        config.line_rate_hz,
     )
 
 

@@ -230,7 +230,7 @@ def _spec(config: RigConfig, scene: SceneConfig) -> RecordingSpec:
         extra=describe(scene),
         chunk_lines=recording.chunk_lines,
         shard_chunks=recording.shard_chunks,
-        codec=recording.codec,
+        codec="lz4" if recording.codec == "auto" else recording.codec,  # nothing has to be kept up with
         fsync=recording.fsync,
         layout=scene.optics.layout,
     )

@@ -1,8 +1,11 @@
-"""Tests that need a compiler, genicam or Dask are left out where there is none, and the summary says so."""
+"""Tests that need what a machine lacks are left out there, and the summary says so."""
 
 from __future__ import annotations
 
 import importlib.util
+import os
+import subprocess
+import tempfile
 from collections import Counter
 from shutil import which
 from typing import Any
@@ -25,11 +28,22 @@ def _have_aravis() -> bool:
     return True
 
 
+def _can_mount() -> bool:
+    """A file system of a few MB that is really full is one that is mounted here."""
+    with tempfile.TemporaryDirectory() as place:
+        command = ["mount", "-t", "tmpfs", "-o", "size=64k", "none", place]
+        if os.geteuid() != 0 or which("mount") is None or subprocess.run(command, check=False).returncode:
+            return False
+        subprocess.run(["umount", place], check=True)
+        return True
+
+
 MISSING = {
     "needs_aravis": not _have_aravis() and "Aravis' library",
     "needs_gige_camera": not (_have_aravis() and which(FAKE_GIGE)) and f"Aravis and {FAKE_GIGE}",
     "needs_compiler": not (compiler() and _HAVE_GENICAM) and "a C compiler and the genicam package",
     "needs_dask": importlib.util.find_spec("distributed") is None and "dask.distributed",
+    "needs_mount": not _can_mount() and "the right to mount a small file system",
     "needs_genicam": not _HAVE_GENICAM and "the genicam package",
 }
 _left_out: Counter[str] = Counter()
@@ -38,6 +52,7 @@ _left_out: Counter[str] = Counter()
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "needs_compiler: builds the simulated GenTL producer")
     config.addinivalue_line("markers", "needs_dask: spreads work over a Dask cluster")
+    config.addinivalue_line("markers", "needs_mount: fills a small file system of its own")
     config.addinivalue_line("markers", "needs_genicam: loads a GenTL producer")
     config.addinivalue_line("markers", "needs_aravis: loads Aravis' shared library")
     config.addinivalue_line("markers", "needs_gige_camera: runs Aravis' GigE Vision camera on loopback")

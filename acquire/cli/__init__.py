@@ -16,6 +16,7 @@ import sys
 import typer
 
 from acquire.cli import (
+    bench,
     camera,
     config,
     control,
@@ -47,6 +48,7 @@ MODULES = (
     config,
     trigger,
     camera,
+    bench,
 )
 """Modules of commands, in the order of the help; each has ``register(app)``. New groups are added here."""
 

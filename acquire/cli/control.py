@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from acquire.cli.durations import seconds
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, quantity
 from acquire.errors import DataError, UsageError
 
@@ -22,17 +23,26 @@ DAMAGED = ("INCOMPLETE", "ABORTED", None)
 
 
 def register(app: typer.Typer) -> None:
-    for command in (arm, start, stop, disarm, status):
+    for command in (arm, start, mark, stop, disarm, status):
         app.command(rich_help_panel="Capture")(command)
 
 
-def arm(socket: SocketOption = None, json: JsonFlag = False) -> None:
+def arm(
+    force: Annotated[
+        bool, typer.Option("--force", help="Even where this host is too slow for the configured rate.")
+    ] = False,
+    socket: SocketOption = None,
+    json: JsonFlag = False,
+) -> None:
     """Start trigger and cameras; nothing is written yet.
+
+    The daemon measures first what ring, codec and disk sustain here (a second; valid for ten minutes), and
+    refuses, exit code 2, where that is less than what is configured.
 
     Example: [bold]acquire arm[/]
     """
     with _daemon(socket) as daemon:
-        _show(daemon.arm(), json)
+        _show(daemon.arm(force=force), json)
 
 
 def start(
@@ -40,16 +50,43 @@ def start(
         Path | None, typer.Argument(metavar="[RECORDING]", help="New recording; else named by rig and time.")
     ] = None,
     lines: Annotated[int | None, typer.Option(help="Stop after so many lines.")] = None,
-    duration: Annotated[float | None, typer.Option(help="Stop after so many seconds.")] = None,
+    duration: Annotated[
+        float | None, typer.Option(parser=seconds, metavar="TIME", help="Stop after 5s, 500ms, 2min.")
+    ] = None,
+    pre: Annotated[
+        float | None, typer.Option(parser=seconds, metavar="TIME", help="Of that, from before: see the ring.")
+    ] = None,
+    post: Annotated[
+        float | None, typer.Option(parser=seconds, metavar="TIME", help="Stop so long after this command.")
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with a sealed RECORDING, in a segment beside it.")
+    ] = False,
     socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Record from the next line on, until stopped or for a number of lines or seconds.
+    """Record from the next line on, or from before it; until stopped, or for some lines or time.
 
-    Example: [bold]acquire start run.zarr --lines 100000[/]
+    Example: [bold]acquire start run.zarr --lines 100000[/], or [bold]acquire start --pre 2s --post 1s[/]
     """
     with _daemon(socket) as daemon:
-        _show(daemon.start(path, lines=lines, duration_s=duration), json)
+        status = daemon.start(
+            path, lines=lines, duration_s=duration, pre_s=pre or 0.0, post_s=post, resume=resume
+        )
+        _show(status, json)
+
+
+def mark(
+    text: Annotated[str, typer.Argument(help="What happens, in your words.")] = "",
+    socket: SocketOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """Note that something happens now. While armed it starts a recording, where the rig's [events] say so.
+
+    Example: [bold]acquire mark "the valve opens"[/]
+    """
+    with _daemon(socket) as daemon:
+        _show(daemon.mark(text), json)
 
 
 def stop(socket: SocketOption = None, json: JsonFlag = False) -> None:
@@ -117,6 +154,7 @@ def _show(status: Status, json: bool) -> None:
             "run": status.run_id,
             "recording": _recording(status),
             "last": _last(status.last),
+            "sustains": _capacity(status),
             "possible": ", ".join(status.possible) or "wait until it is idle",
         }
     )
@@ -133,6 +171,14 @@ def _recording(status: Status) -> str | None:
         f"{now.path}, {now.recorded_lines}{budget} lines from line {now.first_line} on, "
         f"{now.committed_lines} readable"
     )
+
+
+def _capacity(status: Status) -> str | None:
+    found = status.capacity
+    if found is None or found.warning is not None:
+        return None if found is None else f"WARNING: {found.warning}"
+    sustained, configured = quantity(found.sustained_hz or 0, "Hz"), quantity(found.line_rate_hz, "Hz")
+    return f"lines at {sustained} (the {found.limit} allows least); configured {configured}"
 
 
 def _last(last: LastRecording | None) -> str | None:

@@ -10,7 +10,7 @@ import typer
 from acquire.cli.interrupts import first_interrupt_asks
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, print_warning
 from acquire.cli.progress import stage_progress
-from acquire.cli.recordings import RecordingArgument
+from acquire.cli.recordings import PlaceArgument
 from acquire.errors import EXIT_INTERRUPTED, UsageError
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def register(app: typer.Typer) -> None:
 
 
 def reconstruct(
-    recording: RecordingArgument,
+    recording: PlaceArgument,
     out: Annotated[
         Path | None, typer.Option(metavar="VIDEO", help="New video, a directory NAME.zarr.")
     ] = None,

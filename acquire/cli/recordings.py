@@ -1,21 +1,32 @@
-"""``acquire ls | info | cut``: recordings on disk; no daemon needed."""
+"""``acquire ls | info | cut | verify | recover | hold | upload``: recordings, here or at URLs; no daemon."""
 
 from __future__ import annotations
 
 import os
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, quantity
+from acquire.cli.progress import stage_progress
 from acquire.errors import AcquireError, DataError, UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from acquire.lines import Segment
+    from acquire.store import Mirrored, Verification
+
+PlaceArgument = Annotated[
+    str, typer.Argument(metavar="RECORDING", help="A directory NAME.zarr, or its URL: s3://bucket/NAME.zarr.")
+]
 
 RecordingArgument = Annotated[Path, typer.Argument(metavar="RECORDING", help="A directory NAME.zarr.")]
+
+LISTED = 20
+"""Damaged stretches that are printed; --json has all of them."""
 
 CELL_CHARACTERS = 72
 """What a table shows of an error; --json has all of it."""
@@ -23,7 +34,7 @@ CELL_CHARACTERS = 72
 
 def register(app: typer.Typer) -> None:
     app.command("ls", rich_help_panel="Recordings")(list_recordings)
-    for command in (info, cut):
+    for command in (info, verify, recover, hold, upload, cut):
         app.command(rich_help_panel="Recordings")(command)
 
 
@@ -46,7 +57,7 @@ def list_recordings(
         print_table(("recording", "lines", "duration", "size", "state", "started (UTC)"), map(_row, found))
 
 
-def info(recording: RecordingArgument, json: JsonFlag = False) -> None:
+def info(recording: PlaceArgument, json: JsonFlag = False) -> None:
     """What a recording holds: geometry, code, clock, losses, how it ended.
 
     Example: [bold]acquire info run.zarr[/]
@@ -69,8 +80,99 @@ def info(recording: RecordingArgument, json: JsonFlag = False) -> None:
         print_table(("arm", "first lost line", "lines", "cause"), rows)
 
 
-def cut(
+def verify(recording: PlaceArgument, json: JsonFlag = False) -> None:
+    """Read all of a recording: is every line there and intact, do numbering, gaps and ledger agree?
+
+    Ends with 6 where something is lost or damaged, and says which lines.
+
+    Example: [bold]acquire verify run.zarr[/]
+    """
+    from acquire.store import verify as verify_recording
+
+    with stage_progress("verifying") as progress:
+        found = verify_recording(recording, progress)
+    if json:
+        print_json(found.to_dict())
+    else:
+        _print_verification(found)
+    if not found.intact:
+        raise typer.Exit(DataError.exit_code)
+
+
+def recover(recording: RecordingArgument, json: JsonFlag = False) -> None:
+    """Seal a recording whose writer was killed or lost its power; nothing that was committed is cut off.
+
+    Lines that are not intact on disk are flagged as missing and listed. A second time changes nothing.
+
+    Example: [bold]acquire recover run.zarr[/]
+    """
+    from acquire.store import recover as recover_recording
+
+    with stage_progress("recovering") as progress:
+        done = recover_recording(recording, progress=progress)
+    if json:
+        print_json(done.to_dict())
+        return
+    added = done.lines - done.lines_before
+    what = (
+        f"sealed; {added} lines were on disk that no commit listed" if done.changed else "nothing to recover"
+    )
+    typer.echo(f"{done.path}: {done.lines} lines, {what}")
+    if done.indices_mended:
+        typer.echo(f"  {done.indices_mended} indices of files were mended")
+    _print_list("lost, flagged as missing", map(str, done.damage))
+
+
+def hold(
     recording: RecordingArgument,
+    first_line: Annotated[int, typer.Option(help="The trigger's number of the first line.")],
+    lines: Annotated[int, typer.Option(help="How many lines; they may be still to come.")],
+    why: Annotated[str, typer.Option(help="A word for those who wonder.")] = "",
+    json: JsonFlag = False,
+) -> None:
+    """Keep lines of an endless recording, with what reconstruction needs around them, from being dropped.
+
+    Ends with 6 where some of them are gone already; the others are held.
+
+    Example: [bold]acquire hold run.zarr --first-line 2000 --lines 5000 --why flash[/]
+    """
+    from acquire.store import hold as hold_lines
+
+    held = hold_lines(recording, first_line, lines, why)
+    if json:
+        print_json({"path": str(recording), "first_line": held.first_line, "lines": held.count, "why": why})
+    else:
+        typer.echo(f"{recording}: lines {first_line} to {first_line + lines - 1} are held")
+
+
+def upload(
+    recording: RecordingArgument,
+    url: Annotated[str, typer.Argument(help="s3://bucket/NAME.zarr, or whatever fsspec reaches.")],
+    follow: Annotated[bool, typer.Option("--follow", help="Go on until the recording is sealed.")] = False,
+    json: JsonFlag = False,
+) -> None:
+    """Copy a recording to a remote store, also while it grows; one that was interrupted goes on where it was.
+
+    Lines that are not copied yet are held: retention of an endless recording leaves them alone.
+
+    Example: [bold]acquire upload run.zarr s3://bucket/run.zarr --follow[/]
+    """
+    from acquire.store import mirror
+
+    def report(done: Mirrored) -> None:
+        if not json:
+            typer.echo(f"{url}: {done.lines} lines, {quantity(done.bytes, 'B')} copied", err=True)
+
+    done = mirror(recording, url, follow=follow, report=report)
+    if json:
+        print_json(done.to_dict())
+    else:
+        state = "sealed" if done.sealed else "still growing"
+        typer.echo(f"{url}: {done.lines} lines, {state}; {quantity(done.bytes, 'B')} copied now")
+
+
+def cut(
+    recording: PlaceArgument,
     first_line: Annotated[int, typer.Option(help="The trigger's number of the first line.")],
     lines: Annotated[int, typer.Option(help="How many lines.")],
     out: Annotated[Path, typer.Option(metavar="FILE.npz", help="New file.")],
@@ -91,6 +193,24 @@ def cut(
         print_json(facts)
     else:
         typer.echo(f"{out}: lines {first_line} to {first_line + lines - 1}, {quantity(size, 'B')}")
+
+
+def _print_verification(found: Verification) -> None:
+    verdict = "intact" if found.intact else "DAMAGED"
+    size = quantity(found.bytes, "B")
+    typer.echo(f"{found.path}: {verdict}; {found.state}, {found.lines} lines, {size}")
+    _print_list("not intact on disk", map(str, found.damage))
+    _print_list("contradictions", found.contradictions)
+    _print_list("note", found.notes)
+
+
+def _print_list(title: str, items: Iterable[str]) -> None:
+    """Some items under a title; those that are too many are counted."""
+    listed = list(items)
+    for item in listed[:LISTED]:
+        typer.echo(f"  {title}: {item}")
+    if len(listed) > LISTED:
+        typer.echo(f"  {title}: and {len(listed) - LISTED} more; --json has them all")
 
 
 def _may_be_one(path: Path) -> bool:
@@ -140,6 +260,10 @@ def _readable(facts: dict[str, Any]) -> dict[str, Any]:
         "state": f"{facts['state']}, {facts['run_condition'] or 'no condition yet'}",
         "end": facts["end_reason"],
         "lines": f"{lines} ({first} to {first + lines - 1})" if lines else "0",
+        "continues": _outage(facts["segment"]),
+        "segments": ", ".join(facts["segments"]) or None,
+        "dropped": _stretches(facts["dropped"]),
+        "held": _stretches(facts["holds"]),
         "duration": f"{facts['duration_s']:.6f} s at {quantity(facts['line_rate_hz'], 'Hz')}",
         "started": _utc(facts["start_ns"]),
         "geometry": f"M = {sizes['stages']}, S = {sizes['substeps']}, {sizes['pixels']} pixels",
@@ -147,10 +271,45 @@ def _readable(facts: dict[str, Any]) -> dict[str, Any]:
         "code": ", ".join(f"{key} {value}" for key, value in facts["code"].items()),
         "clock": f"{facts['clock']['clock_hz']} Hz, UTC known to {facts['clock']['uncertainty_ns']} ns",
         "size": quantity(facts["bytes"], "B"),
+        "disk": _disk(facts["disk"]),
+        "at risk": _at_risk(facts["durability"]),
         "lost lines": ", ".join(f"{arm} {count}" for arm, count in facts["lost_lines"].items()),
         "simulated": "yes" if facts["simulated"] else "no",
         "written by": f"acquire {facts['versions']['acquire']}",
     }
+
+
+def _outage(segment: dict[str, Any] | None) -> str | None:
+    """What a further segment follows, and what is lost between."""
+    if segment is None:
+        return None
+    outage = segment["outage"]
+    lines = "numbering began anew" if outage["lines"] is None else f"{outage['lines']} lines"
+    return f"{segment['of']} after line {outage['after_line']}; outage: {lines}, {outage['cause']}"
+
+
+def _stretches(stretches: list[list[Any]]) -> str | None:
+    """Stretches of lines, at most some of them."""
+    shown = [f"{first} to {first + count - 1}" for first, count, *_ in stretches[:LISTED]]
+    more = [f"and {len(stretches) - LISTED} more"] if len(stretches) > LISTED else []
+    return ", ".join(shown + more) or None
+
+
+def _disk(disk: dict[str, float] | None) -> str | None:
+    """How long a growing recording can go on."""
+    if disk is None:
+        return None
+    free, rate = quantity(disk["free_bytes"], "B"), quantity(disk["bytes_per_s"], "B/s")
+    return f"{free} free, full in {timedelta(seconds=round(disk['seconds_to_full']))} at {rate}"
+
+
+def _at_risk(durability: dict[str, Any]) -> str | None:
+    """What a crash can cost, of a recording that says so."""
+    if not durability:
+        return None
+    kill, power = durability["kill_lines"], durability["power_lines"]
+    at_power = f"at most {power} lines" if power is not None else "what the system has not written back"
+    return f"kill -9: at most {kill} lines; power loss: {at_power} (fsync at {durability['fsync']})"
 
 
 def _utc(time_ns: int | None) -> str:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Self
 import httpx
 from pydantic import ValidationError
 
-from acquire.daemon.messages import ErrorMessage, StartRequest, Status
+from acquire.daemon.messages import ArmRequest, ErrorMessage, StartRequest, Status
 from acquire.daemon.states import State
 from acquire.errors import AcquireError, NoDaemonError, StateError, UsageError
 
@@ -57,23 +57,44 @@ class Client:
         """What the daemon is doing; answered at once, whatever it is busy with."""
         return self._call("GET", "status", STATUS_TIMEOUT_S)
 
-    def arm(self) -> Status:
-        """idle → armed: cameras and trigger run, nothing is written."""
-        return self._call("POST", "arm")
+    def arm(self, *, force: bool = False) -> Status:
+        """idle → armed: cameras and trigger run, nothing is written. ``force``: however slow the host."""
+        return self._call("POST", "arm", body=ArmRequest(force=force).model_dump())
 
     def start(
-        self, path: Path | None = None, *, lines: int | None = None, duration_s: float | None = None
+        self,
+        path: Path | None = None,
+        *,
+        lines: int | None = None,
+        duration_s: float | None = None,
+        pre_s: float = 0.0,
+        post_s: float | None = None,
+        resume: bool = False,
     ) -> Status:
-        """armed → recording. A relative ``path`` is meant from the caller's directory."""
+        """armed → recording. A relative ``path`` is meant from the caller's directory.
+
+        ``pre_s`` of the recording are from before the request, as far as the ring holds them; ``post_s`` is
+        another way to say how long it is to go on. With ``resume``, ``path`` is a sealed recording that goes
+        on in a segment beside it.
+        """
         try:
             request = StartRequest(
-                path=None if path is None else path.absolute(), lines=lines, duration_s=duration_s
+                path=None if path is None else path.absolute(),
+                lines=lines,
+                duration_s=duration_s,
+                pre_s=pre_s,
+                post_s=post_s,
+                resume=resume,
             )
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(map(str, first["loc"]))
             raise UsageError(f"start: {where} {first['msg']}".replace("  ", " ")) from error
         return self._call("POST", "start", body=request.model_dump(mode="json"))
+
+    def mark(self, text: str = "") -> Status:
+        """An event at the newest line; it starts a recording where the rig's ``[events]`` say so."""
+        return self._call("POST", "mark", body={"text": text})
 
     def stop(self) -> Status:
         """recording → idle: returns once the recording is sealed."""

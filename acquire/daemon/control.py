@@ -16,7 +16,9 @@ from starlette.exceptions import HTTPException
 from acquire import __version__
 from acquire.daemon.messages import (
     HTTP_STATUS,
+    ArmRequest,
     ErrorMessage,
+    MarkRequest,
     StartRequest,
     Status,
     error_body,
@@ -37,8 +39,9 @@ class Commands(Protocol):
     """What the API controls."""
 
     def status(self) -> Status: ...
-    def arm(self) -> None: ...
+    def arm(self, request: ArmRequest) -> None: ...
     def start(self, request: StartRequest) -> None: ...
+    def mark(self, text: str) -> None: ...
     def stop(self) -> None: ...
     def disarm(self) -> None: ...
 
@@ -61,13 +64,18 @@ def build_app(service: Commands, run: Callable[[Callable[[], None]], Awaitable[N
         return service.status()
 
     @app.post("/arm", summary="idle → armed")
-    async def arm() -> Status:
-        await run(service.arm)
+    async def arm(request: ArmRequest | None = None) -> Status:
+        await run(lambda: service.arm(request or ArmRequest()))
         return service.status()
 
     @app.post("/start", summary="armed → recording")
     async def start(request: StartRequest) -> Status:
         await run(lambda: service.start(request))
+        return service.status()
+
+    @app.post("/mark", summary="armed or recording: an event at the newest line")
+    async def mark(request: MarkRequest) -> Status:
+        await run(lambda: service.mark(request.text))
         return service.status()
 
     @app.post("/stop", summary="recording → draining → idle; returns once the recording is sealed")

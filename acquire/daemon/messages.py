@@ -20,6 +20,12 @@ class _Message(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+class ArmRequest(_Message):
+    """How to arm."""
+
+    force: bool = Field(default=False, description="even where the host is too slow for the configured rate")
+
+
 class StartRequest(_Message):
     """Where to record, and how much."""
 
@@ -32,11 +38,25 @@ class StartRequest(_Message):
     duration_s: float | None = Field(
         default=None, gt=0, le=1e9, allow_inf_nan=False, description="budget in seconds instead of lines"
     )
+    pre_s: float = Field(
+        default=0.0, ge=0, le=1e6, allow_inf_nan=False, description="of it, from before the request"
+    )
+    post_s: float | None = Field(
+        default=None, gt=0, le=1e9, allow_inf_nan=False, description="to record after the request, as budget"
+    )
+    resume: bool = Field(
+        default=False, description="path is a sealed recording: go on with it in a further segment beside it"
+    )
 
     @model_validator(mode="after")
     def _one_budget(self) -> StartRequest:
-        if self.lines is not None and self.duration_s is not None:
-            raise ValueError("lines and duration_s are two ways to say the same: give one")
+        given = [name for name in ("lines", "duration_s", "post_s") if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise ValueError(f"{' and '.join(given)} are ways to say the same: give one")
+        if self.duration_s is not None and self.pre_s >= self.duration_s:
+            raise ValueError("pre_s is a part of duration_s: give a smaller one")
+        if self.resume and self.path is None:
+            raise ValueError("resume needs the path of the recording to go on with")
         if self.path is not None and not self.path.is_absolute():
             raise ValueError(f"path {str(self.path)!r} is not absolute: the daemon has another directory")
         return self
@@ -48,6 +68,12 @@ class StartRequest(_Message):
         if "\0" in text or text != text.encode(errors="replace").decode():
             raise ValueError(f"path {text!r} is not UTF-8, or has a NUL")
         return path
+
+
+class MarkRequest(_Message):
+    """What happens now, in the operator's words."""
+
+    text: str = Field(default="", max_length=400)
 
 
 class RingStatus(_Message):
@@ -95,6 +121,16 @@ class LastRecording(_Message):
     end_reason: str | None
 
 
+class CapacityStatus(_Message):
+    """What this host sustains, as measured before the run was armed; line rates of both arms."""
+
+    line_rate_hz: float = Field(description="configured")
+    sustained_hz: float | None = Field(default=None, description="null: could not be measured")
+    limit: str | None = Field(default=None, description="what allows least")
+    limits_hz: dict[str, float] = Field(default={}, description="ring, codec, recorder, processors")
+    warning: str | None = None
+
+
 class Status(_Message):
     """What the daemon is doing, and how well."""
 
@@ -111,6 +147,8 @@ class Status(_Message):
     arms: dict[str, ArmStatus]
     last: LastRecording | None
     fault: str | None
+    capacity: CapacityStatus | None = None
+    processes: dict[str, int] = Field(default={}, description="of the run: name → process number")
 
 
 class ErrorMessage(_Message):

@@ -8,8 +8,10 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-from acquire.store import RecordingSpec
-from acquire.stream import Capture, CapturePlan
+from acquire.daemon.storage import choose_for, storage_settings
+from acquire.store import RecordingSpec, next_segment
+from acquire.stream import NOW, Capture, CapturePlan
+from acquire.stream.messages import Note
 from acquire.trigger.base import TriggerRun
 
 if TYPE_CHECKING:
@@ -17,7 +19,8 @@ if TYPE_CHECKING:
 
     from acquire.config import RigConfig
     from acquire.rig import Rig
-    from acquire.stream import CaptureStatus
+    from acquire.store import Codec, CodecChoice
+    from acquire.stream import CaptureStatus, Window
 
 
 STALL_S = 3.0
@@ -32,15 +35,45 @@ class Run:
         self.run_id = new_run_id(config.name)
         self._config = config
         self._rig = rig
+        self._choice: CodecChoice | None = None
         self._capture = Capture(capture_plan(config, rig, self.run_id), rig.trigger)
+
+    @property
+    def _codec(self) -> Codec:
+        """As configured, or as it was chosen at arm."""
+        configured = self._config.recording.codec
+        if configured != "auto":
+            return configured
+        return self._choice.codec if self._choice else "none"
 
     def arm(self) -> None:
         """Cameras and trigger run; on failure everything is undone and the first error raised."""
+        if self._config.recording.codec == "auto":
+            self._choice = choose_for(self._config)
         self._capture.arm()
 
-    def start(self, path: Path, lines: int | None) -> None:
-        """Record to ``path``. Raises UsageError where it cannot be, before anything is touched."""
-        self._capture.start(path, self._spec(), lines)
+    def start(self, path: Path, lines: int | None, window: Window = NOW, *, resume: bool = False) -> Path:
+        """Record to ``path``, or, to ``resume`` what is there, to a segment beside it; says where.
+
+        Raises UsageError where it cannot be, before anything is touched.
+        """
+        spec = self._spec()
+        if resume:
+            path, spec = next_segment(path, spec)
+        self._capture.start(path, spec, lines, window)
+        return path
+
+    def mark(self, text: str) -> Note:
+        """An event of the operator's, at the newest line."""
+        return Note(self._capture.note("mark", text), "mark", text)
+
+    def extend(self, line: int) -> None:
+        """Let the recording under way not end before ``line``."""
+        self._capture.extend(line)
+
+    def events(self) -> list[Note]:
+        """What trigger and lines have told since the last call."""
+        return self._capture.take_events()
 
     def stop(self, reason: str) -> None:
         """End the recording at the newest line; ``reason`` is recorded."""
@@ -70,12 +103,10 @@ class Run:
             trigger={**asdict(self._rig.trigger.identify()), "settings": config.trigger.model_dump()},
             cameras={arm: self._camera(arm, facts) for arm, facts in self._capture.cameras.items()},
             config=config.model_dump(mode="json"),
-            extra=self._rig.describe(),
-            chunk_lines=config.recording.chunk_lines,
-            shard_chunks=config.recording.shard_chunks,
-            codec=config.recording.codec,
-            fsync=config.recording.fsync,
+            extra=self._rig.describe() | ({"codec_choice": self._choice.to_attrs()} if self._choice else {}),
+            codec=self._codec,
             layout=self._rig.layout,
+            **storage_settings(config),
         )
 
     def _camera(self, arm: str, facts: dict[str, Any]) -> dict[str, Any]:
@@ -97,12 +128,14 @@ def capture_plan(config: RigConfig, rig: Rig, run_id: str) -> CapturePlan:
         pixels=config.geometry.stages,
         dtype=config.cameras.a.dtype,
         block_lines=config.stream.block_lines,
-        ring_slots=config.stream.ring_slots,
+        ring_slots=config.ring_slots,
+        ring_reserve=config.ring_reserve,
         white_dn=config.cameras.a.white_dn,
         openers=rig.openers(),
         stall_timeout_s=max(STALL_S, config.stream.reopen_s + 1.0),
         reopen_timeout_s=config.stream.reopen_s,
         columns=config.columns,
+        realtime=config.stream.realtime,
         line_period_ns=1e9 / config.line_rate_hz / config.simulation.speed,
     )
 

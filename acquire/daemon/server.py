@@ -20,6 +20,7 @@ from acquire.daemon.control import build_app
 from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.notify import notify
 from acquire.daemon.plan import Run
+from acquire.daemon.proof import Proof
 from acquire.daemon.service import Service
 from acquire.errors import EXIT_INTERRUPTED, StateError
 from acquire.rig import Rig
@@ -44,7 +45,7 @@ def serve(config: RigConfig) -> int:
     Raises StateError where another daemon has the socket, before any device is touched.
     """
     with contextlib.closing(Endpoint(config.control.socket.absolute())) as endpoint, Rig(config) as rig:
-        service = Service(config, lambda: Run(config, rig))
+        service = Service(config, lambda: Run(config, rig), Proof(config))
         return asyncio.run(Daemon(service, endpoint).run())
 
 

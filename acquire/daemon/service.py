@@ -13,10 +13,12 @@ import os
 import threading
 import time
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from acquire import __version__
-from acquire.daemon.messages import LastRecording, RecordingStatus, Status
+from acquire.daemon.events import StandingOrder, budget_lines, window_of
+from acquire.daemon.messages import ArmRequest, LastRecording, RecordingStatus, Status
 from acquire.daemon.plan import default_path
 from acquire.daemon.report import Rates, arm_statuses, delivered_lines
 from acquire.daemon.states import Event, State, after, commands
@@ -26,14 +28,16 @@ from acquire.stream import CaptureStatus
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-    from pathlib import Path
 
     from acquire.config import RigConfig
-    from acquire.daemon.messages import StartRequest
+    from acquire.daemon.messages import CapacityStatus, StartRequest
+    from acquire.stream import Window
+    from acquire.stream.messages import Note
 
 DRAIN_TIMEOUT_S = 30.0
 """From the last line's number to the sealed recording; more is a fault."""
 POLL_S = 0.05
+ARM = ArmRequest()
 
 log = logging.getLogger("acquire.daemon")
 
@@ -44,18 +48,29 @@ class Run(Protocol):
     run_id: str
 
     def arm(self) -> None: ...
-    def start(self, path: Path, lines: int | None) -> None: ...
+    def start(self, path: Path, lines: int | None, window: Window, *, resume: bool = False) -> Path: ...
+    def mark(self, text: str) -> Note: ...
+    def extend(self, line: int) -> None: ...
+    def events(self) -> list[Note]: ...
     def stop(self, reason: str) -> None: ...
     def poll(self) -> CaptureStatus: ...
     def close(self) -> None: ...
 
 
+class Prove(Protocol):
+    """What the service needs of `acquire.daemon.proof.Proof`."""
+
+    def __call__(self, *, force: bool) -> CapacityStatus: ...
+
+
 class Service:
     """One instrument, at most one run at a time. See the module for who may call what."""
 
-    def __init__(self, config: RigConfig, open_run: Callable[[], Run]) -> None:
+    def __init__(self, config: RigConfig, open_run: Callable[[], Run], prove: Prove | None = None) -> None:
         self._config = config
         self._open_run = open_run
+        self._prove = prove
+        self._capacity: CapacityStatus | None = None
         self._hurried = threading.Event()
         self._born = time.monotonic()
         self._state = State.IDLE
@@ -64,6 +79,8 @@ class Service:
         self._run: Run | None = None
         self._seen = CaptureStatus()
         self._rates = Rates()
+        self._order = StandingOrder(config)
+        self._by_event = False
         self._target: tuple[Path, int | None] | None = None
         self._drain_until = math.inf
         self._last: LastRecording | None = None
@@ -82,9 +99,13 @@ class Service:
 
     # ---- commands
 
-    def arm(self) -> None:
-        """idle → armed. Raises what the devices refuse with; the state is idle then."""
+    def arm(self, request: ArmRequest = ARM) -> None:
+        """idle → armed. Raises what the devices refuse with, and UsageError where the host is too slow for
+        them and that is not forced; the state is idle then.
+        """
         with self._doing(Event.ARM):
+            if self._prove is not None:
+                self._capacity = self._prove(force=request.force)
             run = self._open_run()
             run.arm()
             self._run, self._seen, self._rates = run, CaptureStatus(), Rates()
@@ -94,13 +115,17 @@ class Service:
     def start(self, request: StartRequest) -> None:
         """armed → recording. Raises UsageError for a path that cannot be; the state is armed then."""
         with self._doing(Event.START):
-            assert self._run is not None
-            path = request.path or default_path(self._config)
-            lines = self._budget(request)
-            self._run.start(path, lines)
-            self._target = path, lines
-            self._go(Event.START, f"{path}, {'until stopped' if lines is None else f'{lines} lines'}")
+            rate_hz = self._config.line_rate_hz
+            window = window_of(request, rate_hz)
+            self._begin(request.path, budget_lines(request, rate_hz), window, resume=request.resume)
+            self._by_event = False
             self.supervise()
+
+    def mark(self, text: str) -> None:
+        """An event at the newest line; the state changes where it starts a recording."""
+        with self._doing(Event.MARK):
+            assert self._run is not None
+            self._heed(self._run.mark(text))
 
     def stop(self) -> None:
         """recording → draining → idle; returns once the recording is sealed and the devices are released."""
@@ -160,6 +185,9 @@ class Service:
         if seen.fault is not None:
             self._fail(seen.fault)
             return
+        assert self._run is not None
+        for note in self._run.events():
+            self._heed(note)
         if self._state is State.RECORDING and (seen.draining or seen.done):
             self._go(Event.FULL)
         if self._state is not State.DRAINING:
@@ -175,7 +203,31 @@ class Service:
         self._rates.look(delivered_lines(self._seen))
         return self._seen
 
+    def _begin(self, path: Path | None, lines: int | None, window: Window, *, resume: bool = False) -> None:
+        assert self._run is not None
+        path = self._run.start(path or default_path(self._config), lines, window, resume=resume)
+        if window.post_lines is not None:
+            lines = window.pre_lines + window.post_lines
+        self._target = path, lines
+        self._go(Event.START, f"{path}, {'until stopped' if lines is None else f'{lines} lines'}")
+
+    def _heed(self, note: Note) -> None:
+        """Do at an event what the rig asks for."""
+        assert self._run is not None
+        log.info("event: %s at line %d%s", note.kind, note.line, f": {note.text}" if note.text else "")
+        if not self._order.covers(note):
+            return
+        if self._state is State.ARMED:
+            self._begin(None, None, self._order.window(note))
+            self._by_event = True
+        elif self._state is State.RECORDING and self._by_event:
+            self._run.extend(self._order.end_line(note))
+
     def _finish(self) -> None:
+        if self._by_event and self._order.rearm and self._seen.done and not self._hurried.is_set():
+            self._remember()
+            self._go(Event.KEPT, self._last_words())
+            return
         self._release()
         if self._seen.condition is RunCondition.ABORTED:
             self._fail(f"the recording was aborted: {self._seen.end_reason}")
@@ -216,6 +268,9 @@ class Service:
         if self._target is None:
             return
         (path, _), self._target = self._target, None
+        if self._seen.path not in (None, str(path)):
+            log.warning("%s was cut off; acquire recover %s seals it", path, path)
+        path = Path(self._seen.path or path)
         self._last = LastRecording(
             path=path,
             lines=self._seen.committed_lines,
@@ -259,11 +314,6 @@ class Service:
         log.log(level, "%s → %s (%s%s)", before, self._state, event, f": {why}" if why else "")
         self._publish()
 
-    def _budget(self, request: StartRequest) -> int | None:
-        if request.duration_s is None:
-            return request.lines
-        return math.ceil(request.duration_s * self._config.line_rate_hz)
-
     def _publish(self) -> None:
         self._status = Status(
             state=self._state,
@@ -279,6 +329,8 @@ class Service:
             arms=arm_statuses(self._seen, self._rates),
             last=self._last,
             fault=self._fault,
+            capacity=self._capacity,
+            processes={} if self._run is None else self._seen.pids,
         )
 
     def _recording(self) -> RecordingStatus | None:
@@ -286,7 +338,7 @@ class Service:
             return None
         path, budget = self._target
         return RecordingStatus(
-            path=path,
+            path=Path(self._seen.path or path),
             first_line=self._seen.first_line,
             budget_lines=budget,
             recorded_lines=self._seen.recorded_lines,

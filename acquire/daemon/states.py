@@ -4,13 +4,15 @@
 
                 ARM             START               STOP, FULL               SEALED
        idle ──────────▶ armed ──────────▶ recording ──────────▶ draining ──────────▶ idle
-         ▲               │  │                 │                    │
+         ▲               │  │ ▲               │                    │
+         │               │  │ └───── KEPT ────┼────────────────────┤
          ├── DISARM ─────┘  │ FAULT           │ FAULT              │ FAULT
          │                  ▼                 ▼                    ▼
          └── DISARM ───────────────────── faulted ◀────────────────┘
 
-ARM, START, STOP and DISARM are commands; FULL (the line budget is recorded), SEALED (the recording is
-closed and the devices are released) and FAULT come from the capture path. What is not drawn is refused.
+ARM, START, MARK (armed or recording, which it stays), STOP and DISARM are commands; FULL (the line budget is
+recorded), SEALED (the recording is closed and the devices are released), KEPT (it is closed, and the devices
+wait for the next event) and FAULT come from the capture path. What is not drawn is refused.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ class State(StrEnum):
     IDLE = "idle"
     """No device is in use."""
     ARMED = "armed"
-    """The trigger runs, the cameras deliver, every line is discarded."""
+    """The trigger runs, the cameras deliver; the rings hold the latest lines, and let the oldest go."""
     RECORDING = "recording"
     """Lines are written."""
     DRAINING = "draining"
@@ -40,25 +42,30 @@ class Event(StrEnum):
 
     ARM = "arm"
     START = "start"
+    MARK = "mark"
     STOP = "stop"
     DISARM = "disarm"
     FULL = "full"
     SEALED = "sealed"
+    KEPT = "kept"
     FAULT = "fault"
 
 
-COMMANDS = (Event.ARM, Event.START, Event.STOP, Event.DISARM)
+COMMANDS = (Event.ARM, Event.START, Event.MARK, Event.STOP, Event.DISARM)
 """Events that a user can cause."""
 
 TABLE: dict[tuple[State, Event], State] = {
     (State.IDLE, Event.ARM): State.ARMED,
     (State.ARMED, Event.START): State.RECORDING,
+    (State.ARMED, Event.MARK): State.ARMED,
     (State.ARMED, Event.DISARM): State.IDLE,
     (State.ARMED, Event.FAULT): State.FAULTED,
+    (State.RECORDING, Event.MARK): State.RECORDING,
     (State.RECORDING, Event.STOP): State.DRAINING,
     (State.RECORDING, Event.FULL): State.DRAINING,
     (State.RECORDING, Event.FAULT): State.FAULTED,
     (State.DRAINING, Event.SEALED): State.IDLE,
+    (State.DRAINING, Event.KEPT): State.ARMED,
     (State.DRAINING, Event.FAULT): State.FAULTED,
     (State.FAULTED, Event.DISARM): State.IDLE,
 }

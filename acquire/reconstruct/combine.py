@@ -16,6 +16,7 @@ from acquire.errors import AcquireError
 from acquire.recon.segments import Stitcher
 from acquire.reconstruct.work import Task
 from acquire.store import VideoWriter
+from acquire.store.remote import is_url
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -79,7 +80,8 @@ def combine(
     """
     began, grid = time.monotonic(), request.grid
     segments = request.stream.arrange(request.stretches, request.fade)
-    tasks = [Task(str(recording.path), segment, grid, options) for segment in segments]
+    place = str(recording) if is_url(str(recording)) else str(recording.path.resolve())
+    tasks = [Task(place, segment, grid, options) for segment in segments]
     clock = _Clock.of(recording, request)
     stitcher, parts = Stitcher(grid), []
     with VideoWriter(
@@ -190,7 +192,7 @@ def describe_parts(
     ]
     voxels = request.grid.voxels
     return {
-        "recording": str(recording.path),
+        "recording": str(recording),
         "run_id": recording.attrs["run_id"],
         "first_line": min(part["first_line"] for part in parts),
         "lines": max(part["first_line"] + part["lines"] for part in parts)

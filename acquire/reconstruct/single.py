@@ -38,7 +38,7 @@ def describe(result: Reconstruction, recording: Recording, segment: Segment) -> 
     """Where a video comes from and how good it is, as JSON."""
     quality = {key: value if math.isfinite(value) else None for key, value in asdict(result.quality).items()}
     return {
-        "recording": str(recording.path),
+        "recording": str(recording),
         "run_id": recording.attrs["run_id"],
         "first_line": segment.first_line,
         "lines": segment.geometry.lines,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -61,7 +60,7 @@ class Watch(Protocol):
 def solve(task: Task, watch: Watch) -> Part:
     """Cut, reconstruct, bring to the grid. Raises what `Recording.cut` and `reconstruct` raise."""
     segment, options, voxels = task.segment, task.options, task.segment.voxels
-    lines = open_recording(Path(task.recording)).cut(segment.first_line, segment.lines)
+    lines = open_recording(task.recording).cut(segment.first_line, segment.lines)
 
     def advanced(progress: Progress) -> None:
         watch.advance(1 / progress.iterations)

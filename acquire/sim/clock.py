@@ -48,7 +48,10 @@ _PAYLOAD_AT = _RECORD_AT + _RECORD.size
 _ROOM = _PAGE - _PAYLOAD_AT - 64
 """Bytes for a train when it starts; the number it stops after comes on top."""
 _POLL_S = 0.002
-"""How often a waiter looks for a start or a stop; pulses themselves are awaited by their due time."""
+"""How often a waiter looks for a start; pulses themselves are awaited by their due time."""
+_STOP_POLL_S = 0.008
+"""How often it looks for a stop while pulses come: often would be most of what a fast camera costs."""
+_WRITE_S = 1e-5
 _TORN_S = 1.0
 """A write takes microseconds: a sequence that stays odd this long belongs to a writer that died."""
 
@@ -206,10 +209,10 @@ class Wire:
             now_ns = self.clock.monotonic_ns()
             if now_ns >= deadline_ns:
                 return reading
-            wake_ns = deadline_ns
-            if reading.train is not None and reading.running:
-                wake_ns = min(wake_ns, reading.train.due_ns(pulses - 1))
-            self.clock.sleep(min(_POLL_S, max(wake_ns - now_ns, 1) * 1e-9))
+            wake_ns, nap_s = deadline_ns, _POLL_S
+            if reading.train is not None and reading.running and reading.run == run:
+                wake_ns, nap_s = min(wake_ns, reading.train.due_ns(pulses - 1)), _STOP_POLL_S
+            self.clock.sleep(min(nap_s, max(wake_ns - now_ns, 1) * 1e-9))
 
     def _observe(self) -> tuple[int, Reading]:
         """A sequence and the reading that belongs to it."""
@@ -220,7 +223,7 @@ class Wire:
                 train, now_ns = self._known[1], self.clock.monotonic_ns()
                 if self._sequence() == sequence == self._known[0]:
                     return sequence, Reading(train, 0 if train is None else train.issued(now_ns))
-            time.sleep(0)
+            time.sleep(_WRITE_S)  # not 0: a reader in real time would keep the writer from going on
         raise DeviceError("the simulated trigger died while it wrote on the wire")
 
     def _sequence(self) -> int:

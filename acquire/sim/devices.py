@@ -11,7 +11,7 @@ from __future__ import annotations
 import multiprocessing
 from collections import deque
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -33,6 +33,23 @@ if TYPE_CHECKING:
     from acquire.scene_config import SceneConfig
     from acquire.sim.clock import PulseTrain, Reading, Wire
     from acquire.sim.pins import PinWire
+
+
+class Sensor(Protocol):
+    """Gives lines by their numbers."""
+
+    def read(self, first_line: int, count: int) -> Readout: ...
+
+
+class Optics(Protocol):
+    """What stands in front of a simulated sensor."""
+
+    @property
+    def geometry(self) -> GeometryConfig: ...
+
+    def expose(self, train: PulseTrain, code: Code, config: CameraConfig) -> Sensor:
+        """The lines that the camera gives under a train's timing and the light's code."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +78,7 @@ class SimulatedCamera:
     def __init__(
         self,
         wire: Wire | PinWire,
-        optics: SimulatedOptics,
+        optics: Optics,
         config: CameraConfig,
         block_lines: int,
         line_rate_hz: float,
@@ -74,7 +91,7 @@ class SimulatedCamera:
         self._delivered = 0
         self._lost = 0
         self._ready: deque[CameraBlock] = deque()
-        self._light: Camera | None = None
+        self._light: Sensor | None = None
 
     def identify(self) -> CameraIdentity:
         return CameraIdentity("acquire", "simulated TDI camera", self._config.serial, __version__)
@@ -135,7 +152,9 @@ class SimulatedCamera:
             raise CameraError("times were asked of a camera without its pulses")
         spacing = train.line_period_ns / train.speed
         pulses = self._first_pulse + first_line + np.arange(count, dtype=np.int64)
-        times: NDArray[np.int64] = train.start_ns - (-pulses * spacing.numerator // spacing.denominator)
+        whole, rest = divmod(spacing.numerator, spacing.denominator)
+        late = pulses * whole - (-pulses * rest // spacing.denominator)  # the product as it is would overflow
+        times: NDArray[np.int64] = train.start_ns + late
         return times
 
     def release(self, block: CameraBlock) -> None:
@@ -174,20 +193,22 @@ class SimulatedCamera:
         first_line = self._first_pulse + self._delivered - self._depth_lines
         lines = self._light.read(first_line, count)
         if not lines.missing.any():
-            block = CameraBlock(self._delivered, lines.pixels, np.zeros(count, np.uint16))
+            time_ns = int(self.times_ns(self._delivered, 1)[0])
+            block = CameraBlock(self._delivered, lines.pixels, np.zeros(count, np.uint16), time_ns=time_ns)
             self._delivered += count
             return block
         self._lost += int(lines.missing.sum())
-        self._ready.extend(_whole_runs(self._delivered, lines))
+        self._ready.extend(_whole_runs(self._delivered, lines, self.times_ns(self._delivered, count)))
         self._delivered += count
         return self._ready.popleft() if self._ready else None
 
 
-def _whole_runs(first: int, lines: Readout) -> Iterator[CameraBlock]:
+def _whole_runs(first: int, lines: Readout, times_ns: NDArray[np.int64]) -> Iterator[CameraBlock]:
     """The stretches between lines that did not come."""
     edges = np.flatnonzero(np.diff(lines.missing, prepend=True, append=True))
     for begin, end in edges.reshape(-1, 2).tolist():
-        yield CameraBlock(first + begin, lines.pixels[begin:end], np.zeros(end - begin, np.uint16))
+        flags = np.zeros(end - begin, np.uint16)
+        yield CameraBlock(first + begin, lines.pixels[begin:end], flags, time_ns=int(times_ns[begin]))
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,28 +1,58 @@
 """Recordings and videos on disk: Zarr v3 that zarr-python, xarray and tensorstore open without us.
 
-Downwards: `writer` · `reader` · `video`; `arm_writer` · `camera_stream` one arm; `table` gaps and events;
-`layout` metadata; `spec` what a recording says of itself; `shard` one growing array; `files` the disk.
+::
+
+    whole recordings   writer                     reader, opening           verify  recover  mirror  video
+      with             retention room resume                                scan    mend
+    one arm            arm_writer                 camera_stream
+    one array          array_writer → shard       chunks                    tables: table, table_reader
+    what is written    spec (attributes), layout (metadata), codecs (bytes)
+    where              files (disk), pages        source → disk | remote (URLs)
 """
 
 from acquire.store.camera_stream import CameraStream
-from acquire.store.reader import Event, Gap, Recording, format_of, open_recording
+from acquire.store.codecs import Codec, CodecChoice, choose_codec
+from acquire.store.files import measure_disk
+from acquire.store.mirror import Mirrored, mirror
+from acquire.store.opening import format_of, open_recording
+from acquire.store.reader import Recording
+from acquire.store.recover import Recovery, recover
+from acquire.store.resume import Continuation, next_segment
+from acquire.store.retention import Hold, Retention, hold
 from acquire.store.spec import FORMAT, RecordingSpec, RunCondition
+from acquire.store.table_reader import Event, Gap
+from acquire.store.verify import Verification, verify
 from acquire.store.video import VideoFile, VideoWriter, open_video, write_video
 from acquire.store.writer import RecordingWriter
 
 __all__ = [
     "FORMAT",
     "CameraStream",
+    "Codec",
+    "CodecChoice",
+    "Continuation",
     "Event",
     "Gap",
+    "Hold",
+    "Mirrored",
     "Recording",
     "RecordingSpec",
     "RecordingWriter",
+    "Recovery",
+    "Retention",
     "RunCondition",
+    "Verification",
     "VideoFile",
     "VideoWriter",
+    "choose_codec",
     "format_of",
+    "hold",
+    "measure_disk",
+    "mirror",
+    "next_segment",
     "open_recording",
     "open_video",
+    "recover",
+    "verify",
     "write_video",
 ]

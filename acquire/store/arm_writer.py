@@ -2,29 +2,48 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import TYPE_CHECKING
 
 from acquire.errors import DataError
 from acquire.store import layout
-from acquire.store.shard import ArrayWriter
+from acquire.store.array_writer import ArrayWriter
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from concurrent.futures import ThreadPoolExecutor
     from pathlib import Path
 
     from acquire.lines import TaggedBlock
-    from acquire.store.files import Publisher
+    from acquire.store.codecs import EncodeOnce
+    from acquire.store.files import Disk, Publisher
     from acquire.store.spec import RecordingSpec
 
 
 class ArmWriter:
     """The arrays of one arm; all of them get the same rows."""
 
-    def __init__(self, directory: Path, spec: RecordingSpec) -> None:
+    def __init__(
+        self,
+        directory: Path,
+        spec: RecordingSpec,
+        disk: Disk,
+        pool: ThreadPoolExecutor | None,
+        once: Mapping[str, EncodeOnce],
+    ) -> None:
         self.directory = directory
         self._first_line = spec.first_line
-        durable = spec.fsync == "commit"
+        self._disk = disk
         self._arrays = {
-            column: ArrayWriter(directory / column.name, layout.column_shape(column, spec), durable=durable)
+            column: ArrayWriter(
+                directory / column.name,
+                layout.column_shape(column, spec),
+                durable=spec.fsync == "commit",
+                padding=column.fill,
+                disk=disk,
+                pool=pool if column.name == "lines" else None,
+                once=once.get(column.name),
+            )
             for column in layout.line_columns(spec.dtype)
         }
 
@@ -33,17 +52,27 @@ class ArmWriter:
         return self._first_line + min(array.rows for array in self._arrays.values())
 
     @property
-    def whole_rows(self) -> int:
+    def written_rows(self) -> int:
         """Rows that are on disk in every array, in whole chunks."""
+        return min(array.written_rows for array in self._arrays.values())
+
+    @property
+    def whole_rows(self) -> int:
+        """Of these, what is in the indices of all their shards."""
         return min(array.whole_rows for array in self._arrays.values())
 
     @property
     def bytes_written(self) -> int:
         return sum(array.bytes_written for array in self._arrays.values())
 
+    @property
+    def direct(self) -> bool:
+        """Lines are written past the page cache."""
+        return any(array.direct for array in self._arrays.values())
+
     def create(self) -> None:
         for array in self._arrays.values():
-            array.directory.mkdir(parents=True)
+            self._disk.make_directory(array.directory, parents=True)
 
     def begin(self, first_line: int) -> None:
         """Row 0 is line ``first_line``; before the first `append`."""
@@ -58,6 +87,17 @@ class ArmWriter:
         for array in self._arrays.values():
             array.pad()
 
+    def settle(self) -> None:
+        """Wait for what is being encoded, write it, and put all that is written into the indices."""
+        for array in self._arrays.values():
+            array.settle()
+
+    def publish_chunks(self) -> None:
+        """Put what is written into the indices, as far as the disk lets it."""
+        for array in self._arrays.values():
+            with contextlib.suppress(OSError):
+                array.publish()
+
     def sync(self) -> None:
         for array in self._arrays.values():
             array.sync()
@@ -66,17 +106,18 @@ class ArmWriter:
         for array in self._arrays.values():
             array.close()
 
-    def publish(self, publisher: Publisher, rows: int) -> dict[str, layout.Document]:
-        """Make ``rows`` rows visible; returns the metadata by path below the recording."""
+    def publish(self, publisher: Publisher, rows: int, *, own: bool) -> dict[str, layout.Document]:
+        """Metadata of ``rows`` rows, by path below the recording; ``own``: what lies in the arm's directory
+        is replaced by it, too.
+        """
         documents = {
             column.name: layout.line_array(column, array.shape, rows)
             for column, array in self._arrays.items()
         }
-        for name, document in documents.items():
-            publisher.replace(self.directory / name / "zarr.json", layout.to_json(document))
         arm = self.directory.name
         group = layout.group_document({"arm": arm, "first_line": self._first_line}, documents)
-        publisher.replace(self.directory / "zarr.json", layout.to_json(group))
+        for name, document in (documents | {"": group}).items() if own else ():
+            publisher.replace(self.directory / name / "zarr.json", layout.to_json(document))
         return {arm: group} | {f"{arm}/{name}": document for name, document in documents.items()}
 
     def _check(self, block: TaggedBlock) -> None:

@@ -8,30 +8,59 @@ import numpy as np
 import zarr
 
 from acquire.errors import DataError
-from acquire.store.shard import ABSENT, read_index, shard_path
+from acquire.store.chunks import AbsentChunkError, ChunkReader, DamagedChunkError
+from acquire.store.layout import line_columns
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from collections.abc import Callable
 
     from numpy.typing import NDArray
+
+    from acquire.store.layout import Document
+    from acquire.store.source import Source
 
 DAMAGE = (OSError, ValueError, RuntimeError, LookupError, TypeError, AttributeError, ArithmeticError)
 """What zarr and arithmetic raise for metadata or chunks that are not what they should be."""
 
-READ_ATTEMPTS = 3
-"""A chunk's index may be met in the instant of its replacement; its checksum tells, and it is read again."""
-
 
 class CameraStream:
-    """One arm: arrays that are read when they are sliced; row i of each is line ``first_line + i``."""
+    """One arm: arrays that are read when they are sliced; row i of each is line ``first_line + i``.
 
-    def __init__(self, path: Path, group: zarr.Group, first_line: int) -> None:
-        self.path = path
+    ``documents`` are the metadata of its arrays by name, ``group`` opens it in zarr-python.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        arm: str,
+        documents: dict[str, Document],
+        first_line: int,
+        group: Callable[[], zarr.Group],
+    ) -> None:
+        self.arm = arm
         self.first_line = first_line
+        self._source = source
         self._group = group
+        self._readers = {
+            column.name: ChunkReader(source, f"{arm}/{column.name}", documents[column.name])
+            for column in line_columns("any")
+        }
 
     def __len__(self) -> int:
-        return int(self.lines.shape[0])
+        return self._readers["lines"].rows
+
+    def __str__(self) -> str:
+        return f"{self._source}/{self.arm}"
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Of a sample."""
+        return self._readers["lines"].shape.dtype
+
+    @property
+    def pixels(self) -> int:
+        """Samples of a line."""
+        return self._readers["lines"].shape.row_shape[0]
 
     @property
     def lines(self) -> zarr.Array[Any]:
@@ -70,39 +99,39 @@ class CameraStream:
 
     def array(self, name: str) -> zarr.Array[Any]:
         """The Zarr array ``name`` of this arm."""
-        return child_array(self._group, name)
+        return child_array(self._group(), f"{self.arm}/{name}")
+
+    def reader(self, name: str) -> ChunkReader:
+        """The chunks of the array ``name``."""
+        return self._readers[name]
 
     def read(self, name: str, start: int, stop: int) -> NDArray[Any]:
         """Rows ``start .. stop - 1`` of one array; DataError when they are not intact on disk."""
-        array = self.array(name)
-        absent = _first_absent_row(self.path / name, array, range(start, stop))
-        if absent is not None:
+        try:
+            return self._readers[name].read(start, stop)
+        except AbsentChunkError as error:
             raise DataError(
-                f"{self.path / name}: line {self.first_line + absent} is recorded, but not on disk",
-                hint="a copy of the recording: one of its files was lost or cut short",
-            )
-        return self._read_intact(array, name, slice(start, stop))
+                f"{self}/{name}: line {self.first_line + self._first_absent(name, start, stop)} is recorded, "
+                "but not on disk",
+                hint="`acquire verify` says which lines are left; a file was lost or cut short",
+            ) from error
+        except (DamagedChunkError, OSError) as error:
+            raise DataError(
+                f"{self}/{name}: lines {self.first_line + start} to {self.first_line + stop - 1} cannot be "
+                f"read: {error}",
+                hint="`acquire verify` says which lines are intact",
+            ) from error
 
-    def _read_intact(self, array: zarr.Array[Any], name: str, rows: slice) -> NDArray[Any]:
-        for attempt in range(1, READ_ATTEMPTS + 1):
+    def _first_absent(self, name: str, start: int, stop: int) -> int:
+        """The first of these rows whose chunk is not in its file."""
+        reader = self._readers[name]
+        size = reader.shape.chunk_rows
+        for chunk in range(start // size, -(-stop // size)):
             try:
-                return np.asarray(array[rows])
-            except DAMAGE as error:
-                if attempt == READ_ATTEMPTS:
-                    lines = f"lines {self.first_line + rows.start} to {self.first_line + rows.stop - 1}"
-                    raise DataError(
-                        f"{self.path / name}: {lines} cannot be read: {error}",
-                        hint="other lines, or a copy of the recording",
-                    ) from error
-        raise AssertionError
-
-
-def child_group(group: zarr.Group, name: str) -> zarr.Group:
-    """The group ``name`` inside ``group``; TypeError when it is something else."""
-    node = group[name]
-    if not isinstance(node, zarr.Group):
-        raise TypeError(f"{name} is not a group")
-    return node
+                reader.entry(chunk)
+            except AbsentChunkError:
+                return max(start, chunk * size)
+        return start
 
 
 def child_array(group: zarr.Group, name: str) -> zarr.Array[Any]:
@@ -111,17 +140,3 @@ def child_array(group: zarr.Group, name: str) -> zarr.Array[Any]:
     if not isinstance(node, zarr.Array):
         raise TypeError(f"{name} is not an array")
     return node
-
-
-def _first_absent_row(directory: Path, array: zarr.Array[Any], rows: range) -> int | None:
-    """The first of ``rows`` whose chunk is not in its shard: zarr itself would give zeros without a word."""
-    assert array.shards is not None
-    chunk_rows, shard_chunks = array.chunks[0], array.shards[0] // array.chunks[0]
-    chunks = range(rows.start // chunk_rows, -(-rows.stop // chunk_rows))
-    for shard in range(chunks.start // shard_chunks, -(-chunks.stop // shard_chunks)):
-        index = read_index(shard_path(directory, shard, array.ndim), shard_chunks)
-        here = range(max(chunks.start, shard * shard_chunks), min(chunks.stop, (shard + 1) * shard_chunks))
-        for chunk in here:
-            if index[chunk % shard_chunks, 0] == ABSENT:
-                return max(rows.start, chunk * chunk_rows)
-    return None

@@ -1,19 +1,34 @@
-"""What the store asks of a file system: whole writes, atomic replacement, forcing to the medium."""
+"""What the store asks of a file system: whole writes, atomic replacement, forcing to the medium.
+
+Every change that the store makes on a disk is a method of `Disk` or of the `ShardFile` that it opens, so that
+tests can put a disk in its place that fails, that is slow, or that loses its power between any two of them.
+"""
 
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
+import shutil
+import time
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from acquire.errors import UsageError
+from acquire.errors import StateError, UsageError
+from acquire.store.pages import aligned_bytes, open_direct
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from typing_extensions import Buffer
+
+SCRATCH = ".next"
+"""Where new metadata of a recording is prepared, beside the shards of its first array."""
+
+NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
+"""What a file system without locks answers; some network disks are such."""
 
 
 def check_new_path(path: Path) -> None:
@@ -37,38 +52,191 @@ def _is_taken(path: Path) -> bool:
     return True
 
 
-def write_all(fd: int, data: Buffer, offset: int) -> None:
-    """Write all of ``data`` (contiguous) at ``offset``; a short write goes on until the disk says why."""
-    view = memoryview(data).cast("B")
-    while len(view):
-        written = os.pwrite(fd, view, offset)
+def write_all(fd: int, parts: Sequence[Buffer], offset: int) -> None:
+    """Write all of ``parts`` from ``offset`` on; a short write goes on until the disk says why."""
+    views = [memoryview(part).cast("B") for part in parts]
+    while views := [view for view in views if len(view)]:
+        written = os.pwritev(fd, views, offset)
         if written == 0:
             raise OSError(errno.EIO, "the disk takes no more bytes")
-        view, offset = view[written:], offset + written
+        offset += written
+        for number, view in enumerate(views):
+            views[number] = view[written:]
+            written -= min(written, len(view))
 
 
-def sync_directory(path: Path) -> None:
-    """Force the entries of a directory to the medium."""
-    _sync(path, os.O_DIRECTORY)
+class ShardFile:
+    """A new file of chunks: an index in its first page, which is replaced in place, and pages that follow.
+
+    With ``direct`` the pages go past the page cache where the file system allows it: the memory that they
+    come from is read by the disk itself. Elsewhere they go through it, and are dropped from it once they are
+    written, since a cache that fills up stalls whoever writes.
+    """
+
+    def __init__(self, path: Path, *, direct: bool) -> None:
+        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+        self._direct = open_direct(path) if direct else -1
+        self._cached = (0, 0)
+
+    @property
+    def direct(self) -> bool:
+        """Pages go past the page cache."""
+        return self._direct >= 0
+
+    def write_pages(self, parts: Sequence[Buffer], offset: int) -> None:
+        """Write whole pages from page-aligned memory at ``offset``, a multiple of the page."""
+        if self.direct and self._write_direct(parts, offset):
+            return
+        self.write(parts, offset)
+        os.posix_fadvise(self._fd, *self._cached, os.POSIX_FADV_DONTNEED)
+        self._cached = offset, sum(memoryview(part).nbytes for part in parts)
+
+    def _write_direct(self, parts: Sequence[Buffer], offset: int) -> bool:
+        """False once the file system refuses this way: it wants larger pages, or took part of one."""
+        try:
+            write_all(self._direct, parts, offset)
+        except OSError as error:
+            if error.errno != errno.EINVAL:
+                raise
+            os.close(self._direct)
+            self._direct = -1
+        return self.direct
+
+    def write(self, parts: Sequence[Buffer], offset: int) -> None:
+        """Write bytes anywhere, through the page cache."""
+        write_all(self._fd, parts, offset)
+
+    def sync(self) -> None:
+        """Force the file's bytes to the medium, by whichever way they were written."""
+        os.fdatasync(self._fd)
+
+    def close(self) -> None:
+        """Idempotent."""
+        fds, self._fd, self._direct = (self._fd, self._direct), -1, -1
+        for fd in fds:
+            if fd >= 0:
+                os.close(fd)
 
 
-def sync_tree(path: Path) -> None:
-    """Force every file and directory below ``path``, and ``path`` itself, to the medium."""
-    for directory, files in _walk(path):
-        for file in files:
-            _sync(file)
-        sync_directory(directory)
+class Disk:
+    """The local file system. Raises OSError as the system gives it."""
+
+    def make_directory(self, path: Path, *, parents: bool = False) -> None:
+        """Make one; with ``parents``, also those above, and none of them need be new."""
+        path.mkdir(parents=parents, exist_ok=parents)
+
+    def create(self, path: Path, *, direct: bool) -> ShardFile:
+        """A new file of chunks."""
+        return ShardFile(path, direct=direct)
+
+    def write_file(self, path: Path, data: Buffer, *, durable: bool) -> None:
+        """Write a whole small file, over what was there; ``durable`` forces its bytes to the medium."""
+        fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
+        try:
+            write_all(fd, [data], 0)
+            if durable:
+                os.fsync(fd)
+        finally:
+            os.close(fd)
+
+    def patch(self, path: Path, data: Buffer, offset: int) -> None:
+        """Replace bytes of a file that exists, or add some behind its end."""
+        fd = os.open(path, os.O_WRONLY | os.O_CLOEXEC)
+        try:
+            write_all(fd, [data], offset)
+        finally:
+            os.close(fd)
+
+    def reserve(self, path: Path, size: int) -> None:
+        """A file that keeps ``size`` bytes of the disk for later; remove it to have them."""
+        with path.open("wb") as file:
+            os.posix_fallocate(file.fileno(), 0, size)
+
+    def rename(self, source: Path, target: Path) -> None:
+        """Replace ``target`` in one step."""
+        source.replace(target)
+
+    def remove(self, path: Path) -> None:
+        """Remove a file; no matter if there is none."""
+        path.unlink(missing_ok=True)
+
+    def remove_tree(self, path: Path) -> None:
+        """Remove a directory with all below it, as far as that can be done."""
+        shutil.rmtree(path, ignore_errors=True)
+
+    def sync_directory(self, path: Path) -> None:
+        """Force the entries of a directory to the medium."""
+        _sync(path, os.O_DIRECTORY)
+
+    def sync_tree(self, path: Path) -> None:
+        """Force every file and directory below ``path``, and ``path`` itself, to the medium."""
+        for directory, files in _walk(path):
+            for file in files:
+                _sync(file)
+            self.sync_directory(directory)
+
+    def free_bytes(self, path: Path) -> int:
+        """What the file system of ``path`` can still take from us."""
+        room = os.statvfs(path)
+        return room.f_bavail * room.f_frsize
 
 
-def reserve(path: Path, size: int) -> None:
-    """A file that keeps ``size`` bytes of the disk for later; delete it to have them."""
-    with path.open("wb") as file:
-        os.posix_fallocate(file.fileno(), 0, size)
+DISK = Disk()
+"""The one that is used unless told otherwise."""
+
+
+def measure_disk(directory: Path, size: int = 2**27) -> float:
+    """Bytes per second that the disk of ``directory`` takes, past the page cache where that can be.
+
+    Writes ``size`` bytes and deletes them. Raises OSError.
+    """
+    block = aligned_bytes(2**22)
+    path = directory / f".acquire-{os.getpid()}.measure"
+    file = ShardFile(path, direct=True)
+    try:
+        begun = time.perf_counter()
+        for offset in range(0, size, len(block)):
+            file.write_pages([block.data], offset)
+        file.sync()
+        return size / (time.perf_counter() - begun)
+    finally:
+        file.close()
+        path.unlink()
 
 
 def tree_bytes(path: Path) -> int:
-    """Bytes of all files below ``path``."""
+    """Bytes that all files below ``path`` take of the disk."""
     return sum(file.stat().st_size for _, files in _walk(path) for file in files)
+
+
+@contextmanager
+def locked(path: Path, doing: str) -> Iterator[None]:
+    """Hold the directory ``path`` for ourselves; StateError while another process does. Ends with us.
+
+    On a file system without locks it is taken for free.
+    """
+    fd = lock(path, doing)
+    try:
+        yield
+    finally:
+        os.close(fd)
+
+
+def lock(path: Path, doing: str) -> int:
+    """A descriptor that holds the directory ``path`` until it is closed; see `locked`."""
+    fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(fd)
+        raise StateError(
+            f"{doing} {path}: another process is writing it", hint="when its recording has ended"
+        ) from error
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            os.close(fd)
+            raise
+    return fd
 
 
 def _walk(path: Path) -> Iterator[tuple[Path, list[Path]]]:
@@ -94,16 +262,11 @@ class Publisher:
     """
 
     scratch: Path
+    disk: Disk = DISK
 
     def replace(self, path: Path, data: Buffer, *, durable: bool = False) -> None:
         """Replace ``path``; ``durable`` forces bytes and name to the medium before it returns."""
-        fd = os.open(self.scratch, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
-        try:
-            write_all(fd, data, 0)
-            if durable:
-                os.fsync(fd)
-        finally:
-            os.close(fd)
-        self.scratch.replace(path)
+        self.disk.write_file(self.scratch, data, durable=durable)
+        self.disk.rename(self.scratch, path)
         if durable:
-            sync_directory(path.parent)
+            self.disk.sync_directory(path.parent)

@@ -18,30 +18,42 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.lines import LineFlag
+from acquire.store.codecs import codec_of
 from acquire.store.shard import ArrayShape
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from acquire.store.shard import Codec
+    from acquire.store.codecs import Codec
     from acquire.store.spec import RecordingSpec
 
 Document = dict[str, Any]
 """The content of one zarr.json."""
 
+PARSE_ERRORS = (LookupError, TypeError, ValueError, AttributeError)
+"""What a document that is not what it should be raises when it is taken apart."""
+
+DATA_TYPES = ("uint8", "uint16", "uint64", "int64")
+
 BYTES = {"name": "bytes", "configuration": {"endian": "little"}}
 CRC32C = {"name": "crc32c"}
 VLEN_UTF8 = {"name": "vlen-utf8", "configuration": {}}
+NO_LINE = 2**64 - 1
+"""Code index of a row that never was a line: it fills up a last chunk, or is not on disk."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Column:
-    """One array of an arm: its name in the recording, where a TaggedBlock has it, and its attributes."""
+    """One array of an arm: its name in the recording, where a TaggedBlock has it, and its attributes.
+
+    ``fill`` is what a reader meets where there is nothing on disk, and what fills up the last chunk.
+    """
 
     name: str
     source: str
     dtype: str
     attributes: dict[str, Any] = field(default_factory=dict)
+    fill: int = 0
 
 
 def line_columns(dtype: str) -> tuple[Column, ...]:
@@ -67,6 +79,7 @@ TAG_COLUMNS = (
             "units": "1",
             "description": "the code's bit k gates the light in sub-step k of the run; one bit per sub-step",
         },
+        fill=NO_LINE,
     ),
     Column(
         "code",
@@ -107,8 +120,13 @@ TAG_COLUMNS = (
             "flag_masks": [int(flag) for flag in LineFlag],
             "flag_meanings": " ".join(flag.name.lower() for flag in LineFlag if flag.name),
         },
+        fill=int(LineFlag.MISSING),
     ),
 )
+
+
+SAME_IN_BOTH_ARMS = ("code_index", "code", "tick", "time")
+"""Arrays whose rows follow from the line's number."""
 
 
 def column_shape(column: Column, spec: RecordingSpec) -> ArrayShape:
@@ -139,7 +157,24 @@ def line_array(column: Column, shape: ArrayShape, rows: int) -> Document:
         chunk_shape=shape.shard_shape,
         codecs=[{"name": "sharding_indexed", "configuration": sharding}],
         attributes=column.attributes,
+        fill=column.fill,
     )
+
+
+def parse_line_array(document: Document) -> tuple[ArrayShape, int]:
+    """How an array of `line_array` is cut into pieces, and its rows; one of `PARSE_ERRORS` for any other."""
+    (sharding,) = document["codecs"]
+    inner = sharding["configuration"]
+    rows, *row_shape = map(int, document["shape"])
+    chunk_rows, *chunk_rest = map(int, inner["chunk_shape"])
+    shard_rows, *shard_rest = map(int, document["chunk_grid"]["configuration"]["chunk_shape"])
+    if not row_shape == chunk_rest == shard_rest or min(rows + 1, chunk_rows, shard_rows // chunk_rows) < 1:
+        raise ValueError(f"shape {document['shape']} in chunks {inner['chunk_shape']}")
+    if inner["index_location"] != "start" or document["data_type"] not in DATA_TYPES:
+        raise ValueError(f"index at the {inner['index_location']}, samples {document['data_type']}")
+    dtype = np.dtype(document["data_type"]).newbyteorder("<")
+    codec = codec_of(inner["codecs"])
+    return ArrayShape(dtype, tuple(row_shape), chunk_rows, shard_rows // chunk_rows, codec), rows
 
 
 def array_document(
@@ -150,8 +185,9 @@ def array_document(
     chunk_shape: Sequence[int],
     codecs: list[Document],
     attributes: Mapping[str, Any],
+    fill: int = 0,
 ) -> Document:
-    """Metadata of any array; the fill value is 0, or the empty text."""
+    """Metadata of any array; a text's fill value is empty."""
     return {
         "zarr_format": 3,
         "node_type": "array",
@@ -159,7 +195,7 @@ def array_document(
         "data_type": data_type,
         "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(chunk_shape)}},
         "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
-        "fill_value": "" if data_type == "string" else 0,
+        "fill_value": "" if data_type == "string" else fill,
         "codecs": codecs,
         "attributes": dict(attributes),
         "dimension_names": list(dimensions),

@@ -6,10 +6,8 @@ open it again to see more. Nothing is read before it is asked for.
 
 from __future__ import annotations
 
-import json
-import math
-from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,47 +18,63 @@ from acquire.codes import code_from_attrs
 from acquire.errors import DataError, UsageError
 from acquire.geometry import Geometry
 from acquire.lines import ARMS, LineFlag, Segment
-from acquire.store.camera_stream import DAMAGE, CameraStream, child_array, child_group
-from acquire.store.files import tree_bytes
+from acquire.store.camera_stream import CameraStream
+from acquire.store.files import DISK
 from acquire.store.layout import line_columns
-from acquire.store.spec import CAMERA_KEYS, FORMAT
+from acquire.store.source import LocalSource
+from acquire.store.table_reader import read_events, read_gaps
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from collections.abc import Callable
 
     from numpy.typing import NDArray
 
+    from acquire.store.layout import Document
+    from acquire.store.source import Source
+    from acquire.store.table_reader import Event, Gap
+
+CUT_COLUMNS = ("lines", "flags", "code", "code_index", "time")
+"""Arrays that a segment is made of."""
+
 UNUSABLE = LineFlag.MISSING | LineFlag.INCOMPLETE
-
-
-@dataclass(frozen=True, slots=True)
-class Gap:
-    """Lines of one arm that were lost."""
-
-    arm: str
-    first_line: int
-    count: int
-    cause: str
-
-
-@dataclass(frozen=True, slots=True)
-class Event:
-    """What happened when, on the trigger's clock."""
-
-    kind: str
-    tick: int
-    line: int
-    text: str
 
 
 class Recording:
     """One recording, opened for reading; `open_recording` makes it."""
 
-    def __init__(self, path: Path, group: zarr.Group) -> None:
-        self.path = path
-        self.attrs: dict[str, Any] = dict(group.attrs)
-        self._group = group
-        self.arms = {arm: CameraStream(path / arm, child_group(group, arm), self.first_line) for arm in ARMS}
+    def __init__(self, source: Source, document: Document, opener: Callable[[Source], Recording]) -> None:
+        """``document`` is the root's zarr.json; ``opener`` opens further segments.
+
+        Raises one of `camera_stream.DAMAGE` where the document is damaged.
+        """
+        self.source = source
+        self._opener = opener
+        self.document = document
+        self.attrs: dict[str, Any] = document["attributes"]
+        self._nodes = nodes = document["consolidated_metadata"]["metadata"]
+        columns = [column.name for column in line_columns("any")]
+        self.arms = {
+            arm: CameraStream(
+                source, arm, {name: nodes[f"{arm}/{name}"] for name in columns}, self.first_line, self._open
+            )
+            for arm in ARMS
+        }
+
+    def __str__(self) -> str:
+        return str(self.source)
+
+    @property
+    def path(self) -> Path:
+        """Where it lies; of a remote recording only the name means something."""
+        return Path(str(self.source))
+
+    @cached_property
+    def group(self) -> zarr.Group:
+        """The recording in zarr-python."""
+        return zarr.open_group(self.source.zarr_store(), mode="r", zarr_format=3)
+
+    def _open(self) -> zarr.Group:
+        return self.group
 
     @property
     def state(self) -> str:
@@ -85,10 +99,65 @@ class Recording:
     def line_period_ns(self) -> float:
         return int(self.attrs["trigger"]["line_period_ticks"]) * NS_PER_S / self.clock.clock_hz
 
+    @property
+    def substeps(self) -> int:
+        """S."""
+        return int(self.attrs["geometry"]["substeps"])
+
+    @property
+    def dropped(self) -> tuple[tuple[int, int], ...]:
+        """Lines that retention has deleted: first line and count of every stretch."""
+        return tuple((int(first), int(count)) for first, count in self.attrs.get("dropped", ()))
+
+    @property
+    def first_available_line(self) -> int:
+        """The first line that retention has left."""
+        line = self.first_line
+        for first, count in sorted(self.dropped):
+            line = first + count if first == line else line
+        return line
+
+    def dropped_rows(self) -> list[range]:
+        """The same, in rows."""
+        return [range(first - self.first_line, first - self.first_line + n) for first, n in self.dropped]
+
+    @cached_property
+    def segments(self) -> tuple[Recording, ...]:
+        """Recordings that continue this one after an outage, in order. Raises DataError for a damaged one."""
+        return tuple(self._opener(self.source.beside(name)) for name in self.attrs.get("segments", ()))
+
+    def end_ns(self) -> int | None:
+        """UTC at which the line after the last is read out; None without lines."""
+        if not self.lines:
+            return None
+        last = int(self.arms[ARMS[0]].read("time", self.lines - 1, self.lines)[0])
+        return last + round(self.line_period_ns)
+
+    def kept_chunks(self) -> list[int]:
+        """Chunks that hold rows and have not been deleted; retention deletes whole ones."""
+        reader = self.arms[ARMS[0]].reader("lines")
+        size, dropped = reader.shape.chunk_rows, self.dropped_rows()
+        return [c for c in range(reader.chunks) if not any(c * size in rows for rows in dropped)]
+
+    def lost_rows(self, arm: str, lines: int | None = None) -> list[range]:
+        """Rows of one arm that are listed in gaps; of the first ``lines`` rows, or of all that there are."""
+        start, end = self.first_line, self.lines if lines is None else lines
+        gaps = [
+            range(gap.first_line - start, min(end, gap.first_line - start + gap.count))
+            for gap in self.gaps
+            if gap.arm == arm
+        ]
+        return [rows for rows in gaps if rows]
+
+    @cached_property
+    def gaps_not_listed(self) -> int:
+        """Gaps for which the table had no room."""
+        return int(self._nodes["gaps"]["attributes"]["not_listed"])
+
     def camera(self, arm: str) -> CameraStream:
         """The arrays of arm ``"a"`` or ``"b"``."""
         if arm not in self.arms:
-            raise UsageError(f"arm {arm!r} of {self.path}", possible=", ".join(self.arms))
+            raise UsageError(f"arm {arm!r} of {self}", possible=", ".join(self.arms))
         return self.arms[arm]
 
     def geometry_for(self, lines: int) -> Geometry:
@@ -99,17 +168,12 @@ class Recording:
     @cached_property
     def gaps(self) -> tuple[Gap, ...]:
         """Lost lines in the order in which they were noticed."""
-        table = _table(self._group, "gaps")
-        first, count = _numbers(table, "first_line"), _numbers(table, "count")
-        return tuple(map(Gap, _words(table, "arm"), first, count, _words(table, "cause")))
+        return read_gaps(self.source, self._nodes)
 
     @cached_property
     def events(self) -> tuple[Event, ...]:
         """What happened, in the order in which it was noted."""
-        table = _table(self._group, "events")
-        texts = [str(text) for text in _column(table, "text")]
-        ticks, lines = _numbers(table, "tick"), _numbers(table, "line")
-        return tuple(map(Event, _words(table, "kind"), ticks, lines, texts))
+        return read_events(self.source, self._nodes)
 
     def cut(self, first_line: int, lines: int) -> Segment:
         """The segment of ``lines`` lines from the trigger's line ``first_line`` on.
@@ -118,11 +182,18 @@ class Recording:
         Raises UsageError for lines that are not there, and DataError when the file is damaged or the code
         that the attributes describe is not the one recorded with the lines.
         """
+        if (segment := self._segment_with(first_line)) is not None:
+            return segment.cut(first_line, lines)
         start, stop = self._rows(first_line, lines)
         geometry = self.geometry_for(lines)
-        if (pixels := self.arms["a"].lines.shape[1]) != geometry.stages:
+        if (pixels := self.arms["a"].pixels) != geometry.stages:
             raise UsageError(f"cut of lines with {pixels} pixels", possible=f"M = {geometry.stages} pixels")
         arms = self.arms.values()
+        expected = [stream.reader(name) for stream in arms for name in CUT_COLUMNS]
+        for reader in expected:
+            reader.expect_index(start, stop)
+        for reader in expected:
+            reader.expect(start, stop)
         samples = np.stack([stream.read("lines", start, stop) for stream in arms])
         flags = np.stack([stream.read("flags", start, stop) for stream in arms])
         return Segment(
@@ -142,26 +213,59 @@ class Recording:
         period_ns, lines = self.line_period_ns, self.lines
         keys = ("run_id", "state", "run_condition", "end_reason", "layout", "geometry", "code", "clock")
         return {
-            "path": str(self.path),
+            "path": str(self),
             **{key: self.attrs[key] for key in keys},
             "first_line": self.first_line,
             "lines": lines,
+            "first_available_line": self.first_available_line,
+            "dropped": [list(stretch) for stretch in self.dropped],
+            "holds": self.attrs.get("holds", []),
             "duration_s": lines * period_ns / NS_PER_S,
             "line_rate_hz": NS_PER_S / period_ns,
-            "start_ns": int(self.arms["a"].read("time", 0, 1)[0]) if lines else None,
-            "dtype": str(self.arms["a"].lines.dtype),
-            "bytes": tree_bytes(self.path),
+            "start_ns": self._start_ns(),
+            "dtype": self.arms["a"].dtype.name,
+            "bytes": self.source.total_bytes(),
+            "segment": self.attrs.get("segment"),
+            "segments": self.attrs.get("segments", []),
             "gaps": len(self.gaps),
             "lost_lines": {arm: sum(gap.count for gap in self.gaps if gap.arm == arm) for arm in ARMS},
             "events": len(self.events),
             "simulated": bool(self.attrs.get("simulated", False)),
             "cameras": self.attrs["cameras"],
+            "disk": self._disk_facts(),
             "ledger": self.attrs["ledger"],
+            "durability": self.attrs.get("durability", {}),
             "versions": self.attrs["versions"],
         }
 
+    def _disk_facts(self) -> dict[str, float] | None:
+        """While it grows here: bytes free, bytes per second that it takes, seconds until the disk is full."""
+        if self.state == "sealed" or not isinstance(self.source, LocalSource) or not self.lines:
+            return None
+        free = DISK.free_bytes(self.source.path)
+        rate = self.source.total_bytes() * NS_PER_S / (self.lines * self.line_period_ns)
+        return {"free_bytes": free, "bytes_per_s": rate, "seconds_to_full": free / rate}
+
+    def _segment_with(self, line: int) -> Recording | None:
+        """The further segment that has a line which is not here."""
+        if line < self.first_line + self.lines:
+            return None
+        return next((s for s in self.segments if s.first_line <= line < s.first_line + s.lines), None)
+
+    def _start_ns(self) -> int | None:
+        """When the first line that there is was read out."""
+        row = self.first_available_line - self.first_line
+        return int(self.arms[ARMS[0]].read("time", row, row + 1)[0]) if row < self.lines else None
+
     def _rows(self, first_line: int, lines: int) -> tuple[int, int]:
         start = first_line - self.first_line
+        for first, count in self.dropped:
+            if lines > 0 and first < first_line + lines and first_line < first + count:
+                raise DataError(
+                    f"{self}: lines {first} to {first + count - 1} were dropped by retention",
+                    possible=f"lines {self.first_available_line} to {self.first_line + self.lines - 1}",
+                    hint="`acquire hold` keeps lines while a recording is being written",
+                )
         if lines < 1 or start < 0 or start + lines > self.lines:
             have = (
                 f"lines {self.first_line} to {self.first_line + self.lines - 1}"
@@ -202,113 +306,7 @@ class Recording:
     def _refuse_code(self, stream: CameraStream, first_line: int, wrong: NDArray[np.bool_]) -> None:
         if wrong.any():
             raise DataError(
-                f"{stream.path}: the code recorded with line {first_line + int(wrong.argmax())} is not what "
+                f"{stream}: the code recorded with line {first_line + int(wrong.argmax())} is not what "
                 f"the recording's attributes describe ({wrong.sum()} of {len(wrong)} lines disagree)",
                 hint="lines from before or after; the lines themselves are intact",
             )
-
-
-def open_recording(path: Path) -> Recording:
-    """Open a recording, growing or sealed. Raises DataError when ``path`` is not one, or is damaged."""
-    _check_format(path, format_of(path))
-    try:
-        group = zarr.open_group(path, mode="r", zarr_format=3)
-        recording = Recording(path, group)
-        _check_complete(recording)
-    except (*DAMAGE, UsageError) as error:
-        raise DataError(
-            f"{path}: the metadata of the recording is damaged: {type(error).__name__}: {error}",
-            hint="a copy of the recording",
-        ) from error
-    return recording
-
-
-def format_of(path: Path) -> str | None:
-    """The format that a Zarr group names, if any; DataError where there is no group to ask."""
-    attributes = _root_attributes(path)
-    name = attributes.get("format") if isinstance(attributes, dict) else None
-    return name if isinstance(name, str) else None
-
-
-def _root_attributes(path: Path) -> object:
-    if not path.exists():
-        raise DataError(f"{path} does not exist", hint="the path of a recording (a directory NAME.zarr)")
-    try:
-        document = json.loads((path / "zarr.json").read_bytes())
-        attributes: object = document["attributes"]
-    except (FileNotFoundError, NotADirectoryError) as error:
-        raise DataError(f"{path} is not a recording: it holds no zarr.json") from error
-    except OSError as error:
-        raise DataError(f"{path} cannot be read: {error.strerror}") from error
-    except (ValueError, LookupError, TypeError) as error:
-        raise DataError(f"{path}: zarr.json is damaged: {error}", hint="a copy of the recording") from error
-    return attributes
-
-
-def _check_format(path: Path, name: str | None) -> None:
-    if name == FORMAT:
-        return
-    if name is not None and name.startswith(FORMAT.split("/")[0] + "/"):
-        raise DataError(
-            f"{path} is a recording of format {name!r}",
-            possible=f"{FORMAT!r}",
-            hint="a newer version of acquire",
-        )
-    raise DataError(f"{path} is a Zarr group, but not a recording: format {name!r}", possible=f"{FORMAT!r}")
-
-
-def _check_complete(recording: Recording) -> None:
-    """Touch everything that a recording needs; what is absent or impossible raises DAMAGE or UsageError."""
-    attributes = recording.attrs
-    for key in ("state", "run_condition", "ledger", "layout", "run_id", "end_reason"):
-        attributes[key]
-    attributes["versions"]["acquire"]
-    code_from_attrs(attributes["code"])
-    recording.geometry_for(1)
-    _check_number("pixels", int(attributes["geometry"]["pixels"]), above=0)
-    _check_number("clock_hz", recording.clock.clock_hz, above=0)
-    _check_number("line period", recording.line_period_ns, above=0)
-    for arm, stream in recording.arms.items():
-        _check_arm(stream, attributes["cameras"][arm])
-
-
-def _check_arm(stream: CameraStream, camera: dict[str, Any]) -> None:
-    for column in line_columns("any"):
-        if len(stream.array(column.name).shape) != (2 if column.name == "lines" else 1):
-            raise ValueError(f"{stream.path.name}/{column.name} has the wrong number of axes")
-    for key in CAMERA_KEYS:
-        _check_number(key, float(camera[key]), above=-math.inf if key == "black_level_dn" else 0)
-
-
-def _check_number(name: str, value: float, *, above: float) -> None:
-    if not (math.isfinite(value) and value > above):
-        raise ValueError(f"{name} is {value}")
-
-
-def _table(group: zarr.Group, name: str) -> zarr.Group:
-    try:
-        return child_group(group, name)
-    except DAMAGE as error:
-        raise DataError(f"table {name} cannot be read: {error}") from error
-
-
-def _column(table: zarr.Group, name: str) -> NDArray[Any]:
-    try:
-        return np.asarray(child_array(table, name)[:])
-    except DAMAGE as error:
-        raise DataError(f"table {table.path}/{name} cannot be read: {error}") from error
-
-
-def _numbers(table: zarr.Group, name: str) -> list[int]:
-    return [int(value) for value in _column(table, name)]
-
-
-def _words(table: zarr.Group, name: str) -> list[str]:
-    """A column of CF flag values as their meanings."""
-    try:
-        attributes = child_array(table, name).attrs
-        values: Any = attributes["flag_values"]
-        by_value = dict(zip(values, str(attributes["flag_meanings"]).split(), strict=True))
-        return [by_value[value] for value in _numbers(table, name)]
-    except DAMAGE as error:
-        raise DataError(f"table {table.path}/{name} cannot be read: {error!r}") from error

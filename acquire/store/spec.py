@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -13,11 +13,16 @@ import numpy as np
 import acquire
 from acquire.codes import code_from_attrs
 from acquire.errors import UsageError
+from acquire.geometry import Geometry
 from acquire.lines import ARMS
-from acquire.store.shard import MAX_CHUNK_BYTES, MAX_SHARD_CHUNKS, Codec
+from acquire.store.array_writer import ENCODED_AHEAD
+from acquire.store.codecs import CODECS, Codec
+from acquire.store.shard import MAX_CHUNK_BYTES, MAX_SHARD_CHUNKS
 
 if TYPE_CHECKING:
     from acquire.clock import ClockFit
+    from acquire.store.resume import Continuation
+    from acquire.store.retention import Retention
 
 FORMAT = "acquire-recording/1"
 
@@ -43,6 +48,23 @@ class RunCondition(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class Durability:
+    """What is lost at worst, in lines of either arm that both had delivered to the writer.
+
+    Attributes
+    ----------
+    fsync : when bytes are forced to the medium
+    kill_lines : when the writer's process is killed and the recording recovered: the chunk that fills, and
+        those that are being packed
+    power_lines : when the machine loses power; None: as many as the system had not written back
+    """
+
+    fsync: str
+    kill_lines: int
+    power_lines: int | None
+
+
+@dataclass(frozen=True, slots=True)
 class RecordingSpec:
     """Everything that is known when a recording begins; refuses with UsageError what cannot be recorded.
 
@@ -58,7 +80,12 @@ class RecordingSpec:
     extra : further attributes (``scene``, ``effects``, ``simulated`` ...)
     chunk_lines, shard_chunks : lines per chunk; chunks per file
     codec : of the pixels
+    encoders : threads that pack chunks, where there is a codec
     fsync : force bytes to the medium at every ``"commit"``, or only at the ``"seal"``
+    commit_lines : lines on disk that may wait for their commit; a whole number of chunks is best
+    retention : what of an endless recording is kept; None: everything
+    reserve_bytes : of the disk that are left free: the recording should end when nothing else is left
+    continues : what this recording is a further segment of, if it is one
     layout : of the instrument: ``dual``, ``compact``, ``emulated``, ``interline``
     """
 
@@ -78,7 +105,12 @@ class RecordingSpec:
     chunk_lines: int = 4096
     shard_chunks: int = 64
     codec: Codec = "none"
+    encoders: int = 2
     fsync: Literal["commit", "seal"] = "seal"
+    commit_lines: int = 2**16
+    retention: Retention | None = None
+    reserve_bytes: int = 2**28
+    continues: Continuation | None = None
     layout: str = "dual"
 
     def __post_init__(self) -> None:
@@ -90,10 +122,17 @@ class RecordingSpec:
     def line_dtype(self) -> np.dtype[Any]:
         return np.dtype(self.dtype).newbyteorder("<")
 
+    @property
+    def durability(self) -> Durability:
+        """What this recording can lose."""
+        held = self.chunk_lines * (1 if self.codec == "none" else 1 + ENCODED_AHEAD)
+        committed = self.commit_lines + held if self.fsync == "commit" else None
+        return Durability(self.fsync, held, committed)
+
     def _check_choices(self) -> None:
         choices = {
             "dtype": ("uint8", "uint16"),
-            "codec": ("none", "lz4", "zstd"),
+            "codec": CODECS,
             "fsync": ("commit", "seal"),
             "layout": ("dual", "compact", "emulated", "interline"),
         }
@@ -111,6 +150,9 @@ class RecordingSpec:
             "first_line": (0, 2**63 - 1),
             "substep_ticks": (1, 2**32),
             "shard_chunks": (1, MAX_SHARD_CHUNKS),
+            "encoders": (1, 64),
+            "commit_lines": (1, 2**40),
+            "reserve_bytes": (0, 2**60),
             "chunk_lines": (1, MAX_CHUNK_BYTES // max(8, self.pixels * self.line_dtype.itemsize)),
         }
         for name, (low, high) in limits.items():
@@ -148,7 +190,15 @@ class Ending:
 
 def root_attributes(spec: RecordingSpec, ending: Ending | None = None) -> dict[str, Any]:
     """Attributes of the recording's root group; ``ending`` makes it sealed."""
-    return {**spec.extra, **_own_attributes(spec, ending)}
+    segment = {"segment": _segment(spec, spec.continues)} if spec.continues else {}
+    return {**spec.extra, **segment, **_own_attributes(spec, ending)}
+
+
+def _segment(spec: RecordingSpec, continues: Continuation) -> dict[str, Any]:
+    """What the recording continues, now that its first line is known."""
+    readout = Geometry(spec.stages, spec.substeps, 1).readout_substep
+    tick = np.array([(spec.substeps * spec.first_line + readout) * spec.substep_ticks], np.uint64)
+    return continues.to_attrs(spec.first_line, int(spec.clock.time_ns(tick)[0]))
 
 
 def _own_attributes(spec: RecordingSpec, ending: Ending | None) -> dict[str, Any]:
@@ -176,6 +226,7 @@ def _own_attributes(spec: RecordingSpec, ending: Ending | None) -> dict[str, Any
         "clock": spec.clock.to_attrs(),
         "cameras": spec.cameras,
         "config": spec.config,
+        "durability": asdict(spec.durability),
         "versions": {
             "acquire": acquire.__version__,
             "python": platform.python_version(),

@@ -14,13 +14,13 @@ from numcodecs.vlen import VLenUTF8
 
 from acquire.lines import ARMS
 from acquire.store import layout
-from acquire.store.shard import crc32c
+from acquire.store.codecs import crc32c
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from acquire.store.files import Publisher
+    from acquire.store.files import Disk, Publisher
 
 GAP_ROWS = 16384
 EVENT_ROWS = 4096
@@ -91,18 +91,21 @@ class Table:
         for column in self._columns:
             self._cells[column.name].append(_cell(column, row[column.name]))
 
-    def create(self) -> None:
+    def create(self, disk: Disk) -> None:
         for column in self._columns:
-            (self.directory / column.name / "c").mkdir(parents=True)
+            disk.make_directory(self.directory / column.name / "c", parents=True)
 
-    def publish(self, publisher: Publisher) -> None:
-        """Replace chunks, then arrays' metadata, then the group's. Raises OSError as the disk gives it."""
+    def publish(self, publisher: Publisher, *, durable: bool = False) -> None:
+        """Replace chunks, then arrays' metadata, then the group's. Raises OSError as the disk gives it.
+
+        ``durable`` forces the chunks to the medium: what a recording's root says of them is what counts.
+        """
         if not self.dirty:
             return
         for column in self._columns:
             place = self.directory / column.name
             if len(self):
-                publisher.replace(place / "c" / "0", self._chunk(column))
+                publisher.replace(place / "c" / "0", self._chunk(column), durable=durable)
             publisher.replace(place / "zarr.json", layout.to_json(self._array(column)))
         publisher.replace(self.directory / "zarr.json", layout.to_json(self._group()))
         self.dirty = False

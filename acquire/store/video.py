@@ -26,7 +26,7 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 
 from acquire.errors import DataError, UsageError
 from acquire.store.camera_stream import DAMAGE, child_array
-from acquire.store.files import check_new_path, sync_directory, sync_tree
+from acquire.store.files import DISK, check_new_path
 from acquire.store.layout import group_document, to_json
 
 if TYPE_CHECKING:
@@ -151,10 +151,10 @@ class VideoWriter:
             names = ("0", *self._columns)
             nodes = {n: json.loads((self._partial / n / "zarr.json").read_bytes()) for n in names}
             (self._partial / "zarr.json").write_bytes(to_json(group_document(attributes, nodes)))
-            sync_tree(self._partial)
+            DISK.sync_tree(self._partial)
             check_new_path(self._path)
             self._partial.rename(self._path)
-            sync_directory(self._path.parent)
+            DISK.sync_directory(self._path.parent)
 
     def _flush(self, *, whole_chunks: bool) -> None:
         arrays = [np.concatenate(parts) for parts in zip(*self._chunk, strict=True)]

@@ -6,23 +6,30 @@ The order of a commit, each step complete before the next begins::
            → root zarr.json with the metadata of everything: the commit record
 
 A reader that starts at the root therefore sees one consistent, slightly older recording; no length ever
-covers a line that is not on disk, in both arms.
+covers a line that is not on disk, in both arms. What arrays and groups of lines say of themselves, for those
+who open one by itself, is renewed once a second only: at ten commits a second it cost more than the lines.
 """
 
 from __future__ import annotations
 
 import errno
 import json
-import shutil
+import os
+import time
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
 
-from acquire.errors import DataError, UsageError
+from acquire.errors import DataError, StateError, UsageError
 from acquire.lines import ARMS
 from acquire.store import layout
 from acquire.store.arm_writer import ArmWriter
-from acquire.store.files import Publisher, check_new_path, reserve, sync_directory, sync_tree
+from acquire.store.codecs import EncodeOnce
+from acquire.store.files import DISK, SCRATCH, Publisher, check_new_path, lock
+from acquire.store.resume import list_segment
+from acquire.store.retention import Keeper
+from acquire.store.room import RoomWatch
 from acquire.store.spec import Ending, RunCondition, root_attributes
 from acquire.store.table import event_table, gap_table
 
@@ -31,6 +38,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from acquire.lines import TaggedBlock
+    from acquire.store.files import Disk
+    from acquire.store.room import Room
     from acquire.store.spec import RecordingSpec
 
 NOT_A_PLACE = (
@@ -45,6 +54,12 @@ NOT_A_PLACE = (
 )
 """Why a directory cannot be made where it was asked for; all other reasons are the disk's."""
 
+OWN_INTERVAL_S = 1.0
+"""How much older than the root the metadata of a group or an array opened by itself may be."""
+
+RESERVE = ".reserve"
+"""Of a recording that is being written, beside the shards of the first array."""
+
 RESERVE_BYTES = 2**20
 """Kept free for the metadata of the end: more than the tables and the root take."""
 
@@ -53,9 +68,10 @@ class RecordingWriter:
     """Writes one recording; one thread at a time.
 
     Lines go to disk in whole chunks of ``spec.chunk_lines``. Lines of the last chunk that is not whole yet
-    are held in memory and become readable at `seal` only: ``kill -9`` can lose them, and what was not
-    committed, but nothing that `committed_lines` has acknowledged. (With ``fsync="seal"`` a power failure
-    can; with ``"commit"`` it cannot, for a reader that starts at the root.)
+    are held in memory and become readable at `seal` only: ``kill -9`` can lose them, but nothing that
+    `committed_lines` has acknowledged. (With ``fsync="seal"`` a power failure can; with ``"commit"`` it
+    cannot, for a reader that starts at the root.) What can be lost is bounded, see `spec.Durability`: the
+    writer commits by itself when as many lines wait for it as the specification allows.
 
     A row is committed when both arms have it. An arm that runs ahead is written but not visible; how far
     it may run is the caller's to bound.
@@ -65,31 +81,41 @@ class RecordingWriter:
     last commit made it.
     """
 
-    def __init__(self, path: Path, spec: RecordingSpec) -> None:
+    def __init__(self, path: Path, spec: RecordingSpec, disk: Disk) -> None:
         """Use `create`."""
         self.path = path
         self.spec = spec
-        self._arms = {arm: ArmWriter(path / arm, spec) for arm in ARMS}
+        self._disk = disk
+        self._lock = -1
+        threads = 0 if spec.codec == "none" else spec.encoders
+        self._pool = ThreadPoolExecutor(threads, "encoder") if threads else None
+        once = {name: EncodeOnce() for name in layout.SAME_IN_BOTH_ARMS}
+        self._arms = {arm: ArmWriter(path / arm, spec, disk, self._pool, once) for arm in ARMS}
         self._gaps = gap_table(path)
         self._events = event_table(path)
         self._tables = (self._gaps, self._events)
         # No Zarr reader lists what is inside an array's directory.
         hidden = path / ARMS[0] / "lines"
-        self._publisher = Publisher(hidden / ".next")
-        self._reserve = hidden / ".reserve"
+        self._publisher = Publisher(hidden / SCRATCH, disk)
+        self._reserve = hidden / RESERVE
+        self._keeper: Keeper | None = None
+        self._watch = RoomWatch(disk, path, spec.reserve_bytes)
+        self._looked = self._watch.room
+        self._stuck = False
         self._committed = 0
+        self._own_due_s = 0.0
         self._failure: str | None = None
         self._closed = False
 
     @classmethod
-    def create(cls, path: Path, spec: RecordingSpec) -> RecordingWriter:
+    def create(cls, path: Path, spec: RecordingSpec, disk: Disk = DISK) -> RecordingWriter:
         """A new, empty recording at ``path``, from line ``spec.first_line`` on: `prepare`, then `begin`."""
-        writer = cls.prepare(path, spec)
+        writer = cls.prepare(path, spec, disk)
         writer.begin(spec.first_line)
         return writer
 
     @classmethod
-    def prepare(cls, path: Path, spec: RecordingSpec) -> RecordingWriter:
+    def prepare(cls, path: Path, spec: RecordingSpec, disk: Disk = DISK) -> RecordingWriter:
         """Do all that takes time; ``path`` becomes a recording, and takes lines, once `begin` was called.
 
         Raises UsageError when ``path`` exists or cannot be created, before anything is touched, and
@@ -97,17 +123,20 @@ class RecordingWriter:
         """
         check_new_path(path)
         try:
-            path.mkdir()
+            disk.make_directory(path)
         except FileExistsError as error:  # somebody was faster
             raise UsageError(f"{path} exists already", hint="another name") from error
         except OSError as error:
             kind = UsageError if error.errno in NOT_A_PLACE else DataError
             raise kind(f"{path} cannot be created: {error.strerror}") from error
+        writer = None
         try:
-            writer = cls(path, spec)
+            writer = cls(path, spec, disk)
             writer._create_parts()
         except (DataError, UsageError, MemoryError):
-            shutil.rmtree(path, ignore_errors=True)
+            if writer is not None:
+                writer.close()
+            disk.remove_tree(path)
             raise
         return writer
 
@@ -119,25 +148,31 @@ class RecordingWriter:
         self.spec = replace(self.spec, first_line=first_line)
         for arm in self._arms.values():
             arm.begin(first_line)
+        if self.spec.retention is not None:
+            shard_lines = self.spec.chunk_lines * self.spec.shard_chunks
+            self._keeper = Keeper(self.path, self.spec.retention, shard_lines, first_line, self._disk)
         try:
-            with self._disk("creating the recording"):
-                durable = self.spec.fsync == "commit"
-                self._publish_root(0, self._publish_parts(0), durable=durable)
-        except DataError:
+            with self._failing("creating the recording"):
+                self._publish_root(0, self._publish_parts(0, own=False))  # `prepare` did all that takes time
+                if self.spec.continues is not None:
+                    list_segment(self.path, self.spec.continues, self._disk)
+        except (DataError, StateError):
             self.close()
-            shutil.rmtree(self.path, ignore_errors=True)
+            self._disk.remove_tree(self.path)
             raise
 
     def _create_parts(self) -> None:
-        with self._disk("creating the recording"):
+        with self._failing("creating the recording"):
+            self._lock = lock(self.path, "recording to")
             for arm in self._arms.values():
                 arm.create()
             for table in self._tables:
-                table.create()
-            reserve(self._reserve, RESERVE_BYTES)
-            if self.spec.fsync == "commit":
-                sync_tree(self.path)
-                sync_directory(self.path.parent)
+                table.create(self._disk)
+            self._publish_parts(0, own=True)
+            self._disk.reserve(self._reserve, RESERVE_BYTES)
+            if self._durable:
+                self._disk.sync_tree(self.path)
+                self._disk.sync_directory(self.path.parent)
 
     def __enter__(self) -> Self:
         return self
@@ -165,8 +200,11 @@ class RecordingWriter:
         Raises DataError unless the block begins with the next line of its arm, and when the disk fails.
         """
         self._check_alive()
-        with self._disk(f"writing lines of arm {block.arm}"):
+        with self._failing(f"writing lines of arm {block.arm}"):
             self._arms[block.arm].append(block)
+        written = min(arm.written_rows for arm in self._arms.values())
+        if written - self._committed >= self.spec.commit_lines:
+            self.commit()
 
     def add_gap(self, arm: str, first_line: int, count: int, cause: str) -> None:
         """List ``count`` lines of ``arm`` as lost because of ``cause``, a short name.
@@ -182,6 +220,8 @@ class RecordingWriter:
         if tick < 0 or line < 0:
             raise UsageError(f"event {kind!r} at tick {tick}, line {line}", possible="0 or more")
         self._events.add({"tick": tick, "line": line, "kind": kind, "text": text})
+        if self._keeper is not None:
+            self._keeper.note(kind, line)
 
     def commit(self) -> None:
         """Make every row that both arms have in whole chunks visible, and all gaps and events.
@@ -190,15 +230,34 @@ class RecordingWriter:
         what it was.
         """
         self._check_alive()
-        rows = self._whole_rows()
-        if rows == self._committed and not any(table.dirty for table in self._tables):
-            return
-        durable = self.spec.fsync == "commit"
-        with self._disk("committing"):
-            if durable:
+        with self._failing("committing"):
+            for arm in self._arms.values():
+                arm.settle()
+            rows = self._whole_rows()
+            room = self._watch.look(self.bytes_written)
+            if rows == self._committed and not any(table.dirty for table in self._tables):
+                return
+            if self._durable:
                 for arm in self._arms.values():
                     arm.sync()
-            self._publish_root(rows, self._publish_parts(rows), durable=durable)
+            if own := time.monotonic() >= self._own_due_s:
+                self._own_due_s = time.monotonic() + OWN_INTERVAL_S
+            self._publish_kept(rows, self._publish_parts(rows, own=own), room)
+
+    @property
+    def room(self) -> Room:
+        """What the disk could still take at the latest commit, and for how long."""
+        return self._watch.room
+
+    @property
+    def nearly_full(self) -> str | None:
+        """Why the recording should be sealed now, while there is room for that; None: it need not.
+
+        With retention the oldest lines go first, and this is said only when nothing is left that may go.
+        """
+        if not self._stuck:
+            return None
+        return f"disk nearly full: {self.spec.reserve_bytes} bytes are kept free"
 
     def seal(self, condition: RunCondition, end_reason: str, ledger: dict[str, Any]) -> None:
         """Write the lines that wait, pad their chunk with 0, end the recording, and force it to the medium.
@@ -208,26 +267,43 @@ class RecordingWriter:
         """
         self._check_open()
         _check_ledger(ledger)
-        with self._disk("sealing"):
-            rows = self._whole_rows() if self._failure else self._pad()
-            self._reserve.unlink(missing_ok=True)
-            sync_tree(self.path)
-            nodes = self._publish_parts(rows)
-            sync_tree(self.path)
+        with self._failing("sealing"):
+            rows = self._rescue() if self._failure else self._pad()
+            self._disk.remove(self._reserve)
+            self._disk.sync_tree(self.path)
+            nodes = self._publish_parts(rows, own=True)
+            self._disk.sync_tree(self.path)
             ending = Ending(condition, end_reason, {**ledger, "store": self._ledger(rows)})
-            self._publish_root(rows, nodes, durable=True, ending=ending)
-            sync_directory(self.path.parent)
+            self._publish_root(rows, nodes, ending)
+            if self._keeper is not None:
+                self._keeper.finish()
+            self._disk.sync_directory(self.path.parent)
         self.close()
 
     def close(self) -> None:
         """Let go of all files; what was not committed is dropped. Idempotent."""
         self._closed = True
-        with self._disk("closing files"):
+        if self._pool is not None:
+            self._pool.shutdown(cancel_futures=True)
+        with self._failing("closing files"):
             for arm in self._arms.values():
                 arm.close()
+            if self._lock >= 0:
+                held, self._lock = self._lock, -1
+                os.close(held)
+
+    @property
+    def _durable(self) -> bool:
+        return self.spec.fsync == "commit"
 
     def _whole_rows(self) -> int:
         return min(arm.whole_rows for arm in self._arms.values())
+
+    def _rescue(self) -> int:
+        """After a failure: the rows that are whole."""
+        for arm in self._arms.values():
+            arm.publish_chunks()
+        return self._whole_rows()
 
     def _pad(self) -> int:
         rows = min(arm.next_line for arm in self._arms.values()) - self.spec.first_line
@@ -235,21 +311,36 @@ class RecordingWriter:
             arm.pad()
         return rows
 
-    def _publish_parts(self, rows: int) -> dict[str, layout.Document]:
-        """Replace all metadata but the root's; returns it by path below the recording."""
+    def _publish_parts(self, rows: int, *, own: bool) -> dict[str, layout.Document]:
+        """Replace all metadata but the root's; returns it by path below the recording.
+
+        Without ``own``, that of the arms is returned only.
+        """
         nodes: dict[str, layout.Document] = {}
         for arm in self._arms.values():
-            nodes |= arm.publish(self._publisher, rows)
+            nodes |= arm.publish(self._publisher, rows, own=own)
         for table in self._tables:
-            table.publish(self._publisher)
+            table.publish(self._publisher, durable=self._durable)
             nodes |= table.nodes()
         return nodes
 
+    def _publish_kept(self, rows: int, nodes: dict[str, layout.Document], room: Room) -> None:
+        """The commit, without the lines that retention lets go; their files are deleted once it is told."""
+        looked, self._looked = self._looked is not room, room
+        going = self._keeper.choose(rows, -room.free_bytes if looked else 0) if self._keeper else []
+        if looked:
+            self._stuck = room.full and not going
+        self._publish_root(rows, nodes)
+        if self._keeper and self._keeper.delete(going):
+            self._publish_root(rows, nodes)
+
     def _publish_root(
-        self, rows: int, nodes: dict[str, layout.Document], *, durable: bool, ending: Ending | None = None
+        self, rows: int, nodes: dict[str, layout.Document], ending: Ending | None = None
     ) -> None:
         """The commit itself."""
-        root = layout.group_document(root_attributes(self.spec, ending), nodes)
+        kept = self._keeper.attributes() if self._keeper else {}
+        root = layout.group_document({**root_attributes(self.spec, ending), **kept}, nodes)
+        durable = self._durable or ending is not None
         self._publisher.replace(self.path / "zarr.json", layout.to_json(root), durable=durable)
         self._committed = rows
 
@@ -257,6 +348,7 @@ class RecordingWriter:
         end = self.spec.first_line + rows
         return {
             "lines": rows,
+            "direct_io": any(arm.direct for arm in self._arms.values()),
             "lines_left_out": {name: arm.next_line - end for name, arm in self._arms.items()},
             "bytes_written": self.bytes_written,
             "gaps_not_listed": self._gaps.not_listed,
@@ -279,7 +371,7 @@ class RecordingWriter:
         return f"{self._committed} lines of each arm are committed and can be read"
 
     @contextmanager
-    def _disk(self, doing: str) -> Iterator[None]:
+    def _failing(self, doing: str) -> Iterator[None]:
         """Turn what the disk refuses into DataError, and remember it: nothing after it is acknowledged."""
         try:
             yield

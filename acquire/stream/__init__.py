@@ -9,11 +9,13 @@
 Grabbers and recorder are processes, the supervisor is a thread; `Capture` owns them all. Rings are shared
 memory: nothing between a camera's buffer and the recorder's is sent, and nothing waits for a reader.
 
-`shared` memory, counters · `losses` causes · `ring` · `process` children and their pipe · `messages` ·
-`grabber` · `tagger` · `session` one recording · `recorder` · `plan` · `supervisor` · `capture`
+`shared` memory, counters · `losses` causes · `ring` · `observer` of a ring · `process` children and their
+pipe · `messages` · `grabber` · `tagger` · `window` of lines around an event · `session` one recording ·
+`recorder` · `plan` · `supervisor` · `capture`
 """
 
 from acquire.stream.capture import Capture
 from acquire.stream.plan import CapturePlan, CaptureStatus
+from acquire.stream.window import NOW, Window
 
-__all__ = ["Capture", "CapturePlan", "CaptureStatus"]
+__all__ = ["NOW", "Capture", "CapturePlan", "CaptureStatus", "Window"]

@@ -20,12 +20,14 @@ from acquire.errors import AcquireError, DataError, StateError, UsageError
 from acquire.lines import ARMS
 from acquire.stream import grabber, recorder
 from acquire.stream.losses import Cause
-from acquire.stream.messages import Begin, End, Interrupt, Quit, Ready, RunStarted
+from acquire.stream.messages import Begin, Extend, Interrupt, Note, Quit, Ready, RunStarted
 from acquire.stream.plan import CaptureStatus
 from acquire.stream.process import Worker
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.shared import Counters
+from acquire.stream.succession import Succession
 from acquire.stream.supervisor import RECORDER, Supervisor
+from acquire.stream.window import NOW
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -34,6 +36,7 @@ if TYPE_CHECKING:
     from acquire.clock import ClockFit
     from acquire.store import RecordingSpec
     from acquire.stream.plan import CapturePlan
+    from acquire.stream.window import NOW, Window
     from acquire.trigger.base import Trigger
 
 _TAG_RING = RingShape(slots=64, rows=256, width=3, dtype="uint64")
@@ -88,11 +91,13 @@ class Capture:
                 error.add_note(f"while undoing it: {second}")
             raise
 
-    def start(self, path: Path, spec: RecordingSpec, lines: int | None = None) -> None:
-        """Record ``lines`` lines, or until `stop`, to ``path``, from the next line that both arms can give.
+    def start(self, path: Path, spec: RecordingSpec, lines: int | None = None, window: Window = NOW) -> None:
+        """Record ``lines`` lines, or until `stop`, to ``path``.
 
-        ``spec`` tells all but the first line, which the recorder sets. Returns once the recording exists.
-        Raises UsageError or DataError when it cannot be made; nothing has changed then.
+        From the next line that both arms can give, unless ``window`` begins earlier. ``spec`` tells all but
+        the first line, which the recorder sets. Returns once the recording exists. Raises UsageError or
+        DataError when it cannot be made, or when the rings do not hold what the window asks for; nothing
+        has changed then.
         """
         supervisor = self._running("start")
         if supervisor.recording:
@@ -101,7 +106,27 @@ class Capture:
             raise StateError(f"start: the capture has failed ({supervisor.fault})", hint="arm again")
         if lines is not None and lines < 1:
             raise UsageError(f"start with a budget of {lines} lines", possible="1 or more")
-        supervisor.begin(Begin(path, spec, lines))
+        supervisor.begin(Begin(path, spec, lines, window))
+
+    def note(self, kind: str, text: str, line: int | None = None) -> int:
+        """Something happens at ``line``, or at the newest: listed in every recording that holds the line.
+
+        Returns the line. A recording that begins later can still hold it: see `Window`.
+        """
+        self._running("note")
+        if line is None:
+            line = max(ring.newest_line for ring in self._rings.values())
+        self._workers[RECORDER].post(Note(line, kind, text))
+        return line
+
+    def take_events(self) -> list[Note]:
+        """What the trigger's inputs and the lines have told since the last call; marks are not among it."""
+        return self._running("take_events").take_events()
+
+    def extend(self, line: int) -> None:
+        """Let the recording under way not end before ``line``, unless it is ending already."""
+        self._running("extend")
+        self._workers[RECORDER].post(Extend(line))
 
     def stop(self, reason: str = "stopped") -> None:
         """End the recording at the newest line; `poll` tells when it is sealed. Idempotent."""
@@ -109,7 +134,7 @@ class Capture:
         if supervisor.began is None:
             raise StateError("stop: nothing has been recorded", possible="start")
         if supervisor.recording:
-            self._workers[RECORDER].post(End(reason))
+            supervisor.end_recording(reason)
 
     def poll(self) -> CaptureStatus:
         """What is seen at this moment; after `close`, what was seen last."""
@@ -166,6 +191,10 @@ class Capture:
             self._plan.stall_timeout_s,
             self._plan.margin_lines,
             self._plan.grabbers,
+            Succession(
+                {RECORDER: self._next_recorder}
+                | {name: partial(self._next_grabber, name) for name in self._plan.grabbers}
+            ),
         )
         self._supervisor.start()
 
@@ -177,16 +206,41 @@ class Capture:
             self._counters[arm] = Counters(grabber.COUNTERS)
 
     def _spawn(self) -> None:
+        self._workers[RECORDER] = self._new_recorder()
+        for name in self._plan.grabbers:
+            self._workers[name] = self._new_grabber(name)
+
+    def _new_recorder(self) -> Worker:
         plan = self._plan
         what = recorder.RecorderPlan(
-            plan.run, plan.stages, plan.stall_timeout_s, plan.tag_wait_s, plan.max_skew_lines
+            plan.run,
+            plan.stages,
+            plan.stall_timeout_s,
+            plan.tag_wait_s,
+            plan.max_skew_lines,
+            plan.realtime,
         )
-        self._workers[RECORDER] = Worker(
-            RECORDER, recorder.record, what, self._rings, self._tags, self._counters[RECORDER]
-        )
-        for name, arms in plan.grabbers.items():
-            tasks = [(self._grabber_plan(arm), self._rings[arm], self._counters[arm]) for arm in arms]
-            self._workers[name] = Worker(f"grabber {name}", grabber.grab, *tasks)
+        return Worker(RECORDER, recorder.record, what, self._rings, self._tags, self._counters[RECORDER])
+
+    def _new_grabber(self, name: str, *, successor: bool = False) -> Worker:
+        tasks = [
+            (replace(self._grabber_plan(arm), successor=successor), self._rings[arm], self._counters[arm])
+            for arm in self._plan.grabbers[name]
+        ]
+        return Worker(f"grabber {name}", grabber.grab, *tasks)
+
+    def _next_recorder(self) -> Worker:
+        worker = self._new_recorder()
+        worker.post(RunStarted(self.clock))
+        return worker
+
+    def _next_grabber(self, name: str) -> Worker | None:
+        """Only a camera that tells time can be numbered again."""
+        arms = self._plan.grabbers[name]
+        self._settle_books(arms)
+        if not all(self._counters[arm]["stamp_ns"] for arm in arms):
+            return None
+        return self._new_grabber(name, successor=True)
 
     def _grabber_plan(self, arm: str) -> grabber.GrabberPlan:
         plan = self._plan
@@ -199,6 +253,7 @@ class Capture:
             plan.reopen_timeout_s,
             plan.line_period_ns,
             plan.columns.get(arm),
+            plan.realtime,
         )
 
     def _running(self, command: str) -> Supervisor:
@@ -214,6 +269,7 @@ class Capture:
             ring={arm: self._ring_counts(arm) for arm in ARMS},
             lines={arm: self._line_counts(arm, began=began is not None) for arm in ARMS},
             fault=supervisor.fault,
+            pids={name: pid for name, pid in self.pids.items() if pid is not None},
         )
         if began is None:
             return status
@@ -222,6 +278,7 @@ class Capture:
             recording=supervisor.recording,
             draining=supervisor.recording and bool(counters["draining"]),
             done=sealed is not None,
+            path=None if supervisor.path is None else str(supervisor.path),
             first_line=began.first_line,
             recorded_lines=counters["recorded"],
             committed_lines=counters["committed"],
@@ -240,7 +297,11 @@ class Capture:
         lost = {
             str(Cause.CAMERA): grabbed[Cause.CAMERA],
             str(Cause.RING_FULL): self._rings[arm].statistics().dropped_lines,
-            **{str(cause): grabbed[cause] for cause in grabber.CAMERA_CAUSES[1:] if grabbed[cause]},
+            **{
+                str(cause): grabbed[cause]
+                for cause in (*grabber.CAMERA_CAUSES[1:], Cause.GRABBER_LOST)
+                if grabbed[cause]
+            },
         }
         return {
             "delivered": grabbed["delivered"],
@@ -279,8 +340,14 @@ class Capture:
             worker.post(Quit())
         _run_all(*(partial(worker.end, deadline) for worker in order))
 
+    def _settle_books(self, arms: tuple[str, ...]) -> None:
+        for arm in arms:
+            grabber.settle_books(self._rings[arm], self._counters[arm])
+
     def _empty_rings(self) -> None:
         """Nobody will take what the last of the grabbers left."""
+        for name in self._supervisor.dead if self._supervisor else ():
+            self._settle_books(self._plan.grabbers.get(name, ()))
         for arm, ring in self._rings.items():
             self._left_over[arm] = ring.empty()
 

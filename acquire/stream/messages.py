@@ -2,7 +2,7 @@
 
 ::
 
-    owner ──▶ recorder      RunStarted, Begin, End, Interrupt, Quit
+    owner ──▶ recorder      RunStarted, Begin, Note, Extend, End, Interrupt, Quit
     recorder ──▶ owner      Ready, Began | Refused, Sealed
     owner ──▶ grabber       Quit
     grabber ──▶ owner       Ready
@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from acquire.stream.losses import Cause
+from acquire.stream.window import NOW, Window
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -47,11 +48,28 @@ class RunStarted:
 
 @dataclass(frozen=True, slots=True)
 class Begin:
-    """Write a recording to ``path``, of ``lines`` lines or until told to end."""
+    """Write a recording of the lines in ``window`` to ``path``, ``lines`` of them or until told to end."""
 
     path: Path
     spec: RecordingSpec
     lines: int | None
+    window: Window = NOW
+
+
+@dataclass(frozen=True, slots=True)
+class Note:
+    """Something happened at ``line``: for the events of every recording that holds it."""
+
+    line: int
+    kind: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Extend:
+    """Do not end before ``line``."""
+
+    line: int
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from acquire.store import RunCondition
     from acquire.trigger.base import TriggerRun
 
+OBSERVERS = 2
+"""Readers of a ring that nobody waits for: the watcher is the first, a preview can be the second."""
+
 MAX_SUBSTEPS = 8
 """A line's code is recorded in one byte."""
 
@@ -42,8 +45,10 @@ class CapturePlan:
     reopen_timeout_s : how long a camera that is gone is waited for; less than ``stall_timeout_s``, or the
         arm counts as stalled first
     line_period_ns : by the trigger's clock; 0: not told
+    realtime : grabbers run before everything else on the host, where that is allowed
     columns : compact layout: arm → first column and the one after the last, on the one camera that
         ``openers["a"]`` opens; empty: a camera per arm
+    ring_reserve : slots that hold no history: see `RingShape`
     """
 
     run: TriggerRun
@@ -59,6 +64,8 @@ class CapturePlan:
     reopen_timeout_s: float = 2.0
     line_period_ns: float = 0.0
     columns: dict[str, tuple[int, int]] = field(default_factory=dict)
+    realtime: bool = False
+    ring_reserve: int = 2
 
     def __post_init__(self) -> None:
         if tuple(sorted(self.openers)) != ARMS:
@@ -83,7 +90,9 @@ class CapturePlan:
 
     @property
     def ring_shape(self) -> RingShape:
-        return RingShape(self.ring_slots, self.block_lines, self.pixels, self.dtype)
+        return RingShape(
+            self.ring_slots, self.block_lines, self.pixels, self.dtype, OBSERVERS, self.ring_reserve
+        )
 
     @property
     def grabbers(self) -> dict[str, tuple[str, ...]]:
@@ -114,6 +123,7 @@ class CaptureStatus:
     recording : a recording is being written
     draining : its last line is known
     done : the latest recording is closed; ``condition``, ``end_reason`` and ``ledger`` are final
+    path : of the latest recording; another than was asked for, when its recorder was killed and replaced
     first_line : the trigger's number of its row 0, or None before the first recording
     recorded_lines, committed_lines : rows that both arms have; rows that a reader finds
     ring : arm → slots, fill, peak, drops (blocks), dropped_lines, all since arm
@@ -123,17 +133,20 @@ class CaptureStatus:
         the camera was ``reopened``, and its ``clock``: the latest stamp (line, its time by the camera) and
         how much faster it runs than the trigger's, in parts per billion; all 0 where it tells no time
     fault : what failed first, or None
+    pids : process numbers: of the recorder, and of each grabber
     """
 
     recording: bool = False
     draining: bool = False
     done: bool = False
+    path: str | None = None
     first_line: int | None = None
     recorded_lines: int = 0
     committed_lines: int = 0
     ring: dict[str, dict[str, int]] = field(default_factory=dict)
     lines: dict[str, dict[str, Any]] = field(default_factory=dict)
     fault: str | None = None
+    pids: dict[str, int] = field(default_factory=dict)
     condition: RunCondition | None = None
     end_reason: str | None = None
     ledger: dict[str, Any] = field(default_factory=dict)

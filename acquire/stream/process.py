@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import multiprocessing
+import os
 import pickle
 import select
 import signal
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     from types import FrameType
 
 _KILL_WAIT_S = 5.0
+_IMPORTANT = -15
+"""Niceness; threads that are started later have it as well."""
 
 
 class OwnerGone(Exception):  # noqa: N818 - an event, not an error: the child ends in order
@@ -138,6 +141,27 @@ class Worker:
         self._process.close()
         if forced:
             raise DeviceError(f"{self.name}: the process did not end when told to, and was killed")
+
+
+def become_urgent() -> bool:
+    """Run before everything else on the host, in real time; says whether that is allowed here.
+
+    For what waits most of the time and does little at once: it would starve the host otherwise.
+    """
+    try:
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+    except PermissionError:
+        return False
+    return True
+
+
+def become_important() -> bool:
+    """Get more of the processors than others, who still get some; says whether that is allowed here."""
+    try:
+        os.setpriority(os.PRIO_PROCESS, 0, _IMPORTANT)
+    except PermissionError:
+        return False
+    return True
 
 
 def _live(pipe: Connection[Any, Any], name: str, target: Callable[..., None], *args: Any) -> None:

@@ -5,6 +5,7 @@
     discarding ──Begin──▶ opening ──▶ recording ──last line──▶ closing ──▶ discarding
 
 Lines are discarded while a recording is opened as well: its first line is chosen when it can take lines.
+Unless it begins with what was before (`window`): that is taken back from the rings at once, and waits there.
 A block waits in its ring until a tag of the trigger confirms its lines, but not longer than ``tag_wait_s``
 and not once the ring is half full; then its lines are written flagged. Creating and sealing a recording
 wait for the disk: a second thread does them, so that the rings are emptied meanwhile. What is counted is
@@ -16,21 +17,33 @@ from __future__ import annotations
 
 import select
 import time
+from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from acquire.errors import AcquireError, DataError, StateError
+from acquire.errors import AcquireError, DataError, StateError, UsageError
 from acquire.lines import ARMS
 from acquire.store import RecordingWriter, RunCondition
 from acquire.stream.losses import Cause
-from acquire.stream.messages import Began, Begin, End, Interrupt, Ready, Refused, RunStarted
-from acquire.stream.process import OwnerGone
+from acquire.stream.messages import (
+    Began,
+    Begin,
+    End,
+    Extend,
+    Interrupt,
+    Note,
+    Ready,
+    Refused,
+    RunStarted,
+)
+from acquire.stream.process import OwnerGone, become_important
 from acquire.stream.session import Session
 from acquire.stream.stalls import Arm, find_stall
 from acquire.stream.tagger import Tagger
+from acquire.stream.window import Span, hold, span
 
 if TYPE_CHECKING:
     from acquire.stream.messages import Sealed
@@ -41,17 +54,20 @@ if TYPE_CHECKING:
 
 COUNTERS = (
     *("recorded", "committed", "draining", "rows_a", "rows_b", "missing_a", "missing_b"),
-    *("discarded_a", "discarded_b", "turns"),
+    *("discarded_a", "discarded_b", "turns", "awaited_a", "awaited_b"),
 )
 """Of the latest recording: rows in both arms, rows that a reader finds, whether its last line is known; per
 arm the rows written and those of them that are missing. Since armed: per arm the lines taken from its ring
-that no recording holds; turns of the loop, which stand still when it hangs."""
+that no recording holds; turns of the loop, which stand still when it hangs. The owner alone counts how often
+it has seen that an arm's next grabber is only starting: its silence means nothing then."""
 
 _WAIT_S = 0.02
 _COMMIT_INTERVAL_S = 0.1
 _COMMIT_SHARE = 4
 """Commits take at most one part in so many of the time, however slow the disk."""
 _BLOCKS_PER_TURN = 8
+_NOTES = 1024
+"""Events that are remembered for recordings which begin later and hold their lines."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,13 +79,15 @@ class RecorderPlan:
     stall_timeout_s: float
     tag_wait_s: float
     max_skew_lines: int
+    realtime: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Opening:
-    """A recording that is being created, for ``lines`` lines."""
+    """A recording that is being created, for the lines in ``span``; None: for those that come then."""
 
-    lines: int | None
+    begin: Begin
+    span: Span | None
     writer: Future[RecordingWriter]
 
 
@@ -77,6 +95,8 @@ def record(
     mailbox: Mailbox, plan: RecorderPlan, rings: dict[str, Ring], tags: Ring, counters: Counters
 ) -> None:
     """Life of the recorder: empty the rings, write recordings when told to, until told to end."""
+    if plan.realtime:
+        become_important()  # not in real time: it computes, and must not keep the grabbers waiting
     with ThreadPoolExecutor(1, thread_name_prefix="store") as disk:
         recorder = Recorder(mailbox, plan, rings, tags, counters, disk)
         mailbox.post(Ready())
@@ -106,6 +126,9 @@ class Recorder:
         self._opening: Opening | None = None
         self._session: Session | None = None
         self._closing: tuple[Session, Future[Sealed]] | None = None
+        self._notes: deque[Note] = deque(maxlen=_NOTES)
+        self._line_rate_hz = 0.0
+        self._free_from = 0
         self._trouble: tuple[str, dict[str, Cause]] | None = None
         self._owner = True
         self._busy = False
@@ -158,8 +181,13 @@ class Recorder:
         match message:
             case RunStarted(clock):
                 self._tagger = Tagger(self._plan.run, self._plan.stages, clock)
+                self._line_rate_hz = clock.clock_hz / self._plan.run.line_period_ticks
             case Begin():
                 self._begin(message)
+            case Note():
+                self._note(message)
+            case Extend(line) if self._session is not None:
+                self._session.extend(line)
             case End(reason) if self._session is not None:
                 self._session.end(self._newest_line(), reason)
             case Interrupt(reason, lost, cause):
@@ -170,9 +198,25 @@ class Recorder:
         if self._tagger is None or self._opening or self._session or self._closing:
             self._mailbox.post(Refused(StateError("start: the recorder is not armed, or is recording")))
             return
-        self._opening = Opening(
-            begin.lines, self._disk.submit(RecordingWriter.prepare, begin.path, begin.spec)
-        )
+        try:
+            span = None if begin.window.is_now else self._hold(begin)
+        except UsageError as error:
+            self._mailbox.post(Refused(error))
+            return
+        writer = self._disk.submit(RecordingWriter.prepare, begin.path, begin.spec)
+        self._opening = Opening(begin, span, writer)
+
+    def _hold(self, begin: Begin) -> Span:
+        """Keep from being discarded what the recording begins with."""
+        held = hold(begin.window, {name: arm.ring for name, arm in self._arms.items()}, self._free_from)
+        for name, lines in held.taken.items():
+            self._counters.add(f"discarded_{name}", -lines)
+        return span(begin.window, begin.lines, held, self._line_rate_hz)
+
+    def _note(self, note: Note) -> None:
+        self._notes.append(note)
+        if self._session is not None:
+            self._session.note(note.kind, note.line, note.text)
 
     def _interrupt(self, reason: str, lost: dict[str, Cause]) -> None:
         """What is lost stays lost: a recording that is only being created will know."""
@@ -202,18 +246,18 @@ class Recorder:
             self._mailbox.post(sealed.result())
 
     def _opened(self, opening: Opening) -> None:
-        """From the newest line on: both arms have still to deliver what comes after it."""
-        assert self._tagger is not None
+        """From the newest line on: both arms have still to deliver what comes after it; or from the past."""
+        first_line = self._newest_line() if opening.span is None else opening.span.first_line
         try:
             writer = opening.writer.result()
-            writer.begin(first_line := self._newest_line())
+            writer.begin(first_line)
         except AcquireError as error:
             self._mailbox.post(Refused(error))
             return
         except (OSError, ValueError, MemoryError) as error:
             self._mailbox.post(Refused(DataError(f"the recording cannot be created: {error!r}")))
             return
-        self._session = Session(writer, self._tagger, self._blank, first_line, opening.lines)
+        self._session = self._new_session(writer, opening, first_line)
         for arm in self._arms.values():
             arm.revive(time.monotonic())
         self._publish(self._session)
@@ -221,8 +265,23 @@ class Recorder:
         if self._trouble is not None:
             self._interrupt(*self._trouble)
 
+    def _new_session(self, writer: RecordingWriter, opening: Opening, first_line: int) -> Session:
+        assert self._tagger is not None
+        lines, at = opening.begin.lines, first_line
+        if opening.span is not None:
+            at = opening.span.at
+            lines = None if opening.span.end_line is None else opening.span.end_line - first_line
+        session = Session(writer, self._tagger, self._blank, first_line, lines)
+        window = opening.begin.window
+        if window.kind:
+            self._notes.append(Note(at, window.kind, window.text))
+        for note in self._notes:
+            session.note(note.kind, note.line, note.text)
+        return session
+
     def _close(self, session: Session, error: Exception | None = None) -> None:
         self._session = None
+        self._free_from = max(book.next_line for book in session.books.values())
         self._publish(session)
         self._closing = session, self._disk.submit(session.close, error)
 
@@ -237,7 +296,9 @@ class Recorder:
 
     def _drain(self, name: str, arm: Arm) -> bool:
         """Take what the arm has, some blocks at most; says whether there was any."""
-        arm.watch(time.monotonic())
+        arm.watch(time.monotonic(), self._counters[f"awaited_{name}"])
+        if self._opening is not None and self._opening.span is not None:
+            return False  # it waits for the recording
         for taken in range(_BLOCKS_PER_TURN):
             block = arm.ring.acquire()
             if block is None or not self._may_go(arm.ring, block):

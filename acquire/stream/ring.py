@@ -1,20 +1,31 @@
-"""A bounded ring of equal slots in shared memory between one producer and one consumer process.
+"""A bounded ring of equal slots in shared memory: one producer process, one reader that it waits for, and
+observers that it does not.
 
 ::
 
-    control   head peak drops newest | tail          words of 8 bytes, one cache line per writer
-    headers   sequence first_line count time losses  one per slot
+    control   head peak drops newest | tail | cursor peak lost | …   words of 8 bytes, a cache line per writer
+    headers   sequence first_line count time total losses               one per slot
     flags     (slot, row) uint16
     pixels    (slot, row, pixel)
 
-The producer claims a slot, fills it in place and commits it; with no slot free it is told so and counts
-the lines it drops. The consumer acquires the oldest slot, reads it in place and releases it. Block ``k``
-of the stream lies in slot ``k mod slots``; its sequence number is 2k + 1 while it is being filled and
-2k + 2 when it is whole, so that a torn or stale read shows. `head` and `tail` have one writer each and
-are stored last: a producer killed at any instant leaves whole blocks only. (Stores must be seen in order,
-as x86-64 does; elsewhere the doorbell's system call orders them.)
+                 oldest that `lease` can take back
+                 ▼              ▼ tail        ▼ head
+       │ reserve │   history    │   waiting   │ free, claimed next …   (block k lies in slot k mod slots)
 
-A second reader would get a tail and a doorbell of its own; the producer would then look at the slowest.
+The producer claims a slot, fills it in place and commits it; with no slot free it is told so and counts
+the lines it drops. The reader acquires the oldest slot, reads it in place and releases it. What it has
+released stays where it is until the producer comes round: that is the ring's history, and `lease` takes it
+back. Between history and producer ``reserve`` slots are kept, so that the cameras can go on while the reader
+begins with what was.
+
+An observer (`acquire.stream.observer`) reads without being waited for: dead or slow, it is lapped, and told
+how many slots it lost.
+
+The sequence number of block ``k`` is 2k + 1 while it is being filled and 2k + 2 when it is whole, so that a
+torn or stale read shows. Every word has one writer, and `head` and `tail` are stored last: a producer killed
+at any instant leaves whole blocks only, and its successor, given the same memory, goes on behind them.
+(Stores must be seen in order, as x86-64 does; elsewhere the doorbell's system call orders them. `lease` alone
+stores, then looks: two slots of reserve are more than a store can be late.)
 """
 
 from __future__ import annotations
@@ -39,31 +50,49 @@ if TYPE_CHECKING:
 
 _HEAD, _PEAK, _DROPPED_BLOCKS, _DROPPED_LINES, _NEWEST = range(5)
 _TAIL = 8
-_CONTROL_WORDS = 16
-_SEQUENCE, _FIRST_LINE, _COUNT, _TIME_NS, _LOSS_COUNT, _LOSSES = range(6)
+_OBSERVERS = 16
+_LINE_WORDS = 8
+_SEQUENCE, _FIRST_LINE, _COUNT, _TIME_NS, _TOTAL, _LOSS_COUNT, _LOSSES = range(7)
 _HEADER_WORDS = 32
 _PAGE_BYTES = 4096
 _CAUSES = tuple(Cause)
+LEAST_RESERVE = 2
 
 
 @dataclass(frozen=True, slots=True)
 class RingShape:
-    """``slots`` slots of up to ``rows`` rows of ``width`` samples of ``dtype``."""
+    """``slots`` slots of up to ``rows`` rows of ``width`` samples of ``dtype``; room for ``observers``.
+
+    ``reserve`` slots are no history: they stay free for the producer while the reader begins with the past.
+    """
 
     slots: int
     rows: int
     width: int
     dtype: str
+    observers: int = 0
+    reserve: int = 2
 
     def __post_init__(self) -> None:
         if min(self.slots, self.rows, self.width) < 1:
             raise UsageError(
                 f"ring of {self.slots} slots of {self.rows} x {self.width}", possible="1 or more"
             )
+        if self.reserve < LEAST_RESERVE:
+            raise UsageError(f"ring with a reserve of {self.reserve}", possible=f"{LEAST_RESERVE} or more")
+
+    @property
+    def history_slots(self) -> int:
+        """Most slots that can be taken back."""
+        return max(0, self.slots - self.reserve)
+
+    @property
+    def control_words(self) -> int:
+        return _OBSERVERS + self.observers * _LINE_WORDS
 
     @property
     def flags_offset(self) -> int:
-        return (_CONTROL_WORDS + self.slots * _HEADER_WORDS) * WORD_BYTES
+        return (self.control_words + self.slots * _HEADER_WORDS) * WORD_BYTES
 
     @property
     def pixels_offset(self) -> int:
@@ -81,13 +110,18 @@ class RingShape:
 
 @dataclass(frozen=True, slots=True)
 class RingStatistics:
-    """What happened to a ring since it was made."""
+    """What happened to a ring since it was made; in blocks, but for ``dropped_lines``.
+
+    ``fill`` waits for the reader, and was ``peak`` at most; dropped is what found no free slot. ``history``
+    is what can be taken back.
+    """
 
     slots: int
     fill: int
     peak: int
     dropped_blocks: int
     dropped_lines: int
+    history: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,7 +151,7 @@ class RingBlock:
 
 
 class Ring:
-    """See the module. One process produces, one consumes, any process may read the statistics."""
+    """See the module. One process produces, one consumes, any process may observe and read the statistics."""
 
     def __init__(
         self, name: str, shape: RingShape, memory: SharedBytes | None = None, bell: int = -1
@@ -128,9 +162,10 @@ class Ring:
         self._bell = bell if bell >= 0 else os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self._ringing = select.poll()
         self._ringing.register(self._bell, select.POLLIN)
-        self._control = self._memory.words(0, _CONTROL_WORDS)
+        self._control = self._memory.words(0, shape.control_words)
         self._headers = [
-            self._memory.words(_CONTROL_WORDS + k * _HEADER_WORDS, _HEADER_WORDS) for k in range(shape.slots)
+            self._memory.words(shape.control_words + k * _HEADER_WORDS, _HEADER_WORDS)
+            for k in range(shape.slots)
         ]
         self._slots = [self._view(k) for k in range(shape.slots)]
 
@@ -147,10 +182,10 @@ class Ring:
 
     def commit(self, first_line: int, count: int, losses: Sequence[Loss] = ()) -> None:
         """Hand the claimed slot's first ``count`` rows over, as lines from ``first_line``."""
-        head = self._control[_HEAD]
+        head, total = self._control[_HEAD], self.committed_lines + count
         header = self._headers[head % self.shape.slots]
         header[_FIRST_LINE], header[_COUNT] = first_line, count
-        header[_TIME_NS] = time.monotonic_ns()
+        header[_TIME_NS], header[_TOTAL] = time.monotonic_ns(), total
         _write_losses(header, losses)
         header[_SEQUENCE] = 2 * head + 2
         self._control[_NEWEST] = first_line + count
@@ -163,29 +198,37 @@ class Ring:
         self._control[_DROPPED_BLOCKS] += 1
         self._control[_DROPPED_LINES] += lines
 
-    # ---- consumer
+    # ---- the reader that is waited for
 
     def acquire(self, timeout_s: float = 0.0) -> RingBlock | None:
         """The oldest block, or None when none came within ``timeout_s``; the same one until released."""
         if not self._wait(timeout_s):
             return None
         tail = self._control[_TAIL]
-        header = self._headers[tail % self.shape.slots]
-        self._check(header, tail)
-        count, slot = header[_COUNT], self._slots[tail % self.shape.slots]
-        return RingBlock(
-            first_line=header[_FIRST_LINE],
-            pixels=slot.pixels[:count],
-            flags=slot.flags[:count],
-            time_ns=header[_TIME_NS],
-            losses=_read_losses(header) if header[_LOSS_COUNT] else (),
-        )
+        block = self.read(tail)
+        if block is None:
+            raise self._torn(tail)
+        return block
 
     def release(self) -> None:
         """Give the oldest block's slot back to the producer."""
         tail = self._control[_TAIL]
-        self._check(self._headers[tail % self.shape.slots], tail)
+        if not self.is_whole(tail):
+            raise self._torn(tail)
         self._control[_TAIL] = tail + 1
+
+    def lease(self, first_line: int) -> int:
+        """Take released blocks back, from the one that holds ``first_line`` on; the lines in them.
+
+        Where the history begins later, all of it: see `history_line`. `acquire` gives them once more.
+        """
+        tail = self._control[_TAIL]
+        oldest = min(tail, self._oldest())
+        self._control[_TAIL] = oldest  # first keep the producer away, then look what has been kept
+        while oldest < tail and not (self.is_whole(oldest) and self._end_line(oldest) > first_line):
+            oldest += 1
+            self._control[_TAIL] = oldest
+        return sum(self._header(block)[_COUNT] for block in range(oldest, tail))
 
     def empty(self) -> int:
         """Release everything that waits, unread; returns the number of lines."""
@@ -217,6 +260,59 @@ class Ring:
         """The line after the last committed one; 0 before the first."""
         return int(self._control[_NEWEST])
 
+    @property
+    def committed_lines(self) -> int:
+        """Lines that were committed so far; right after a producer's death at any instant, too."""
+        head = self._control[_HEAD]
+        return int(self._header(head - 1)[_TOTAL]) if head else 0
+
+    @property
+    def history_line(self) -> int:
+        """The first line that `lease` can take back, or that waits; `newest_line` where there is none."""
+        head = self._control[_HEAD]
+        for number in range(self._oldest(), head):
+            block = self.read(number)
+            if block is not None:
+                return block.first_line
+        return self.newest_line
+
+    @property
+    def head(self) -> int:
+        """Number of the next block; those before it were committed."""
+        return int(self._control[_HEAD])
+
+    def read(self, number: int) -> RingBlock | None:
+        """Block ``number`` in place, or None when it is not in the ring, or is being overwritten.
+
+        Whoever is not waited for must ask `is_whole` again after having used it.
+        """
+        header, slot = self._header(number), self._slots[number % self.shape.slots]
+        if not self.is_whole(number):
+            return None
+        count = header[_COUNT]
+        block = RingBlock(
+            first_line=header[_FIRST_LINE],
+            pixels=slot.pixels[:count],
+            flags=slot.flags[:count],
+            time_ns=header[_TIME_NS],
+            losses=_read_losses(header) if header[_LOSS_COUNT] else (),
+        )
+        return block if self.is_whole(number) else None
+
+    def is_whole(self, number: int) -> bool:
+        """The slot holds this block, and all of it."""
+        sequence: int = self._header(number)[_SEQUENCE]
+        return sequence == 2 * number + 2
+
+    def observer_words(self, number: int) -> memoryview:
+        """What belongs to an observer alone; zero at first. The caller releases the view before `close`."""
+        if not 0 <= number < self.shape.observers:
+            raise UsageError(
+                f"observer {number} of ring {self.name}", possible=f"0 to {self.shape.observers - 1}"
+            )
+        at = _OBSERVERS + number * _LINE_WORDS
+        return self._control[at : at + _LINE_WORDS]
+
     def statistics(self) -> RingStatistics:
         control = self._control
         return RingStatistics(
@@ -225,6 +321,7 @@ class Ring:
             peak=control[_PEAK],
             dropped_blocks=control[_DROPPED_BLOCKS],
             dropped_lines=control[_DROPPED_LINES],
+            history=max(0, control[_TAIL] - self._oldest()),
         )
 
     def close(self) -> None:
@@ -250,12 +347,21 @@ class Ring:
             os.eventfd_read(self._bell)
         return True
 
-    def _check(self, header: memoryview, block: int) -> None:
-        if header[_SEQUENCE] != 2 * block + 2:
-            raise DataError(
-                f"ring {self.name}: block {block} is torn or stale (sequence {header[_SEQUENCE]})",
-                possible=f"sequence {2 * block + 2} while exactly one process produces and one consumes",
-            )
+    def _oldest(self) -> int:
+        return int(max(0, self._control[_HEAD] - self.shape.history_slots))
+
+    def _header(self, number: int) -> memoryview:
+        return self._headers[number % self.shape.slots]
+
+    def _end_line(self, number: int) -> int:
+        header = self._header(number)
+        return int(header[_FIRST_LINE] + header[_COUNT])
+
+    def _torn(self, number: int) -> DataError:
+        return DataError(
+            f"ring {self.name}: block {number} is torn or stale (sequence {self._header(number)[_SEQUENCE]})",
+            possible=f"sequence {2 * number + 2} while exactly one process produces and one consumes",
+        )
 
     def _view(self, index: int) -> Slot:
         shape = self.shape

@@ -44,6 +44,8 @@ class Writer(Protocol):
 
     @property
     def committed_lines(self) -> int: ...
+    @property
+    def nearly_full(self) -> str | None: ...
     def append(self, block: TaggedBlock) -> None: ...
     def add_gap(self, arm: str, first_line: int, count: int, cause: str) -> None: ...
     def add_event(self, kind: str, tick: int, line: int, text: str = "") -> None: ...
@@ -166,6 +168,16 @@ class Session:
         self._told_to_end = True
         self._floor = _worse(self._floor, condition)
 
+    def extend(self, line: int) -> None:
+        """Do not end before ``line``; too late once an arm has all its rows."""
+        if not self.ending:
+            self.end_line = max(self.end_line, line)
+
+    def note(self, kind: str, line: int, text: str) -> None:
+        """List an event of a line in range; others belong to other recordings."""
+        if self.first_line <= line < self.end_line:
+            self._note(kind, line, text)
+
     def mismatches(self, found: list[TagMismatch]) -> None:
         """The trigger contradicts the count of lines; all are counted, the first are listed."""
         for mismatch in found[: max(0, MAX_MISMATCH_EVENTS - self._mismatches)]:
@@ -173,8 +185,10 @@ class Session:
         self._mismatches += len(found)
 
     def commit(self) -> None:
-        """Make what is written visible to readers."""
+        """Make what is written visible to readers; a disk that is nearly full ends the recording."""
         self._writer.commit()
+        if (reason := self._writer.nearly_full) is not None and not self._told_to_end:
+            self.end(max(book.next_line for book in self.books.values()), reason, RunCondition.INTERRUPTED)
 
     def close(self, error: Exception | None = None) -> Sealed:
         """Seal the recording; as aborted after a write ``error``, or one now, if the disk still allows it."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import mmap
 import os
 from multiprocessing import reduction
+from pathlib import Path
 from typing import Any
 
 from acquire.errors import DeviceError
@@ -76,7 +77,20 @@ class Counters:
         return Counters, (self.names, self._memory)
 
 
+def available_bytes() -> int:
+    """Memory that can be had without another program losing any, as the kernel estimates it."""
+    with Path("/proc/meminfo").open(encoding="ascii") as lines:
+        sizes = dict(line.split(":") for line in lines)
+    return int(sizes["MemAvailable"].split()[0]) * 1024
+
+
 def _allocate(name: str, size: int) -> int:
+    if size > (available := available_bytes()):
+        raise DeviceError(
+            f"{name}: {size / 2**20:.0f} MiB of shared memory",
+            possible=f"{available / 2**20:.0f} MiB are available",
+            hint="fewer or shorter ring slots, or fewer seconds (stream.ring_slots, ring_seconds)",
+        )
     fd = os.memfd_create(f"acquire-{name}")
     try:
         os.posix_fallocate(fd, 0, size)

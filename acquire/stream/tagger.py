@@ -7,6 +7,7 @@ tick (S·l + n - 1)·substep_ticks on. A tag that says the same confirms every l
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,8 +27,8 @@ if TYPE_CHECKING:
 
 UNCONFIRMED = np.uint16(LineFlag.TIME_ESTIMATED | LineFlag.CODE_UNVERIFIED)
 
-_PAGE_LINES = 8192
-_PAGES_KEPT = 4
+_SPAN_LINES = 32768
+_SPANS_KEPT = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +57,9 @@ class LineTable:
     tick: NDArray[np.uint64]
     time_ns: NDArray[np.int64]
 
+    def __len__(self) -> int:
+        return len(self.tick)
+
     def __getitem__(self, part: slice) -> LineTable:
         return LineTable(self.code_index[part], self.code[part], self.tick[part], self.time_ns[part])
 
@@ -73,7 +77,7 @@ class Tagger:
         self._run = run
         self._clock = clock
         self._readout_substep = Geometry(stages, run.substeps, 1).readout_substep
-        self._pages: dict[int, LineTable] = {}
+        self._spans: dict[int, LineTable] = {}
         self._last_line = -1
         self._restarted = False
         self.confirmed_end = 0
@@ -85,6 +89,8 @@ class Tagger:
         confirmed any more.
         """
         expected = self._expected(rows[:, 0])
+        if self._all_right(rows, expected):
+            return []
         wrong = (rows != expected).any(axis=1)
         right = np.flatnonzero(~wrong)
         lines = rows[right, 0].astype(np.int64)
@@ -96,6 +102,16 @@ class Tagger:
         self._restarted |= bool(back.any())
         suspects = np.union1d(np.flatnonzero(wrong), right[back])
         return [_mismatch(rows[k], expected[k]) for k in suspects]
+
+    def _all_right(self, rows: NDArray[np.uint64], expected: NDArray[np.uint64]) -> bool:
+        """The common case, at a fraction of the cost: all tags as predicted, each ahead of the one before."""
+        lines = rows[:, 0].tolist()
+        ahead = all(before < line for before, line in pairwise((self._last_line, *lines)))
+        if self._restarted or not ahead or not np.array_equal(rows, expected):
+            return False
+        self._last_line = lines[-1] if lines else self._last_line
+        self.confirmed_end = self._last_line + 1
+        return True
 
     def tag(self, block: LineBlock) -> TaggedBlock:
         """The block with code and time; lines that no tag confirmed so far are flagged."""
@@ -117,26 +133,24 @@ class Tagger:
         )
 
     def table(self, first_line: int, count: int) -> LineTable:
-        """The lines ``first_line .. first_line + count - 1``; both arms share the pages it is cut from."""
-        page, at = divmod(first_line, _PAGE_LINES)
-        if at + count <= _PAGE_LINES:
-            return self._page(page)[at : at + count]
-        return self._compute(first_line, count)
-
-    def _page(self, number: int) -> LineTable:
-        page = self._pages.pop(number, None) or self._compute(number * _PAGE_LINES, _PAGE_LINES)
-        self._pages[number] = page
-        if len(self._pages) > _PAGES_KEPT:
-            del self._pages[next(iter(self._pages))]  # the one not used for longest
-        return page
+        """The lines ``first_line .. first_line + count - 1``; both arms share the spans it is cut from."""
+        for start, span in reversed(self._spans.items()):
+            if start <= first_line and first_line + count <= start + len(span):
+                return span[first_line - start : first_line - start + count]
+        self._spans[first_line] = span = self._compute(first_line, max(count, _SPAN_LINES))
+        if len(self._spans) > _SPANS_KEPT:
+            del self._spans[next(iter(self._spans))]  # the oldest
+        return span[:count]
 
     def _compute(self, first_line: int, count: int) -> LineTable:
         substeps = self._run.substeps
         first_bit = substeps * first_line
         code_index = np.arange(first_bit, first_bit + substeps * count, substeps, dtype=np.uint64)
         tick = (code_index + np.uint64(self._readout_substep)) * np.uint64(self._run.substep_ticks)
-        bits = self._run.code.bits(first_bit, substeps * count).reshape(count, substeps)
-        code = np.packbits(bits, axis=1, bitorder="little")[:, 0]
+        bits = self._run.code.bits(first_bit, substeps * count)
+        code = np.zeros(count, np.uint8)
+        for substep in range(substeps):  # packbits of rows this short takes several times as long
+            code |= bits[substep::substeps] << np.uint8(substep)
         return LineTable(code_index, code, tick, self._clock.time_ns(tick))
 
     def _expected(self, lines: NDArray[np.uint64]) -> NDArray[np.uint64]:

@@ -51,6 +51,15 @@ class LineTag:
     tick: int
 
 
+@dataclass(frozen=True, slots=True)
+class TagEvent:
+    """Something that the trigger noticed during ``line``: ``input``, ``missed_trigger_a`` and so on."""
+
+    line: int
+    tick: int
+    kind: str
+
+
 class Trigger(Protocol):
     """One sync trigger. Calls are bounded in time and raise TriggerError."""
 
@@ -66,6 +75,10 @@ class Trigger(Protocol):
 
     def tags(self, timeout_s: float) -> list[LineTag]:
         """Tags that arrived since the last call, in order; waits at most ``timeout_s`` for the first."""
+        ...
+
+    def events(self) -> list[TagEvent]:
+        """What else the tags of all calls so far have told, each event once, in order."""
         ...
 
     def stop(self) -> int:

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 from acquire.clock import NS_PER_S, ClockFit
 from acquire.errors import TriggerError
 from acquire.trigger import registers as r
-from acquire.trigger.base import LineTag, TriggerIdentity
+from acquire.trigger.base import LineTag, TagEvent, TriggerIdentity
 from acquire.trigger.device import ANSWER_S, Device, DeviceStatus
 from acquire.trigger.link import Link
 from acquire.trigger.registers import Command, State
@@ -139,6 +139,9 @@ class TriggerDriver:
             return tags.take(device.link.tags(min(timeout_s, patience_s)))
         except TriggerError as error:
             raise TriggerError(f"{error.message}; last heard of {tags}", hint=error.hint) from error
+
+    def events(self) -> list[TagEvent]:
+        return self._tags.events() if self._tags is not None else []
 
     def stop(self) -> int:
         """End the run after a whole line; the number of lines. Idempotent."""

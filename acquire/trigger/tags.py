@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections import deque
 from typing import TYPE_CHECKING, ClassVar
 
-from acquire.trigger.base import LineTag
+from acquire.trigger.base import LineTag, TagEvent
 from acquire.trigger.registers import TAG_FIELDS, TIME_BITS, TagFlag
 
 if TYPE_CHECKING:
@@ -16,6 +17,18 @@ if TYPE_CHECKING:
 _NUMBERS = 1 << 16
 _RUN_BITS = dict(TAG_FIELDS)["run"]
 _WRAP = 1 << TIME_BITS
+_MOST_EVENTS = 4096
+EVENTS = {
+    TagFlag.PPS: "input",
+    TagFlag.MISSED_A: "missed_trigger_a",
+    TagFlag.MISSED_B: "missed_trigger_b",
+    TagFlag.UNEXPECTED_A: "unexpected_strobe_a",
+    TagFlag.UNEXPECTED_B: "unexpected_strobe_b",
+    TagFlag.WATCHDOG: "watchdog",
+    TagFlag.CLOCK_LOST: "clock_lost",
+    TagFlag.BUDGET: "line_budget",
+}
+"""Why a tag was sent → the event's name."""
 
 
 class TagReader:
@@ -39,12 +52,19 @@ class TagReader:
         self._run, self._number, self._start_tick = run, number % (1 << _RUN_BITS), start_tick
         self._next = 0
         self._counts = dict(self.NOTHING)
+        self._events: deque[TagEvent] = deque(maxlen=_MOST_EVENTS)
 
     def __str__(self) -> str:
         return f"run {self._run.run_id!r} with {self.lines_known} lines"
 
     def statistics(self) -> dict[str, int]:
         return dict(self._counts)
+
+    def events(self) -> list[TagEvent]:
+        """Events among the tags taken since the last call."""
+        taken = list(self._events)
+        self._events.clear()
+        return taken
 
     def take(self, arrivals: Iterable[TagArrival]) -> list[LineTag]:
         """The tags of lines among them; not those of events and of other runs."""
@@ -66,6 +86,11 @@ class TagReader:
         self._counts["tags"] += 1
         if not tag.flags & TagFlag.NO_LINES:
             self.lines_known = max(self.lines_known, tag.line + 1)
+        for flag, kind in EVENTS.items():
+            if tag.flags & flag:
+                self._events.append(
+                    TagEvent(tag.line, self._ticks_since_start(tag.timestamp, tag.line), kind)
+                )
         if not tag.flags & TagFlag.LINE:
             return None
         return LineTag(tag.line, tag.code_index, self._ticks_since_start(tag.timestamp, tag.line))

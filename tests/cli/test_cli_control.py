@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from acquire.cli import control
+from acquire.cli.durations import seconds
 from acquire.daemon.messages import ArmStatus, LastRecording, RecordingStatus, RingStatus, Status
 from acquire.daemon.states import State, commands
 
@@ -105,9 +106,14 @@ def test_start_passes_everything_on(cli: Cli, answering: Callable[[Status], Fake
     client = answering(status(State.RECORDING))
     assert cli("start", "x.zarr", "--lines", 5).code == 0
     assert cli("start", "--duration", 0.5).code == 0
+    assert cli("start", "--pre", "2s", "--post", "250ms").code == 0
+    assert cli("mark", "a bang").code == 0
+    budget = {"lines": None, "duration_s": None, "pre_s": 0.0, "post_s": None}
     assert client.calls == [
-        ("start", Path("x.zarr"), {"lines": 5, "duration_s": None}),
-        ("start", None, {"lines": None, "duration_s": 0.5}),
+        ("start", Path("x.zarr"), budget | {"lines": 5}),
+        ("start", None, budget | {"duration_s": 0.5}),
+        ("start", None, budget | {"pre_s": 2.0, "post_s": 0.25}),
+        ("mark", "a bang", {}),
     ]
 
 
@@ -128,3 +134,18 @@ def test_stop_tells_of_lost_lines(
     assert answer.code == code
     assert "/d/x.zarr, 500 lines" in answer.out
     assert ("acquire info /d/x.zarr" in answer.err) == bool(code)
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("2s", 2.0), ("500ms", 0.5), ("1.5min", 90.0), ("1h", 3600.0), ("3", 3.0), ("1e-3", 1e-3)],
+)
+def test_durations_in_words(text: str, value: float) -> None:
+    assert seconds(text) == pytest.approx(value)
+
+
+@pytest.mark.parametrize("text", ["", "s", "2 weeks", "-1s", "1s2", "nan", "inf", "1..2s"])
+def test_what_is_no_duration_is_refused(cli: Cli, text: str) -> None:
+    answer = cli("start", f"--pre={text}")
+    assert answer.code == 2
+    assert "is no duration: 2s, 500ms" in " ".join(answer.err.split())

@@ -6,6 +6,7 @@ import errno
 import json
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from acquire.cli.recordings import CELL_CHARACTERS
 from acquire.clock import ClockFit
 from acquire.codes import PrbsCode
 from acquire.lines import ARMS, LineFlag, TaggedBlock
-from acquire.store import RecordingSpec, RecordingWriter, RunCondition, open_recording, write_video
+from acquire.store import RecordingSpec, RecordingWriter, Retention, RunCondition, open_recording, write_video
 
 Cli = Callable[..., Any]
 M, S, FIRST, LINES = 4, 2, 100, 64
@@ -216,3 +217,66 @@ def test_cut_outside_says_what_is_there(cli: Cli, recording: Path, tmp_path: Pat
     assert answer.code == 2
     assert "possible: lines 100 to 163" in answer.err
     assert not (tmp_path / "c.npz").exists()
+
+
+def test_verify_says_which_lines_are_lost_and_ends_with_6(cli: Cli, recording: Path) -> None:
+    answer = cli("verify", recording)
+    assert (answer.code, answer.out.split("; ")[0]) == (0, f"{recording}: intact")
+    (recording / "b" / "tick" / "c" / "0").unlink()
+    answer = cli("verify", recording)
+    assert answer.code == 6
+    assert "not intact on disk: b/tick: lines 100 to 163: it is not on disk" in answer.out
+    found = cli("verify", recording, "--json")
+    assert (found.code, found.json["damage"][0]["count"]) == (6, 64)
+
+
+def test_recover_seals_what_its_writer_left(cli: Cli, tmp_path: Path) -> None:
+    path = tmp_path / "left.zarr"
+    with RecordingWriter.create(path, spec()) as writer:
+        for arm in ARMS:
+            writer.append(block(arm, range(0)))
+    answer = cli("recover", path)
+    assert (answer.code, answer.err) == (0, "")
+    assert "64 lines, sealed; 64 lines were on disk that no commit listed" in answer.out
+    assert cli("recover", path).out == f"{path}: 64 lines, nothing to recover\n"
+    assert cli("recover", path, "--json").json["changed"] is False
+    assert "INTERRUPTED" in cli("info", path).out
+    assert cli("verify", path).code == 0
+
+
+def test_info_states_what_can_be_lost(cli: Cli, recording: Path) -> None:
+    assert (
+        "kill -9: at most 16 lines; power loss: what the system has not written back"
+        in cli("info", recording).out
+    )
+
+
+def test_hold_keeps_lines_of_a_recording_that_grows(cli: Cli, tmp_path: Path) -> None:
+    path = tmp_path / "endless.zarr"
+    policy = Retention(max_age_lines=16, margin_lines=4)
+    with RecordingWriter.create(path, replace(spec(), retention=policy, shard_chunks=1)) as writer:
+        answer = cli("hold", path, "--first-line", FIRST, "--lines", 10, "--why", "flash")
+        assert answer.out == f"{path}: lines {FIRST} to {FIRST + 9} are held\n"
+        for arm in ARMS:
+            writer.append(block(arm, range(0)))
+        writer.commit()
+        shown = cli("info", path).out
+        assert "116 to 147" in shown
+        assert f"{FIRST} to {FIRST + 9}" in shown
+        answer = cli("hold", path, "--first-line", 120, "--lines", 1)
+        assert (answer.code, "gone already" in answer.err) == (6, True)
+        assert cli("cut", path, "--first-line", 120, "--lines", 5, "--out", tmp_path / "c.npz").code == 6
+        assert cli("cut", path, "--first-line", FIRST, "--lines", 5, "--out", tmp_path / "c.npz").code == 0
+
+
+def test_recordings_at_urls(cli: Cli, recording: Path, tmp_path: Path) -> None:
+    url = f"memory://{tmp_path.name}/one.zarr"
+    answer = cli("upload", recording, url)
+    assert (answer.code, "64 lines, sealed" in answer.out) == (0, True)
+    assert cli("upload", recording, url, "--json").json["shards"] == 0
+    assert url in cli("info", url).out
+    assert cli("verify", url).code == 0
+    out = tmp_path / "far.npz"
+    assert cli("cut", url, "--first-line", 110, "--lines", 20, "--out", out).code == 0
+    with np.load(out) as saved:
+        assert np.array_equal(saved["lines"], open_recording(recording).cut(110, 20).lines)

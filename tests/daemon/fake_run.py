@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 from acquire.config import load_rig
 from acquire.lines import ARMS
 from acquire.store import RunCondition
-from acquire.stream import CaptureStatus
+from acquire.stream import CaptureStatus, Window
+from acquire.stream.messages import Note
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -45,6 +46,8 @@ class FakeRun:
         self.calls: list[Any] = []
         self.refuse = refuse
         self.seen = CALM
+        self.happened: list[Note] = []
+        self.window = Window()
         self.may_arm = threading.Event()
         self.may_arm.set()
         self.seals_at_stop = True
@@ -69,9 +72,22 @@ class FakeRun:
         self._call("arm")
         self.seen = CALM
 
-    def start(self, path: Path, lines: int | None) -> None:
+    def start(self, path: Path, lines: int | None, window: Window, *, resume: bool = False) -> Path:
         self._call("start", path, lines)
+        self.window = window
         self.see(recording=True, first_line=40)
+        return path.with_name("segment.zarr") if resume else path
+
+    def mark(self, text: str) -> Note:
+        self._call("mark", text)
+        return Note(77, "mark", text)
+
+    def extend(self, line: int) -> None:
+        self._call("extend", line)
+
+    def events(self) -> list[Note]:
+        happened, self.happened = self.happened, []
+        return happened
 
     def stop(self, reason: str) -> None:
         self._call("stop", reason)

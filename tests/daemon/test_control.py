@@ -70,7 +70,7 @@ def daemon(path: Path, run: FakeRun) -> Iterator[Client]:
 def test_commands(daemon: Client, run: FakeRun, tmp_path: Path) -> None:
     assert daemon.arm().state is State.ARMED
     status = daemon.start(tmp_path / "x.zarr", lines=7)
-    assert (status.state, status.possible) == (State.RECORDING, ["stop"])
+    assert (status.state, status.possible) == (State.RECORDING, ["mark", "stop"])
     assert run.calls[-1] == ("start", tmp_path / "x.zarr", 7)
     assert daemon.stop().state is State.IDLE
 
@@ -102,8 +102,10 @@ def test_device_error_keeps_its_class_and_words(daemon: Client, run: FakeRun) ->
 def test_impossible_start_is_refused_before_it_is_sent(daemon: Client) -> None:
     with pytest.raises(UsageError, match="lines"):
         daemon.start(lines=0)
-    with pytest.raises(UsageError, match="two ways to say the same"):
+    with pytest.raises(UsageError, match="lines and duration_s are ways to say the same"):
         daemon.start(lines=1, duration_s=1.0)
+    with pytest.raises(UsageError, match="pre_s is a part of duration_s"):
+        daemon.start(duration_s=1.0, pre_s=1.0)
 
 
 def test_malformed_request_names_the_key(path: Path, daemon: Client) -> None:
@@ -114,7 +116,7 @@ def test_malformed_request_names_the_key(path: Path, daemon: Client) -> None:
         assert message.error == "UsageError"
         assert message.message.startswith("line = 5")
         described = raw.get("/openapi.json").json()
-    assert {"/status", "/arm", "/start", "/stop", "/disarm"} == set(described["paths"])
+    assert {"/status", "/arm", "/start", "/mark", "/stop", "/disarm"} == set(described["paths"])
     assert "Status" in described["components"]["schemas"]
 
 

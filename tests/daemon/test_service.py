@@ -9,12 +9,15 @@ from pathlib import Path
 import pytest
 from fake_run import FakeRun, rig_config
 
+from acquire.config import load_rig
 from acquire.daemon import service as service_module
 from acquire.daemon.messages import StartRequest
 from acquire.daemon.service import Service
 from acquire.daemon.states import State
 from acquire.errors import CameraError, DeviceError, StateError, UsageError
 from acquire.store import RunCondition
+from acquire.stream import Window
+from acquire.stream.messages import Note
 
 
 class Bed:
@@ -278,3 +281,57 @@ def test_shutdown_closes_the_run_whatever_fails(tmp_path: Path) -> None:
     bed.service.shutdown()
     assert bed.run.names[-1] == "close"
     assert bed.service.status().last is not None
+
+
+def eventful(directory: Path, **events: object) -> Bed:
+    """A service whose rig records by itself, at a tenth of a second's notice."""
+    bed = Bed(directory, FakeRun())
+    settings = {"recording.directory": str(directory), "stream.ring_seconds": 1.0}
+    given = {"events.pre_s": 0.1, "events.post_s": 0.2, **{f"events.{key}": events[key] for key in events}}
+    bed.service = Service(load_rig("rig-demo", {**settings, **given}), bed._open)
+    bed.service.arm()
+    return bed
+
+
+def test_an_event_starts_a_recording_with_what_was_before(tmp_path: Path) -> None:
+    bed = eventful(tmp_path, sources=["input"])
+    bed.run.happened = [Note(1000, "threshold", ""), Note(9000, "input", "tick 5")]
+    bed.service.supervise()
+    status = bed.service.status()
+    assert (status.state, status.recording and status.recording.budget_lines) == (State.RECORDING, 10_001)
+    assert bed.run.window == Window(9000, 3334, 6667, exact=False)
+    bed.run.happened = [Note(12_000, "input", "")]
+    bed.service.supervise()
+    assert bed.run.calls[-1] == ("extend", 12_000 + 6667)
+    bed.run.seal()
+    bed.service.supervise()
+    assert (bed.state, bed.run.names[-1]) == (State.IDLE, "close")
+
+
+def test_a_rig_that_rearms_waits_for_the_next_event(tmp_path: Path) -> None:
+    bed = eventful(tmp_path, sources=["mark"], rearm=True)
+    for number in (1, 2):
+        bed.service.mark("now")
+        assert bed.state is State.RECORDING
+        bed.run.seal(lines=number)
+        bed.service.supervise()
+        last = bed.service.status().last
+        assert (bed.state, last and last.lines) == (State.ARMED, number)
+        bed.run.see(done=False, condition=None, end_reason=None)
+    bed.service.mark("once more")
+    bed.service.stop()  # a command: also then it stays armed for the next event
+    assert (bed.state, "close" in bed.run.names) == (State.ARMED, False)
+    bed.service.disarm()
+    assert bed.state is State.IDLE
+
+
+def test_a_mark_is_only_noted_where_nobody_asked_for_more(bed: Bed) -> None:
+    with pytest.raises(StateError, match="cannot mark while idle"):
+        bed.service.mark("too early")
+    bed.service.arm()
+    bed.service.mark("hello")
+    assert (bed.state, bed.run.calls[-1]) == (State.ARMED, ("mark", "hello"))
+    bed.service.start(StartRequest(pre_s=0.01, post_s=0.01))
+    assert bed.run.window == Window(None, 334, 334, kind="mark", text="acquire start")
+    bed.service.mark("hello")
+    assert bed.run.calls[-1] == ("mark", "hello")  # nothing is prolonged

@@ -12,12 +12,15 @@ from acquire.errors import StateError
 ARROWS = """
 idle arm armed
 armed start recording
+armed mark armed
 armed disarm idle
 armed fault faulted
+recording mark recording
 recording stop draining
 recording full draining
 recording fault faulted
 draining sealed idle
+draining kept armed
 draining fault faulted
 faulted disarm idle
 """
@@ -48,5 +51,5 @@ def test_every_state_leads_back_to_idle(state: State) -> None:
 
 
 def test_commands_are_what_the_table_allows() -> None:
-    assert commands(State.ARMED) == (Event.START, Event.DISARM)
+    assert commands(State.ARMED) == (Event.START, Event.MARK, Event.DISARM)
     assert commands(State.DRAINING) == ()

@@ -59,6 +59,29 @@ def test_whole_life(daemon: Daemon) -> None:
     assert changes == ["idle → armed", "armed → recording", "recording → draining", "draining → idle"]
 
 
+def test_a_recording_goes_on_in_a_segment(daemon: Daemon) -> None:
+    """Another day, the same recording: what is there is not touched, the outage is told."""
+    for resume in ((), ("--resume",)):
+        assert daemon("arm").code == 0
+        begun = daemon("start", "days.zarr", "--lines", 300, *resume, "--json")
+        assert begun.code == 0, begun.err
+        assert daemon("status", "--wait", "idle", "--timeout", 30).code == 0
+    assert begun.json["recording"]["path"] == str(daemon.home / "days-2.zarr")
+    first = open_recording(daemon.home / "days.zarr")
+    (second,) = first.segments
+    assert (first.lines, second.lines) == (300, 300)
+    assert second.attrs["run_id"] == first.attrs["run_id"]
+    assert second.attrs["segment"]["of"] == "days.zarr"
+    for path in ("days.zarr", "days-2.zarr"):
+        assert daemon("verify", path).code == 0
+    shown = daemon("info", "days-2.zarr").out
+    assert "days.zarr after line" in shown
+    assert daemon("arm").code == 0
+    refused = daemon("start", "none.zarr", "--resume")
+    assert (refused.code, "does not exist" in refused.err) == (6, True)
+    assert daemon("disarm").code == 0
+
+
 def test_line_budget(daemon: Daemon) -> None:
     """The daemon goes idle by itself; both arms hold exactly the budget, contiguous, with the run's code."""
     with daemon.client() as client:

@@ -16,7 +16,7 @@ import zarr
 from store_helpers import Truth, check_rows
 from writer_process import SPEC
 
-from acquire.store import open_recording
+from acquire.store import open_recording, recover, verify
 
 SCRIPT = Path(__file__).with_name("writer_process.py")
 WAIT_S = 60.0
@@ -70,6 +70,12 @@ def test_kill_leaves_everything_that_was_acknowledged(tmp_path, seed):
     assert (recording.state, recording.lines) == ("recording", rows)
     if rows:
         assert recording.cut(SPEC.first_line, rows).mask.all()
+    recovered = recover(path)
+    assert recovered.lines >= rows
+    assert not recovered.damage
+    check_rows(zarr.open_group(path, mode="r"), SPEC, recovered.lines)
+    assert verify(path).intact
+    assert not recover(path).changed
 
 
 def test_reader_of_a_growing_recording_never_sees_a_line_that_is_not_there(tmp_path):

@@ -109,7 +109,20 @@ def test_xarray_opens_an_arm_with_times_and_flags(path):
         }
 
 
-def test_every_way_of_opening_sees_a_growing_recording_alike(path):
+def test_parts_opened_by_themselves_are_older_than_the_root_at_most(path):
+    with RecordingWriter.create(path, make_spec()) as writer:
+        for step in range(4):
+            fill(writer, 40)
+            writer.commit()
+            alone = zarr.open_array(path / "a" / "time", mode="r").shape[0]
+            assert alone in {0, *((k + 1) * 40 // 16 * 16 for k in range(step + 1))}
+            assert zarr.open_group(path, mode="r")["a/time"].shape[0] == writer.committed_lines
+        writer.seal(RunCondition.GOOD, "done", {})
+    assert zarr.open_array(path / "a" / "time", mode="r").shape == (160,)
+
+
+def test_every_way_of_opening_sees_a_growing_recording_alike(path, monkeypatch):
+    monkeypatch.setattr("acquire.store.writer.OWN_INTERVAL_S", 0.0)
     spec = make_spec()
     with RecordingWriter.create(path, spec) as writer:
         for step in range(4):
@@ -287,7 +300,7 @@ def test_what_cannot_be_a_path_is_refused(tmp_path, name):
     ],
 )
 def test_a_place_that_takes_no_directory_is_not_a_disk_that_fails(path, monkeypatch, number, kind):
-    def refuse(*_):
+    def refuse(*_, **__):
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(type(path), "mkdir", refuse)

@@ -7,18 +7,22 @@ import os
 import signal
 import threading
 import time
-from collections import deque
-from itertools import count
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from multiprocessing.process import BaseProcess
+from typing import ClassVar
 
 import numpy as np
 import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from acquire.errors import DataError, UsageError
 from acquire.stream.losses import MAX_LOSSES, Cause, Loss
-from acquire.stream.ring import Ring, RingShape, RingStatistics
+from acquire.stream.observer import Observer, ObserverStatistics
+from acquire.stream.ring import Ring, RingBlock, RingShape, RingStatistics
+from acquire.stream.shared import Counters
 
 SHAPE = RingShape(slots=3, rows=4, width=5, dtype="uint16")
 
@@ -29,17 +33,54 @@ def pattern(first_line: int, lines: int, width: int) -> np.ndarray:
     return ((line * 31 + np.arange(width)) % 60_000).astype(np.uint16)
 
 
-class RingMachine(RuleBasedStateMachine):
-    """Commits, drops, reads and releases in any order, against a queue."""
+OBSERVERS = 2
 
-    def __init__(self) -> None:
-        super().__init__()
-        self.ring = Ring("model", SHAPE)
-        self.queue: deque[tuple[int, int, tuple[Loss, ...]]] = deque()
-        self.line = self.peak = self.dropped_blocks = self.dropped_lines = self.newest = 0
+
+@dataclass
+class Watching:
+    """What an observer should be: where it stands, what it lost, and the block that it looks at."""
+
+    cursor: int = 0
+    peak: int = 0
+    lost: int = 0
+    holds: int | None = None
+
+
+class RingMachine(RuleBasedStateMachine):
+    """Producer, reader and observers do what they may in any order, against the list of all blocks."""
+
+    @initialize(slots=st.integers(1, 12), reserve=st.integers(2, 5))
+    def make(self, slots: int, reserve: int) -> None:
+        self.slots, self.reserve = slots, reserve
+        self.ring = Ring("model", replace(SHAPE, slots=slots, observers=OBSERVERS, reserve=reserve))
+        self.observers = [Observer(self.ring, number) for number in range(OBSERVERS)]
+        self.watching = [Watching() for _ in range(OBSERVERS)]
+        self.blocks: list[tuple[int, int, tuple[Loss, ...]]] = []
+        self.tail = self.line = self.peak = self.dropped_blocks = self.dropped_lines = 0
+        self.claimed = -1
 
     def teardown(self) -> None:
-        self.ring.close()
+        if hasattr(self, "ring"):
+            for observer in self.observers:
+                observer.close()
+            self.ring.close()
+
+    @property
+    def head(self) -> int:
+        return len(self.blocks)
+
+    @property
+    def oldest(self) -> int:
+        return max(0, self.head - max(0, self.slots - self.reserve))
+
+    def whole(self, number: int) -> bool:
+        return number > self.claimed - self.slots
+
+    def check(self, block: RingBlock, number: int) -> None:
+        first, lines, losses = self.blocks[number]
+        assert (block.first_line, block.end_line, block.losses) == (first, first + lines, losses)
+        assert np.array_equal(block.pixels, pattern(first, lines, SHAPE.width))
+        assert block.flags.tolist() == list(range(lines))
 
     @rule(
         lines=st.integers(1, SHAPE.rows),
@@ -50,57 +91,106 @@ class RingMachine(RuleBasedStateMachine):
     )
     def produce(self, lines: int, losses: list[Loss]) -> None:
         slot = self.ring.claim()
-        assert (slot is None) == (len(self.queue) == SHAPE.slots)
+        assert (slot is None) == (self.head - self.tail == self.slots)
         if slot is None:
             self.ring.drop(lines)
             self.dropped_blocks += 1
             self.dropped_lines += lines
         else:
+            self.claimed = self.head
             slot.pixels[:lines] = pattern(self.line, lines, SHAPE.width)
             slot.flags[:lines] = np.arange(lines)
             self.ring.commit(self.line, lines, losses)
-            self.queue.append((self.line, lines, tuple(losses)))
-            self.peak = max(self.peak, len(self.queue))
-            self.newest = self.line + lines
+            self.blocks.append((self.line, lines, tuple(losses)))
+            self.peak = max(self.peak, self.head - self.tail)
         self.line += lines
 
     @rule()
-    def claim_and_think_better_of_it(self) -> None:
-        self.ring.claim()
+    def claim_and_die(self) -> None:
+        """Whoever comes after it claims the same slot again."""
+        if self.ring.claim() is not None:
+            self.claimed = self.head
 
     @rule()
     def look(self) -> None:
         block = self.ring.acquire()
-        assert (block is None) == (not self.queue)
+        assert (block is None) == (self.tail == self.head)
         if block is not None:
-            first, lines, losses = self.queue[0]
-            assert (block.first_line, block.end_line, block.losses) == (first, first + lines, losses)
-            assert np.array_equal(block.pixels, pattern(first, lines, SHAPE.width))
-            assert block.flags.tolist() == list(range(lines))
+            self.check(block, self.tail)
 
-    @precondition(lambda self: self.queue)
-    @rule()
-    def release(self) -> None:
-        assert self.ring.acquire() is not None
-        self.ring.release()
-        self.queue.popleft()
+    @rule(blocks=st.integers(1, 12))
+    def release(self, blocks: int) -> None:
+        for _ in range(min(blocks, self.head - self.tail)):
+            assert self.ring.acquire() is not None
+            self.ring.release()
+            self.tail += 1
 
-    @precondition(lambda self: not self.queue)
+    @precondition(lambda self: self.tail == self.head)
     @rule()
     def release_nothing(self) -> None:
         with pytest.raises(DataError, match="torn or stale"):
             self.ring.release()
 
+    @rule(back=st.integers(0, 60))
+    def lease(self, back: int) -> None:
+        first_line = max(0, self.line - back)
+        before, self.tail = self.tail, min(self.tail, self.oldest)
+        while self.tail < before and sum(self.blocks[self.tail][:2]) <= first_line:
+            self.tail += 1
+        taken = sum(lines for _, lines, _ in self.blocks[self.tail : before])
+        assert self.ring.lease(first_line) == taken
+
+    @rule(who=st.integers(0, OBSERVERS - 1))
+    def observe(self, who: int) -> None:
+        block, seen = self.observers[who].acquire(), self.watching[who]
+        while (waiting := self.head - seen.cursor) > 0:
+            seen.peak = max(seen.peak, min(waiting, self.slots))
+            if waiting < self.slots and self.whole(seen.cursor):
+                break
+            skipped = max(1, waiting - self.slots // 2)
+            seen.lost += skipped
+            seen.cursor += skipped
+        assert (block is None) == (seen.cursor == self.head)
+        if block is not None:
+            self.check(block, seen.cursor)
+            seen.holds = seen.cursor
+
+    @rule(who=st.integers(0, OBSERVERS - 1))
+    def leave(self, who: int) -> None:
+        """What was overwritten since it was acquired is not passed off as whole."""
+        seen = self.watching[who]
+        if seen.holds == seen.cursor:
+            whole = self.whole(seen.cursor)
+            assert self.observers[who].release() == whole
+            seen.cursor += 1
+            seen.lost += not whole
+            seen.holds = None
+
+    @rule(who=st.integers(0, OBSERVERS - 1))
+    def skip(self, who: int) -> None:
+        seen = self.watching[who]
+        assert self.observers[who].skip() == self.head - seen.cursor
+        seen.cursor = self.head
+
     @invariant()
     def statistics_tell(self) -> None:
+        if not hasattr(self, "ring"):
+            return
+        waiting, history = self.head - self.tail, max(0, self.tail - self.oldest)
         assert self.ring.statistics() == RingStatistics(
-            SHAPE.slots, len(self.queue), self.peak, self.dropped_blocks, self.dropped_lines
+            self.slots, waiting, self.peak, self.dropped_blocks, self.dropped_lines, history
         )
-        assert self.ring.newest_line == self.newest
+        newest = sum(self.blocks[-1][:2]) if self.blocks else 0
+        assert self.ring.newest_line == newest
+        held = self.blocks[self.oldest :]
+        assert self.ring.history_line == (held[0][0] if held else newest)
+        for observer, seen in zip(self.observers, self.watching, strict=True):
+            fill = min(self.head - seen.cursor, self.slots)
+            assert observer.statistics() == ObserverStatistics(fill, seen.peak, seen.lost)
 
 
 TestRingMachine = RingMachine.TestCase
-TestRingMachine.settings = settings(max_examples=100, stateful_step_count=40, deadline=None)
+TestRingMachine.settings = settings(max_examples=100, stateful_step_count=60, deadline=None)
 
 
 @pytest.fixture
@@ -148,49 +238,173 @@ def test_doorbell_rings_until_hushed(ring: Ring) -> None:
     assert ring.acquire() is not None  # what was committed does not depend on the bell
 
 
+def test_history_is_taken_back_from_the_line_that_is_asked_for() -> None:
+    ring = Ring("history", RingShape(slots=16, rows=10, width=1, dtype="uint8", reserve=4))
+    for block in range(40):
+        assert ring.claim() is not None
+        ring.commit(10 * block, 10)
+        ring.release()
+    assert (ring.shape.history_slots, ring.history_line, ring.statistics().history) == (12, 280, 12)
+    assert ring.lease(345) == 60  # the block from 340 on
+    taken = ring.acquire()
+    assert taken is not None
+    assert taken.first_line == 340
+    assert ring.fill == 6
+    assert ring.lease(0) == 60  # all that there is
+    assert ring.history_line == 280
+    assert (ring.lease(395), ring.fill) == (0, 12)  # what was taken back stays
+    for block in range(40, 44):  # the reserve
+        assert ring.claim() is not None
+        ring.commit(10 * block, 10)
+    assert ring.claim() is None
+    del taken
+    ring.close()
+
+
 def test_impossible_shapes_and_losses_are_refused(ring: Ring) -> None:
     with pytest.raises(UsageError, match="0 slots"):
         RingShape(0, 1, 1, "uint8")
+    with pytest.raises(UsageError, match="reserve of 1"):
+        RingShape(4, 1, 1, "uint8", reserve=1)
+    with pytest.raises(UsageError, match="observer 0"):
+        Observer(ring, 0)
     ring.claim()
     with pytest.raises(UsageError, match="losses"):
         ring.commit(0, 1, [Loss(0, 1, Cause.CAMERA)] * (MAX_LOSSES + 1))
 
 
-BIG = RingShape(slots=4, rows=256, width=64, dtype="uint16")
+BIG = RingShape(slots=8, rows=256, width=64, dtype="uint16", observers=1)
+COUNTS = ("read", "lines", "seen", "lapped", "wrong")
 
 
 def produce_for_ever(ring: Ring) -> None:
-    """A producer in a process of its own, as fast as it can."""
-    line = 0
+    """As fast as it can, from where the last one stopped."""
+    line = ring.newest_line
     while True:
         slot = ring.claim()
-        if slot is not None:
+        if slot is None:
+            ring.drop(BIG.rows)
+            time.sleep(0.0005)
+        else:
             slot.pixels[:] = pattern(line, BIG.rows, BIG.width)
             slot.flags[:] = line % 1000
             ring.commit(line, BIG.rows)
-            line += BIG.rows
+        line += BIG.rows
 
 
-def test_producer_killed_in_mid_stream_leaves_whole_blocks_only() -> None:
-    ring = Ring("killed", BIG)
-    process = multiprocessing.get_context("spawn").Process(target=produce_for_ever, args=(ring,))
-    process.start()
-    try:
-        for number in count():
-            block = ring.acquire(20 if number == 0 else 0.2)
-            if block is None:
-                break
-            assert block.first_line == number * BIG.rows
-            assert np.array_equal(block.pixels, pattern(block.first_line, BIG.rows, BIG.width))
-            assert (block.flags == block.first_line % 1000).all()
-            ring.release()
-            del block
-            if number == 200:
-                assert process.pid is not None
-                os.kill(process.pid, signal.SIGKILL)
-        assert number > 200
-    finally:
+def is_right(block: RingBlock) -> bool:
+    flags_right = (block.flags == block.first_line % 1000).all()
+    return bool(flags_right) and np.array_equal(block.pixels, pattern(block.first_line, BIG.rows, BIG.width))
+
+
+def read_for_ever(ring: Ring, counts: Counters) -> None:
+    """Lines follow one another; what was released is never seen again."""
+    while True:
+        if (block := ring.acquire(1.0)) is None:
+            continue
+        right = is_right(block) and block.first_line >= counts["lines"]
+        counts.add("wrong", not right)
+        counts["lines"] = block.end_line
+        ring.release()
+        counts.add("read", 1)
+
+
+def observe_for_ever(ring: Ring, counts: Counters) -> None:
+    """What it takes for whole is whole."""
+    observer = Observer(ring, 0)
+    while True:
+        if (block := observer.acquire()) is None:
+            time.sleep(0.0005)
+            continue
+        right = is_right(block)
+        if observer.release():
+            counts.add("seen", 1)
+            counts.add("wrong", not right)
+        counts["lapped"] = observer.statistics().lost
+
+
+class Players:
+    """Processes on one ring that can be killed and replaced."""
+
+    targets: ClassVar = {"producer": produce_for_ever, "reader": read_for_ever, "observer": observe_for_ever}
+
+    def __init__(self) -> None:
+        self.ring = Ring("killed", BIG)
+        self.counts = Counters(COUNTS)
+        self.processes: dict[str, BaseProcess] = {}
+
+    def begin(self, name: str) -> None:
+        args = (self.ring,) if name == "producer" else (self.ring, self.counts)
+        process = multiprocessing.get_context("spawn").Process(target=self.targets[name], args=args)
+        process.start()
+        self.processes[name] = process
+
+    def signal(self, name: str, number: signal.Signals) -> None:
+        pid = self.processes[name].pid
+        assert pid is not None
+        os.kill(pid, number)
+
+    def kill(self, name: str) -> None:
+        process = self.processes.pop(name)
         process.kill()
         process.join(10)
         process.close()
-        ring.close()
+
+    def until_more(self, name: str, more: int) -> None:
+        target, deadline = self.counts[name] + more, time.monotonic() + 60
+        while self.counts[name] < target:
+            assert time.monotonic() < deadline, f"{name} stands at {self.counts[name]}"
+            time.sleep(0.001)
+
+    def close(self) -> None:
+        for name in list(self.processes):
+            self.kill(name)
+        self.counts.close()
+        self.ring.close()
+
+
+@pytest.fixture
+def players() -> Iterator[Players]:
+    made = Players()
+    yield made
+    made.close()
+
+
+@pytest.mark.parametrize("victim", ["producer", "reader", "observer"])
+def test_whoever_is_killed_the_others_go_on_and_a_successor_continues(players: Players, victim: str) -> None:
+    for name in Players.targets:
+        players.begin(name)
+    players.until_more("seen", 50)
+    for kill in range(3):
+        players.until_more("read", 20 + 7 * kill)
+        players.kill(victim)
+        before = players.ring.head
+        if victim == "observer":
+            players.until_more("read", 3 * BIG.slots)  # nobody waits for it
+        players.begin(victim)
+        players.until_more("seen", 50)
+        assert players.ring.head > before
+    for name in ("producer", "observer"):
+        players.kill(name)
+    deadline = time.monotonic() + 30
+    while players.ring.fill and time.monotonic() < deadline:
+        time.sleep(0.001)
+    players.kill("reader")
+    assert players.counts["wrong"] == 0
+    # Killed between release and count, a reader may owe one block per life.
+    assert players.ring.head - 3 <= players.counts["read"] <= players.ring.head
+    assert players.counts["lines"] == players.ring.newest_line
+
+
+def test_an_observer_that_stops_is_lapped_and_told(players: Players) -> None:
+    for name in Players.targets:
+        players.begin(name)
+    players.until_more("seen", 50)
+    lapped = players.counts["lapped"]
+    players.signal("observer", signal.SIGSTOP)
+    players.until_more("read", 10 * BIG.slots)
+    assert players.counts["lapped"] == lapped
+    players.signal("observer", signal.SIGCONT)
+    players.until_more("seen", 50)
+    assert players.counts["lapped"] - lapped >= 9 * BIG.slots - BIG.slots // 2
+    assert players.counts["wrong"] == 0

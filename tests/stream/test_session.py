@@ -37,6 +37,7 @@ class MemoryWriter:
     closed: bool = False
     broken: tuple[str, ...] = ()
     committed_lines: int = 0
+    nearly_full: str | None = None
 
     def append(self, block: TaggedBlock) -> None:
         self._refuse("append")

@@ -20,7 +20,7 @@ from acquire.errors import CameraError, TriggerError
 from acquire.store import RecordingSpec
 from acquire.stream import CapturePlan
 from acquire.stream.shared import Counters
-from acquire.trigger.base import LineTag, TriggerIdentity, TriggerRun
+from acquire.trigger.base import LineTag, TagEvent, TriggerIdentity, TriggerRun
 
 STAGES, SUBSTEPS, PIXELS, WHITE = 8, 3, 8, 4095
 DEPTH = STAGES + 1
@@ -139,6 +139,7 @@ class WireTrigger:
         self.mute = self.refuse = False
         self.broken: Exception | None = None
         self.shift = 0
+        self.told: list[TagEvent] = []
         self.stops = 0
         self._next = 0
 
@@ -166,6 +167,10 @@ class WireTrigger:
         self._next += len(lines) * self.run.tag_every_lines
         period = self.run.line_period_ticks
         return [LineTag(line, line * SUBSTEPS + self.shift, line * period) for line in lines]
+
+    def events(self) -> list[TagEvent]:
+        told, self.told = self.told, []
+        return told
 
     def stop(self) -> int:
         self.stops += 1

@@ -1,0 +1,76 @@
+"""How late a simulated camera's blocks are when they have come to rest in the ring: counted, never stored."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.stream.shared import WORD_BYTES, SharedBytes
+
+if TYPE_CHECKING:
+    from acquire.camera.base import Camera, CameraBlock
+    from acquire.sim.devices import SimulatedCamera
+    from acquire.sim.pattern import PatternCameraOpener
+
+
+class Latencies:
+    """A histogram in shared memory: one process adds, any reads. Steps of 10 µs up to 0.2 s."""
+
+    STEP_NS, BINS = 10_000, 20_000
+
+    def __init__(self, memory: SharedBytes | None = None) -> None:
+        self._memory = memory or SharedBytes("latencies", (self.BINS + 1) * WORD_BYTES)
+        self._words = self._memory.words(0, self.BINS + 1)
+
+    def add(self, latency_ns: int) -> None:
+        self._words[min(max(latency_ns, 0) // self.STEP_NS, self.BINS - 1)] += 1
+        self._words[self.BINS] = max(self._words[self.BINS], latency_ns)
+
+    def clear(self) -> None:
+        self._words[:] = memoryview(bytes((self.BINS + 1) * WORD_BYTES)).cast("q")
+
+    def percentiles_ms(self) -> dict[str, float]:
+        """Upper ends of the steps; 0 where nothing was added."""
+        reached = np.cumsum(np.array(self._words[: self.BINS]))
+        found = {
+            name: float(np.searchsorted(reached, part * reached[-1]) + 1) * self.STEP_NS / 1e6
+            for name, part in (("p50", 0.5), ("p99", 0.99), ("p99.9", 0.999))
+        }
+        return found | {"max": self._words[self.BINS] / 1e6}
+
+    def close(self) -> None:
+        """Let go of the memory. Idempotent."""
+        self._words.release()
+        self._memory.close()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Latencies, (self._memory,)
+
+
+@dataclass(frozen=True, slots=True)
+class TimedOpener:
+    """Opens a camera that notes how late its blocks were when they came to rest in the ring."""
+
+    opener: PatternCameraOpener
+    latencies: Latencies
+
+    def __call__(self) -> Camera:
+        return TimedCamera(self.opener(), self.latencies)
+
+
+class TimedCamera:
+    """A simulated camera and a stopwatch; see `TimedOpener`."""
+
+    def __init__(self, camera: SimulatedCamera, latencies: Latencies) -> None:
+        self._camera, self._latencies = camera, latencies
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._camera, name)
+
+    def release(self, block: CameraBlock) -> None:
+        last = block.first_line + len(block.flags) - 1
+        self._latencies.add(time.monotonic_ns() - int(self._camera.times_ns(last, 1)[0]))
+        self._camera.release(block)

@@ -1,0 +1,162 @@
+"""What ring, codec and disk of this host sustain, one by one and as the recorder uses them: a second in all.
+
+Every part works through lines as they come from a camera, flat out, in this thread. A part that is too slow
+by itself is too slow in the capture path; and all of them share the host's processors.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.capacity.load import recording_spec, trigger_run
+from acquire.clock import ClockFit
+from acquire.lines import ARMS, LineBlock
+from acquire.sim.pattern import Pattern
+from acquire.store import RecordingWriter
+from acquire.store.codecs import crc32c, encode
+from acquire.stream.ring import Ring, RingShape
+from acquire.stream.tagger import Tagger
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    from acquire.capacity.load import Load
+
+PART_S = 0.25
+"""How long each part is made to work."""
+_BLOCKS = 8
+"""Different ones, so that a processor's cache does not hold them all."""
+_PREFIX = ".capacity-"
+_CLOCK = ClockFit(90_000_000, 0, 0)
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """How fast something takes lines, of both arms each: by the clock, and by the processor time it takes."""
+
+    lines_per_s: float
+    cpu_s_per_line: float
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """Paces of a load's parts. ``recorder`` is tags, codec, checksum and disk together, as in a recording."""
+
+    load: Load
+    ring: Pace
+    codec: Pace
+    recorder: Pace
+    cores: int
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """Line rate in Hz that each part allows; ``processors``: all of them together."""
+        return {
+            "ring": self.ring.lines_per_s,
+            "codec": self.codec.lines_per_s,
+            "recorder": self.recorder.lines_per_s,
+            "processors": self.cores / (self.ring.cpu_s_per_line + self.recorder.cpu_s_per_line),
+        }
+
+    @property
+    def limit(self) -> str:
+        """The part that allows least."""
+        return min(self.limits, key=self.limits.__getitem__)
+
+    @property
+    def line_rate_hz(self) -> float:
+        """What all of them allow."""
+        return self.limits[self.limit]
+
+
+def measure_parts(load: Load, directory: Path) -> Parts:
+    """Measure, with a recording below ``directory`` that is gone afterwards.
+
+    Raises what a recording there would be refused with.
+    """
+    patterns = [Pattern(arm, load.pixels, load.dtype, 255) for arm in ARMS]
+    blocks = [
+        pattern.lines(k * load.block_lines, load.block_lines) for k in range(_BLOCKS) for pattern in patterns
+    ]
+    return Parts(
+        load,
+        ring=_pace_of_ring(load, blocks),
+        codec=_pace_of_codec(load, blocks),
+        recorder=_pace_of_recorder(load, blocks, directory),
+        cores=len(os.sched_getaffinity(0)),
+    )
+
+
+def _pace(work: Callable[[int], int], finish: Callable[[], object] = lambda: None) -> Pace:
+    """Of ``work(k)``, which does the k-th piece and returns its lines of one arm."""
+    begun_s, begun_cpu_s, lines, k = time.perf_counter(), time.process_time(), 0, 0
+    while time.perf_counter() - begun_s < PART_S or k < len(ARMS):
+        lines += work(k)
+        k += 1
+    finish()
+    both = lines / len(ARMS)
+    return Pace(both / (time.perf_counter() - begun_s), (time.process_time() - begun_cpu_s) / both)
+
+
+def _pace_of_ring(load: Load, blocks: list[NDArray[Any]]) -> Pace:
+    """What a grabber does with a block, and the recorder's side of it."""
+    ring = Ring("capacity", RingShape(2, load.block_lines, load.pixels, load.dtype))
+
+    def pass_through(k: int) -> int:
+        slot = ring.claim()
+        assert slot is not None
+        slot.pixels[:] = blocks[k % len(blocks)]
+        slot.pixels.max()
+        ring.commit(k * load.block_lines, load.block_lines)
+        ring.acquire()
+        ring.release()
+        return load.block_lines
+
+    try:
+        return _pace(pass_through)
+    finally:
+        ring.close()
+
+
+def _pace_of_codec(load: Load, blocks: list[NDArray[Any]]) -> Pace:
+    def pack(k: int) -> int:
+        crc32c(encode(blocks[k % len(blocks)], load.codec).data)
+        return load.block_lines
+
+    return _pace(pack)
+
+
+def _pace_of_recorder(load: Load, blocks: list[NDArray[Any]], directory: Path) -> Pace:
+    _clear(directory)
+    path = directory / f"{_PREFIX}{os.getpid()}.zarr"
+    tagger = Tagger(trigger_run(load), load.stages, _CLOCK)
+    flags = np.zeros(load.block_lines, np.uint16)
+    with RecordingWriter.create(path, recording_spec(load, _CLOCK)) as writer:
+
+        def append(k: int) -> int:
+            turn, arm = divmod(k, len(ARMS))
+            block = LineBlock(ARMS[arm], turn * load.block_lines, blocks[k % len(blocks)], flags)
+            writer.append(tagger.tag(block))
+            return load.block_lines
+
+        try:
+            return _pace(append, writer.commit)
+        finally:
+            writer.close()
+            shutil.rmtree(path, ignore_errors=True)
+
+
+def _clear(directory: Path) -> None:
+    """Remove what processes that were killed while they measured have left."""
+    for path in directory.glob(f"{_PREFIX}*.zarr"):
+        if not Path("/proc", path.stem.removeprefix(_PREFIX)).exists():
+            shutil.rmtree(path, ignore_errors=True)

@@ -1,0 +1,132 @@
+"""``acquire bench``: the highest line rate that this host captures and records without a loss."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, quantity
+from acquire.errors import DataError, UsageError
+
+if TYPE_CHECKING:
+    from acquire.capacity.load import Load
+    from acquire.capacity.parts import Parts
+    from acquire.capacity.search import Trial
+
+
+def register(app: typer.Typer) -> None:
+    app.command(rich_help_panel="Capture")(bench)
+
+
+def bench(
+    config: Annotated[
+        str, typer.Option("--config", "-c", metavar="FILE", help="Rig file, or the name of a built-in one.")
+    ] = "rig-demo",
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="KEY=VALUE", help="Change one value of the file, e.g. recording.codec=lz4."
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Where to record; else the configuration's directory.")
+    ] = None,
+    seconds: Annotated[float, typer.Option(help="Duration of each run.")] = 2.0,
+    runs: Annotated[int, typer.Option(min=1, max=100, help="Most runs.")] = 9,
+    json: JsonFlag = False,
+) -> None:
+    """Search the highest line rate without a loss.
+
+    Cameras show stored lines, everything else is as in a run. Every run has processes, rings and a
+    recording of its own, which is removed again. Exit code 6 where no rate that is tried can be held.
+
+    Example: [bold]acquire bench --config rig-vt-4k5c-h100 --out /data[/]
+    """
+    from acquire.capacity.load import Load
+    from acquire.capacity.parts import measure_parts
+    from acquire.capacity.search import best, search_rate
+    from acquire.config import load_rig, parse_settings
+
+    if not 0.1 <= seconds <= 600:
+        raise UsageError(f"bench --seconds {seconds:g}", possible="0.1 to 600")
+    rig = load_rig(config, parse_settings(settings or []))
+    load, directory = Load.of(rig), (out or rig.recording.directory).absolute()
+    parts = measure_parts(load, directory)
+    if not json:
+        _show_parts(load, parts, directory)
+    trials = search_rate(load, directory, parts.line_rate_hz, seconds, None if json else _tell, runs)
+    found = best(trials)
+    if json:
+        print_json(_facts(load, parts, trials, found))
+    elif found is not None:
+        _show(load, trials, found)
+    if found is None:
+        raise DataError("no line rate that was tried could be held", hint="another disk, or a longer ring")
+
+
+def _show_parts(load: Load, parts: Parts, directory: Path) -> None:
+    limits = ", ".join(f"{name} {quantity(rate, 'Hz')}" for name, rate in parts.limits.items())
+    print_facts(
+        {
+            "lines": f"2 x {load.pixels} px {load.dtype}, codec {load.codec}",
+            "recorded to": str(directory),
+            "parts allow": limits,
+        }
+    )
+
+
+def _tell(trial: Trial) -> None:
+    typer.echo(f"  {quantity(trial.line_rate_hz, 'Hz')}: {'held' if trial.held else 'not held'}", err=True)
+
+
+def _show(load: Load, trials: list[Trial], found: Trial) -> None:
+    columns = ("lines/s", "MB/s", "lost", "ring peak", "cores", "latency p99.9", "")
+    rows = [_row(load, trial, found) for trial in sorted(trials, key=lambda trial: trial.line_rate_hz)]
+    typer.echo()
+    print_table(columns, rows)
+
+
+def _row(load: Load, trial: Trial, found: Trial) -> tuple[str, ...]:
+    rate, mb_s = quantity(trial.line_rate_hz, "Hz"), f"{trial.line_rate_hz * load.line_bytes / 1e6:.0f}"
+    report = trial.report
+    if report is None:
+        return (rate, mb_s, "", "", "", "", trial.trouble)
+    return (
+        rate,
+        mb_s,
+        str(report.lost + report.unaccounted),
+        f"{100 * report.ring_peak:.0f} %",
+        f"{sum(report.cores.values()):.2f}",
+        f"{report.latency_ms['p99.9']:.1f} ms",
+        "highest without loss" if trial is found else ("held" if trial.held else "not held"),
+    )
+
+
+def _facts(load: Load, parts: Parts, trials: list[Trial], found: Trial | None) -> dict[str, Any]:
+    return {
+        "pixels": load.pixels,
+        "dtype": load.dtype,
+        "codec": load.codec,
+        "configured_hz": load.line_rate_hz,
+        "limits_hz": parts.limits,
+        "highest_hz": None if found is None else found.line_rate_hz,
+        "highest_bytes_per_s": None if found is None else found.line_rate_hz * load.line_bytes,
+        "trials": [_trial_facts(trial) for trial in trials],
+    }
+
+
+def _trial_facts(trial: Trial) -> dict[str, Any]:
+    facts: dict[str, Any] = {"line_rate_hz": trial.line_rate_hz, "held": trial.held}
+    if trial.report is None:
+        return facts | {"trouble": trial.trouble}
+    report = trial.report
+    return facts | {
+        "lines": report.lines,
+        "lost": report.lost,
+        "unaccounted": report.unaccounted,
+        "ring_peak": report.ring_peak,
+        "cores": report.cores,
+        "latency_ms": report.latency_ms,
+    }

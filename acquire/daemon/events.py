@@ -1,0 +1,54 @@
+"""Recordings that start by themselves: what the rig's ``[events]`` ask for, in lines."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from acquire.stream import Window
+
+if TYPE_CHECKING:
+    from acquire.config import RigConfig
+    from acquire.daemon.messages import StartRequest
+    from acquire.stream.messages import Note
+
+
+def budget_lines(request: StartRequest, line_rate_hz: float) -> int | None:
+    """Lines of the recording in all; None: until stopped, or as its window says."""
+    if request.duration_s is None:
+        return request.lines
+    return math.ceil(request.duration_s * line_rate_hz)
+
+
+def window_of(request: StartRequest, line_rate_hz: float) -> Window:
+    """The lines around the moment of the request; refused where the ring does not hold them."""
+    post_lines = None if request.post_s is None else max(1, math.ceil(request.post_s * line_rate_hz))
+    window = Window(None, math.ceil(request.pre_s * line_rate_hz), post_lines)
+    return window if window.is_now else replace(window, kind="mark", text="acquire start")
+
+
+class StandingOrder:
+    """What is to happen at an event."""
+
+    def __init__(self, config: RigConfig) -> None:
+        self._events = config.events
+        self._rate_hz = config.line_rate_hz
+        self.rearm = config.events.rearm
+
+    def covers(self, note: Note) -> bool:
+        """The event starts a recording, or prolongs the one that an event started."""
+        return note.kind in self._events.sources
+
+    def window(self, note: Note) -> Window:
+        """From before the event, as far as the ring still holds it: an event cannot come again."""
+        pre_lines = math.ceil(self._events.pre_s * self._rate_hz)
+        return Window(note.line, pre_lines, self._post_lines, exact=False)
+
+    def end_line(self, note: Note) -> int:
+        """The recording goes on to this line at least."""
+        return note.line + self._post_lines
+
+    @property
+    def _post_lines(self) -> int:
+        return max(1, math.ceil(self._events.post_s * self._rate_hz))

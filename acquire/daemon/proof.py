@@ -1,0 +1,79 @@
+"""Before a run is armed: can ring, codec and disk of this host keep up with what is configured?
+
+Measured once for a directory, and again after some minutes, or with another configuration: a disk fills, and
+others come to use it.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from typing import TYPE_CHECKING
+
+from acquire.capacity.load import Load
+from acquire.capacity.parts import measure_parts
+from acquire.daemon.messages import CapacityStatus
+from acquire.errors import DataError, UsageError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from acquire.capacity.parts import Parts
+    from acquire.config import RigConfig
+
+VALID_S = 600.0
+TIGHT = 0.7
+"""Of what is sustained; a rate above it is armed with a warning."""
+
+log = logging.getLogger("acquire.daemon")
+
+
+class Proof:
+    """What one rig's recordings need, and what the host has to offer."""
+
+    def __init__(self, config: RigConfig) -> None:
+        self._load = Load.of(config)
+        self._directory = config.recording.directory.absolute()
+        self._measured: tuple[float, Parts] | None = None
+
+    def __call__(self, *, force: bool = False) -> CapacityStatus:
+        """What is sustained. Raises UsageError where that is less than what is configured, unless forced."""
+        try:
+            parts = self._parts(self._directory)
+        except (UsageError, DataError) as error:
+            log.warning("capacity: nothing can be recorded to measure it: %s", error)
+            return CapacityStatus(line_rate_hz=self._load.line_rate_hz, warning=f"not measured: {error}")
+        short = parts.line_rate_hz < self._load.line_rate_hz
+        tight = parts.line_rate_hz * TIGHT < self._load.line_rate_hz
+        warning = f"{self._configured()}; {_sustained(parts)}" if tight else None
+        if short and not force:
+            raise UsageError(
+                f"arm: {self._configured()} is more than this host sustains",
+                possible=_sustained(parts),
+                hint="another codec or directory (acquire bench), or arm --force",
+            )
+        if warning:
+            log.warning("capacity: %s", warning)
+        return CapacityStatus(
+            line_rate_hz=self._load.line_rate_hz,
+            sustained_hz=round(parts.line_rate_hz),
+            limit=parts.limit,
+            limits_hz={name: round(rate) for name, rate in parts.limits.items()},
+            warning=warning,
+        )
+
+    def _parts(self, directory: Path) -> Parts:
+        now_s = time.monotonic()
+        if self._measured is None or now_s - self._measured[0] > VALID_S:
+            self._measured = now_s, measure_parts(self._load, directory)
+        return self._measured[1]
+
+    def _configured(self) -> str:
+        load = self._load
+        mb_s = load.bytes_per_s / 1e6
+        return f"2 x {load.pixels} px x {load.line_rate_hz:.6g} lines/s = {mb_s:.4g} MB/s, codec {load.codec}"
+
+
+def _sustained(parts: Parts) -> str:
+    limits = ", ".join(f"{name} {rate:.3g}" for name, rate in parts.limits.items())
+    return f"{parts.line_rate_hz:.3g} lines/s, limited by {parts.limit} (lines/s: {limits})"

@@ -1,0 +1,64 @@
+"""How recordings are stored, from the rig's configuration; the codec measured where it says ``auto``."""
+
+from __future__ import annotations
+
+from math import ceil
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.geometry import Geometry
+from acquire.lines import ARMS
+from acquire.store import Retention, choose_codec, measure_disk
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.config import RetentionConfig, RigConfig
+    from acquire.store import CodecChoice
+
+SAMPLE_BYTES = 4 * 2**20
+"""Of lines that codecs are tried on."""
+
+
+def storage_settings(config: RigConfig) -> dict[str, Any]:
+    """Fields of a RecordingSpec that ``[recording]`` decides, but for an ``auto`` codec."""
+    recording = config.recording
+    chunks = ceil(recording.commit_s * config.line_rate_hz / recording.chunk_lines)
+    return {
+        "chunk_lines": recording.chunk_lines,
+        "shard_chunks": recording.shard_chunks,
+        "fsync": recording.fsync,
+        "commit_lines": chunks * recording.chunk_lines,
+        "reserve_bytes": round(recording.reserve_gb * 1e9),
+        "retention": recording.retention and _retention(recording.retention, config),
+    }
+
+
+def choose_for(config: RigConfig, lines: NDArray[Any] | None = None) -> CodecChoice:
+    """The codec for both arms at full rate, measured here in about a second: on ``lines`` (line, pixel) like
+    those to come, or on shot noise at half the range.
+    """
+    sample = shot_noise(config) if lines is None else lines
+    needed = len(ARMS) * config.line_rate_hz * sample[0].nbytes
+    return choose_codec(sample, needed, measure_disk(config.recording.directory))
+
+
+def shot_noise(config: RigConfig) -> NDArray[Any]:
+    """(line, pixel) lines of even light at half the range, with the noise of photons."""
+    camera, pixels = config.cameras.a, config.geometry.stages
+    count = max(1, SAMPLE_BYTES // (pixels * np.dtype(camera.dtype).itemsize))
+    light = np.random.default_rng(0).poisson(camera.white_dn / 2, (count, pixels))
+    return np.minimum(light, camera.white_dn).astype(camera.dtype)
+
+
+def _retention(config: RetentionConfig, rig: RigConfig) -> Retention:
+    rate = rig.line_rate_hz
+    depth = Geometry(rig.geometry.stages, rig.geometry.substeps, 1).depth_lines
+    return Retention(
+        max_bytes=None if config.max_gb is None else round(config.max_gb * 1e9),
+        max_age_lines=None if config.max_age_s is None else ceil(config.max_age_s * rate),
+        margin_lines=depth + config.segment_lines,
+        hold_events=config.hold_events,
+        hold_lines=(ceil(config.hold_before_s * rate), ceil(config.hold_after_s * rate)),
+    )

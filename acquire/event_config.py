@@ -1,0 +1,36 @@
+"""Model of a rig's ``[events]``: what starts a recording by itself, and what it keeps of before and after."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from acquire.effect_config import FrozenModel
+
+
+class EventsConfig(FrozenModel):
+    """While armed, an event of one of ``sources`` starts a recording; while that is written, it prolongs it.
+
+    The level is the mean of the arm's pixels over some lines. It counts as crossed once, until it has gone
+    back by the hysteresis.
+    """
+
+    sources: tuple[Literal["mark", "input", "threshold"], ...] = Field(
+        default=(),
+        description="'mark': acquire mark; 'input': an edge at the trigger's PPS input; 'threshold': level",
+    )
+    arm: Literal["a", "b"] = Field(default="a", description="'threshold': whose lines")
+    level_dn: float = Field(default=0.0, ge=0, description="'threshold': mean of the pixels")
+    hysteresis_dn: float = Field(default=0.0, ge=0, description="by which it must go back to count again")
+    edge: Literal["rising", "falling"] = "rising"
+    average_lines: int = Field(default=64, ge=1, le=65536, description="lines that the mean is taken over")
+    pre_s: float = Field(default=0.0, ge=0, description="recorded from before the event, as the ring has it")
+    post_s: float = Field(default=1.0, gt=0, description="recorded after the last event")
+    rearm: bool = Field(default=False, description="stay armed after such a recording, for the next event")
+
+    @model_validator(mode="after")
+    def _level_known(self) -> EventsConfig:
+        if "threshold" in self.sources and not self.hysteresis_dn < self.level_dn:
+            raise ValueError("source 'threshold' needs a level_dn above hysteresis_dn")
+        return self

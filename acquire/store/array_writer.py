@@ -1,0 +1,193 @@
+"""Writer of one Zarr v3 array that grows along its first axis, in sharded chunks written whole.
+
+::
+
+    append ─▶ buffer of one chunk ─full─▶ encode (in a thread of the pool) ─in order─▶ shard ─▶ disk
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.store.codecs import EncodeOnce, encode
+from acquire.store.files import DISK
+from acquire.store.pages import aligned_bytes
+from acquire.store.shard import DIRECT_BYTES, Pages, ShardWriter, shard_key
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future, ThreadPoolExecutor
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from acquire.store.files import Disk
+    from acquire.store.shard import ArrayShape
+
+ENCODED_AHEAD = 2
+"""Chunks of an array that are encoded while others are filled and written."""
+
+
+class ArrayWriter:
+    """Appends rows to one array; whole chunks go to disk at once, the rest waits in one buffer.
+
+    Buffers are allocated once. Rows that make a whole chunk by themselves are written without a copy, unless
+    a ``pool`` encodes: then up to ``ahead`` chunks are encoded while others are filled and written, always in
+    order. ``once`` is shared by arrays of equal rows. ``durable`` forces each file to the medium before it is
+    left for the next. What fills up the last chunk is ``padding``.
+    """
+
+    def __init__(
+        self,
+        directory: Path,
+        shape: ArrayShape,
+        *,
+        durable: bool,
+        padding: int = 0,
+        disk: Disk = DISK,
+        pool: ThreadPoolExecutor | None = None,
+        ahead: int = ENCODED_AHEAD,
+        once: EncodeOnce | None = None,
+    ) -> None:
+        self.directory = directory
+        self.shape = shape
+        self.rows = 0
+        """Rows appended."""
+        self.bytes_written = 0
+        self._durable = durable
+        self._padding = padding
+        self._disk = disk
+        self._pool = pool
+        self._once = once
+        self._free: deque[NDArray[Any]] = deque(_buffer(shape) for _ in range(1 + ahead if pool else 1))
+        self._buffer = self._free.popleft()
+        self._filled = 0
+        self._encoding: deque[tuple[Future[NDArray[np.uint8]], NDArray[Any]]] = deque()
+        self._chunks = 0
+        self._published = 0
+        self._shard: ShardWriter | None = None
+        self._pages = Pages()
+        self._unsynced = False
+
+    @property
+    def written_rows(self) -> int:
+        """Rows in chunks that are on disk, without what pads the last."""
+        return min(self._chunks * self.shape.chunk_rows, self.rows)
+
+    @property
+    def whole_rows(self) -> int:
+        """Rows in chunks that are on disk and in their shard's index, without what pads the last."""
+        return min(self._published * self.shape.chunk_rows, self.rows)
+
+    @property
+    def direct(self) -> bool:
+        """Chunks go past the page cache."""
+        return self._shard is not None and self._shard.direct
+
+    def append(self, rows: NDArray[Any]) -> None:
+        """Append rows of this array's dtype and row shape, any number of them."""
+        start = 0
+        while start < len(rows):
+            taken = self._take(rows[start:])
+            start += taken
+            self.rows += taken
+
+    def pad(self) -> None:
+        """Write the rows that wait as one more chunk, filled up with ``padding``."""
+        if self._filled:
+            self._buffer[self._filled :] = self._padding
+            self._flush()
+        self.settle()
+
+    def settle(self) -> None:
+        """Wait for the chunks that are being encoded, write them, and publish all of them."""
+        while self._encoding:
+            self._write_oldest()
+        self.publish()
+
+    def publish(self) -> None:
+        """Put what is written into the index of its shard."""
+        if self._shard is not None:
+            self._shard.publish()
+            self._published = self._chunks
+
+    def sync(self) -> None:
+        """Force what was written since the last call to the medium."""
+        if self._shard is not None and self._unsynced:
+            self._shard.sync()
+            self._unsynced = False
+
+    def close(self) -> None:
+        """Let go of the file; rows that wait are dropped. Idempotent."""
+        if self._shard is not None:
+            self._shard.close()
+
+    def _take(self, rows: NDArray[Any]) -> int:
+        size = self.shape.chunk_rows
+        if self._pool is None and self._filled == 0 and len(rows) >= size and rows.flags.c_contiguous:
+            self._write(self._encode(rows[:size]))
+            return size
+        count = min(size - self._filled, len(rows))
+        self._buffer[self._filled : self._filled + count] = rows[:count]
+        self._filled += count
+        if self._filled == size:
+            self._flush()
+        return count
+
+    def _flush(self) -> None:
+        self._filled = 0
+        if self._pool is None:
+            self._write(self._encode(self._buffer))
+            return
+        self._encoding.append((self._pool.submit(encode, self._buffer, self.shape.codec), self._buffer))
+        if not self._free:
+            self._write_oldest()
+        self._buffer = self._free.popleft()
+
+    def _encode(self, rows: NDArray[Any]) -> NDArray[np.uint8]:
+        if self._once is None:
+            return encode(rows, self.shape.codec)
+        return self._once(self._chunks, rows, self.shape.codec)
+
+    def _write_oldest(self) -> None:
+        payload, buffer = self._encoding.popleft()
+        self._free.append(buffer)
+        self._write(payload.result())
+
+    def _write(self, payload: NDArray[np.uint8]) -> None:
+        shard = self._shard
+        if shard is None or shard.full:
+            shard = self._next_shard()
+        self._unsynced = True
+        self.bytes_written += shard.append(payload, self._pages)
+        self._chunks += 1
+
+    def _next_shard(self) -> ShardWriter:
+        self.publish()
+        if self._durable:
+            self.sync()
+        self.close()
+        self._shard = None
+        key = shard_key(self._chunks // self.shape.shard_chunks, len(self.shape.chunk_shape))
+        path = self.directory / key
+        self.directory.stat()  # one that was taken away is a failure, and not made again
+        self._disk.make_directory(path.parent, parents=True)
+        direct = self.shape.chunk_bytes >= DIRECT_BYTES
+        self._shard = ShardWriter(self._disk, path, self.shape.shard_chunks, direct=direct)
+        if self._durable:
+            self._sync_directories(path.parent)
+        return self._shard
+
+    def _sync_directories(self, directory: Path) -> None:
+        """Force the way to a new shard to the medium."""
+        while directory != self.directory.parent:
+            self._disk.sync_directory(directory)
+            directory = directory.parent
+
+
+def _buffer(shape: ArrayShape) -> NDArray[Any]:
+    """A chunk in page-aligned memory."""
+    samples = aligned_bytes(shape.chunk_bytes)[: shape.chunk_bytes]
+    return samples.view(shape.dtype).reshape(shape.chunk_shape)

@@ -1,0 +1,169 @@
+"""How the bytes of a chunk are packed: as they are, or by blosc with bit shuffle; and how fast that is here.
+
+What is packed here, plain Zarr unpacks. Every chunk carries a crc32c, since blosc notices no flipped bit.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import google_crc32c
+import numpy as np
+from numcodecs import blosc
+
+from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+    from typing_extensions import Buffer
+
+Codec = Literal["none", "lz4", "zstd"]
+CODECS: tuple[Codec, ...] = ("none", "lz4", "zstd")
+CRC_BYTES = 4
+_MOST_KEPT = 4
+BLOSC_HEADER = 16
+"""Bytes; the second word is the unpacked size, the fourth the packed one."""
+
+blosc.use_threads = False  # its own threads serve one caller at a time; ours are the writer's
+
+
+@dataclass(frozen=True, slots=True)
+class CodecSpeed:
+    """What one thread makes of sample lines: MB of lines per second, and how many times smaller they get."""
+
+    codec: Codec
+    megabytes_per_s: float
+    ratio: float
+
+
+@dataclass(frozen=True, slots=True)
+class CodecChoice:
+    """The codec for a rate of lines, and the numbers that it was chosen by; JSON by `to_attrs`."""
+
+    codec: Codec
+    reason: str
+    needed_megabytes_per_s: float
+    measured: tuple[CodecSpeed, ...]
+
+    def to_attrs(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def encode(rows: NDArray[Any], codec: Codec) -> NDArray[np.uint8]:
+    """Bytes of one chunk before its checksum; ``rows`` is C-contiguous and little-endian."""
+    if codec == "none":
+        return rows.reshape(-1).view(np.uint8)
+    return np.frombuffer(blosc.compress(rows, codec.encode(), 1, blosc.BITSHUFFLE), np.uint8)
+
+
+class EncodeOnce:
+    """Packs chunks that come twice, once from either arm, a single time: code and ticks are alike."""
+
+    def __init__(self) -> None:
+        self._packed: dict[tuple[int, bytes], NDArray[np.uint8]] = {}
+
+    def __call__(self, chunk: int, rows: NDArray[Any], codec: Codec) -> NDArray[np.uint8]:
+        """`encode` of the rows of chunk number ``chunk``."""
+        key = chunk, crc32c(rows.data)
+        packed = self._packed.pop(key, None)
+        if packed is None:
+            packed = self._packed[key] = encode(rows, codec)
+            if len(self._packed) > _MOST_KEPT:
+                del self._packed[next(iter(self._packed))]
+        return packed
+
+
+def decode(payload: Buffer, codec: Codec) -> NDArray[np.uint8]:
+    """The bytes that were packed; `check_size` has agreed with their number."""
+    samples: NDArray[np.uint8] = np.frombuffer(
+        memoryview(payload) if codec == "none" else blosc.decompress(payload), np.uint8
+    )
+    return samples
+
+
+def check_size(payload: memoryview, size: int, codec: Codec) -> None:
+    """Raise ValueError unless ``payload`` is of the length that it says, and unpacks to ``size`` bytes."""
+    have, stored = len(payload), len(payload)
+    if codec != "none" and have >= BLOSC_HEADER:
+        have, stored = struct.unpack_from("<4xI4xI", payload)
+    if (have, stored) != (size, len(payload)):
+        raise ValueError(f"{len(payload)} bytes that do not make {size}")
+
+
+def stored_size(header: bytes, size: int, codec: Codec) -> int:
+    """Bytes on disk, with checksum, of a chunk of ``size`` bytes that begins so; 0: none does."""
+    if len(header) < BLOSC_HEADER:
+        return size + CRC_BYTES if codec == "none" else 0
+    stored = size if codec == "none" else int(struct.unpack_from("<12xI", header)[0])
+    return stored + CRC_BYTES
+
+
+def crc32c(data: Buffer) -> bytes:
+    """Checksum as Zarr stores it: 4 bytes, little-endian."""
+    # The library refuses memoryviews, but takes arrays.
+    value: int = google_crc32c.value(np.frombuffer(memoryview(data), np.uint8))
+    return value.to_bytes(CRC_BYTES, "little")
+
+
+def choose_codec(
+    lines: NDArray[Any],
+    bytes_per_s: float,
+    disk_bytes_per_s: float,
+    *,
+    threads: int = 1,
+    margin: float = 1.5,
+) -> CodecChoice:
+    """The codec that records ``bytes_per_s`` here with ``margin`` to spare; takes some tenths of a second.
+
+    ``lines`` (line, pixel) are like those to come, some MB of them; ``disk_bytes_per_s`` is what the disk
+    sustains; ``threads`` pack beside each other. The smallest recording wins among the codecs that hold the
+    rate with ``margin``; where none does, the one that comes nearest.
+    """
+    if not lines.size or bytes_per_s <= 0 or disk_bytes_per_s <= 0:
+        raise UsageError(
+            f"choosing a codec for {lines.shape} lines at {bytes_per_s:g} B/s", possible="above 0"
+        )
+    measured = tuple(measure_codec(lines, codec) for codec in CODECS)
+    needed = bytes_per_s * margin
+    held = {speed.codec: _sustained(speed, disk_bytes_per_s, threads) for speed in measured}
+    able = [speed for speed in measured if held[speed.codec] >= needed]
+    if able:
+        best = max(able, key=lambda speed: speed.ratio)
+        reason = f"the smallest that holds {needed / 1e6:.0f} MB/s"
+    else:
+        best = max(measured, key=lambda speed: held[speed.codec])
+        reason = f"none holds {needed / 1e6:.0f} MB/s; this one {held[best.codec] / 1e6:.0f} MB/s"
+    return CodecChoice(best.codec, reason, needed / 1e6, measured)
+
+
+def measure_codec(lines: NDArray[Any], codec: Codec, seconds: float = 0.1) -> CodecSpeed:
+    """How fast one thread packs ``lines`` with checksum: the best of the rounds that fit ``seconds``."""
+    rows = np.ascontiguousarray(lines)
+    best, until = float("inf"), time.perf_counter() + seconds
+    while (begun := time.perf_counter()) < until or best == float("inf"):
+        payload = encode(rows, codec)
+        crc32c(payload.data)
+        best = min(best, time.perf_counter() - begun)
+    return CodecSpeed(codec, rows.nbytes / best / 1e6, rows.nbytes / len(payload))
+
+
+def _sustained(speed: CodecSpeed, disk_bytes_per_s: float, threads: int) -> float:
+    """Bytes of lines per second: packing and writing go on beside each other, the slower one counts."""
+    return min(speed.megabytes_per_s * 1e6 * threads, disk_bytes_per_s * speed.ratio)
+
+
+def codec_of(chain: Sequence[dict[str, Any]]) -> Codec:
+    """The codec of a Zarr codec chain of ours: `bytes`, perhaps `blosc`, `crc32c`. ValueError for others."""
+    names = [codec["name"] for codec in chain]
+    if names == ["bytes", "crc32c"]:
+        return "none"
+    if names == ["bytes", "blosc", "crc32c"]:
+        for codec in CODECS:
+            if codec == chain[1]["configuration"]["cname"]:
+                return codec
+    raise ValueError(f"codecs {', '.join(names)}")

@@ -1,0 +1,86 @@
+"""Repairs inside the files of a recording that nobody writes: torn indices, chunks that are lost.
+
+They are forced to the medium by whoever tells of them in the recording's root.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.store.chunks import DamagedChunkError
+from acquire.store.codecs import crc32c, encode
+from acquire.store.pages import PAGE, page_up
+from acquire.store.shard import ABSENT, pack_index
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from acquire.store.chunks import ChunkReader
+    from acquire.store.files import Disk
+
+
+def mend_index(disk: Disk, path: Path, reader: ChunkReader, shard: int, *, grow: bool) -> bool:
+    """Rewrite the index of a shard when its checksum is wrong; says whether it was changed.
+
+    Replacing an index adds entries and leaves the others: each entry of a torn one is either right, which
+    its chunk's own checksum tells, or it is none. With ``grow``, chunks that were written behind the last
+    one are added, too: a commit would have put them into the index.
+    """
+    entries, intact = reader.index(shard)
+    first = shard * len(entries)
+    mended = np.full_like(entries, ABSENT)
+    for slot, (offset, size) in enumerate(entries):
+        if intact or _holds(reader, first + slot, int(offset), int(size)):
+            mended[slot] = offset, size
+    if grow:
+        _grow(reader, first, mended)
+    if intact and np.array_equal(mended, entries):
+        return False
+    disk.patch(path / reader.shard_file(shard), pack_index(mended), 0)
+    return True
+
+
+def _grow(reader: ChunkReader, first: int, entries: NDArray[np.uint64]) -> None:
+    """Add what lies behind the last chunk that ``entries`` know; chunk ``first`` is in slot 0."""
+    present = np.flatnonzero(entries[:, 0] != ABSENT)
+    slot = int(present[-1]) + 1 if len(present) else 0
+    offset = page_up(int(entries[slot - 1].sum())) if slot else PAGE
+    while slot < len(entries):
+        size = reader.size_at(first + slot, offset)
+        if not _holds(reader, first + slot, offset, size):
+            return
+        entries[slot] = offset, size
+        slot, offset = slot + 1, page_up(offset + size)
+
+
+def rewrite_chunk(disk: Disk, path: Path, reader: ChunkReader, chunk: int, rows: NDArray[Any]) -> None:
+    """Put ``rows`` in the place of a chunk: at the end of its file, which is made where there is none."""
+    file = path / reader.file(chunk)
+    entries, _ = reader.index(chunk // reader.shape.shard_chunks)
+    payload = encode(rows, reader.shape.codec).tobytes()
+    data = payload + crc32c(payload)
+    if file.exists():
+        offset = page_up(file.stat().st_size)
+        disk.patch(file, data, offset)
+    else:
+        offset = PAGE
+        disk.make_directory(file.parent, parents=True)
+        disk.write_file(file, bytes(PAGE) + data, durable=False)
+    changed = entries.copy()
+    changed[chunk % len(entries)] = offset, len(data)
+    disk.patch(file, pack_index(changed), 0)
+
+
+def _holds(reader: ChunkReader, chunk: int, offset: int, size: int) -> bool:
+    """There is a whole chunk at this place; what an index did not say, or could not, is not asked for."""
+    if not 0 < size <= 2 * reader.shape.chunk_bytes + PAGE or offset % PAGE or offset < PAGE:
+        return False
+    try:
+        reader.payload(chunk, offset, size)
+    except (DamagedChunkError, OSError):
+        return False
+    return True

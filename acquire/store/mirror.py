@@ -1,0 +1,188 @@
+"""Copies a recording to a remote store while it grows; the local disk is the spool.
+
+::
+
+    writer ─▶ run.zarr (local) ─▶ whole shards ─▶ tables ─▶ metadata of arrays ─▶ root ─▶ s3://…/run.zarr
+
+The order is the writer's: the root is last, and says only what has come before it. A copy that was
+interrupted goes on where it was. What is not copied yet is held, so that retention can bound the spool and
+no line is lost: a store that is too slow ends the recording in good order, when the disk gets full.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import time
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+from acquire.errors import DataError, UsageError
+from acquire.lines import ARMS
+from acquire.store.files import DISK
+from acquire.store.layout import group_document, to_json
+from acquire.store.opening import open_recording
+from acquire.store.remote import RemoteSource
+from acquire.store.retention import keep_from, shard_files
+from acquire.store.scan import COLUMNS
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from acquire.store.files import Disk
+    from acquire.store.layout import Document
+    from acquire.store.reader import Recording
+
+LOOK_S = 0.5
+"""How often a growing recording is looked at."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mirrored:
+    """How far a copy has come: lines, shards and bytes since it was begun or gone on with."""
+
+    url: str
+    lines: int
+    shards: int
+    bytes: int
+    sealed: bool
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def mirror(
+    path: Path,
+    url: str,
+    *,
+    follow: bool = False,
+    idle_s: float = 60.0,
+    report: Callable[[Mirrored], None] = lambda _: None,
+) -> Mirrored:
+    """Copy the recording at ``path`` to ``url``; with ``follow`` until it is sealed.
+
+    Raises UsageError where ``url`` holds something else, DataError when the store fails, and when a recording
+    that is followed has not grown for ``idle_s``: its writer is gone.
+    """
+    copying = Mirror(path, url)
+    done = copying.step()
+    moved = time.monotonic()
+    while follow and not done.sealed:
+        time.sleep(LOOK_S)
+        before, done = done, copying.step()
+        if done != before:
+            moved = time.monotonic()
+            report(done)
+        if time.monotonic() - moved > idle_s:
+            raise DataError(
+                f"{path} has not grown for {idle_s:g} s and is not sealed",
+                possible=f"{done.lines} lines are in {url}",
+                hint=f"acquire recover {path}, then copy again",
+            )
+    return done
+
+
+class Mirror:
+    """One copy; `step` brings it up to date."""
+
+    def __init__(self, path: Path, url: str, disk: Disk = DISK) -> None:
+        self.path = path
+        self.target = RemoteSource(url)
+        self._disk = disk
+        self._run_id = str(open_recording(path).attrs["run_id"])
+        try:
+            self._there = self.target.sizes()
+            self._check_target()
+        except OSError as error:
+            raise DataError(f"{url} cannot be used: {error}") from error
+        self._bytes = 0
+        self._shards = 0
+        self._directories: set[str] = set()
+        self._root = b""
+
+    def step(self) -> Mirrored:
+        """Copy what is new and whole. Raises DataError when the store fails; a later step goes on."""
+        recording = open_recording(self.path)
+        sealed = recording.state == "sealed"
+        rows = recording.arms[ARMS[0]].reader("lines").shape.shard_rows
+        whole = recording.lines // rows
+        shards = range(whole + (1 if sealed and recording.lines % rows else 0))
+        lines = recording.lines if sealed else whole * rows
+        try:
+            for shard in shards:
+                self._copy_shard(shard)
+            self._publish(recording, lines)
+        except OSError as error:
+            raise DataError(f"copying {self.path} to {self.target}: {error}") from error
+        if not sealed:
+            keep_from(self.path, recording.first_line + lines, self._disk)
+        return Mirrored(str(self.target), lines, self._shards, self._bytes, sealed)
+
+    def _check_target(self) -> None:
+        """Only a copy of the same run may be there."""
+        if not self._there:
+            return
+        if "zarr.json" in self._there:
+            said = json.loads(self.target.read("zarr.json"))["attributes"].get("run_id")
+            if said == self._run_id:
+                return
+            raise UsageError(f"{self.target} holds another recording: run {said}", hint="another URL")
+        if any(key.split("/")[0] not in (*ARMS, "gaps", "events") for key in self._there):
+            raise UsageError(f"{self.target} holds something that is no recording", hint="another URL")
+
+    def _copy_shard(self, shard: int) -> None:
+        """A shard that is whole is never written again: what is there of the right size is the same."""
+        copied = False
+        for file in shard_files(self.path, shard):
+            key = file.relative_to(self.path).as_posix()
+            size = file.stat().st_size
+            if self._there.get(key) != size:
+                self._make_way(key)
+                self.target.put_file(key, file)
+                self._there[key] = size
+                self._bytes += size
+                copied = True
+        self._shards += copied
+
+    def _publish(self, recording: Recording, lines: int) -> None:
+        """Tables and metadata of what is copied; nothing where the root would be the same."""
+        document = copy.deepcopy(recording.document)
+        nodes: dict[str, Document] = document["consolidated_metadata"]["metadata"]
+        for arm in ARMS:
+            for name in COLUMNS:
+                nodes[f"{arm}/{name}"]["shape"][0] = lines
+        document["attributes"] |= {"dropped": self._dropped(recording, lines), "holds": []}
+        root = to_json(document)
+        if root == self._root:
+            return
+        for table in ("gaps", "events"):
+            for file in sorted((self.path / table).glob("*/c/0")):
+                self._put(file.relative_to(self.path).as_posix(), file.read_bytes())
+        for key, node in nodes.items():
+            inner = {name.partition("/")[2]: n for name, n in nodes.items() if name.startswith(f"{key}/")}
+            own = group_document(node["attributes"], inner) if node["node_type"] == "group" else node
+            self._put(f"{key}/zarr.json", to_json(own))
+        self._put("zarr.json", root)
+        self._root = root
+
+    def _dropped(self, recording: Recording, lines: int) -> list[list[int]]:
+        """Lines that retention deleted here before they could be copied."""
+        size = recording.arms[ARMS[0]].reader("lines").shape.shard_rows
+        return [
+            [recording.first_line + shard * size, size]
+            for rows in recording.dropped_rows()
+            for shard in range(rows.start // size, rows.stop // size)
+            if f"a/tick/c/{shard}" not in self._there and shard * size < lines
+        ]
+
+    def _put(self, key: str, data: bytes) -> None:
+        self._make_way(key)
+        self.target.put(key, data)
+        self._bytes += len(data)
+
+    def _make_way(self, key: str) -> None:
+        directory = key.rpartition("/")[0]
+        if self.target.has_directories and directory not in self._directories:
+            self.target.make_directory_of(key)
+            self._directories.add(directory)

@@ -1,0 +1,109 @@
+"""Opening recordings, here or far away: what is not one, or is damaged, is told before anything is read."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import TYPE_CHECKING, Any
+
+from acquire.codes import code_from_attrs
+from acquire.errors import DataError, UsageError
+from acquire.store.camera_stream import DAMAGE, CameraStream
+from acquire.store.layout import line_columns
+from acquire.store.reader import Recording
+from acquire.store.source import source_of
+from acquire.store.spec import CAMERA_KEYS, FORMAT
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from acquire.store.layout import Document
+    from acquire.store.source import Source
+
+
+def open_recording(place: Path | str) -> Recording:
+    """Open a recording, growing or sealed. Raises DataError where there is none, or a damaged one."""
+    return open_source(source_of(place))
+
+
+def open_source(source: Source) -> Recording:
+    """`open_recording` of what lies in a source."""
+    document = read_root(source)
+    _check_format(source, _format(document))
+    try:
+        recording = Recording(source, document, open_source)
+        _check_complete(recording)
+    except (*DAMAGE, UsageError) as error:
+        raise DataError(
+            f"{source}: the metadata of the recording is damaged: {type(error).__name__}: {error}",
+            hint="a copy of the recording",
+        ) from error
+    return recording
+
+
+def format_of(place: Path | str) -> str | None:
+    """The format that a Zarr group names, if any; DataError where there is no group to ask."""
+    return _format(read_root(source_of(place)))
+
+
+def read_root(source: Source) -> Document:
+    """The root's zarr.json, with attributes. Raises DataError where there is none."""
+    try:
+        document: Document = json.loads(source.read("zarr.json"))
+        dict(document["attributes"])
+    except (FileNotFoundError, NotADirectoryError) as error:
+        if not source.exists():
+            raise DataError(f"{source} does not exist", hint="the path of a directory NAME.zarr") from error
+        raise DataError(
+            f"{source} is not a recording: it holds no zarr.json", hint="the path of a directory NAME.zarr"
+        ) from error
+    except OSError as error:
+        raise DataError(f"{source} cannot be read: {error.strerror or error}") from error
+    except (ValueError, LookupError, TypeError) as error:
+        raise DataError(f"{source}: zarr.json is damaged: {error}", hint="a copy of the recording") from error
+    return document
+
+
+def _format(document: Document) -> str | None:
+    name = document["attributes"].get("format")
+    return name if isinstance(name, str) else None
+
+
+def _check_format(source: Source, name: str | None) -> None:
+    if name == FORMAT:
+        return
+    if name is not None and name.startswith(FORMAT.split("/")[0] + "/"):
+        raise DataError(
+            f"{source} is a recording of format {name!r}",
+            possible=f"{FORMAT!r}",
+            hint="a newer version of acquire",
+        )
+    raise DataError(f"{source} is a Zarr group, but not a recording: format {name!r}", possible=f"{FORMAT!r}")
+
+
+def _check_complete(recording: Recording) -> None:
+    """Touch everything that a recording needs; what is absent or impossible raises DAMAGE or UsageError."""
+    attributes = recording.attrs
+    for key in ("state", "run_condition", "ledger", "layout", "run_id", "end_reason"):
+        attributes[key]
+    attributes["versions"]["acquire"]
+    code_from_attrs(attributes["code"])
+    recording.geometry_for(1)
+    _check_number("pixels", int(attributes["geometry"]["pixels"]), above=0)
+    _check_number("clock_hz", recording.clock.clock_hz, above=0)
+    _check_number("line period", recording.line_period_ns, above=0)
+    for arm, stream in recording.arms.items():
+        _check_arm(stream, attributes["cameras"][arm])
+
+
+def _check_arm(stream: CameraStream, camera: dict[str, Any]) -> None:
+    for column in line_columns("any"):
+        if len(stream.reader(column.name).shape.chunk_shape) != (2 if column.name == "lines" else 1):
+            raise ValueError(f"{stream.arm}/{column.name} has the wrong number of axes")
+    for key in CAMERA_KEYS:
+        _check_number(key, float(camera[key]), above=-math.inf if key == "black_level_dn" else 0)
+
+
+def _check_number(name: str, value: float, *, above: float) -> None:
+    if not (math.isfinite(value) and value > above):
+        raise ValueError(f"{name} is {value}")

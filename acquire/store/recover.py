@@ -1,0 +1,270 @@
+"""Makes a recording whole again whose writer did not end it: what is on disk is kept, the end is told.
+
+::
+
+    scan every chunk ─▶ mend indices ─▶ flag what is lost ─▶ tables ─▶ lengths ─▶ root: sealed, INTERRUPTED
+
+Nothing that was committed is cut off: lines of which a part is not on disk stay, flagged as missing and
+listed in gaps. Whole chunks that were written after the last commit are added. A second run finds nothing
+to do; one that is interrupted is simply run again, since the root is written last.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.lines import ARMS, LineFlag
+from acquire.store import layout
+from acquire.store.files import DISK, SCRATCH, Publisher, locked
+from acquire.store.mend import mend_index, rewrite_chunk
+from acquire.store.opening import open_recording
+from acquire.store.retention import HOLDS, delete_shard
+from acquire.store.scan import COLUMNS, ArmScan, Damage, covered, missing_rows, real_rows, runs, scan
+from acquire.store.spec import RunCondition
+from acquire.store.table import event_table, gap_table
+from acquire.store.writer import RESERVE
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from acquire.store.files import Disk
+    from acquire.store.reader import Recording
+
+REASON = "recovered: its writer ended without sealing it"
+
+
+@dataclass(frozen=True, slots=True)
+class Recovery:
+    """What was done.
+
+    Attributes
+    ----------
+    changed : anything at all
+    lines, lines_before : rows of each arm that a reader finds
+    indices_mended : files whose index was torn, or did not know all chunks yet
+    damage : lines that are lost, of which array and why
+    """
+
+    path: str
+    changed: bool
+    lines: int
+    lines_before: int
+    indices_mended: int
+    damage: tuple[Damage, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def recover(path: Path, disk: Disk = DISK, progress: Callable[[int, int], None] | None = None) -> Recovery:
+    """Recover the recording at ``path``; idempotent.
+
+    Raises DataError where there is none or the disk refuses, StateError while somebody writes it.
+    """
+    recording = open_recording(path)
+    with locked(path, "recovering"):
+        recording = open_recording(path)  # as it is now that nobody writes it
+        return _Recoverer(recording, path, disk).run(progress)
+
+
+class _Recoverer:
+    """One recovery, with the recording held."""
+
+    def __init__(self, recording: Recording, path: Path, disk: Disk) -> None:
+        self.recording = recording
+        self.path = path
+        self.disk = disk
+        self.sealed = recording.state == "sealed"
+        self.rows = recording.lines
+        self.flags_changed = 0
+
+    def run(self, progress: Callable[[int, int], None] | None) -> Recovery:
+        recording = self.recording
+        mended = sum(self._mend(arm) for arm in ARMS)
+        scans = scan(recording, recording.kept_chunks(), progress)
+        if not self.sealed:
+            self.rows = self._grown(scans)
+        damage = tuple(found for arm in scans.values() for found in arm.damages(recording.lines))
+        new_gaps = {arm: self._flag(found) for arm, found in scans.items()}
+        changed = bool(not self.sealed or mended or self.flags_changed or any(new_gaps.values()))
+        if changed:
+            self._publish(new_gaps)
+        lines = open_recording(self.path).lines
+        return Recovery(str(self.path), changed, lines, recording.lines, mended, damage)
+
+    def _mend(self, arm: str) -> int:
+        """Torn indices of an arm, mended."""
+        stream = self.recording.arms[arm]
+        mended = 0
+        for name in COLUMNS:
+            reader = stream.reader(name)
+            directory = self.path / reader.key / "c"
+            shards = [int(entry.name) for entry in directory.glob("*") if entry.name.isdigit()]
+            mended += sum(
+                mend_index(self.disk, self.path, reader, shard, grow=not self.sealed)
+                for shard in sorted(shards)
+            )
+        return mended
+
+    def _grown(self, scans: dict[str, ArmScan]) -> int:
+        """Rows with those that are whole on disk in every array, though no commit lists them."""
+        streams = [found.stream for found in scans.values()]
+        size = streams[0].reader("lines").shape.chunk_rows
+        rows = self.recording.lines
+        while rows % size == 0:
+            chunk = rows // size
+            beyond = scan(self.recording, [chunk])
+            if any(found.damaged_chunks for found in beyond.values()):
+                break
+            rows += min(real_rows(stream, chunk) for stream in streams)
+            if rows == chunk * size:
+                break
+        return rows
+
+    def _flag(self, found: ArmScan) -> list[tuple[int, int, str]]:
+        """Flag what is lost of one arm; gaps to be listed: first line, count, cause."""
+        size = found.stream.reader("flags").shape.chunk_rows
+        listed = sorted(self.recording.lost_rows(found.stream.arm, self.rows), key=lambda rows: rows.start)
+        gaps: list[tuple[int, int, str]] = []
+        for chunk in self._chunks(size):
+            here = range(chunk * size, min(self.rows, (chunk + 1) * size))
+            lost = chunk in found.damaged_chunks
+            missing = self._flag_chunk(found, chunk, lost)[: len(here)] & ~covered(listed, here)
+            cause = "damaged" if lost else "unlisted"
+            for first, count in runs(missing, self.recording.first_line + here.start):
+                gaps = _joined(gaps, first, count, cause)
+        return gaps
+
+    def _chunks(self, size: int) -> list[int]:
+        """Chunks that hold rows now."""
+        beyond = range(-(-self.recording.lines // size), -(-self.rows // size))
+        return [*self.recording.kept_chunks(), *beyond]
+
+    def _flag_chunk(self, found: ArmScan, chunk: int, lost: bool) -> NDArray[np.bool_]:
+        """Which rows of a chunk are missing; all of one that is ``lost``, and so it stands on disk then."""
+        reader = found.stream.reader("flags")
+        if chunk in found.troubles["flags"]:
+            flags = np.zeros(reader.shape.chunk_rows, reader.shape.dtype)
+        else:
+            flags = reader.chunk(chunk).copy()
+        if lost and (chunk in found.troubles["flags"] or not missing_rows(flags).all()):
+            flags |= np.uint16(LineFlag.MISSING)
+            rewrite_chunk(self.disk, self.path, reader, chunk, flags)
+            self.flags_changed += 1
+        return missing_rows(flags)
+
+    def _publish(self, new_gaps: dict[str, list[tuple[int, int, str]]]) -> None:
+        hidden = self.path / ARMS[0] / "lines"
+        publisher = Publisher(hidden / SCRATCH, self.disk)
+        document = copy.deepcopy(self.recording.document)
+        nodes: dict[str, layout.Document] = document["consolidated_metadata"]["metadata"]
+        nodes |= self._tables(publisher, new_gaps)
+        self._resize(publisher, nodes)
+        document["attributes"] = self._attributes(new_gaps)
+        self.disk.sync_tree(self.path)
+        publisher.replace(self.path / "zarr.json", layout.to_json(document), durable=True)
+        for leftover in (SCRATCH, RESERVE):
+            self.disk.remove(hidden / leftover)
+        self.disk.remove_tree(hidden / HOLDS)
+        for shard in self._dropped_shards():
+            delete_shard(self.disk, self.path, shard)
+        self.disk.sync_directory(self.path.parent)
+
+    def _dropped_shards(self) -> list[int]:
+        """Shards that retention had told of, and may have had no time to delete."""
+        size = self.recording.arms[ARMS[0]].reader("lines").shape.shard_rows
+        dropped = self.recording.dropped_rows()
+        return [shard for rows in dropped for shard in range(rows.start // size, rows.stop // size)]
+
+    def _tables(
+        self, publisher: Publisher, new_gaps: dict[str, list[tuple[int, int, str]]]
+    ) -> dict[str, layout.Document]:
+        """Gaps and events as they were, with what is new."""
+        recording = self.recording
+        gaps, events = gap_table(self.path), event_table(self.path)
+        end = recording.first_line + self.rows
+        known = [(gap.arm, gap.first_line, gap.count, gap.cause) for gap in recording.gaps]
+        found = [(arm, *gap) for arm, gaps_found in new_gaps.items() for gap in gaps_found]
+        for arm, first, count, cause in [*known, *found]:
+            kept = min(count, end - first)
+            if kept > 0:
+                gaps.add({"first_line": first, "count": kept, "cause": cause, "arm": ARMS.index(arm)})
+        gaps.not_listed += recording.gaps_not_listed
+        for event in recording.events:
+            events.add({"tick": event.tick, "line": event.line, "kind": event.kind, "text": event.text})
+        text = f"{self.rows} lines, {recording.lines} of them were committed"
+        events.add({"tick": 0, "line": end, "kind": "recovered", "text": text})
+        for table in (gaps, events):
+            table.publish(publisher, durable=True)
+        return gaps.nodes() | events.nodes()
+
+    def _resize(self, publisher: Publisher, nodes: dict[str, layout.Document]) -> None:
+        """Make the rows visible to readers that begin below the root."""
+        for arm in ARMS:
+            arrays = {name: nodes[f"{arm}/{name}"] for name in COLUMNS}
+            for name, array in arrays.items():
+                array["shape"] = [self.rows, *array["shape"][1:]]
+                publisher.replace(self.path / arm / name / "zarr.json", layout.to_json(array))
+            group = layout.group_document(nodes[arm]["attributes"], arrays)
+            publisher.replace(self.path / arm / "zarr.json", layout.to_json(group))
+
+    def _attributes(self, new_gaps: dict[str, list[tuple[int, int, str]]]) -> dict[str, Any]:
+        attributes = dict(self.recording.attrs)
+        lost = {arm: sum(count for _, count, _ in found) for arm, found in new_gaps.items()}
+        if self.sealed:
+            attributes["ledger"] = _with_lost(attributes["ledger"], lost)
+            if any(lost.values()) and attributes["run_condition"] in (
+                RunCondition.GOOD,
+                RunCondition.TAINTED,
+            ):
+                attributes["run_condition"] = str(RunCondition.INCOMPLETE)
+            return attributes
+        arms = {arm: self._book(arm, new_gaps[arm]) for arm in ARMS}
+        store = {"lines": self.rows, "lines_committed": self.recording.lines}
+        return {
+            **attributes,
+            "state": "sealed",
+            "run_condition": str(RunCondition.INTERRUPTED),
+            "end_reason": REASON,
+            "ledger": {"pulses": self.rows, **arms, "store": store},
+        }
+
+    def _book(self, arm: str, new_gaps: list[tuple[int, int, str]]) -> dict[str, Any]:
+        """Lines of an arm = stored + missing by cause, from what the recording lists."""
+        missing: dict[str, int] = {}
+        end = self.recording.first_line + self.rows
+        listed = [(g.first_line, g.count, g.cause) for g in self.recording.gaps if g.arm == arm]
+        for first, count, cause in [*listed, *new_gaps]:
+            kept = min(count, end - first)
+            if kept > 0:
+                missing[cause] = missing.get(cause, 0) + kept
+        stored = self.rows - sum(missing.values())
+        return {"stored": stored, "missing": missing, "balanced": True}
+
+
+def _joined(
+    gaps: list[tuple[int, int, str]], first: int, count: int, cause: str
+) -> list[tuple[int, int, str]]:
+    """``gaps`` with one more, which may continue the last."""
+    if gaps and gaps[-1][0] + gaps[-1][1] == first and gaps[-1][2] == cause:
+        return [*gaps[:-1], (gaps[-1][0], gaps[-1][1] + count, cause)]
+    return [*gaps, (first, count, cause)]
+
+
+def _with_lost(ledger: dict[str, Any], lost: dict[str, int]) -> dict[str, Any]:
+    """The ledger of a sealed recording of which lines were lost since."""
+    changed = copy.deepcopy(ledger)
+    for arm, count in lost.items():
+        book = changed.get(arm)
+        if count and isinstance(book, dict) and "stored" in book:
+            book["stored"] -= count
+            missing = book.setdefault("missing", {})
+            missing["damaged"] = missing.get("damaged", 0) + count
+    return changed

@@ -1,0 +1,158 @@
+"""Recordings far away: anything that fsspec reaches, with obstore for object stores (S3, Google, Azure).
+
+Credentials and endpoints come from the environment, as those stores document it (AWS_ENDPOINT and the like);
+none of them is ever written anywhere.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from contextlib import contextmanager
+from datetime import timedelta
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+    from pathlib import Path
+
+    from zarr.abc.store import Store
+
+OBJECT_STORES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss")
+RETRY = {"max_retries": 4, "retry_timeout": timedelta(seconds=30)}
+"""For how long a store that does not answer is asked again."""
+
+
+def is_url(place: Path | str) -> bool:
+    """Whether a place is meant as a URL."""
+    return isinstance(place, str) and "://" in place
+
+
+class RemoteSource:
+    """Bytes below a URL; see `source.Source`. Every failure is an OSError."""
+
+    def __init__(self, url: str) -> None:
+        """Raises UsageError for a URL that cannot be one, or whose packages are not installed."""
+        self.url = url.rstrip("/")
+        self._fs, self._root = _file_system(self.url)
+
+    def __str__(self) -> str:
+        return self.url
+
+    def read(self, key: str) -> bytes:
+        with _as_os_errors():
+            data: bytes = self._fs.cat_file(self._path(key))
+            return data
+
+    def read_range(self, key: str, start: int, size: int) -> bytes:
+        with _as_os_errors():
+            data: bytes = self._fs.cat_file(self._path(key), start=start, end=start + size)
+            return data
+
+    def expect(self, key: str, start: int, size: int) -> None:
+        """Nothing is fetched ahead."""
+
+    def size(self, key: str) -> int:
+        with _as_os_errors():
+            return int(self._fs.info(self._path(key))["size"])
+
+    def exists(self) -> bool:
+        with _as_os_errors():
+            return bool(self._fs.exists(self._root))
+
+    def total_bytes(self) -> int:
+        return sum(self.sizes().values())
+
+    def sizes(self) -> dict[str, int]:
+        """Keys of all parts → their bytes."""
+        with _as_os_errors():
+            found = self._fs.find(self._root, detail=True)
+        start = len(self._root.rstrip("/")) + 1
+        return {path[start:]: int(facts["size"]) for path, facts in found.items()}
+
+    def beside(self, name: str) -> RemoteSource:
+        return RemoteSource(f"{self.url.rpartition('/')[0]}/{name}")
+
+    def zarr_store(self) -> Store:
+        from zarr.storage import FsspecStore
+
+        return FsspecStore.from_url(self.url, storage_options=_options(self.url), read_only=True)
+
+    def put(self, key: str, data: bytes) -> None:
+        """Replace one part by ``data``, in one step where the store is an object store."""
+        with _as_os_errors():
+            self._fs.pipe_file(self._path(key), data)
+
+    def put_file(self, key: str, file: Path) -> None:
+        """Replace one part by the bytes of a local file."""
+        with _as_os_errors():
+            self._fs.put_file(str(file), self._path(key))
+
+    def make_directory_of(self, key: str) -> None:
+        """What a file system needs before a part can be put; an object store needs nothing."""
+        with _as_os_errors():
+            self._fs.makedirs(self._path(key).rpartition("/")[0], exist_ok=True)
+
+    @property
+    def has_directories(self) -> bool:
+        return self.url.partition("://")[0] not in OBJECT_STORES
+
+    def _path(self, key: str) -> str:
+        return f"{self._root}/{key}"
+
+
+def _file_system(url: str) -> tuple[Any, str]:
+    if importlib.util.find_spec("fsspec") is None:
+        raise UsageError(f"{url}: fsspec is not installed", hint="pip install 'tdi-acquire[remote]'")
+    import fsspec
+
+    protocol = url.partition("://")[0]
+    _register(protocol)
+    try:
+        system, root = fsspec.core.url_to_fs(url, **_options(url))
+    except (ValueError, ImportError) as error:
+        raise UsageError(
+            f"{url}: {error}",
+            possible=f"{', '.join(OBJECT_STORES)}, file, memory and what else fsspec has a package for",
+            hint="pip install 'tdi-acquire[remote]'",
+        ) from error
+    return system, root
+
+
+def _options(url: str) -> dict[str, Any]:
+    protocol = url.partition("://")[0]
+    return {"retry_config": RETRY} if protocol in OBJECT_STORES and _has_obstore() else {}
+
+
+@cache
+def _register(protocol: str) -> None:
+    """Object stores go through obstore: faster, and no event loop of their own."""
+    if protocol in OBJECT_STORES and _has_obstore():
+        from obstore.fsspec import register
+
+        register(protocol)
+
+
+@cache
+def _has_obstore() -> bool:
+    return importlib.util.find_spec("obstore") is not None
+
+
+@contextmanager
+def _as_os_errors() -> Iterator[None]:
+    """obstore has an exception tree of its own."""
+    try:
+        yield
+    except _store_errors() as error:
+        raise OSError(str(error).partition("\n")[0][:300]) from error
+
+
+@cache
+def _store_errors() -> tuple[type[Exception], ...]:
+    if not _has_obstore():
+        return ()
+    from obstore.exceptions import BaseError
+
+    return (BaseError,)

@@ -1,0 +1,264 @@
+"""Endless recordings: the oldest shards go, by size, age and when the disk gets full, unless they are held.
+
+::
+
+    ├ dropped ┤├ held ┤├ dropped ┤├────────── kept: max_bytes, max_age_lines ──────────┤├ margin ┤ newest line
+
+A shard goes from all arrays of both arms at once. That is first told in the recording's root and then done,
+so that nobody meets lines that are said to be there and are not. Lines are held by an event, by the writer's
+owner, or by anybody with `hold`, from any process: a small file that the writer looks for before it deletes.
+What is held is widened by a margin on both sides, which reconstruction needs to cut a segment there.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+from acquire.errors import DataError, UsageError
+from acquire.lines import ARMS
+from acquire.store.files import DISK, Publisher
+from acquire.store.layout import line_columns
+from acquire.store.opening import open_recording
+from acquire.store.shard import shard_key
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from acquire.store.files import Disk
+
+ALL_LINES = 2**62
+COPY = "0-copy.json"
+
+HOLDS = ".holds"
+"""Directory of the files of `hold`, where no Zarr reader lists names."""
+
+
+@dataclass(frozen=True, slots=True)
+class Retention:
+    """What of an endless recording is kept; refuses with UsageError what cannot be.
+
+    Attributes
+    ----------
+    max_bytes : that the recording may take of the disk; None: as many as there are
+    max_age_lines : lines behind the newest; None: all
+    margin_lines : on either side of what is held, and behind the newest line whatever the limits: M + L_R
+    hold_events : kinds of events that hold lines
+    hold_lines : before and after such an event
+    """
+
+    max_bytes: int | None = None
+    max_age_lines: int | None = None
+    margin_lines: int = 4096
+    hold_events: tuple[str, ...] = ("mark",)
+    hold_lines: tuple[int, int] = (2**16, 2**16)
+
+    def __post_init__(self) -> None:
+        numbers = (self.max_bytes or 1, self.max_age_lines or 1, self.margin_lines + 1, *self.hold_lines)
+        if min(numbers) < 0 or 0 in (self.max_bytes, self.max_age_lines, self.margin_lines + 1):
+            raise UsageError(f"retention {self}", possible="numbers above 0")
+
+
+@dataclass(frozen=True, slots=True)
+class Hold:
+    """Lines that must not be deleted, and why."""
+
+    first_line: int
+    count: int
+    why: str = ""
+
+    @property
+    def lines(self) -> range:
+        return range(self.first_line, self.first_line + self.count)
+
+
+def hold(path: Path, first_line: int, count: int, why: str = "", disk: Disk = DISK) -> Hold:
+    """Keep lines of the recording at ``path``, which may be growing in another process, from being deleted.
+
+    Lines that are still to come can be held, too. Raises DataError when some of them are gone already, and
+    UsageError for a range that cannot be one.
+    """
+    if first_line < 0 or count < 1:
+        raise UsageError(f"hold of {count} lines from line {first_line}", possible="1 line or more")
+    recording = open_recording(path)
+    if first_line + count <= recording.first_line:
+        raise UsageError(
+            f"hold of lines {first_line} to {first_line + count - 1}", possible=f"{recording.first_line} on"
+        )
+    held = Hold(first_line, count, why)
+    directory = _holds(path)
+    text = json.dumps({"first_line": first_line, "count": count, "why": why}).encode()
+    try:
+        disk.make_directory(directory, parents=True)
+        name = f"{first_line}-{count}.json"
+        Publisher(directory / f".{name}", disk).replace(directory / name, text, durable=True)
+    except OSError as error:
+        raise DataError(f"{path}: lines cannot be held: {error.strerror}") from error
+    for first, gone in open_recording(path).dropped:
+        if first < first_line + count and first_line < first + gone:
+            last = min(first + gone, first_line + count) - 1
+            raise DataError(
+                f"{path}: lines {max(first, first_line)} to {last} are gone already",
+                possible="the others are held",
+            )
+    return held
+
+
+def keep_from(path: Path, line: int, disk: Disk = DISK) -> None:
+    """Hold every line from ``line`` on, those to come included; a later call replaces an earlier one."""
+    text = json.dumps({"first_line": line, "count": ALL_LINES, "why": "not copied yet"}).encode()
+    try:
+        disk.make_directory(_holds(path), parents=True)
+        Publisher(_holds(path) / ".copy", disk).replace(_holds(path) / COPY, text, durable=True)
+    except OSError as error:
+        raise DataError(f"{path}: lines cannot be held: {error.strerror}") from error
+
+
+def holds_of(path: Path) -> list[Hold]:
+    """What `hold` was asked for, of a recording that is being written."""
+    found = []
+    for file in sorted(_holds(path).glob("[0-9]*.json")):
+        said = json.loads(file.read_bytes())
+        found.append(Hold(int(said["first_line"]), int(said["count"]), str(said["why"])))
+    return found
+
+
+@dataclass(slots=True)
+class Keeper:
+    """What was dropped of one recording that is being written, and what goes next.
+
+    ``shard_rows`` are the lines of a shard; ``first_line`` is that of row 0.
+    """
+
+    path: Path
+    policy: Retention
+    shard_rows: int
+    first_line: int
+    disk: Disk
+    holds: list[Hold] = field(default_factory=list)
+    gone: list[range] = field(default_factory=list)
+    """Shards that were dropped, as stretches."""
+    sizes: dict[int, int] = field(default_factory=dict)
+    """Whole shards that are there → bytes in all their arrays."""
+
+    def note(self, kind: str, line: int) -> None:
+        """An event happened at ``line``."""
+        if kind in self.policy.hold_events:
+            before, after = self.policy.hold_lines
+            first = max(self.first_line, line - before)
+            self.holds.append(Hold(first, line + after - first + 1, kind))
+
+    def choose(self, rows: int, missing_bytes: int = 0) -> list[int]:
+        """Shards to be dropped now that ``rows`` rows are committed, the oldest first; they count as dropped.
+
+        ``missing_bytes`` more than the limits ask for, where the disk is nearly full.
+        """
+        self._measure(rows)
+        held = [hold.lines for hold in (*self.holds, *holds_of(self.path))]
+        newest = self.first_line + rows
+        partly = max(self.sizes.values(), default=0)
+        excess = missing_bytes
+        if self.policy.max_bytes is not None:
+            excess = max(excess, sum(self.sizes.values()) + partly - self.policy.max_bytes)
+        going = []
+        for shard in sorted(self.sizes):
+            if self._lines(shard).stop > newest - self.policy.margin_lines:
+                break
+            if (excess > 0 or self._old(shard, newest)) and not self._held(shard, held):
+                going.append(shard)
+                excess -= self.sizes.pop(shard)
+                self.gone = _with(self.gone, shard)
+        return going
+
+    def delete(self, shards: list[int]) -> list[int]:
+        """Delete the files of shards that the root calls dropped; those that somebody holds meanwhile stay.
+
+        Returns the latter: they count as kept again.
+        """
+        held = [hold.lines for hold in holds_of(self.path)]
+        saved = [shard for shard in shards if self._held(shard, held)]
+        for shard in shards:
+            if shard in saved:
+                self._restore(shard)
+            else:
+                delete_shard(self.disk, self.path, shard)
+        return saved
+
+    def attributes(self) -> dict[str, Any]:
+        """For the recording's root."""
+        stretches = [
+            [self.first_line + rows.start * self.shard_rows, len(rows) * self.shard_rows]
+            for rows in self.gone
+        ]
+        holds = [[hold.first_line, hold.count, hold.why] for hold in (*self.holds, *holds_of(self.path))]
+        return {"dropped": stretches, "holds": holds}
+
+    def finish(self) -> None:
+        """The recording is sealed: nothing is deleted any more."""
+        self.disk.remove_tree(_holds(self.path))
+
+    def _measure(self, rows: int) -> None:
+        known = max([-1, *self.sizes, *(rows.stop - 1 for rows in self.gone)])
+        for shard in range(known + 1, rows // self.shard_rows):
+            self.sizes[shard] = shard_bytes(self.path, shard)
+
+    def _lines(self, shard: int) -> range:
+        start = self.first_line + shard * self.shard_rows
+        return range(start, start + self.shard_rows)
+
+    def _old(self, shard: int, newest: int) -> bool:
+        age = self.policy.max_age_lines
+        return age is not None and self._lines(shard).stop <= newest - age
+
+    def _held(self, shard: int, held: list[range]) -> bool:
+        lines, margin = self._lines(shard), self.policy.margin_lines
+        return any(h.start - margin < lines.stop and lines.start < h.stop + margin for h in held)
+
+    def _restore(self, shard: int) -> None:
+        self.gone = _without(self.gone, shard)
+        self.sizes[shard] = shard_bytes(self.path, shard)
+
+
+def shard_files(path: Path, shard: int) -> list[Path]:
+    """The files of a shard in all arrays of both arms, that there are."""
+    files = [
+        path / arm / column.name / shard_key(shard, 2 if column.name == "lines" else 1)
+        for arm in ARMS
+        for column in line_columns("any")
+    ]
+    return [file for file in files if file.exists()]
+
+
+def shard_bytes(path: Path, shard: int) -> int:
+    """Bytes of a shard in all arrays of both arms."""
+    return sum(file.stat().st_size for file in shard_files(path, shard))
+
+
+def delete_shard(disk: Disk, path: Path, shard: int) -> None:
+    """Delete a shard from all arrays of both arms; no matter if parts of it are gone."""
+    for file in shard_files(path, shard):
+        disk.remove(file)
+    for arm in ARMS:
+        disk.remove_tree(path / arm / "lines" / "c" / str(shard))
+
+
+def _holds(path: Path) -> Path:
+    return path / ARMS[0] / "lines" / HOLDS
+
+
+def _with(stretches: list[range], number: int) -> list[range]:
+    """Stretches in order, with one more number."""
+    before = [r for r in stretches if r.stop < number]
+    after = [r for r in stretches if r.start > number + 1]
+    touching = [r for r in stretches if r.stop >= number and r.start <= number + 1]
+    start = min([number, *(r.start for r in touching)])
+    stop = max([number + 1, *(r.stop for r in touching)])
+    return [*before, range(start, stop), *after]
+
+
+def _without(stretches: list[range], number: int) -> list[range]:
+    """Stretches in order, without a number."""
+    below = [range(r.start, min(r.stop, number)) for r in stretches]
+    above = [range(max(r.start, number + 1), r.stop) for r in stretches]
+    return sorted((part for part in (*below, *above) if part), key=lambda r: r.start)

@@ -1,0 +1,60 @@
+"""How much the disk can still take, and how long that lasts."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from acquire.store.files import Disk
+
+LOOK_S = 0.5
+"""How often the disk is asked."""
+
+MEMORY_S = 20.0
+"""Over which the rate is averaged."""
+
+
+@dataclass(frozen=True, slots=True)
+class Room:
+    """A disk at one moment: what is free above the reserve, and what is written per second."""
+
+    free_bytes: int
+    bytes_per_s: float
+
+    @property
+    def seconds_to_full(self) -> float:
+        """Infinite while nothing is written."""
+        return max(0, self.free_bytes) / self.bytes_per_s if self.bytes_per_s > 0 else float("inf")
+
+    @property
+    def full(self) -> bool:
+        """Nothing is left but the reserve."""
+        return self.free_bytes <= 0
+
+
+class RoomWatch:
+    """Looks at the disk of ``path`` now and then; ``reserve_bytes`` of it are not ours."""
+
+    def __init__(self, disk: Disk, path: Path, reserve_bytes: int) -> None:
+        self._disk = disk
+        self._path = path
+        self._reserve = reserve_bytes
+        self._begun_s = self._due_s = time.monotonic()
+        self._bytes = 0
+        self._rate = 0.0
+        self.room = Room(2**63, 0.0)
+
+    def look(self, bytes_written: int) -> Room:
+        """The disk after so many bytes in all; asked again only once in `LOOK_S`. Raises OSError."""
+        now = time.monotonic()
+        if now >= self._due_s:
+            elapsed = max(1e-3, now - self._begun_s)
+            share = min(1.0, max(LOOK_S, elapsed) / MEMORY_S) if self._bytes else 1.0
+            self._rate += share * ((bytes_written - self._bytes) / elapsed - self._rate)
+            self._bytes, self._begun_s, self._due_s = bytes_written, now, now + LOOK_S
+            self.room = Room(self._disk.free_bytes(self._path) - self._reserve, self._rate)
+        return self.room

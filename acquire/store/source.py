@@ -1,0 +1,93 @@
+"""Where a recording is read from: named parts of bytes below one place, on a local disk or far away."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+from acquire.store.files import tree_bytes
+from acquire.store.remote import RemoteSource, is_url
+
+if TYPE_CHECKING:
+    from zarr.abc.store import Store
+
+
+class Source(Protocol):
+    """Bytes by key, as ``a/lines/c/0/0``. Methods raise OSError; FileNotFoundError for what is not there."""
+
+    def __str__(self) -> str:
+        """How the place is named to the user."""
+
+    def read(self, key: str) -> bytes:
+        """All bytes of one part."""
+
+    def read_range(self, key: str, start: int, size: int) -> bytes:
+        """Bytes ``start .. start + size - 1`` of one part, fewer where it ends earlier."""
+
+    def expect(self, key: str, start: int, size: int) -> None:
+        """These bytes will be read soon: a hint, which may begin to fetch them."""
+
+    def size(self, key: str) -> int:
+        """Bytes of one part."""
+
+    def exists(self) -> bool:
+        """There is something at this place."""
+
+    def total_bytes(self) -> int:
+        """Bytes of all parts."""
+
+    def beside(self, name: str) -> Source:
+        """The place ``name`` in the directory that holds this one."""
+
+    def zarr_store(self) -> Path | Store:
+        """The same place for zarr-python."""
+
+
+class LocalSource:
+    """A directory."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    def read(self, key: str) -> bytes:
+        return (self.path / key).read_bytes()
+
+    def read_range(self, key: str, start: int, size: int) -> bytes:
+        fd = os.open(self.path / key, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            return os.pread(fd, size, start)
+        finally:
+            os.close(fd)
+
+    def expect(self, key: str, start: int, size: int) -> None:
+        fd = os.open(self.path / key, os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            os.posix_fadvise(fd, start, size, os.POSIX_FADV_WILLNEED)
+        finally:
+            os.close(fd)
+
+    def size(self, key: str) -> int:
+        return (self.path / key).stat().st_size
+
+    def exists(self) -> bool:
+        return self.path.exists()
+
+    def total_bytes(self) -> int:
+        return tree_bytes(self.path)
+
+    def beside(self, name: str) -> LocalSource:
+        return LocalSource(self.path.with_name(name))
+
+    def zarr_store(self) -> Path | Any:
+        return self.path
+
+
+def source_of(place: Path | str) -> Source:
+    """The source for a path, or for a URL. Raises UsageError for a URL that cannot be one."""
+    if is_url(place):
+        return RemoteSource(str(place))
+    return LocalSource(Path(place))

@@ -1,0 +1,94 @@
+"""Reader of a recording's small tables: what happened, and which lines were lost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numcodecs.vlen import VLenUTF8
+
+from acquire.errors import DataError
+from acquire.store.codecs import CRC_BYTES, crc32c
+from acquire.store.layout import PARSE_ERRORS
+
+if TYPE_CHECKING:
+    from acquire.store.layout import Document
+    from acquire.store.source import Source
+
+
+@dataclass(frozen=True, slots=True)
+class Gap:
+    """Lines of one arm that were lost."""
+
+    arm: str
+    first_line: int
+    count: int
+    cause: str
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """What happened when, on the trigger's clock."""
+
+    kind: str
+    tick: int
+    line: int
+    text: str
+
+
+def read_gaps(source: Source, nodes: dict[str, Document]) -> tuple[Gap, ...]:
+    """Lost lines in the order in which they were noticed; ``nodes`` are the root's. Raises DataError."""
+    table = _Table(source, "gaps", nodes)
+    first, count = table.numbers("first_line"), table.numbers("count")
+    return tuple(map(Gap, table.words("arm"), first, count, table.words("cause")))
+
+
+def read_events(source: Source, nodes: dict[str, Document]) -> tuple[Event, ...]:
+    """What happened, in the order in which it was noted; ``nodes`` are the root's. Raises DataError."""
+    table = _Table(source, "events", nodes)
+    texts = table.cells("text")
+    return tuple(map(Event, table.words("kind"), table.numbers("tick"), table.numbers("line"), texts))
+
+
+@dataclass(frozen=True, slots=True)
+class _Table:
+    source: Source
+    name: str
+    nodes: dict[str, Document]
+
+    def cells(self, column: str) -> list[Any]:
+        """The cells of one column, numbers or texts."""
+        try:
+            document = self.nodes[f"{self.name}/{column}"]
+            (rows,), data_type = document["shape"], document["data_type"]
+            if rows == 0:
+                return []
+            data = self._chunk(column)
+            if data_type == "string":
+                return [str(text) for text in VLenUTF8().decode(data)[:rows]]
+            return list(np.frombuffer(data, np.dtype(data_type).newbyteorder("<"), rows))
+        except (*PARSE_ERRORS, OSError) as error:
+            raise DataError(f"{self.source}: table {self.name}/{column} cannot be read: {error!r}") from error
+
+    def numbers(self, column: str) -> list[int]:
+        return [int(value) for value in self.cells(column)]
+
+    def words(self, column: str) -> list[str]:
+        """A column of CF flag values as their meanings."""
+        values = self.numbers(column)
+        try:
+            attributes = self.nodes[f"{self.name}/{column}"]["attributes"]
+            meanings = str(attributes["flag_meanings"]).split()
+            by_value = dict(zip(attributes["flag_values"], meanings, strict=True))
+            return [by_value[value] for value in values]
+        except PARSE_ERRORS as error:
+            raise DataError(f"{self.source}: table {self.name}/{column} cannot be read: {error!r}") from error
+
+    def _chunk(self, column: str) -> bytes:
+        """The column's one chunk; it may have more rows than the root knows."""
+        data = self.source.read(f"{self.name}/{column}/c/0")
+        payload, checksum = data[:-CRC_BYTES], data[-CRC_BYTES:]
+        if crc32c(payload) != checksum:
+            raise ValueError("the checksum is wrong")
+        return payload

@@ -1,0 +1,179 @@
+"""Is a recording whole? Every chunk is read, and everything that is said twice has to agree."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.errors import DataError
+from acquire.lines import ARMS
+from acquire.store.camera_stream import DAMAGE
+from acquire.store.opening import open_source
+from acquire.store.scan import Damage, missing_rows, scan
+from acquire.store.source import source_of
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from acquire.store.camera_stream import CameraStream
+    from acquire.store.reader import Recording
+    from acquire.store.scan import ArmScan
+
+
+@dataclass(frozen=True, slots=True)
+class Verification:
+    """What was found.
+
+    Attributes
+    ----------
+    path, state, lines : of the recording
+    bytes : that all of it takes
+    damage : lines that are not intact on disk
+    contradictions : what is said twice and differs, in words
+    notes : what is no damage, but good to know
+    """
+
+    path: str
+    state: str
+    lines: int
+    bytes: int
+    damage: tuple[Damage, ...]
+    contradictions: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def intact(self) -> bool:
+        return not (self.damage or self.contradictions)
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "path": self.path,
+            "intact": self.intact,
+            "state": self.state,
+            "lines": self.lines,
+            "bytes": self.bytes,
+            "damage": [damage.to_dict() for damage in self.damage],
+            "contradictions": list(self.contradictions),
+            "notes": list(self.notes),
+        }
+
+
+def verify(place: Path | str, progress: Callable[[int, int], None] | None = None) -> Verification:
+    """Read all of a recording, here or far away: presence, length and checksum of every chunk, and that
+    numbering, gaps, flags and ledger agree. Raises DataError where there is no recording to look at.
+    """
+    source = source_of(place)
+    recording = open_source(source)
+    scans = scan(recording, recording.kept_chunks(), progress)
+    gone = open_source(source).dropped  # what retention may have deleted meanwhile is no damage
+    damage = tuple(
+        found
+        for arm in scans.values()
+        for found in arm.damages(recording.lines)
+        if not any(first <= found.first_line < first + count for first, count in gone)
+    )
+    return Verification(
+        path=str(source),
+        state=recording.state,
+        lines=recording.lines,
+        bytes=source.total_bytes(),
+        damage=damage,
+        contradictions=tuple(_contradictions(recording, scans)),
+        notes=tuple(_notes(recording)),
+    )
+
+
+def _contradictions(recording: Recording, scans: dict[str, ArmScan]) -> Iterator[str]:
+    yield from _metadata(recording)
+    try:
+        listed = {arm: _listed(recording, arm) for arm in ARMS}
+        complete = recording.gaps_not_listed == 0
+        recording.events  # noqa: B018  (reads the table)
+    except DataError as error:
+        yield error.message
+        return
+    for arm, found in scans.items():
+        lengths = {found.stream.reader(name).rows for name in found.troubles}
+        if len(lengths) > 1:
+            yield f"{arm}: arrays of {sorted(lengths)} lines"
+        flagged, misnumbered = _read_tags(recording, found)
+        if misnumbered:
+            yield f"{arm}: {misnumbered} lines have a code index that is not S times their number"
+        every, kept = listed[arm]
+        if complete and flagged is not None and flagged != kept:
+            yield f"{arm}: {flagged} lines are flagged as missing, {kept} are listed in gaps"
+        yield from _unbalanced(recording, arm, every if complete else None)
+
+
+def _listed(recording: Recording, arm: str) -> tuple[int, int]:
+    """Lines that are listed as lost, and those of them that retention has not dropped."""
+    lost = recording.lost_rows(arm)
+    every = sum(len(rows) for rows in lost)
+    gone = sum(len(_common(rows, drop)) for rows in lost for drop in recording.dropped_rows())
+    return every, every - gone
+
+
+def _common(one: range, other: range) -> range:
+    return range(max(one.start, other.start), min(one.stop, other.stop))
+
+
+def _read_tags(recording: Recording, found: ArmScan) -> tuple[int | None, int]:
+    """Lines flagged as missing, None where flags are damaged; lines with an impossible code index."""
+    flagged, misnumbered = 0, 0
+    size = found.stream.reader("flags").shape.chunk_rows
+    for chunk in recording.kept_chunks():
+        if chunk in found.troubles["flags"] or chunk in found.troubles["code_index"]:
+            return None, misnumbered
+        rows = min(size, recording.lines - chunk * size)
+        missing = missing_rows(found.stream.reader("flags").chunk(chunk)[:rows])
+        flagged += int(missing.sum())
+        misnumbered += int((_misnumbered(recording, found.stream, chunk, rows) & ~missing).sum())
+    return flagged, misnumbered
+
+
+def _misnumbered(recording: Recording, stream: CameraStream, chunk: int, rows: int) -> Any:
+    first = recording.first_line + chunk * stream.reader("flags").shape.chunk_rows
+    expected = recording.substeps * np.arange(first, first + rows, dtype=np.uint64)
+    return stream.reader("code_index").chunk(chunk)[:rows] != expected
+
+
+def _unbalanced(recording: Recording, arm: str, listed: int | None) -> Iterator[str]:
+    """Lines = stored + missing, by the ledger of a sealed recording, and the gaps say so too."""
+    ledger = recording.attrs["ledger"]
+    book = ledger.get(arm)
+    if recording.state != "sealed" or not isinstance(book, dict) or "stored" not in book:
+        return
+    missing = sum(book.get("missing", {}).values())
+    if book["stored"] + missing != recording.lines:
+        yield (
+            f"{arm}: the ledger does not balance: {recording.lines} lines, {book['stored']} stored, "
+            f"{missing} missing"
+        )
+    if listed is not None and missing != listed:
+        yield f"{arm}: the ledger has {missing} missing lines, gaps list {listed}"
+
+
+def _metadata(recording: Recording) -> Iterator[str]:
+    """Arrays' own metadata, which readers meet that do not begin at the root."""
+    if recording.state != "sealed":
+        return
+    nodes = recording.document["consolidated_metadata"]["metadata"]
+    for path, document in nodes.items():
+        try:
+            own = json.loads(recording.source.read(f"{path}/zarr.json"))
+        except DAMAGE as error:
+            yield f"{path}/zarr.json cannot be read: {error}"
+            continue
+        if any(own.get(key) != value for key, value in document.items() if key != "consolidated_metadata"):
+            yield f"{path}/zarr.json differs from what the root says of it"
+
+
+def _notes(recording: Recording) -> Iterator[str]:
+    for first, count in recording.dropped:
+        yield f"lines {first} to {first + count - 1} were dropped by retention"
+    if recording.state != "sealed":
+        yield "the recording is not sealed: it is being written, or `acquire recover` seals it"

@@ -1,0 +1,120 @@
+"""Which lines a recording takes around an event, and how they are taken back from what the rings still hold.
+
+::
+
+            pre_lines           post_lines
+       ├──────────────────┼────────────────────┤
+       first line         at                   end            (``lines`` in all, post_lines, or endless)
+
+While armed, the recorder lets lines go as soon as they have come; they stay in the ring until it comes round.
+Everything else that a line's row needs (code, ticks, time) follows from its number and from what was fixed
+when the run was armed, so that a line from before the event is recorded as any other.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from acquire.stream.ring import Ring
+
+
+@dataclass(frozen=True, slots=True)
+class Window:
+    """Lines around the line ``at``: an event's, or None for the newest line when the recorder is told.
+
+    Attributes
+    ----------
+    pre_lines : to be recorded before that line
+    post_lines : to be recorded from that line on; None: as many as the recording's budget says
+    exact : refuse where not all of ``pre_lines`` can be had; otherwise take those that there are
+    kind, text : what happened at the line, for the recording's events; "" where nothing did
+    """
+
+    at: int | None = None
+    pre_lines: int = 0
+    post_lines: int | None = None
+    exact: bool = True
+    kind: str = ""
+    text: str = ""
+
+    def __post_init__(self) -> None:
+        if self.pre_lines < 0 or (self.post_lines is not None and self.post_lines < 1):
+            raise UsageError(
+                f"a recording of {self.pre_lines} lines before and {self.post_lines} after",
+                possible="0 or more before, 1 or more after",
+            )
+
+    @property
+    def is_now(self) -> bool:
+        """From the next line on, whichever that will be."""
+        return self.at is None and not self.pre_lines and self.post_lines is None
+
+
+NOW = Window()
+"""From the next line on."""
+
+
+NOW = Window()
+"""From the next line on."""
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """What the rings hold for a window at line ``at``: everything ``from_line`` on; lines ``taken`` back."""
+
+    at: int
+    from_line: int
+    taken: dict[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Span:
+    """Lines ``first_line .. end_line - 1`` around ``at``; end None: until told."""
+
+    first_line: int
+    end_line: int | None
+    at: int
+
+
+def hold(window: Window, rings: Mapping[str, Ring], free_from: int) -> Held:
+    """Take back what the window asks for, as far as it is there; from line ``free_from`` on at most.
+
+    What comes before that is in another recording.
+    """
+    at = min(ring.newest_line for ring in rings.values()) if window.at is None else window.at
+    wanted = max(at - window.pre_lines, free_from, 0)
+    taken = {name: ring.lease(wanted) for name, ring in rings.items()}
+    return Held(at, max(free_from, *(_whole_from(ring) for ring in rings.values())), taken)
+
+
+def span(window: Window, lines: int | None, held: Held, line_rate_hz: float) -> Span:
+    """The lines to record, ``lines`` in all where that is given.
+
+    UsageError, with what there is, for an exact window that reaches further back than what is held.
+    """
+    wanted = held.at - window.pre_lines
+    if wanted < held.from_line and window.exact:
+        has = max(0, held.at - held.from_line)
+        raise UsageError(
+            f"start with {window.pre_lines} lines ({window.pre_lines / line_rate_hz:.3g} s) from before",
+            possible=f"up to {has} lines ({has / line_rate_hz:.3g} s), which the ring holds now",
+            hint="wait until the ring is full, or configure a longer one (stream.ring_seconds)",
+        )
+    first = max(wanted, held.from_line)
+    ends = [first + lines] if lines is not None else []
+    ends += [held.at + window.post_lines] if window.post_lines is not None else []
+    return Span(first, max(min(ends), first + 1) if ends else None, held.at)
+
+
+def _whole_from(ring: Ring) -> int:
+    """The line from which on everything is in the ring, or known to be lost."""
+    block = ring.acquire()
+    if block is None:
+        return ring.newest_line
+    return block.first_line - sum(loss.count for loss in block.losses)

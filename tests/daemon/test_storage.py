@@ -1,0 +1,47 @@
+"""From the rig's configuration to what the store is told."""
+
+from __future__ import annotations
+
+import pytest
+
+from acquire.config import load_rig
+from acquire.daemon.storage import choose_for, shot_noise, storage_settings
+from acquire.errors import ConfigError
+
+
+def test_settings_follow_the_line_rate(tmp_path):
+    rig = load_rig(
+        "rig-demo",
+        {
+            "recording.chunk_lines": 4096,
+            "recording.commit_s": 1.0,
+            "recording.reserve_gb": 2,
+            "recording.retention.max_gb": 50,
+            "recording.retention.max_age_s": 3600,
+            "recording.retention.segment_lines": 300,
+        },
+    )
+    settings = storage_settings(rig)
+    assert settings["commit_lines"] == 9 * 4096  # 33 333 lines, in whole chunks
+    assert settings["reserve_bytes"] == 2 * 10**9
+    kept = settings["retention"]
+    assert (kept.max_bytes, kept.max_age_lines) == (50 * 10**9, pytest.approx(120_000_000))
+    assert kept.margin_lines >= rig.geometry.stages // rig.geometry.substeps + 300
+    assert kept.hold_events == ("mark",)
+    assert storage_settings(load_rig("rig-demo"))["retention"] is None
+
+
+@pytest.mark.parametrize("key", ["max_gb", "max_age_s", "segment_lines"])
+def test_retention_of_nothing_is_refused(key):
+    with pytest.raises(ConfigError, match=key):
+        load_rig("rig-demo", {f"recording.retention.{key}": 0})
+
+
+def test_a_codec_is_chosen_for_the_rig(tmp_path):
+    rig = load_rig("rig-demo", {"recording.codec": "auto", "recording.directory": str(tmp_path)})
+    sample = shot_noise(rig)
+    assert (sample.dtype, sample.shape[1]) == ("uint16", rig.geometry.stages)
+    choice = choose_for(rig)
+    assert choice.codec in ("none", "lz4", "zstd")
+    assert choice.needed_megabytes_per_s == pytest.approx(1.5 * 2 * 33333.3 * 64 * 2 / 1e6, rel=1e-3)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,213 @@
+"""Disks as they are: full ones, some without direct I/O; and codecs chosen by what they sustain."""
+
+from __future__ import annotations
+
+import errno
+import os
+import subprocess
+
+import numpy as np
+import pytest
+import zarr
+from store_helpers import Truth, check_rows, fill, make_spec
+
+from acquire.errors import DataError, UsageError
+from acquire.lines import ARMS
+from acquire.store import (
+    RecordingWriter,
+    RunCondition,
+    choose_codec,
+    measure_disk,
+    open_recording,
+    recover,
+    verify,
+)
+from acquire.store.codecs import CODECS
+from acquire.store.files import Disk, ShardFile
+from acquire.store.pages import PAGE, aligned_bytes, is_aligned, open_direct
+
+BIG = make_spec(pixels=1024, chunk_lines=64, shard_chunks=4, codec="none")
+"""Chunks of 128 KiB: large enough for direct I/O."""
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "r.zarr"
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A file system of 8 MB."""
+    place = tmp_path / "small"
+    place.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m", "none", str(place)], check=True)
+    yield place
+    subprocess.run(["umount", str(place)], check=True)
+
+
+def fill_up(writer):
+    for _ in range(1000):
+        fill(writer, 64)
+        writer.commit()
+
+
+@pytest.mark.needs_mount
+@pytest.mark.parametrize("codec", ["none", "lz4"])
+def test_a_disk_that_is_full_seals_what_it_has(small_disk, codec):
+    path = small_disk / "r.zarr"
+    spec = make_spec(pixels=1024, chunk_lines=64, shard_chunks=4, codec=codec, reserve_bytes=0)
+    with RecordingWriter.create(path, spec) as writer:
+        with pytest.raises(DataError, match=r"No space left on device.*try: free space"):
+            fill_up(writer)
+        acknowledged = writer.committed_lines
+        writer.seal(RunCondition.ABORTED, "disk full", {})
+    assert acknowledged > 100
+    recording = open_recording(path)
+    assert recording.lines >= acknowledged
+    assert recording.attrs["ledger"]["store"]["disk_error"].endswith("No space left on device")
+    assert verify(path).intact
+    check_rows(zarr.open_group(path, mode="r"), spec, recording.lines)
+
+
+@pytest.mark.needs_mount
+def test_the_watch_ends_a_recording_before_the_disk_is_full(small_disk, monkeypatch):
+    monkeypatch.setattr("acquire.store.room.LOOK_S", 0.0)
+    path = small_disk / "r.zarr"
+    spec = make_spec(pixels=1024, chunk_lines=64, shard_chunks=4, codec="none", reserve_bytes=2 * 2**20)
+    with RecordingWriter.create(path, spec) as writer:
+        while writer.nearly_full is None:
+            fill(writer, 64)
+            writer.commit()
+        writer.seal(RunCondition.INTERRUPTED, writer.nearly_full, {})
+    recording = open_recording(path)
+    assert "disk nearly full" in recording.attrs["end_reason"]
+    assert recording.attrs["ledger"]["store"]["disk_error"] is None
+    assert verify(path).intact
+
+
+def test_chunks_go_past_the_page_cache_where_that_can_be(path):
+    with RecordingWriter.create(path, BIG) as writer:
+        fill(writer, 150, block_lines=64)
+        writer.seal(RunCondition.GOOD, "done", {})
+    (path / "probe").touch()
+    fd = open_direct(path / "probe")
+    assert open_recording(path).attrs["ledger"]["store"]["direct_io"] is (fd >= 0)
+    if fd >= 0:
+        os.close(fd)
+    (path / "probe").unlink()
+    check_rows(zarr.open_group(path, mode="r"), BIG, 150)
+
+
+class NoDirect(Disk):
+    """A file system that takes O_DIRECT when a file is opened, and then no write of it."""
+
+    def create(self, path, *, direct):
+        file = ShardFile(path, direct=direct)
+        if file.direct:
+            os.close(file._direct)
+            file._direct = os.open(path, os.O_RDONLY)
+            file._write_direct = lambda *_: False
+        return file
+
+
+def test_without_direct_writes_it_goes_through_the_cache(path):
+    with RecordingWriter.create(path, BIG, NoDirect()) as writer:
+        fill(writer, 150, block_lines=64)
+        writer.seal(RunCondition.GOOD, "done", {})
+    check_rows(zarr.open_group(path, mode="r"), BIG, 150)
+
+
+def test_an_unaligned_short_direct_write_goes_on_through_the_cache(path):
+    path.touch()
+    path.unlink()
+    file = ShardFile(path, direct=True)
+    memory = aligned_bytes(2 * PAGE)
+    memory[:] = 7
+    file.write_pages([memory[1 : PAGE + 1].data], PAGE)  # what direct I/O refuses
+    file.close()
+    assert path.read_bytes() == bytes(PAGE) + b"\7" * PAGE
+
+
+def test_memory_in_pages_is_written_from_where_it_is(path):
+    spec = make_spec(pixels=1024, dtype="uint8", chunk_lines=64, shard_chunks=4, codec="none")
+    truth = Truth(spec)
+    with RecordingWriter.create(path, spec) as writer:
+        for number in range(3):
+            for arm in ARMS:
+                block = truth.block(arm, 1000 + 64 * number, 64)
+                memory = aligned_bytes(block.pixels.nbytes)[: block.pixels.nbytes]
+                memory[:] = block.pixels.reshape(-1)
+                assert is_aligned(memory)
+                object.__setattr__(block, "pixels", memory.reshape(64, 1024))
+                writer.append(block)
+                memory[:] = 0  # it may be used again at once
+        writer.seal(RunCondition.GOOD, "done", {})
+    check_rows(zarr.open_group(path, mode="r"), spec, 192)
+
+
+@pytest.mark.parametrize("codec", ["lz4", "zstd"])
+def test_encoders_keep_the_order_of_chunks(path, codec):
+    spec = make_spec(codec=codec, encoders=4, chunk_lines=16, shard_chunks=3)
+    with RecordingWriter.create(path, spec) as writer:
+        for _ in range(5):
+            fill(writer, 100, block_lines=9)
+            writer.commit()
+            assert writer.committed_lines == (writer.next_line("a") - 1000) // 16 * 16
+        writer.seal(RunCondition.GOOD, "done", {})
+    check_rows(zarr.open_group(path, mode="r"), spec, 500)
+
+
+def test_no_more_is_lost_at_a_kill_than_is_stated(path):
+    spec = make_spec(codec="none", chunk_lines=16, commit_lines=32)
+    lost = spec.durability.kill_lines
+    with RecordingWriter.create(path, spec) as writer:
+        for lines in range(7, 200, 7):
+            fill(writer, 7, block_lines=7)
+            assert writer.next_line("a") - 1000 == lines
+            assert lines - writer.committed_lines < spec.commit_lines + lost
+        told = writer.next_line("a") - 1000
+    assert told - recover(path).lines < lost
+
+
+def lines(noise: float) -> np.ndarray:
+    generator = np.random.default_rng(1)
+    return np.clip(generator.normal(100, noise, (512, 1024)), 0, 255).astype(np.uint8)
+
+
+def test_the_smallest_codec_that_holds_the_rate_is_chosen():
+    slow = choose_codec(lines(1), bytes_per_s=1e3, disk_bytes_per_s=1e9)
+    ratios = {speed.codec: speed.ratio for speed in slow.measured}
+    assert set(ratios) == set(CODECS)
+    assert ratios["none"] == 1
+    assert min(ratios["lz4"], ratios["zstd"]) > 1.5
+    assert ratios[slow.codec] == max(ratios.values())
+    assert "smallest" in slow.reason
+    assert slow.to_attrs()["measured"][0]["codec"] == "none"
+
+
+def test_a_rate_that_no_codec_holds_gets_the_nearest():
+    choice = choose_codec(lines(60), bytes_per_s=1e15, disk_bytes_per_s=1e14)
+    assert choice.codec == "none"
+    assert "none holds" in choice.reason
+
+
+def test_a_slow_disk_asks_for_packing():
+    """Uncompressed lines do not fit through the disk, packed ones do."""
+    choice = choose_codec(lines(1), bytes_per_s=1e4, disk_bytes_per_s=1.6e4)
+    assert choice.codec != "none"
+
+
+@pytest.mark.parametrize("wrong", [(0, 1.0), (1.0, 0)])
+def test_rates_that_cannot_be_are_refused(wrong):
+    with pytest.raises(UsageError, match="choosing a codec"):
+        choose_codec(lines(1), *wrong)
+
+
+def test_the_disk_is_measured_and_nothing_is_left(tmp_path):
+    assert measure_disk(tmp_path, size=2**23) > 1e5
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_disk_that_is_gone_while_measured_is_told(tmp_path):
+    with pytest.raises(OSError, match=os.strerror(errno.ENOENT)):
+        measure_disk(tmp_path / "gone")

@@ -1,0 +1,174 @@
+"""Recordings at URLs: an S3 server on loopback, memory, and the local disk through fsspec."""
+
+from __future__ import annotations
+
+import threading
+import uuid
+
+import numpy as np
+import pytest
+import zarr
+from s3_server import s3_server
+from store_helpers import Truth, check_rows, fill, make_spec
+
+from acquire.errors import DataError, UsageError
+from acquire.store import (
+    RecordingWriter,
+    Retention,
+    RunCondition,
+    format_of,
+    mirror,
+    open_recording,
+    recover,
+    verify,
+)
+from acquire.store.mirror import Mirror
+from acquire.store.remote import RemoteSource
+
+SPEC = make_spec()
+SHARD = 64
+
+
+@pytest.fixture(scope="module", autouse=True)
+def bucket():
+    """Clients keep their event loops for the life of the process: they are made here, before the tests."""
+    with pytest.MonkeyPatch.context() as patch, s3_server(patch) as url:
+        RemoteSource(url).put("made", b"once")
+        assert RemoteSource(url).read("made") == b"once"
+        yield url
+
+
+@pytest.fixture(params=["s3", "memory"])
+def place(request, bucket):
+    """A URL at which a recording can be."""
+    where = bucket if request.param == "s3" else "memory:/"
+    return f"{where}/{uuid.uuid4()}/run.zarr"
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "run.zarr"
+
+
+def write(path, lines=150, spec=SPEC):
+    with RecordingWriter.create(path, spec) as writer:
+        fill(writer, lines)
+        writer.add_gap("a", 1010, 1, "test")
+        writer.add_event("mark", 5, 1010, "grün")
+        writer.seal(RunCondition.GOOD, "done", {"a": {"stored": lines - 1, "missing": {"test": 1}}})
+    return path
+
+
+def test_a_recording_is_the_same_far_away(path, place):
+    here = open_recording(write(path))
+    done = mirror(path, place)
+    assert (done.lines, done.sealed, done.shards) == (150, True, 3)
+    there = open_recording(place)
+    assert (there.lines, there.gaps, there.events) == (150, here.gaps, here.events)
+    for start, lines in ((1000, 150), (1060, 20)):
+        near, far = here.cut(start, lines), there.cut(start, lines)
+        for name in ("lines", "mask", "code", "time_ns"):
+            np.testing.assert_array_equal(getattr(near, name), getattr(far, name))
+    check_rows(zarr.open_group(there.source.zarr_store(), mode="r"), SPEC, 150)
+    assert there.info()["path"] == place
+    assert there.info()["bytes"] == done.bytes
+    assert verify(place).damage == ()
+    assert format_of(place) == "acquire-recording/1"
+    again = mirror(path, place)
+    assert (again.shards, again.lines) == (0, 150)
+
+
+def test_any_file_system_will_do(path, tmp_path):
+    place = f"file://{tmp_path}/far/run.zarr"
+    mirror(write(path), place)
+    check_rows(zarr.open_group(tmp_path / "far" / "run.zarr", mode="r"), SPEC, 150)
+    assert verify(place).damage == verify(tmp_path / "far" / "run.zarr").damage == ()
+
+
+def test_what_is_damaged_far_away_is_told(path, place):
+    write(path)
+    mirror(path, place)
+    target = RemoteSource(place)
+    data = bytearray(target.read("b/lines/c/1/0"))
+    data[4096 + 20] ^= 1
+    target.put("b/lines/c/1/0", bytes(data))
+    (damage,) = verify(place).damage
+    assert (damage.arm, damage.first_line, damage.count) == ("b", 1064, 16)
+    with pytest.raises(DataError, match="checksum"):
+        open_recording(place).cut(1064, 5)
+
+
+def test_a_growing_recording_is_followed_to_its_end(path, place):
+    with RecordingWriter.create(path, SPEC) as writer:
+        fill(writer, 100)
+        writer.commit()
+        copying = Mirror(path, place)
+        done = copying.step()
+        assert (done.lines, done.sealed) == (SHARD, False)
+        assert open_recording(place).lines == SHARD
+        assert open_recording(place).state == "recording"
+        fill(writer, 100)
+        writer.commit()
+        assert copying.step().lines == 3 * SHARD
+        np.testing.assert_array_equal(
+            open_recording(place).cut(1060, 100).lines[0], Truth(SPEC).block("a", 1060, 100).pixels
+        )
+        seen = []
+        follower = threading.Thread(target=lambda: seen.append(mirror(path, place, follow=True)))
+        follower.start()
+        fill(writer, 30)
+        writer.seal(RunCondition.GOOD, "done", {})
+    follower.join(60)
+    assert (seen[0].lines, seen[0].sealed) == (230, True)
+    assert verify(place).intact
+
+
+def test_the_spool_is_bounded_and_no_line_is_lost(path):
+    """Retention deletes here what is there; a copy that lags behind is waited for."""
+    place = f"memory://{uuid.uuid4()}/run.zarr"
+    spec = make_spec(retention=Retention(max_age_lines=SHARD, margin_lines=1))
+    with RecordingWriter.create(path, spec) as writer:
+        copying = Mirror(path, place)
+        copying.step()
+        for _ in range(6):
+            fill(writer, 2 * SHARD, block_lines=32)
+            writer.commit()
+        assert open_recording(path).dropped == ()
+        copying.step()
+        fill(writer, 2 * SHARD, block_lines=32)
+        writer.commit()
+        assert open_recording(path).dropped[0][1] >= 10 * SHARD
+        writer.seal(RunCondition.GOOD, "done", {})
+    copying.step()
+    assert open_recording(place).dropped == ()
+    check_rows(zarr.open_group(RemoteSource(place).zarr_store(), mode="r"), spec, 14 * SHARD)
+
+
+def test_another_recording_is_not_written_over(path, tmp_path):
+    place = f"memory://{uuid.uuid4()}/run.zarr"
+    mirror(write(path), place)
+    other = write(tmp_path / "other.zarr", spec=make_spec(run_id="run-2"))
+    with pytest.raises(UsageError, match="another recording: run run-1"):
+        mirror(other, place)
+
+
+def test_a_writer_that_is_gone_is_told(path, tmp_path):
+    with RecordingWriter.create(path, SPEC) as writer:
+        fill(writer, 100)
+        writer.commit()
+    place = f"file://{tmp_path}/far.zarr"
+    with pytest.raises(DataError, match=r"has not grown for 0 s.*64 lines are in"):
+        mirror(path, place, follow=True, idle_s=0)
+    recover(path)
+    assert mirror(path, place).lines == 96
+
+
+def test_what_cannot_be_reached_is_told(bucket, path):
+    with pytest.raises(DataError, match="does not exist"):
+        open_recording(f"memory://{uuid.uuid4()}/no.zarr")
+    with pytest.raises(UsageError, match="gopher"):
+        open_recording("gopher://x/y.zarr")
+    with pytest.raises(DataError, match="does not exist"):
+        open_recording(f"{bucket}/no.zarr")
+    with pytest.raises(DataError, match="nobucketofthisname"):
+        mirror(write(path), "s3://nobucketofthisname/x.zarr")

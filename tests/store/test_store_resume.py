@@ -1,0 +1,100 @@
+"""A run that goes on after an outage: in segments beside the first recording, which stays as it is."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+import pytest
+from store_helpers import Truth, fill, make_spec
+
+from acquire.errors import StateError, UsageError
+from acquire.store import RecordingWriter, RunCondition, next_segment, open_recording, recover, verify
+from acquire.store.files import locked
+
+
+@pytest.fixture
+def killed(tmp_path):
+    """A recording that its writer has left after 80 lines."""
+    path = tmp_path / "run.zarr"
+    with RecordingWriter.create(path, make_spec()) as writer:
+        fill(writer, 85)
+        writer.commit()
+    return path
+
+
+def bytes_of(path):
+    files = [file for file in sorted(path.rglob("*")) if file.is_file() and file != path / "zarr.json"]
+    return {file: hashlib.sha256(file.read_bytes()).digest() for file in files}
+
+
+def resume(path, first_line, lines, **changes):
+    place, spec = next_segment(path, make_spec(run_id="run-of-today", **changes), cause="power lost")
+    writer = RecordingWriter.prepare(place, spec)
+    writer.begin(first_line)
+    with writer:
+        fill(writer, lines)
+        writer.seal(RunCondition.GOOD, "done", {})
+    return place
+
+
+def test_a_killed_recording_goes_on_in_segments(killed):
+    with pytest.raises(UsageError, match=r"not sealed; try: acquire recover"):
+        next_segment(killed, make_spec())
+    recover(killed)
+    before = bytes_of(killed)
+    second = resume(killed, 1500, 40)
+    third = resume(killed, 1700, 40)
+    assert (second.name, third.name) == ("run-2.zarr", "run-3.zarr")
+    assert bytes_of(killed) == before, "nothing but the list in the root has changed"
+    first = open_recording(killed)
+    assert first.attrs["segments"] == ["run-2.zarr", "run-3.zarr"]
+    assert first.lines == 80
+    period = round(first.line_period_ns)
+    truth = Truth(make_spec())
+    outage = open_recording(second).attrs["segment"]["outage"]
+    assert outage == {
+        "after_line": 1079,
+        "lines": 420,
+        "from_ns": int(truth.block("a", 1079, 1).time_ns[0]) + period,
+        "to_ns": int(truth.block("a", 1500, 1).time_ns[0]),
+        "cause": "power lost",
+    }
+    assert open_recording(third).attrs["segment"]["outage"]["after_line"] == 1539
+    assert {r.attrs["run_id"] for r in (first, *first.segments)} == {"run-1"}
+    for start in (1010, 1505, 1710):
+        np.testing.assert_array_equal(first.cut(start, 20).lines[0], truth.block("a", start, 20).pixels)
+    with pytest.raises(UsageError, match="cut of 5 lines from line 1600 on"):
+        first.cut(1600, 5)
+    assert all(verify(path).intact for path in (killed, second, third))
+
+
+def test_a_trigger_that_began_anew_is_told(killed):
+    recover(killed)
+    segment = open_recording(resume(killed, 0, 40)).attrs["segment"]
+    assert segment["outage"]["lines"] is None
+    assert open_recording(killed).cut(1000, 40).first_line == 1000
+
+
+@pytest.mark.parametrize("changes", [{"pixels": 16}, {"dtype": "uint8"}, {"layout": "compact"}])
+def test_lines_of_another_kind_are_no_segment(killed, changes):
+    recover(killed)
+    with pytest.raises(UsageError, match="resuming"):
+        next_segment(killed, make_spec(**changes))
+
+
+def test_a_segment_is_resumed_through_the_first(killed):
+    recover(killed)
+    second = resume(killed, 1500, 40)
+    with pytest.raises(UsageError, match=r"a segment itself; possible: run\.zarr"):
+        next_segment(second, make_spec())
+
+
+def test_a_segment_that_cannot_be_listed_is_not_begun(killed):
+    recover(killed)
+    place, spec = next_segment(killed, make_spec())
+    writer = RecordingWriter.prepare(place, spec)
+    with locked(killed, "testing"), pytest.raises(StateError, match="another process"):
+        writer.begin(1500)
+    assert not place.exists()
+    assert "segments" not in open_recording(killed).attrs

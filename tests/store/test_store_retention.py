@@ -1,0 +1,220 @@
+"""Endless recordings: what goes, what stays, what is told, and in which order."""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+import zarr
+from store_helpers import Truth, fill, make_spec
+
+from acquire.errors import DataError, UsageError
+from acquire.store import RecordingWriter, Retention, RunCondition, hold, open_recording, recover, verify
+from acquire.store.files import Disk
+from acquire.store.retention import Keeper, shard_bytes, shard_files
+
+SHARD = 64
+"""Lines: 4 chunks of 16."""
+AGE = Retention(max_age_lines=2 * SHARD, margin_lines=16)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "r.zarr"
+
+
+def spec_of(policy, **changes):
+    return make_spec(codec="none", retention=policy, **changes)
+
+
+def grow(writer, lines, step=32):
+    for _ in range(lines // step):
+        fill(writer, step)
+        writer.commit()
+
+
+def left(path):
+    """Shards of which anything is on disk."""
+    return [shard for shard in range(40) if shard_files(path, shard)]
+
+
+def test_lines_that_are_too_old_go_and_that_is_told(path):
+    with RecordingWriter.create(path, spec_of(AGE)) as writer:
+        grow(writer, 10 * SHARD)
+        recording = open_recording(path)
+        assert recording.dropped == ((1000, 8 * SHARD),)
+        assert left(path) == [8, 9]
+        assert recording.first_available_line == 1000 + 8 * SHARD
+        with pytest.raises(DataError, match=r"lines 1000 to 1511 were dropped.*possible: lines 1512 to 1639"):
+            recording.cut(1500, 20)
+        truth = Truth(writer.spec).block("b", 1600, 30)
+        np.testing.assert_array_equal(recording.cut(1600, 30).lines[1], truth.pixels)
+        flags = zarr.open_group(path, mode="r")["a/flags"][:]
+        assert (flags[: 8 * SHARD] == 1).all(), "to plain Zarr they are missing lines"
+        assert verify(path).intact
+        writer.seal(RunCondition.GOOD, "done", {})
+    recording = open_recording(path)
+    assert recording.info()["first_available_line"] == 1512
+    assert recording.info()["start_ns"] == Truth(writer.spec).block("a", 1512, 1).time_ns[0]
+    assert verify(path).intact
+    assert "lines 1000 to 1511 were dropped by retention" in verify(path).notes
+    assert not recover(path).changed
+
+
+def test_the_size_is_bounded(path):
+    with RecordingWriter.create(path, spec_of(None)) as writer:
+        grow(writer, 2 * SHARD)
+        size = shard_bytes(path, 0)
+    bounded = path.with_name("bounded.zarr")
+    limit = 4 * size
+    with RecordingWriter.create(bounded, spec_of(Retention(max_bytes=limit, margin_lines=16))) as writer:
+        for _ in range(20):
+            grow(writer, SHARD, step=32)
+            assert sum(shard_bytes(bounded, shard) for shard in left(bounded)) <= limit
+        assert left(bounded)[-2:] == [18, 19]
+        assert len(left(bounded)) < 5
+
+
+def test_the_margin_behind_the_newest_line_always_stays(path):
+    policy = Retention(max_age_lines=1, margin_lines=3 * SHARD)
+    with RecordingWriter.create(path, spec_of(policy)) as writer:
+        grow(writer, 10 * SHARD)
+        assert left(path) == [7, 8, 9]
+
+
+def test_events_and_marked_lines_are_held_with_their_margin(path):
+    policy = Retention(max_age_lines=SHARD, margin_lines=16, hold_lines=(10, 20))
+    with RecordingWriter.create(path, spec_of(policy)) as writer:
+        grow(writer, SHARD, step=32)
+        writer.add_event("mark", 0, 1000 + SHARD + 20)
+        hold(path, 1000 + 4 * SHARD - 10, 5, why="a flash")
+        grow(writer, 9 * SHARD)
+        assert left(path) == [0, 1, 3, 4, 9], "both touch the next shard with their margin"
+        recording = open_recording(path)
+        assert recording.dropped == ((1000 + 2 * SHARD, SHARD), (1000 + 5 * SHARD, 4 * SHARD))
+        assert recording.attrs["holds"] == [
+            [1000 + SHARD + 10, 31, "mark"],
+            [1000 + 4 * SHARD - 10, 5, "a flash"],
+        ]
+        assert recording.cut(1000, 2 * SHARD).mask.all()
+        with pytest.raises(DataError, match=r"lines 1128 to 1191 are gone already; possible: the others"):
+            hold(path, 1120, 200)
+        writer.seal(RunCondition.GOOD, "done", {})
+    assert not list(path.rglob(".*"))
+    assert verify(path).intact
+
+
+def test_a_hold_that_comes_while_lines_are_being_dropped_wins(path):
+    """The writer has told of the drop and not yet deleted."""
+    with RecordingWriter.create(path, spec_of(None)) as writer:
+        grow(writer, 4 * SHARD)
+        keeper = Keeper(path, AGE, SHARD, 1000, Disk())
+        going = keeper.choose(4 * SHARD)
+        assert (going, keeper.gone) == ([0, 1], [range(2)])
+        hold(path, 1000, 10)
+        assert keeper.delete(going) == [0]
+        assert keeper.gone == [range(1, 2)]
+        assert left(path) == [0, 2, 3]
+
+
+def test_holds_and_drops_race_in_threads(path):
+    """Whatever the order, what `hold` accepted is there at the end."""
+    accepted = []
+    begun = threading.Event()
+
+    def holder():
+        begun.wait(30)
+        for line in range(1000, 1000 + 30 * SHARD, 3 * SHARD):
+            try:
+                accepted.append(hold(path, line, 4))
+            except DataError:
+                continue
+
+    thread = threading.Thread(target=holder)
+    thread.start()
+    try:
+        policy = Retention(max_age_lines=SHARD, margin_lines=1)
+        with RecordingWriter.create(path, spec_of(policy)) as writer:
+            begun.set()
+            grow(writer, 30 * SHARD, step=64)
+            thread.join(60)
+            for held in accepted:
+                assert open_recording(path).cut(held.first_line, held.count).mask.all()
+    finally:
+        begun.set()
+        thread.join(60)
+
+
+class SmallDisk(Disk):
+    """``size`` bytes, of which a recording takes its share."""
+
+    def __init__(self, path, size):
+        self.path, self.size = path, size
+
+    def free_bytes(self, path):
+        return self.size - sum(shard_bytes(self.path, shard) for shard in left(self.path))
+
+
+@pytest.fixture
+def always_looking(monkeypatch):
+    monkeypatch.setattr("acquire.store.room.LOOK_S", 0.0)
+
+
+def test_a_disk_that_is_nearly_full_is_told_before_it_is(path, always_looking):
+    disk = SmallDisk(path, 1_000_000)
+    spec = spec_of(None, reserve_bytes=300_000)
+    with RecordingWriter.create(path, spec, disk) as writer:
+        while writer.nearly_full is None:
+            assert disk.free_bytes(path) > 100_000
+            fill(writer, 48)
+            writer.commit()
+        assert "disk nearly full: 300000 bytes are kept free" in writer.nearly_full
+        assert writer.room.full
+        assert writer.room.seconds_to_full == 0
+        writer.seal(RunCondition.INTERRUPTED, writer.nearly_full, {})
+    assert verify(path).intact
+
+
+def test_with_retention_the_oldest_lines_make_room_instead(path, always_looking):
+    disk = SmallDisk(path, 2_000_000)
+    spec = spec_of(Retention(margin_lines=16), reserve_bytes=300_000)
+    with RecordingWriter.create(path, spec, disk) as writer:
+        grow(writer, 30 * SHARD)
+        assert writer.nearly_full is None
+        assert disk.free_bytes(path) > 0
+        dropped = open_recording(path).dropped
+        assert dropped[0][0] == 1000
+        hold(path, open_recording(path).first_available_line, 10**6)
+        for _ in range(100):
+            grow(writer, SHARD, step=64)
+            if writer.nearly_full:
+                break
+        assert writer.nearly_full
+        assert disk.free_bytes(path) + 300_000 > 0
+
+
+def test_recover_deletes_what_was_only_told(path):
+    with RecordingWriter.create(path, spec_of(AGE)) as writer:
+        grow(writer, 6 * SHARD)
+    before = left(path)
+    assert before == [4, 5]
+    for arm in "ab":
+        (path / arm / "tick" / "c" / "0").write_bytes(b"left")
+    recovered = recover(path)
+    assert (recovered.lines, left(path)) == (6 * SHARD, [4, 5])
+    assert open_recording(path).dropped == ((1000, 4 * SHARD),)
+    assert verify(path).intact
+
+
+@pytest.mark.parametrize("wrong", [{"max_bytes": 0}, {"max_age_lines": -1}, {"margin_lines": -1}])
+def test_limits_that_cannot_be_are_refused(wrong):
+    with pytest.raises(UsageError, match="retention"):
+        Retention(**wrong)
+
+
+def test_holds_that_cannot_be_are_refused(path):
+    with RecordingWriter.create(path, spec_of(AGE)):
+        for first, count in ((-1, 5), (1000, 0), (10, 20)):
+            with pytest.raises(UsageError, match="hold of"):
+                hold(path, first, count)

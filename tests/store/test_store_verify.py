@@ -1,0 +1,201 @@
+"""What `verify` finds wrong and `recover` makes of it: nothing is cut off, the lost is flagged and listed."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import zarr
+from store_helpers import Truth, check_rows, fill, make_spec
+
+from acquire.errors import DataError, StateError
+from acquire.lines import ARMS, LineFlag
+from acquire.store import Gap, RecordingWriter, RunCondition, open_recording, recover, verify
+from acquire.store.pages import PAGE
+
+SPEC = make_spec(codec="none")
+ARRAYS = ("lines", "code_index", "code", "tick", "time", "flags")
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "r.zarr"
+
+
+def write(path, lines=150, lost=range(0)):
+    """A sealed recording of which arm b lacks some lines."""
+    truth = Truth(SPEC)
+    with RecordingWriter.create(path, SPEC) as writer:
+        for arm in ARMS:
+            block = truth.block(arm, SPEC.first_line, lines)
+            gone = np.isin(np.arange(lines), lost) & (arm == "b")
+            if gone.any():
+                writer.add_gap(arm, SPEC.first_line + lost.start, len(lost), "ring_full")
+            writer.append(replace(block, flags=np.where(gone, LineFlag.MISSING, 0).astype(np.uint16)))
+        ledger = {"a": {"stored": lines, "missing": {}}}
+        ledger["b"] = {"stored": lines - len(lost), "missing": {"ring_full": len(lost)}}
+        writer.seal(RunCondition.INCOMPLETE if lost else RunCondition.GOOD, "done", ledger)
+    return path
+
+
+def flip(path, arm, array, chunk, at=5):
+    """Another bit in a chunk of an array; shards have four."""
+    file = path / arm / array / "c" / str(chunk // 4)
+    reader = open_recording(path).arms[arm].reader(array)
+    offset, _ = reader.entry(chunk)
+    with (file / "0" if array == "lines" else file).open("r+b") as opened:
+        opened.seek(offset + at)
+        byte = opened.read(1)[0]
+        opened.seek(offset + at)
+        opened.write(bytes([byte ^ 16]))
+
+
+def test_a_whole_recording_is_intact(path):
+    found = verify(write(path, lost=range(20, 30)))
+    assert found.intact
+    assert (found.state, found.lines, found.notes) == ("sealed", 150, ())
+    assert json.loads(json.dumps(found.to_dict()))["intact"] is True
+    assert not recover(path).changed
+
+
+@pytest.mark.parametrize("array", ARRAYS)
+def test_a_flipped_bit_is_found_and_its_lines_are_flagged(path, array):
+    flip(write(path), "b", array, 5)
+    found = verify(path)
+    (damage,) = found.damage
+    assert (damage.arm, damage.array, damage.first_line, damage.count) == ("b", array, 1080, 16)
+    assert damage.what == "the checksum is wrong"
+    assert not found.intact
+    recovered = recover(path)
+    assert recovered.changed
+    assert (recovered.lines, recovered.damage) == (150, (damage,))
+    assert open_recording(path).gaps == (Gap("b", 1080, 16, "damaged"),)
+    flags = zarr.open_group(path, mode="r")["b/flags"][:]
+    assert np.flatnonzero(flags & LineFlag.MISSING).tolist() == list(range(80, 96))
+    attrs = open_recording(path).attrs
+    assert (attrs["state"], attrs["run_condition"]) == ("sealed", "INCOMPLETE")
+    assert attrs["ledger"]["b"] == {"stored": 134, "missing": {"ring_full": 0, "damaged": 16}}
+    assert verify(path).contradictions == ()
+    again = recover(path)
+    assert (again.changed, again.lines) == (False, 150)
+
+
+def test_a_lost_file_is_found(path):
+    write(path, lost=range(66, 70))
+    (path / "b" / "tick" / "c" / "1").unlink()
+    (damage,) = verify(path).damage
+    assert (damage.array, damage.first_line, damage.count) == ("tick", 1064, 64)
+    assert damage.what == "it is not on disk"
+    recover(path)
+    gaps = open_recording(path).gaps
+    assert [(gap.first_line, gap.count, gap.cause) for gap in gaps] == [
+        (1066, 4, "ring_full"),
+        (1064, 2, "damaged"),
+        (1070, 58, "damaged"),
+    ]
+    assert verify(path).contradictions == ()
+
+
+def test_a_file_that_was_cut_short_is_found(path):
+    write(path)
+    file = path / "a" / "lines" / "c" / "2" / "0"
+    with file.open("r+b") as opened:
+        opened.truncate(PAGE + 40)
+    torn, gone = verify(path).damage
+    assert (torn.first_line, torn.count, torn.what) == (1128, 16, "220 of 260 bytes are not there")
+    assert (gone.first_line, gone.count, gone.what) == (1144, 6, "260 of 260 bytes are not there")
+
+
+def test_lost_flags_are_missing_lines_to_every_reader(path):
+    """Where there is no file, plain Zarr gives the fill value: of flags that is `missing`."""
+    write(path)
+    (path / "a" / "flags" / "c" / "0").unlink()
+    flags = zarr.open_group(path, mode="r")["a/flags"][:]
+    assert (flags[:64] == LineFlag.MISSING).all()
+    assert verify(path).damage[0].array == "flags"
+
+
+def test_a_torn_index_is_mended(path):
+    write(path)
+    file = path / "a" / "lines" / "c" / "1" / "0"
+    with file.open("r+b") as opened:
+        opened.seek(16 * 4)
+        opened.write(b"torn")
+    assert "index" in verify(path).damage[0].what
+    recovered = recover(path)
+    assert (recovered.indices_mended, recovered.damage) == (1, ())
+    assert verify(path).intact
+    root = zarr.open_group(path, mode="r")
+    np.testing.assert_array_equal(root["a/lines"][:], Truth(SPEC).block("a", 1000, 150).pixels)
+
+
+def edit_root(path, change):
+    document = json.loads((path / "zarr.json").read_bytes())
+    change(document)
+    (path / "zarr.json").write_text(json.dumps(document))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda d: d["attributes"]["ledger"]["a"].update(stored=149), "does not balance"),
+        (lambda d: d["attributes"]["ledger"]["b"].update(stored=150, missing={}), "gaps list 10"),
+        (lambda d: d["attributes"]["geometry"].update(substeps=4), "code index"),
+        (lambda d: d["attributes"].update(first_line=900), "code index"),
+        (lambda d: d["consolidated_metadata"]["metadata"]["a/time"].update(shape=[144]), "differs"),
+        (lambda d: d["consolidated_metadata"]["metadata"]["a/time"].update(shape=[144]), "arrays of"),
+    ],
+)
+def test_what_is_said_twice_and_differs_is_found(path, change, words):
+    write(path, lost=range(20, 30))
+    edit_root(path, change)
+    found = verify(path)
+    assert not found.intact
+    assert any(words in contradiction for contradiction in found.contradictions), found
+
+
+def test_flags_that_gaps_do_not_list_are_found(path):
+    write(path, lost=range(20, 30))
+    file = path / "gaps" / "count" / "c" / "0"
+    file.write_bytes(b"\0" * len(file.read_bytes()))
+    assert any("gaps/count cannot be read" in words for words in verify(path).contradictions)
+
+
+def test_a_recording_that_is_being_written_is_left_alone(path):
+    with RecordingWriter.create(path, SPEC) as writer:
+        fill(writer, 40)
+        writer.commit()
+        with pytest.raises(StateError, match="another process is writing it"):
+            recover(path)
+        found = verify(path)
+        assert found.intact
+        assert "not sealed" in found.notes[0]
+        writer.seal(RunCondition.GOOD, "done", {})
+    assert not recover(path).changed
+
+
+def test_what_a_commit_did_not_list_is_added(path):
+    writer = RecordingWriter.create(path, SPEC)
+    fill(writer, 40)
+    writer.commit()
+    writer.add_gap("a", 1040, 3, "ring_full")
+    fill(writer, 45)
+    writer.close()
+    recovered = recover(path)
+    assert (recovered.lines_before, recovered.lines, recovered.changed) == (32, 80, True)
+    recording = open_recording(path)
+    check_rows(zarr.open_group(path, mode="r"), SPEC, 80)
+    assert recording.attrs["run_condition"] == "INTERRUPTED"
+    assert "recovered" in recording.attrs["end_reason"]
+    assert recording.attrs["ledger"]["a"] == {"stored": 80, "missing": {}, "balanced": True}
+    assert recording.events[-1].kind == "recovered"
+    assert not list(path.rglob(".*"))
+    assert verify(path).intact
+
+
+def test_what_is_not_a_recording_cannot_be_verified_or_recovered(tmp_path):
+    for attempt in (verify, recover):
+        with pytest.raises(DataError, match="does not exist"):
+            attempt(tmp_path / "no.zarr")

@@ -1,0 +1,161 @@
+"""Recordings that begin before they were asked for: what the rings still hold, line by line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from test_capture import UNCONFIRMED, armed, check_balance, check_rows, sealed, until
+from wired_devices import make_bench, make_spec
+
+from acquire.errors import UsageError
+from acquire.store import RunCondition
+from acquire.stream.losses import Cause, Loss
+from acquire.stream.ring import Ring, RingShape
+from acquire.stream.window import Held, Window, hold, span
+
+
+@pytest.fixture
+def make_ring() -> Iterator[Callable[..., Ring]]:
+    made: list[Ring] = []
+
+    def make(name: str, blocks: int, lost: range = range(0)) -> Ring:
+        """A ring through which ``blocks`` blocks of 10 lines went but for those in ``lost``."""
+        ring = Ring(name, RingShape(slots=16, rows=10, width=1, dtype="uint8", reserve=4))
+        made.append(ring)
+        losses = [Loss(10 * lost.start, 10 * len(lost), Cause.CAMERA)] if lost else []
+        for block in range(blocks):
+            if block not in lost:
+                assert ring.claim() is not None
+                ring.commit(10 * block, 10, losses if block == lost.stop else ())
+                ring.release()
+        return ring
+
+    yield make
+    for ring in made:
+        ring.close()
+
+
+def test_both_arms_hold_what_is_asked_for(make_ring: Callable[..., Ring]) -> None:
+    rings = {"a": make_ring("a", 40), "b": make_ring("b", 38)}
+    held = hold(Window(pre_lines=45), rings, 0)
+    assert held == Held(at=380, from_line=330, taken={"a": 70, "b": 50})
+    assert span(Window(pre_lines=45), None, held, 1000.0).first_line == 335
+
+
+def test_the_shorter_history_counts(make_ring: Callable[..., Ring]) -> None:
+    rings = {"a": make_ring("a", 40), "b": make_ring("b", 5)}
+    window = Window(at=390, pre_lines=375)
+    held = hold(window, rings, 0)
+    assert held.from_line == 280  # of arm a; b has everything since line 0, and nothing after 50
+    with pytest.raises(UsageError, match=r"375 lines \(0.375 s\).*up to 110 lines \(0.11 s\)"):
+        span(window, None, held, 1000.0)
+
+
+def test_lines_that_were_lost_are_known_to_be(make_ring: Callable[..., Ring]) -> None:
+    rings = {"a": make_ring("a", 40), "b": make_ring("b", 40, lost=range(33, 36))}
+    held = hold(Window(pre_lines=60), rings, 0)
+    assert held == Held(400, 340, {"a": 60, "b": 40})
+    assert span(Window(pre_lines=60), None, held, 1000.0).first_line == 340
+
+
+def test_what_is_recorded_is_not_recorded_again(make_ring: Callable[..., Ring]) -> None:
+    rings = {"a": make_ring("a", 40), "b": make_ring("b", 40)}
+    window = Window(pre_lines=100, exact=False)
+    held = hold(window, rings, 365)
+    assert held == Held(400, 365, {"a": 40, "b": 40})
+    assert span(window, None, held, 1000.0).first_line == 365
+
+
+@given(
+    at=st.integers(0, 500),
+    pre=st.integers(0, 300),
+    post=st.none() | st.integers(1, 300),
+    lines=st.none() | st.integers(1, 300),
+    from_line=st.integers(0, 500),
+)
+def test_a_span_has_a_line_and_ends_where_it_should(
+    at: int, pre: int, post: int | None, lines: int | None, from_line: int
+) -> None:
+    window = Window(at, pre, post, exact=False)
+    found = span(window, lines, Held(at, from_line, {}), 1000.0)
+    assert found.first_line == max(at - pre, from_line)
+    if post is None and lines is None:
+        assert found.end_line is None
+        return
+    assert found.end_line is not None
+    assert found.end_line > found.first_line
+    if lines is not None:
+        assert found.end_line - found.first_line <= lines
+    if post is not None and found.end_line > found.first_line + 1:
+        assert found.end_line <= at + post
+
+
+@pytest.mark.parametrize(("pre", "post"), [(-1, 1), (0, 0)])
+def test_impossible_windows_are_refused(pre: int, post: int) -> None:
+    with pytest.raises(UsageError, match="lines before"):
+        Window(pre_lines=pre, post_lines=post)
+
+
+def test_a_recording_begins_before_it_was_asked_for(tmp_path: Path) -> None:
+    with armed(make_bench(ring_slots=1024)) as capture:
+        until(lambda: capture.poll().lines["b"]["delivered"] > 5000, "history")
+        before = capture.poll()
+        line = capture.note("mark", "something happened")
+        capture.start(tmp_path / "r.zarr", make_spec(), None, Window(line, 3000, 1000))
+        status = sealed(capture)
+    assert before.lines["a"]["discarded"] > 0
+    assert (status.first_line, status.recorded_lines) == (line - 3000, 4000)
+    assert (status.condition, status.end_reason) == (RunCondition.GOOD, "line budget reached")
+    check_balance(status)
+    recording, missing = check_rows(tmp_path / "r.zarr")
+    assert (recording.first_line, recording.lines) == (line - 3000, 4000)
+    assert not missing["a"].any()
+    flags = recording.camera("a").flags[:]
+    assert not (flags & UNCONFIRMED).any()  # the tags of what was before have come as any other
+    assert [(event.kind, event.line, event.text) for event in recording.events] == [
+        ("started", line - 3000, ""),
+        ("mark", line, "something happened"),
+    ]
+
+
+def test_what_the_ring_does_not_hold_is_refused_with_what_it_does(tmp_path: Path) -> None:
+    with armed(make_bench(ring_slots=1024)) as capture:
+        until(lambda: capture.poll().lines["b"]["delivered"] > 2000, "history")
+        with pytest.raises(UsageError, match=r"50000 lines \(.* s\) from before.*which the ring holds now"):
+            capture.start(tmp_path / "r.zarr", make_spec(), 60_000, Window(pre_lines=50_000))
+        assert not any(tmp_path.iterdir())
+        capture.start(tmp_path / "r.zarr", make_spec(), 6000, Window(pre_lines=50_000, exact=False))
+        status = sealed(capture)
+    assert status.condition is RunCondition.GOOD
+    assert status.recorded_lines == 6000
+    check_rows(tmp_path / "r.zarr")
+    check_balance(status)
+
+
+def test_recordings_of_one_run_follow_one_another_without_a_hole(tmp_path: Path) -> None:
+    with armed(make_bench(ring_slots=1024)) as capture:
+        until(lambda: capture.poll().lines["b"]["delivered"] > 2000, "history")
+        capture.start(tmp_path / "0.zarr", make_spec(), 1500, Window(pre_lines=1000))
+        first = sealed(capture)
+        capture.start(tmp_path / "1.zarr", make_spec(), 2000, Window(pre_lines=10**6, exact=False))
+        second = sealed(capture)
+    assert first.first_line is not None
+    assert second.first_line == first.first_line + 1500
+    for name in ("0.zarr", "1.zarr"):
+        assert not check_rows(tmp_path / name)[1]["b"].any()
+
+
+def test_an_event_in_a_recording_lets_it_go_on(tmp_path: Path) -> None:
+    with armed(make_bench(ring_slots=1024)) as capture:
+        capture.start(tmp_path / "r.zarr", make_spec(), 4000)
+        until(lambda: capture.poll().recorded_lines > 100, "rows")
+        line = capture.note("mark", "again")
+        capture.extend(line + 6000)
+        status = sealed(capture)
+    assert status.first_line is not None
+    assert status.first_line + status.recorded_lines == line + 6000
+    check_rows(tmp_path / "r.zarr")

@@ -1,0 +1,106 @@
+"""The whole capture path at full rate: lines lost, ring, cores, latency; beside the bare disk and memory.
+
+``python tools/bench_capture.py --out DIR`` records into DIR at the rates of the fastest cameras, with a bare
+O_DIRECT write and a memcpy before each, so that everything compares within one run.
+``--search`` looks for the highest rate without loss as well, ``--seconds`` says how long each case lasts.
+The cameras show stored lines: no scene is computed. Grabbers have real-time priority where that is allowed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import mmap
+import os
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from acquire.capacity.load import Load, LoadReport, run_load
+from acquire.capacity.search import best, search_rate
+
+LOADS = {
+    "4640 px x 100 kHz": Load(4640, "uint8", 100_000.0),
+    "4640 px x 100 kHz, lz4": Load(4640, "uint8", 100_000.0, codec="lz4"),
+    "54 px x 600 kHz": Load(54, "uint8", 600_000.0, block_lines=8192, chunk_lines=65536),
+}
+BARE_BYTES = 2 * 10**9
+PIECE_BYTES = 4 * 2**20
+
+
+def bare_write(directory: Path) -> tuple[float, float]:
+    """MB/s and processor seconds per GB of one O_DIRECT file, written in pieces from touched memory."""
+    source = mmap.mmap(-1, 8 * PIECE_BYTES)
+    np.frombuffer(source, np.uint8)[:] = np.random.default_rng(0).integers(0, 256, len(source), np.uint8)
+    path = directory / ".bare"
+    fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_DIRECT)
+    begun, used = time.perf_counter(), time.process_time()
+    try:
+        for at in range(0, BARE_BYTES, PIECE_BYTES):
+            part = at % len(source)
+            os.pwrite(fd, memoryview(source)[part : part + PIECE_BYTES], at)
+        size = os.fstat(fd).st_size
+        elapsed_s = time.perf_counter() - begun
+        return size / elapsed_s / 1e6, (time.process_time() - used) / (size / 1e9)
+    finally:
+        os.close(fd)
+        path.unlink()
+
+
+def bare_copy() -> float:
+    """GB/s of numpy from one place to another, both larger than a cache."""
+    source, target = (np.ones(2**26, np.uint8) for _ in range(2))
+    begun = time.perf_counter()
+    for _ in range(10):
+        target[:] = source
+    return 10 * len(source) / (time.perf_counter() - begun) / 1e9
+
+
+def show(name: str, report: LoadReport) -> None:
+    cores, late = report.cores, report.latency_ms
+    mb_s = report.load.bytes_per_s / 1e6
+    print(
+        f"2 x {name}: {mb_s:.0f} MB/s for {report.seconds:.1f} s: {report.condition}\n"
+        f"  lines lost {report.lost}, unaccounted {report.unaccounted}, of {report.lines};"
+        f" ring peak {100 * report.ring_peak:.0f} %\n"
+        f"  cores: recorder {cores['recorder']:.3f}, grabbers {cores['a']:.3f} + {cores['b']:.3f},"
+        f" owner and simulated trigger {cores['owner']:.3f}; {report.cpu_s_per_gb:.3f} s per GB\n"
+        f"  grabber latency ms: p50 {late['p50']:.2f}, p99 {late['p99']:.2f}, p99.9 {late['p99.9']:.2f},"
+        f" max {late['max']:.2f}"
+    )
+
+
+def search(name: str, load: Load, directory: Path) -> None:
+    disk_mb_s, _ = bare_write(directory)
+    found = best(search_rate(load, directory, load.line_rate_hz))
+    if found is None:
+        print(f"2 x {name}: no rate held")
+        return
+    mb_s = replace(load, line_rate_hz=found.line_rate_hz).bytes_per_s / 1e6
+    print(
+        f"2 x {name}: highest rate without loss {found.line_rate_hz / 1e3:.0f} klines/s = {mb_s:.0f} MB/s,"
+        f" {mb_s / disk_mb_s:.2f} of the bare write ({disk_mb_s:.0f} MB/s)"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--out", type=Path, default=Path(tempfile.gettempdir()))
+    parser.add_argument("--search", action="store_true")
+    parser.add_argument("--case", help="only those whose name has this", default="")
+    options = parser.parse_args()
+    for name, load in LOADS.items():
+        if options.case not in name:
+            continue
+        mb_s, cpu = bare_write(options.out)
+        print(f"bare O_DIRECT write {mb_s:.0f} MB/s, {cpu:.3f} s per GB; memcpy {bare_copy():.1f} GB/s")
+        show(name, run_load(load, options.out, options.seconds))
+        if options.search:
+            search(name, load, options.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,279 @@
+"""What the store costs beside the bare disk: writing, packing, and cutting a segment out of an hour.
+
+``python tools/bench_store.py --out DIR`` alternates a bare O_DIRECT write of the same bytes with every case,
+so that each ratio is within one run. Lines are 4640 pixels of 8 bit, both arms, with the noise of photons of
+a sensor whose white is 20 000 electrons; chunks of 1024 lines lie in page-aligned memory, as in the ring.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from acquire.clock import ClockFit
+from acquire.codes import ConstantCode
+from acquire.lines import ARMS, TaggedBlock
+from acquire.store import RecordingSpec, RecordingWriter, RunCondition, open_recording
+from acquire.store.codecs import CODECS, measure_codec
+from acquire.store.files import DISK
+from acquire.store.pages import PAGE, aligned_bytes, open_direct, page_up
+from acquire.store.retention import shard_files
+from acquire.store.shard import shard_key
+
+PIXELS, CHUNK_LINES, SHARD_CHUNKS, SUBSTEPS = 4640, 1024, 64, 3
+LINE_RATE_HZ = 100_000
+HOUR_LINES = 3600 * LINE_RATE_HZ
+SHARD_LINES = CHUNK_LINES * SHARD_CHUNKS
+MIDDLE = HOUR_LINES // 2 // SHARD_LINES * SHARD_LINES
+CUT_LINES = 263
+WHITE_ELECTRONS = 20_000
+CAMERA = {"white_dn": 255, "black_level_dn": 0.0, "responsivity_dn": 1.0}
+
+
+@dataclass(frozen=True)
+class Pace:
+    """MB of lines per second, and processor seconds per GB of lines."""
+
+    mb_s: float
+    cpu_s_per_gb: float
+
+
+def spec(codec: str = "none", fsync: str = "seal") -> RecordingSpec:
+    return RecordingSpec(
+        run_id="bench",
+        stages=PIXELS,
+        substeps=SUBSTEPS,
+        pixels=PIXELS,
+        dtype="uint8",
+        first_line=0,
+        clock=ClockFit(90_000_000, 0, 0),
+        code=ConstantCode(1).to_attrs(),
+        substep_ticks=300,
+        trigger={},
+        cameras={"a": CAMERA, "b": CAMERA},
+        config={},
+        chunk_lines=CHUNK_LINES,
+        shard_chunks=SHARD_CHUNKS,
+        codec=codec,
+        fsync=fsync,
+        commit_lines=10 * CHUNK_LINES,
+        reserve_bytes=0,
+    )
+
+
+def chunk_memory(count: int = 4) -> list[np.ndarray]:
+    """Chunks of lines like those of a camera, on pages."""
+    generator = np.random.default_rng(0)
+    chunks = []
+    for _ in range(count):
+        memory = aligned_bytes(CHUNK_LINES * PIXELS)[: CHUNK_LINES * PIXELS]
+        chunk = memory.reshape(CHUNK_LINES, PIXELS)
+        along, across = np.arange(CHUNK_LINES)[:, None], np.arange(PIXELS)
+        light = 100 * (1.2 + np.sin(across / 300)) * generator.uniform(0.8, 1, (CHUNK_LINES, 1)) + along % 7
+        noise = generator.normal(0, 1, light.shape) * np.sqrt(light * 255 / WHITE_ELECTRONS)
+        chunk[:] = np.clip(np.rint(light + noise), 0, 255)
+        chunks.append(chunk)
+    return chunks
+
+
+def block(arm: str, number: int, pixels: np.ndarray) -> TaggedBlock:
+    line = np.arange(number * CHUNK_LINES, (number + 1) * CHUNK_LINES, dtype=np.uint64)
+    return TaggedBlock(
+        arm=arm,
+        first_line=int(line[0]),
+        pixels=pixels,
+        flags=np.zeros(len(line), np.uint16),
+        code_index=SUBSTEPS * line,
+        code=np.full(len(line), 7, np.uint8),
+        tick=900 * line,
+        time_ns=(10_000 * line).astype(np.int64),
+    )
+
+
+def paced(work: Callable[[], None], size: int) -> Pace:
+    begun, used = time.perf_counter(), time.process_time()
+    work()
+    seconds = time.perf_counter() - begun
+    return Pace(size / seconds / 1e6, (time.process_time() - used) / (size / 1e9))
+
+
+def bare(directory: Path, chunks: list[np.ndarray], count: int) -> Pace:
+    """One file, direct I/O, the same memory, pieces of the same size."""
+    path = directory / ".bare"
+    path.touch()
+    fd, size = open_direct(path), page_up(chunks[0].nbytes) // PAGE * PAGE
+
+    def work() -> None:
+        for number in range(count):
+            os.pwrite(fd, chunks[number % len(chunks)].data.cast("B")[:size], number * size)
+
+    try:
+        return paced(work, count * size)
+    finally:
+        os.close(fd)
+        path.unlink()
+
+
+def written(directory: Path, chunks: list[np.ndarray], count: int, codec: str, fsync: str) -> Pace:
+    """A recording of both arms, ``count`` chunks in all, until its last line is committed."""
+    path = directory / ".bench-store.zarr"
+    blocks = [
+        [block(arm, number, chunks[number % len(chunks)]) for arm in ARMS]
+        for number in range(count // len(ARMS))
+    ]
+    with RecordingWriter.create(path, spec(codec, fsync)) as writer:
+
+        def work() -> None:
+            for pair in blocks:
+                for one in pair:
+                    writer.append(one)
+            writer.commit()
+
+        pace = paced(work, count * chunks[0].nbytes)
+        writer.seal(RunCondition.GOOD, "done", {})
+    DISK.remove_tree(path)
+    return pace
+
+
+def write_cases(directory: Path, gigabytes: float) -> None:
+    chunks = chunk_memory()
+    count = max(2, int(gigabytes * 1e9 / chunks[0].nbytes) // 2 * 2)
+    cases = [("none", "seal"), ("none", "commit"), ("lz4", "seal"), ("zstd", "seal")]
+    for codec, fsync in cases:
+        disk = bare(directory, chunks, count)
+        ours = written(directory, chunks, count, codec, fsync)
+        print(
+            f"writer, codec {codec}, fsync at {fsync}: {ours.mb_s:.0f} MB/s, {ours.cpu_s_per_gb:.3f} s "
+            f"per GB; {ours.mb_s / disk.mb_s:.2f} of the bare write ({disk.mb_s:.0f} MB/s, "
+            f"{disk.cpu_s_per_gb:.3f} s per GB)"
+        )
+
+
+def codec_cases() -> None:
+    (chunk,) = chunk_memory(1)
+    for codec in CODECS:
+        speed = measure_codec(chunk, codec, seconds=0.5)
+        print(f"codec {codec} with crc32c, one thread: {speed.megabytes_per_s:.0f} MB/s, x {speed.ratio:.2f}")
+
+
+def hour(directory: Path) -> Path:
+    """A recording of an hour: one shard in its middle has lines, the others are names of files."""
+    path = directory / ".bench-hour.zarr"
+    chunk = chunk_memory(1)[0]
+    small = replace(
+        spec(), first_line=HOUR_LINES // 2 // (CHUNK_LINES * SHARD_CHUNKS) * CHUNK_LINES * SHARD_CHUNKS
+    )
+    first = small.first_line // CHUNK_LINES
+    with RecordingWriter.create(path, small) as writer:
+        for number in range(first, first + SHARD_CHUNKS):
+            for arm in ARMS:
+                writer.append(block(arm, number, chunk))
+        writer.seal(RunCondition.GOOD, "done", {})
+    _stretch(path, small.first_line)
+    return path
+
+
+def _stretch(path: Path, first_line: int) -> None:
+    """Give the recording an hour of rows, of which the shard that it has is in the middle."""
+    shard, shards = first_line // SHARD_LINES, HOUR_LINES // SHARD_LINES
+    root = path / "zarr.json"
+    document = json.loads(root.read_bytes())
+    document["attributes"]["first_line"] = 0
+    for name, node in document["consolidated_metadata"]["metadata"].items():
+        if node["node_type"] != "array" or name.split("/")[0] not in ARMS:
+            continue
+        axes = len(node["shape"])
+        node["shape"][0] = HOUR_LINES
+        for other in range(shards + 1):
+            file = path / name / shard_key(other, axes)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            if other not in (0, shard):
+                file.touch()
+        (path / name / shard_key(0, axes)).rename(path / name / shard_key(shard, axes))
+    root.write_text(json.dumps(document))
+
+
+def cut_case(directory: Path) -> None:
+    path = hour(directory)
+    try:
+        times = [_cut_cold(path, line) for line in _places()]
+    finally:
+        DISK.remove_tree(path)
+    names = ("open and cut", "cut alone", "cut again, warm", "bare O_DIRECT read of its chunks")
+    for name, values in zip(names, zip(*times, strict=True), strict=True):
+        found = f"median {np.median(values):.1f} ms, worst {max(values):.1f} ms"
+        print(f"{CUT_LINES} lines of an hour, {name}: {found}")
+
+
+def _places() -> list[int]:
+    starts = np.random.default_rng(1).integers(0, SHARD_LINES - CUT_LINES, 9)
+    return [MIDDLE + int(start) for start in starts]
+
+
+def _cut_cold(path: Path, line: int) -> list[float]:
+    """In a process of its own, its files out of the page cache: ms to open and cut, to cut, to cut again,
+    and to read its chunks of lines barely.
+    """
+    for file in shard_files(path, MIDDLE // SHARD_LINES):
+        fd = os.open(file, os.O_RDONLY)
+        os.fsync(fd)
+        os.posix_fadvise(fd, 0, 0, os.POSIX_FADV_DONTNEED)
+        os.close(fd)
+    command = [sys.executable, __file__, "--cut", str(path), str(line)]
+    return list(
+        map(float, subprocess.run(command, check=True, capture_output=True, text=True).stdout.split())
+    )
+
+
+def cut_here(path: Path, line: int) -> None:
+    begun = time.perf_counter()
+    recording = open_recording(path)
+    opened = time.perf_counter()
+    recording.cut(line, CUT_LINES)
+    cut = time.perf_counter()
+    recording.cut(line, CUT_LINES)
+    again = time.perf_counter()
+    bare_s = _bare_read(path, line)
+    print(*(1e3 * seconds for seconds in (cut - begun, cut - opened, again - cut, bare_s)))
+
+
+def _bare_read(path: Path, line: int) -> float:
+    """The chunks of lines that the cut needs, of both arms, one after the other, past the page cache."""
+    row = line - MIDDLE
+    chunks = range(row // CHUNK_LINES, -(-(row + CUT_LINES) // CHUNK_LINES))
+    memory = aligned_bytes(CHUNK_LINES * PIXELS)
+    begun = time.perf_counter()
+    for arm in ARMS:
+        fd = os.open(path / arm / "lines" / shard_key(MIDDLE // SHARD_LINES, 2), os.O_RDONLY | os.O_DIRECT)
+        for chunk in chunks:
+            os.preadv(fd, [memory.data], PAGE + chunk * page_up(CHUNK_LINES * PIXELS + 4))
+        os.close(fd)
+    return time.perf_counter() - begun
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path(tempfile.gettempdir()))
+    parser.add_argument("--gigabytes", type=float, default=2.0, help="written per case")
+    parser.add_argument("--cut", nargs=2, metavar=("RECORDING", "LINE"), help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.cut:
+        cut_here(Path(options.cut[0]), int(options.cut[1]))
+        return
+    write_cases(options.out, options.gigabytes)
+    codec_cases()
+    cut_case(options.out)
+
+
+if __name__ == "__main__":
+    main()
