@@ -112,7 +112,8 @@ def _pulses(studio: Studio, khz: int, kind: str) -> Curves:
     factor = scene.size // geometry.size
     binned = scene.masks[0].reshape(geometry.size, factor, geometry.size, factor).sum(axis=(1, 3))
     result = reconstruct(segment, geometry.size, 1, static_image=binned)
-    light = np.where(segment.code > 0, result.video[:, 0, 0] / binned.mean(), np.nan)
+    level = factor * binned.mean()  # a coarse step collects the light of its fine sub-steps
+    light = np.where(segment.code > 0, result.video[:, 0, 0] / level, np.nan)
     found = light[geometry.trusted]
     first = factor * (geometry.substeps * FIRST + geometry.trusted.start)
     count = factor * len(found)
@@ -153,7 +154,7 @@ def _pulse_curves(curves: dict[int, dict[str, Curves]]) -> Figure:
             curve = curves[khz][kind]
             times = curve.times_us - origin
             ax.step(times, curve.true, where="post", color=THEORY, lw=1.0)
-            ax.step(times, curve.found, where="post", color=COLOUR[kind], lw=3.0)
+            ax.hlines(curve.found, times, times + np.diff(times).mean(), color=COLOUR[kind], lw=3.0)
             ax.set_title(f"{kind}, {khz} kHz", fontsize=9.5)
             ax.set(xlim=(0, SHOWN_US), ylim=(-0.25, 1.3))
         line[0].set_ylabel("light")
