@@ -99,6 +99,8 @@ def combine(
                 begins = grid.edges(slice(writer.frames, writer.frames + len(video)))[:-1]
                 writer.append(video, clock.time_ns(begins), error)
             parts.append(part)
+        if not parts:
+            raise KeyboardInterrupt  # there is nothing to keep
         facts = describe_parts(recording, request, [part.facts for part in parts], options)
         facts["state"] = "interrupted" if watcher.stopped else "complete"
         facts["seconds"] = round(time.monotonic() - began, 3)
