@@ -83,7 +83,8 @@ def combine(
     place = str(recording) if is_url(str(recording)) else str(recording.path.resolve())
     tasks = [Task(place, segment, grid, options) for segment in segments]
     clock = _Clock.of(recording, request)
-    stitcher, parts = Stitcher(grid), []
+    stitcher = Stitcher(grid)
+    done: list[dict[str, Any]] = []
     with VideoWriter(
         path,
         (grid.side, grid.side),
@@ -98,10 +99,10 @@ def combine(
             if len(video):
                 begins = grid.edges(slice(writer.frames, writer.frames + len(video)))[:-1]
                 writer.append(video, clock.time_ns(begins), error)
-            parts.append(part)
-        if not parts:
+            done.append(part.facts)  # not the part: memory must not grow with the stream
+        if not done:
             raise KeyboardInterrupt  # there is nothing to keep
-        facts = describe_parts(recording, request, [part.facts for part in parts], options)
+        facts = describe_parts(recording, request, done, options)
         facts["state"] = "interrupted" if watcher.stopped else "complete"
         facts["seconds"] = round(time.monotonic() - began, 3)
         facts["trusted"] = _trusted_frames(request, writer.frames)

@@ -25,6 +25,7 @@ class Options:
     solver: Solver = "admm"
     iterations: int | None = None
     budget_s: float | None = None
+    bandwidth: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +75,7 @@ def solve(task: Task, watch: Watch) -> Part:
         advanced,
         solver=options.solver,
         iterations=options.iterations,
+        bandwidth=options.bandwidth,
         stop=watch,
     )
     watch.advance(1 - result.iterations / result.iterations_asked)
