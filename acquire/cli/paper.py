@@ -26,7 +26,7 @@ def paper(
         list[str] | None, typer.Argument(metavar="[FIGURE...]", help=f"{', '.join(NAMES)}; else all.")
     ] = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="New directory.")] = Path("acquire-paper"),
-    preset: Annotated[str, typer.Option(help="As of acquire reconstruct.")] = "balanced",
+    preset: Annotated[str, typer.Option(help="fast, balanced or best.")] = "balanced",
     solver: Annotated[str, typer.Option(help="admm, or twist: the paper's.")] = "admm",
     budget: Annotated[float | None, typer.Option(metavar="SECONDS", help="For each reconstruction.")] = None,
     seed: Annotated[int, typer.Option(help="Of the exposure code.")] = 1,

@@ -19,9 +19,6 @@ if TYPE_CHECKING:
     from acquire.store import Recording
 
 
-DOUBTFUL_PREDICTION = 0.3
-"""Good reconstructions predict within a tenth; a wrong code or swapped arms come to half and more."""
-
 PROGRESS_STEPS = 1000
 
 
@@ -70,9 +67,9 @@ def reconstruct(
         str | None, typer.Option(help="trusted, or whole: also what is sampled in part at the ends.")
     ] = None,
     preset: Annotated[
-        str | None, typer.Option(help="fast or balanced; else balanced, or what --budget learned.")
+        str | None, typer.Option(help="fast, balanced or best; else balanced, or what --budget learned.")
     ] = None,
-    solver: Annotated[str, typer.Option(help="admm, or twist: the paper's.")] = "admm",
+    solver: Annotated[str, typer.Option(help="admm; twist, the paper's; twist-band.")] = "admm",
     budget: Annotated[float | None, typer.Option(metavar="SECONDS", help="Stop iterating in time.")] = None,
     iterations: Annotated[int | None, typer.Option(help="Instead of the preset's.")] = None,
     preview: Annotated[bool, typer.Option("--preview", help="Coarse, in a second or two.")] = False,
@@ -165,12 +162,9 @@ def _report(outcomes: list[Outcome], *, json: bool) -> None:
         if len(outcome.provenance["segments"]) > 1:
             typer.echo()
             _print_segments(outcome.provenance["segments"])
-        prediction = outcome.provenance["quality"]["prediction"]
-        if prediction is not None and prediction > DOUBTFUL_PREDICTION:
-            print_warning(
-                f"samples kept from the solver are predicted with an error of {prediction:.0%}: "
-                "do not trust the video before code, arms and losses are checked"
-            )
+        segments = outcome.provenance["segments"]
+        for text in dict.fromkeys(text for part in segments for text in part["warnings"]):
+            print_warning(text)
 
 
 def _readable(outcome: Outcome) -> dict[str, Any]:

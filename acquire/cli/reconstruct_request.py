@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     from acquire.reconstruct import Options, Request
     from acquire.store import Recording
 
-PREVIEW_ITERATIONS = 15
+PREVIEW_ITERATIONS = 8
+PREVIEW_BANDWIDTH = 0.5
+"""Of its frames' Nyquist frequency: to find out would take longer than the preview."""
 PREVIEW_MERGE = 4
 PREVIEW_LINES = 320
 NS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
@@ -87,7 +89,7 @@ def _requests(recording: Recording, asked: Asked) -> Prepared:
     selection, whole = _select(recording, asked), ENDS[asked.ends]
     if asked.preview:
         coarse, voxels = _coarse(selection)
-        options = replace(asked.options, preset="fast", iterations=PREVIEW_ITERATIONS)
+        options = replace(asked.options, iterations=PREVIEW_ITERATIONS, bandwidth=PREVIEW_BANDWIDTH)
         return Prepared({"": in_voxels(coarse, voxels, whole_ends=whole, longest=1 << 62)}, options)
     plan = _plan(recording, selection, asked)
     if plan is not None:

@@ -12,7 +12,6 @@ import typer
 
 from acquire.cli.output import JsonFlag, print_json, print_table
 from acquire.cli.progress import stage_progress, told
-from acquire.errors import UsageError
 
 if TYPE_CHECKING:
     from acquire.evaluate.tradeoff import Run
@@ -32,12 +31,10 @@ def tradeoff(
     out: Annotated[Path, typer.Option(metavar="DIR", help="New directory.")] = Path("acquire-tradeoff"),
     voxels: Annotated[list[str] | None, typer.Option(metavar="NMxTM", help="Repeatable; else 3x1.")] = None,
     solver: Annotated[list[str] | None, typer.Option(help="Repeatable; else every solver.")] = None,
-    preset: Annotated[list[str] | None, typer.Option(help="Repeatable; else every preset.")] = None,
+    preset: Annotated[list[str] | None, typer.Option(help="Repeatable; else fast and balanced.")] = None,
     first_line: Annotated[int | None, typer.Option(help="Of the segment.")] = None,
     lines: Annotated[int, typer.Option(help="How many lines, L_R.")] = LINES,
-    budget: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="At most so long for each run.")
-    ] = None,
+    budget: Annotated[float | None, typer.Option(metavar="SECONDS", help="No run longer than this.")] = None,
     learn: Annotated[bool, typer.Option(help="Keep it for --budget of acquire reconstruct.")] = True,
     json: JsonFlag = False,
 ) -> None:
@@ -48,28 +45,25 @@ def tradeoff(
     from acquire.cli.reconstruct_request import parse_voxels
     from acquire.evaluate.tradeoff import Judge, measure, table
     from acquire.evaluate.tradeoff_page import write_page
-    from acquire.recon.api import ITERATIONS
+    from acquire.recon import ITERATIONS
+    from acquire.recon.request import preset_iterations
     from acquire.reconstruct.learned import remember
     from acquire.store.files import check_new_path
 
     kinds = [parse_voxels(text) for text in voxels or ["3x1"]]
-    cases = [
-        (each, kind)
-        for each in solver or list(ITERATIONS)
-        for kind in preset or list(ITERATIONS.get(each, {"": 0}))
-    ]
-    for each, kind in cases:
-        if kind not in ITERATIONS.get(each, {}):
-            have = "; ".join(f"{name}: {', '.join(presets)}" for name, presets in ITERATIONS.items())
-            raise UsageError(f"solver {each} with preset {kind or '-'}", possible=have)
+    presets = tuple(preset or ("fast", "balanced"))
+    solvers = solver or list(ITERATIONS)
+    for each in solvers:
+        for kind in presets:
+            preset_iterations(each, kind)
     check_new_path(out)
     recording, study = _opened(source, out, (first_line or FIRST_LINE) + lines)
     segment = recording.cut(_first(recording, first_line, lines), lines)
     judge, runs = Judge.of(recording, segment), []
     for shape in kinds:
-        for each, kind in cases:
-            with stage_progress(f"{each} {kind} {shape}") as advance:
-                runs.append(measure(judge, each, kind, shape, budget, advance))  # type: ignore[arg-type]
+        for each in solvers:
+            with stage_progress(f"{each} {shape}") as advance:
+                runs.append(measure(judge, each, shape, presets, budget, advance))  # type: ignore[arg-type]
     command = f"acquire {shlex.join(sys.argv[1:])}"
     page = write_page(runs, study, out, Path(source).stem, command, datetime.now(UTC))
     kept = remember(_lessons(runs)) if learn else None
@@ -116,15 +110,17 @@ def _lessons(runs: list[Run]) -> list[Learned]:
     return [
         Learned(
             run.solver,
-            run.preset,
+            preset,
             run.voxels.spatial_merge,
             run.voxels.temporal_merge,
             run.voxel_count,
-            run.end.seconds,
-            run.end.psnr_db,
+            point.seconds,
+            point.psnr_db,
         )
         for run in runs
-        if run.end.psnr_db is not None
+        for point in run.points
+        for preset in point.presets
+        if point.psnr_db is not None
     ]
 
 
@@ -136,15 +132,16 @@ def _print(runs: list[Run]) -> None:
         (
             str(run.voxels),
             run.solver,
-            run.preset,
-            str(run.end.iteration),
-            text(run.end.seconds, 2),
-            text(run.end.psnr_db, 2),
-            text(run.end.ssim, 3),
-            text(run.end.amplitude_error, 3),
-            text(run.end.frequency_error_hz, 2),
+            ", ".join(point.presets),
+            str(point.iterations),
+            text(point.seconds, 2),
+            text(point.psnr_db, 2),
+            text(point.ssim, 3),
+            text(point.amplitude_error, 3),
+            text(point.frequency_error_hz, 2),
         )
         for run in runs
+        for point in run.points
     ]
     titles = ("voxels", "solver", "preset", "iterations", "seconds", "PSNR", "SSIM", "amplitude", "Hz off")
     print_table(titles, rows)

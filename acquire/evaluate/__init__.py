@@ -8,5 +8,10 @@
                                                                       +--> summary             --+
                                                                       +--> figures, animation  --+--> report
 
-Nothing here opens a device, a recording or a socket; only ``report`` and what it calls write files.
+    runs of every solver --> tradeoff  accuracy, time  --> tradeoff_page
+    scenes of the paper  --> paper     its figures     --> paper.page
+    videos on disk       --> rendering movies, sheets
+
+Nothing here opens a device or a socket. Only reports, pages and renderings write files; ``paper`` also
+makes the recordings that it needs.
 """

@@ -121,7 +121,7 @@ def frames(result: DemoResult) -> Figure:
         for frame, ax in zip(picks, row, strict=True):
             _show_frame(ax, result, video[frame], is_error=is_error)
             if not is_error:
-                _stamp(ax, f"#{frame}  {result.frame_ms[frame]:.2f} ms")
+                stamp(ax, f"#{frame}  {result.frame_ms[frame]:.2f} ms")
         row[0].set_ylabel(label, fontweight="normal" if is_error else "bold")
     _colour_bar(figure, axes[0], "intensity", "neither")
     _colour_bar(figure, axes[2], "|error|", "max")
@@ -197,7 +197,7 @@ def _show_frame(ax: Axes, result: DemoResult, frame: NDArray[Any], *, is_error: 
         ax.imshow(frame, cmap="inferno", vmin=0, vmax=ERROR_SHARE * result.peak)
     else:
         ax.imshow(frame, cmap="gray", vmin=0, vmax=result.peak)
-    _bare(ax)
+    bare(ax)
 
 
 def _colour_bar(figure: Figure, row: NDArray[Any], label: str, extend: str) -> None:
@@ -210,7 +210,7 @@ def _show_region(ax: Axes, result: DemoResult, region: Region) -> None:
     if not region.mask.all():  # a region without an edge has no contour
         ax.contour(region.mask, levels=[0.5], colors=HIGHLIGHT, linewidths=1.2)
     ax.set_ylabel(region.name, fontweight="bold")
-    _bare(ax)
+    bare(ax)
 
 
 def _plot_curves(ax: Axes, result: DemoResult, row: int) -> None:
@@ -254,7 +254,7 @@ def _figure(height_in: float) -> Figure:
     return Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
 
 
-def _bare(ax: Axes) -> None:
+def bare(ax: Axes) -> None:
     """A picture without ticks and frame."""
     ax.set(xticks=[], yticks=[])
     ax.grid(visible=False)
@@ -262,7 +262,7 @@ def _bare(ax: Axes) -> None:
         spine.set_visible(False)
 
 
-def _stamp(ax: Axes, text: str) -> None:
+def stamp(ax: Axes, text: str) -> None:
     """Time within the picture, lower left; outlined, because it may lie on white."""
     outline = [withStroke(linewidth=1.6, foreground="black")]
     ax.text(0.03, 0.03, text, color="white", fontsize=7, transform=ax.transAxes, path_effects=outline)

@@ -1,13 +1,12 @@
 """What accuracy costs in time: every solver, preset and kind of voxels, iteration by iteration.
 
-A run is observed at iterations that are equally spaced in logarithm; the clock stands still while its video
-is judged. Against the truth where it is known (simulated recordings), else by the samples it predicts.
+A solver is asked for more and more iterations; every answer is a whole one, with set-up and finish in its
+time. Against the truth where it is known (simulated recordings), else by the samples it predicts.
 """
 
 from __future__ import annotations
 
-import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +15,7 @@ from acquire.config import RigConfig
 from acquire.evaluate.curves import compare_curve, region_mean
 from acquire.evaluate.metrics import psnr, ssim
 from acquire.recon import reconstruct
+from acquire.recon.request import preset_iterations
 from acquire.scene_config import SceneFile, SineDrive
 from acquire.sim.leds import LedScene
 from acquire.sim.scene import Scene
@@ -28,43 +28,44 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.lines import Segment
-    from acquire.recon import Progress
-    from acquire.recon.api import Preset, Solver
+    from acquire.recon import Preset, Reconstruction, Solver
     from acquire.recon.segments import Voxels
     from acquire.store import Recording
 
-OBSERVATIONS_PER_OCTAVE = 3
+FEWEST_ITERATIONS = 4
+SSIM_WINDOW = 11
 COVERED = 0.9
 """Voxels of an LED's mask that are followed for amplitude and frequency."""
 
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """How good a video was after a time. ``None``: not known, or not a quantity of this scene.
+    """How good the answer after ``iterations`` was. ``None``: not known, or not a quantity of this scene.
 
     ``amplitude_error`` is that of the swings over time, relative; ``frequency_error_hz`` the largest among
-    the scene's sinusoids.
+    the scene's sinusoids; ``prediction`` the error at samples that the solver did not see. ``presets`` are
+    those that end here.
     """
 
-    iteration: int
+    iterations: int
     seconds: float
-    psnr_db: float | None
-    ssim: float | None
-    amplitude_error: float | None
-    frequency_error_hz: float | None
+    psnr_db: float | None = None
+    ssim: float | None = None
+    amplitude_error: float | None = None
+    frequency_error_hz: float | None = None
+    prediction: float | None = None
+    presets: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One solver on one kind of voxels with a preset's parameters."""
+    """One solver on one kind of voxels, asked for more and more iterations."""
 
     solver: Solver
-    preset: Preset
     voxels: Voxels
     dtype: str
     voxel_count: int
     points: tuple[Point, ...]
-    prediction: float | None
 
     @property
     def end(self) -> Point:
@@ -104,20 +105,20 @@ class Judge:
             self._truths[voxels] = whole[self.frames(voxels)]
         return self._truths[voxels]
 
-    def point(self, iteration: int, seconds: float, voxels: Voxels, video: NDArray[Any]) -> Point:
-        """How good a video (of the whole span) is."""
+    def point(self, result: Reconstruction, voxels: Voxels) -> Point:
+        """How good a reconstruction is."""
+        prediction = None if np.isnan(result.quality.prediction) else result.quality.prediction
+        found = Point(result.iterations, result.seconds, prediction=prediction)
         true = self.truth(voxels)
         if true is None:
-            return Point(iteration, seconds, None, None, None, None)
-        shown = video[self.frames(voxels)]
-        small = min(true.shape[1:]) < 11
-        return Point(
-            iteration,
-            seconds,
-            psnr(shown, true),
-            None if small else ssim(shown, true),
-            amplitude_error(shown, true),
-            self._frequency_error(shown, voxels),
+            return found
+        shown = result.video[self.frames(voxels)]
+        return replace(
+            found,
+            psnr_db=psnr(shown, true),
+            ssim=None if min(true.shape[1:]) < SSIM_WINDOW else ssim(shown, true),
+            amplitude_error=amplitude_error(shown, true),
+            frequency_error_hz=self._frequency_error(shown, voxels),
         )
 
     def _frequency_error(self, shown: NDArray[Any], voxels: Voxels) -> float | None:
@@ -150,46 +151,49 @@ def amplitude_error(video: NDArray[Any], truth: NDArray[Any]) -> float | None:
 def measure(
     judge: Judge,
     solver: Solver,
-    preset: Preset,
     voxels: Voxels,
-    budget_s: float | None = None,
+    presets: Sequence[Preset] = ("fast", "balanced"),
+    longest_s: float | None = None,
     progress: Callable[[int, int], object] | None = None,
 ) -> Run:
-    """Reconstruct once, looking at the video on the way."""
+    """Reconstruct with more and more iterations, up to the presets'; each answer is a whole one.
+
+    The series ends early when a run takes ``longest_s``, or when more iterations change nothing.
+    """
+    limits = {preset: preset_iterations(solver, preset) for preset in presets}
+    counts = _counts(limits.values())
     points: list[Point] = []
-    clock = _Stopwatch()
-    iteration = 0
-
-    def observe(video: Callable[[], NDArray[np.float32]]) -> None:
-        nonlocal iteration
-        iteration += 1
-        with clock.stopped():
-            if _is_looked_at(iteration):
-                points.append(judge.point(iteration, clock.seconds(), voxels, video()))
-
-    def advanced(step: Progress) -> None:
+    result = None
+    for number, count in enumerate(counts):
+        result = reconstruct(
+            judge.segment,
+            voxels.spatial_merge,
+            voxels.temporal_merge,
+            budget_s=longest_s,
+            solver=solver,
+            iterations=count,
+        )
+        ended = result.ended != "done"
+        reached = tuple(
+            preset for preset, most in limits.items() if most == count or (ended and most > count)
+        )
+        points.append(replace(judge.point(result, voxels), presets=reached))
         if progress is not None:
-            progress(step.iteration, step.iterations)
+            progress(number + 1, len(counts))
+        if ended:
+            break
+    assert result is not None
+    return Run(solver, voxels, str(result.video.dtype), int(result.video.size), tuple(points))
 
-    judge.truth(voxels)
-    clock.start()
-    result = reconstruct(
-        judge.segment,
-        voxels.spatial_merge,
-        voxels.temporal_merge,
-        preset,
-        None,
-        advanced,
-        solver=solver,
-        observe=observe,
-        stop=lambda: budget_s is not None and clock.seconds() > budget_s,
-    )
-    seconds = clock.seconds()
-    if not points or points[-1].iteration != result.iterations:
-        points.append(judge.point(result.iterations, seconds, voxels, result.video))
-    prediction = None if np.isnan(result.quality.prediction) else result.quality.prediction
-    dtype, count = str(result.video.dtype), int(result.video.size)
-    return Run(solver, preset, voxels, dtype, count, tuple(points), prediction)
+
+def _counts(limits: Iterable[int]) -> list[int]:
+    """Iterations that are asked for: the presets', and halves of the largest down to a few."""
+    wanted = set(limits)
+    count = max(wanted)
+    while count > FEWEST_ITERATIONS:
+        wanted.add(count)
+        count //= 2
+    return sorted(wanted)
 
 
 def pareto(runs: Iterable[Run]) -> list[tuple[Run, Point]]:
@@ -206,9 +210,9 @@ def pareto(runs: Iterable[Run]) -> list[tuple[Run, Point]]:
 
 
 def table(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """Every observation as a flat row."""
+    """Every answer as a flat row."""
     fronts = {
-        (id(run), point.iteration)
+        (id(run), point.iterations)
         for voxels in {run.voxels for run in runs}
         for run, point in pareto(run for run in runs if run.voxels == voxels)
     }
@@ -217,47 +221,18 @@ def table(runs: Sequence[Run]) -> list[dict[str, Any]]:
             "spatial_merge": run.voxels.spatial_merge,
             "temporal_merge": run.voxels.temporal_merge,
             "solver": run.solver,
-            "preset": run.preset,
             "dtype": run.dtype,
             "voxels": run.voxel_count,
-            "iteration": point.iteration,
+            "iterations": point.iterations,
+            "preset": " ".join(point.presets),
             "seconds": round(point.seconds, 4),
             "psnr_db": point.psnr_db,
             "ssim": point.ssim,
             "amplitude_error": point.amplitude_error,
             "frequency_error_hz": point.frequency_error_hz,
-            "end_of_preset": point is run.end,
-            "pareto": (id(run), point.iteration) in fronts,
+            "prediction": point.prediction,
+            "pareto": (id(run), point.iterations) in fronts,
         }
         for run in runs
         for point in run.points
     ]
-
-
-def _is_looked_at(iteration: int) -> bool:
-    """Equally spaced in logarithm."""
-    octaves = np.log2([iteration, max(1, iteration - 1)]) * OBSERVATIONS_PER_OCTAVE
-    return iteration == 1 or int(octaves[0]) > int(octaves[1])
-
-
-class _Stopwatch:
-    """Seconds since `start` less those for which it was stopped."""
-
-    def __init__(self) -> None:
-        self._began = self._paused = time.perf_counter()
-        self._out = 0.0
-
-    def start(self) -> None:
-        self._began, self._out = time.perf_counter(), 0.0
-
-    def seconds(self) -> float:
-        return time.perf_counter() - self._began - self._out
-
-    def stopped(self) -> _Stopwatch:
-        return self
-
-    def __enter__(self) -> None:
-        self._paused = time.perf_counter()
-
-    def __exit__(self, *_: object) -> None:
-        self._out += time.perf_counter() - self._paused

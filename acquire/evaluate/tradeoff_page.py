@@ -33,7 +33,6 @@ METRICS = (
     ("frequency_error_hz", "frequency error (Hz)", True),
 )
 """Name, label, and whether its axis is logarithmic."""
-DASHES = {"fast": "--", "balanced": "-"}
 MARKERS = {"fast": "o", "balanced": "s", "best": "D"}
 
 
@@ -63,7 +62,7 @@ def write_page(
         for name, drawing in drawings.items():
             pictures[name] = directory / f"{name}.png"
             drawing.savefig(pictures[name], dpi=DPI)
-    ends = [row for row in rows if row["end_of_preset"]]
+    ends = [row for row in rows if row["preset"]]
     facts |= {"ends": ends, "kinds": [str(voxels) for voxels in _kinds(runs)]}
     page = directory / "index.html"
     page.write_text(fill_template("tradeoff.html.j2", facts, pictures), encoding="utf-8")
@@ -75,7 +74,7 @@ def _kinds(runs: Sequence[Run]) -> list[Voxels]:
 
 
 def _curves(runs: Sequence[Run], voxels: Voxels) -> Figure:
-    """All metrics over time for one kind of voxels; a curve per solver and preset, and the front."""
+    """All metrics over time for one kind of voxels; a curve per solver, and the front."""
     own = [run for run in runs if run.voxels == voxels]
     shown = [each for each in METRICS if any(getattr(run.end, each[0]) is not None for run in own)]
     figure = canvas(3.1 * -(-len(shown) // 2) + 0.4)
@@ -105,10 +104,11 @@ def _curve(ax: Axes, run: Run, name: str, colour: str) -> None:
     if not points:
         return
     times, values = ([each[i] for each in points] for i in (0, 1))
-    ax.plot(
-        times, values, DASHES.get(run.preset, ":"), color=colour, lw=1.4, label=f"{run.solver} {run.preset}"
-    )
-    ax.plot(times[-1], values[-1], MARKERS.get(run.preset, "o"), color=colour, ms=6)
+    ax.plot(times, values, ".-", color=colour, lw=1.4, ms=4, label=run.solver)
+    for point in run.points:
+        if point.presets and getattr(point, name) is not None:
+            marker = MARKERS.get(point.presets[-1], "o")
+            ax.plot(point.seconds, getattr(point, name), marker, color=colour, ms=7)
 
 
 def _front(ax: Axes, front: list[tuple[Run, Point]]) -> None:

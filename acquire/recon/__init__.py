@@ -1,6 +1,20 @@
 """Reconstruction: from cut lines to a video, with the priors that fill what the lines leave open."""
 
-from acquire.recon.api import Progress, Quality, Reconstruction, reconstruct
+from acquire.recon.api import reconstruct
 from acquire.recon.basis import TemporalBasis
+from acquire.recon.denoisers import Denoiser, HaarShrink
+from acquire.recon.request import ITERATIONS, Preset, Solver
+from acquire.recon.result import Progress, Quality, Reconstruction
 
-__all__ = ["Progress", "Quality", "Reconstruction", "TemporalBasis", "reconstruct"]
+__all__ = [
+    "ITERATIONS",
+    "Denoiser",
+    "HaarShrink",
+    "Preset",
+    "Progress",
+    "Quality",
+    "Reconstruction",
+    "Solver",
+    "TemporalBasis",
+    "reconstruct",
+]

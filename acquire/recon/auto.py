@@ -62,13 +62,7 @@ def tempo(segment: Segment) -> Tempo:
 
 
 def _error(segment: Segment, voxels: Voxels) -> float:
-    bandwidth = min(1.0, 0.13 * voxels.temporal_merge)  # never more than single sub-steps would have
     quality = reconstruct(
-        segment,
-        voxels.spatial_merge,
-        voxels.temporal_merge,
-        "fast",
-        iterations=ITERATIONS,
-        bandwidth=bandwidth,
+        segment, voxels.spatial_merge, voxels.temporal_merge, "fast", iterations=ITERATIONS
     ).quality
     return quality.misfit if np.isnan(quality.prediction) else quality.prediction

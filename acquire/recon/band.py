@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.geometry import Geometry
-    from acquire.recon.basis import TemporalBasis
+    from acquire.recon.basis import Basis
 
 
 LARGEST_FACTORS_BYTES = 1 << 30
@@ -28,7 +28,7 @@ LARGEST_FACTORS_BYTES = 1 << 30
 def band_operator(
     geometry: Geometry,
     code: NDArray[np.uint8],
-    basis: TemporalBasis,
+    basis: Basis,
     spatial_merge: int = 1,
     temporal_merge: int = 1,
 ) -> BandOperator | InBasis:
@@ -47,7 +47,7 @@ class BandOperator:
         self,
         geometry: Geometry,
         code: NDArray[np.uint8],
-        basis: TemporalBasis,
+        basis: Basis,
         spatial_merge: int = 1,
         temporal_merge: int = 1,
     ) -> None:
@@ -56,6 +56,7 @@ class BandOperator:
         self.lines_shape = geometry.lines_shape
         self.dtype = basis.dtype
         self._columns = (geometry.size, geometry.substeps, spatial_merge)
+        self._pixels = geometry.stages
         starts, lengths = block_bounds(geometry.size, spatial_merge)
         lit = self._lit_cosines(code, basis, temporal_merge)
         flipped = geometry.size - starts - lengths
@@ -66,27 +67,34 @@ class BandOperator:
 
     def forward(self, theta: NDArray[Any]) -> NDArray[Any]:
         """B·θ."""
-        rows, columns = theta.transpose(1, 0, 2), theta.transpose(2, 0, 1)  # (block along TDI, K, across)
-        side = self.theta_shape[1]
-        return np.stack(
-            [
-                blocks_to_pixels(factor @ np.ascontiguousarray(view).reshape(-1, side), *self._columns)
-                for factor, view in zip(self._factors, (rows, columns), strict=True)
-            ]
-        )
+        views = theta.transpose(1, 0, 2), theta.transpose(2, 0, 1)  # (block along TDI, K, across)
+        return np.stack([self._arm(*pair) for pair in zip(self._factors, views, strict=True)])
 
     def adjoint(self, lines: NDArray[Any]) -> NDArray[Any]:
         """Bᵀ·y."""
         K, side, _ = self.theta_shape
         rows, columns = (
-            (factor.T @ pixels_to_blocks(arm, *self._columns)).reshape(side, K, side)
-            for factor, arm in zip(self._factors, lines, strict=True)
+            self._arm_adjoint(*pair).reshape(side, K, side) for pair in zip(self._factors, lines, strict=True)
         )
         theta: NDArray[Any] = rows.transpose(1, 0, 2) + columns.transpose(1, 2, 0)
         return theta
 
+    def _arm(self, factor: NDArray[Any], view: NDArray[Any]) -> NDArray[Any]:
+        """Columns are merged into pixels on that side of the product where it is the smaller."""
+        blocks = np.ascontiguousarray(view).reshape(-1, self.theta_shape[1])
+        if self.theta_shape[1] > self._pixels:
+            pixels: NDArray[Any] = factor @ blocks_to_pixels(blocks, *self._columns)
+            return pixels
+        return blocks_to_pixels(factor @ blocks, *self._columns)
+
+    def _arm_adjoint(self, factor: NDArray[Any], arm: NDArray[Any]) -> NDArray[Any]:
+        if self.theta_shape[1] > self._pixels:
+            return pixels_to_blocks(factor.T @ arm, *self._columns)
+        blocks: NDArray[Any] = factor.T @ pixels_to_blocks(arm, *self._columns)
+        return blocks
+
     @staticmethod
-    def _lit_cosines(code: NDArray[np.uint8], basis: TemporalBasis, temporal_merge: int) -> NDArray[Any]:
+    def _lit_cosines(code: NDArray[np.uint8], basis: Basis, temporal_merge: int) -> NDArray[Any]:
         """E(t)·D_k(t // T_m): (T, K)."""
         frame = np.arange(len(code)) // temporal_merge
         lit: NDArray[Any] = basis.matrix().T[frame] * code[:, None].astype(basis.dtype)
@@ -96,7 +104,7 @@ class BandOperator:
 class InBasis:
     """Λ′·Dᵀ by synthesising the video and shearing it: for a full basis, K = T."""
 
-    def __init__(self, operator: DualArm, basis: TemporalBasis) -> None:
+    def __init__(self, operator: DualArm, basis: Basis) -> None:
         self._operator, self._basis = operator, basis
 
     def forward(self, theta: NDArray[Any]) -> NDArray[Any]:

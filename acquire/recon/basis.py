@@ -1,12 +1,13 @@
 """The temporal subspace: the first K cosines of the segment's time axis (orthonormal DCT-II).
 
 A video of T frames whose coefficients beyond K are 0 is band-limited to K/(2T) of the frame rate. Working
-with the K coefficient frames instead of T frames is what makes the solvers fast.
+with the K coefficient frames instead of T frames is what makes the solvers fast. Where a scene is a few
+patterns with a curve each, a `LearnedBasis` of these curves, combined out of the cosines, is smaller still.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from scipy.fft import dct, idct
@@ -17,6 +18,30 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
+class Basis(Protocol):
+    """Orthonormal rows D (K, T) along the frames' time."""
+
+    @property
+    def frames(self) -> int: ...
+
+    @property
+    def count(self) -> int: ...
+
+    @property
+    def cosines(self) -> int:
+        """The bandwidth: cosines that the rows are made of."""
+        ...
+
+    @property
+    def dtype(self) -> np.dtype[Any]: ...
+
+    def matrix(self, grid: int | None = None) -> NDArray[Any]: ...
+
+    def synthesize(self, theta: NDArray[Any]) -> NDArray[Any]: ...
+
+    def analyze(self, video: NDArray[Any]) -> NDArray[Any]: ...
+
+
 class TemporalBasis:
     """D (K, T), orthonormal rows: θ = D·x analyses, x = Dᵀ·θ synthesises, along axis 0."""
 
@@ -25,7 +50,7 @@ class TemporalBasis:
             raise UsageError(
                 f"{count} temporal coefficients", possible=f"1 to {frames} (frames of the segment)"
             )
-        self.frames, self.count, self.dtype = frames, count, np.dtype(dtype)
+        self.frames, self.count, self.cosines, self.dtype = frames, count, count, np.dtype(dtype)
 
     def matrix(self, grid: int | None = None) -> NDArray[Any]:
         """D (K, grid) at ``grid`` ≥ K equidistant instants of the span (default: the frames)."""
@@ -47,3 +72,26 @@ class TemporalBasis:
         """θ = D·x: (T, …) → (K, …)."""
         theta: NDArray[Any] = dct(video, axis=0, norm="ortho", workers=2)[: self.count]
         return theta.astype(self.dtype, copy=False)
+
+
+class LearnedBasis:
+    """R orthonormal combinations of a basis' K rows: D = curvesᵀ·D_K, with ``curves`` (K, R)."""
+
+    def __init__(self, within: TemporalBasis, curves: NDArray[Any]) -> None:
+        self._within, self.curves = within, curves.astype(within.dtype)
+        self.frames, self.count, self.dtype = within.frames, curves.shape[1], within.dtype
+        self.cosines = within.count
+
+    def matrix(self, grid: int | None = None) -> NDArray[Any]:
+        """D (R, grid)."""
+        matrix: NDArray[Any] = self.curves.T @ self._within.matrix(grid)
+        return matrix
+
+    def synthesize(self, theta: NDArray[Any]) -> NDArray[Any]:
+        """x = Dᵀ·θ: (R, …) → (T, …)."""
+        return self._within.synthesize(np.tensordot(self.curves, theta, 1))
+
+    def analyze(self, video: NDArray[Any]) -> NDArray[Any]:
+        """θ = D·x: (T, …) → (R, …)."""
+        theta: NDArray[Any] = np.tensordot(self.curves.T, self._within.analyze(video), 1)
+        return theta

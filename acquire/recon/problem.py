@@ -1,19 +1,20 @@
 """What the solvers work on: samples made dimensionless, with a mask and an operator of norm at most 1.
 
 Dividing by the operator's norm bound and by the scene's mean makes λ mean the same for every segment,
-whatever the camera's gain or the light. Samples that are not finite, saturated or lost are masked: their
-weight is 0 and their value is never looked at.
+whatever the camera's gain or the light. Samples that are lost, saturated or no light at all (outliers) are
+masked: their weight is 0 and their value is never looked at.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from acquire.errors import NumericsError, UsageError
 from acquire.forward import DualArm
+from acquire.recon.outliers import outliers
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -41,6 +42,7 @@ class Problem:
     norm : upper bound of ‖Λ′‖₂
     scale : scene units per dimensionless voxel
     coverage : share of the samples that are usable
+    masked_by : samples left out, by cause
     """
 
     samples: NDArray[Any]
@@ -49,6 +51,7 @@ class Problem:
     norm: float
     scale: float
     coverage: float
+    masked_by: dict[str, int] = field(default_factory=dict)
 
     @property
     def used_samples(self) -> NDArray[Any]:
@@ -101,12 +104,13 @@ def pose(
     Raises
     ------
     UsageError : no sample is usable, or the share is not in [0, 0.5]
-    NumericsError : the code is dark for the whole segment
+    NumericsError : the code is dark for the whole segment, or the samples overflow
     """
     if not 0 <= hold_out <= 0.5:
         raise UsageError(f"held-out share {hold_out}", possible="0 to 0.5")
-    samples = segment.samples(np.float32)
-    usable = segment.mask & np.isfinite(samples)
+    samples = segment.samples(np.float64)
+    bad = outliers(samples, segment.mask)
+    usable = segment.mask & ~np.logical_or.reduce([np.zeros_like(segment.mask), *bad.values()])
     if not usable.any():
         raise UsageError("no sample of the segment is usable", hint="another line range")
     operator = DualArm(segment.geometry, segment.code, spatial_merge, temporal_merge)
@@ -114,13 +118,17 @@ def pose(
     flat = operator.forward(np.ones(operator.video_shape, np.float32))
     scale = _scale(samples[usable], flat[usable])
     held_out = usable & (np.random.default_rng(seed).random(usable.shape) < hold_out)
+    if not (usable & ~held_out).any():
+        held_out = np.zeros_like(usable)
     return Problem(
-        samples=np.where(usable, samples, 0).astype(np.float32) / np.float32(scale * norm),
+        samples=(np.where(usable, samples, 0) / (scale * norm)).astype(np.float32),
         weight=(usable & ~held_out).astype(np.float32),
         held_out=held_out,
         norm=norm,
         scale=scale,
         coverage=float(usable.mean()),
+        masked_by={"lost or saturated": int((~segment.mask).sum())}
+        | {k: int(v.sum()) for k, v in bad.items()},
     )
 
 

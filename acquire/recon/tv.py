@@ -34,9 +34,10 @@ class FrameTv:
         tv_value(frames, values)
         return float(values.sum())
 
-    def prox(self, frames: NDArray[Any], weight: float) -> NDArray[Any]:
-        """argmin_x ½‖x − frames‖² + weight·Σ_k TV(x_k)."""
+    def prox(self, frames: NDArray[Any], weight: float | NDArray[Any]) -> NDArray[Any]:
+        """argmin_x ½‖x − frames‖² + Σ_k weight_k·TV(x_k); ``weight`` is one number or (K,)."""
         out = np.empty_like(frames)
-        weights = np.full(len(frames), min(weight, LARGEST_WEIGHT), frames.dtype)
+        weights = np.empty(len(frames), frames.dtype)
+        weights[:] = np.minimum(weight, LARGEST_WEIGHT)
         tv_prox(frames, weights, self._dual, self.iterations, out)
         return out

@@ -16,6 +16,7 @@ from acquire.errors import AcquireError
 from acquire.recon.segments import Stitcher
 from acquire.reconstruct.work import Task
 from acquire.store import VideoWriter
+from acquire.store.remote import is_url
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -79,9 +80,11 @@ def combine(
     """
     began, grid = time.monotonic(), request.grid
     segments = request.stream.arrange(request.stretches, request.fade)
-    tasks = [Task(str(recording.path), segment, grid, options) for segment in segments]
+    place = str(recording) if is_url(str(recording)) else str(recording.path.resolve())
+    tasks = [Task(place, segment, grid, options) for segment in segments]
     clock = _Clock.of(recording, request)
-    stitcher, parts = Stitcher(grid), []
+    stitcher = Stitcher(grid)
+    done: list[dict[str, Any]] = []
     with VideoWriter(
         path,
         (grid.side, grid.side),
@@ -96,8 +99,10 @@ def combine(
             if len(video):
                 begins = grid.edges(slice(writer.frames, writer.frames + len(video)))[:-1]
                 writer.append(video, clock.time_ns(begins), error)
-            parts.append(part)
-        facts = describe_parts(recording, request, [part.facts for part in parts], options)
+            done.append(part.facts)  # not the part: memory must not grow with the stream
+        if not done:
+            raise KeyboardInterrupt  # there is nothing to keep
+        facts = describe_parts(recording, request, done, options)
         facts["state"] = "interrupted" if watcher.stopped else "complete"
         facts["seconds"] = round(time.monotonic() - began, 3)
         facts["trusted"] = _trusted_frames(request, writer.frames)
@@ -190,7 +195,7 @@ def describe_parts(
     ]
     voxels = request.grid.voxels
     return {
-        "recording": str(recording.path),
+        "recording": str(recording),
         "run_id": recording.attrs["run_id"],
         "first_line": min(part["first_line"] for part in parts),
         "lines": max(part["first_line"] + part["lines"] for part in parts)

@@ -64,7 +64,7 @@ class Here:
         if self._watch is not None and self._watch(self._done):
             self._stopped = True
 
-    def stopped(self) -> bool:
+    def is_set(self) -> bool:
         return self._stopped
 
 
@@ -103,7 +103,7 @@ class _Shared:
         for _ in range(int(steps)):
             self._steps.release()
 
-    def stopped(self) -> bool:
+    def is_set(self) -> bool:
         return self.stop.is_set()
 
 
@@ -136,7 +136,7 @@ class _Nobody:
 
     def advance(self, share: float) -> None: ...
 
-    def stopped(self) -> bool:
+    def is_set(self) -> bool:
         return False
 
 

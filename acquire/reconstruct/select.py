@@ -65,7 +65,7 @@ def by_lines(recording: Recording, first_line: int | None = None, lines: int | N
     end = whole.end_line if lines is None else first + lines
     if not whole.first_line <= first < end <= whole.end_line:
         have = f"lines {whole.first_line} to {whole.end_line - 1}" if recording.lines else "no lines yet"
-        raise UsageError(f"lines {first} to {end - 1} of {recording.path}", possible=have)
+        raise UsageError(f"lines {first} to {end - 1} of {recording}", possible=have)
     return Selection(Stream(whole.stages, whole.substeps, first, end))
 
 

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from acquire.recon import reconstruct
-from acquire.recon.reliability import frame_error
 from acquire.store import open_recording
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from acquire.recon import Progress
-    from acquire.recon.api import Preset, Solver
+    from acquire.recon import Preset, Progress, Solver
     from acquire.recon.segments import Grid, SubSegment
 
 
@@ -28,6 +25,7 @@ class Options:
     solver: Solver = "admm"
     iterations: int | None = None
     budget_s: float | None = None
+    bandwidth: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,11 +46,6 @@ class Part:
     error: NDArray[np.float32]
     facts: dict[str, Any] = field(default_factory=dict)
 
-    @property
-    def finished(self) -> bool:
-        """It was not stopped before its time."""
-        return bool(self.facts["iterations"] == self.facts["iterations_asked"])
-
 
 class Watch(Protocol):
     """Who looks on while a task is solved."""
@@ -60,7 +53,7 @@ class Watch(Protocol):
     def advance(self, share: float) -> None:
         """``share`` of the task was done since the last call."""
 
-    def stopped(self) -> bool:
+    def is_set(self) -> bool:
         """The best so far is wanted now."""
         ...
 
@@ -68,7 +61,7 @@ class Watch(Protocol):
 def solve(task: Task, watch: Watch) -> Part:
     """Cut, reconstruct, bring to the grid. Raises what `Recording.cut` and `reconstruct` raise."""
     segment, options, voxels = task.segment, task.options, task.segment.voxels
-    lines = open_recording(Path(task.recording)).cut(segment.first_line, segment.lines)
+    lines = open_recording(task.recording).cut(segment.first_line, segment.lines)
 
     def advanced(progress: Progress) -> None:
         watch.advance(1 / progress.iterations)
@@ -82,14 +75,14 @@ def solve(task: Task, watch: Watch) -> Part:
         advanced,
         solver=options.solver,
         iterations=options.iterations,
-        stop=watch.stopped,
+        bandwidth=options.bandwidth,
+        stop=watch,
     )
     watch.advance(1 - result.iterations / result.iterations_asked)
-    error = frame_error(lines, result.video, voxels.spatial_merge, voxels.temporal_merge)
     substeps = lines.geometry.substeps
     return Part(
         video=task.grid.resample(result.video, segment, substeps),
-        error=task.grid.resample_time(error, segment, substeps),
+        error=task.grid.resample_time(result.frame_error, segment, substeps),
         facts={
             "first_line": segment.first_line,
             "lines": segment.lines,
@@ -99,7 +92,10 @@ def solve(task: Task, watch: Watch) -> Part:
             "temporal_merge": voxels.temporal_merge,
             "iterations": result.iterations,
             "iterations_asked": result.iterations_asked,
+            "ended": result.ended,
             "seconds": round(result.seconds, 3),
+            "masked": result.masked,
+            "warnings": list(result.warnings),
             "parameters": result.parameters,
             "quality": {name: _json(value) for name, value in asdict(result.quality).items()},
         },

@@ -44,14 +44,15 @@ def test_lines_and_times(cli: Cli, recording: Path, tmp_path: Path) -> None:
         100,
         "--nm",
         2,
+        "--iterations",
+        8,
         "--json",
     )
     assert answer.code == 0, answer.err
     assert (answer.json["first_line"], answer.json["lines"]) == (20, 100)
     assert answer.json["shape"] == [177, 12, 12]
-    answer = cli(
-        "reconstruct", recording, "--out", tmp_path / "b.zarr", "--from", "1ms", "--to", "2ms", "--nm", 2
-    )
+    times = ("--from", "1ms", "--to", "2ms", "--nm", 2, "--iterations", 8)
+    answer = cli("reconstruct", recording, "--out", tmp_path / "b.zarr", *times)
     assert answer.code == 0, answer.err
     video = open_video(tmp_path / "b.zarr")
     assert video.video.shape == (100, 12, 12)
@@ -60,7 +61,7 @@ def test_lines_and_times(cli: Cli, recording: Path, tmp_path: Path) -> None:
 
 
 def test_several_voxels_side_by_side(cli: Cli, recording: Path, tmp_path: Path) -> None:
-    words = ("--lines", 120, "--voxels", "1x66", "--voxels", "2x3", "--preset", "fast")
+    words = ("--lines", 120, "--voxels", "1x66", "--voxels", "2x3", "--iterations", 8)
     assert cli("reconstruct", recording, "--out", tmp_path / "v.zarr", *words).code == 0
     slow, fast = tmp_path / "v-1x66.zarr", tmp_path / "v-2x3.zarr"
     assert open_video(slow).video.shape[1:] == (24, 24)
@@ -72,7 +73,19 @@ def test_several_voxels_side_by_side(cli: Cli, recording: Path, tmp_path: Path) 
 
 
 def test_a_plan_on_the_command_line(cli: Cli, recording: Path, tmp_path: Path) -> None:
-    words = ("--segment", "40:2x2", "--segment", "1ms:1x30", "--segment", ":2x2", "--workers", 1, "--json")
+    words = (
+        "--segment",
+        "40:2x2",
+        "--segment",
+        "1ms:1x30",
+        "--segment",
+        ":2x2",
+        "--workers",
+        1,
+        "--iterations",
+        8,
+        "--json",
+    )
     answer = cli("reconstruct", recording, "--out", tmp_path / "v.zarr", "--lines", 200, *words)
     assert answer.code == 0, answer.err
     lengths = [part["end_substep"] - part["begin_substep"] for part in answer.json["segments"]]
@@ -207,7 +220,17 @@ def test_no_cluster_where_one_was_named(recording: Path, tmp_path: Path) -> None
 
 @pytest.mark.needs_dask
 def test_a_cluster_gives_what_this_machine_gives(cluster: str, recording: Path, tmp_path: Path) -> None:
-    common = [sys.executable, "-m", "acquire", "reconstruct", str(recording), "--nm", "2", "--preset", "fast"]
+    common = [
+        sys.executable,
+        "-m",
+        "acquire",
+        "reconstruct",
+        str(recording),
+        "--nm",
+        "2",
+        "--iterations",
+        "8",
+    ]
     words = ["--segment", "100:2x1", "--segment", ":2x1"]
     for name, where in (("here", ["--workers", "1"]), ("there", ["--dask", cluster])):
         ended = subprocess.run(
@@ -219,4 +242,4 @@ def test_a_cluster_gives_what_this_machine_gives(cluster: str, recording: Path, 
         )
         assert ended.returncode == 0, ended.stderr
     here, there = (open_video(tmp_path / f"{name}.zarr").video[:] for name in ("here", "there"))
-    np.testing.assert_allclose(here, there, atol=1e-3)
+    np.testing.assert_allclose(here, there, atol=1e-2)  # sums in another order

@@ -119,7 +119,8 @@ def test_a_budget_is_kept_and_progress_is_told() -> None:
     steps: list[Progress] = []
     result = reconstruct(segment(), 3, 1, budget_s=1e-6, progress=steps.append)
     assert result.iterations == len(steps) == 1
-    assert steps[0].iterations == result.iterations_asked == 80
+    assert steps[0].iterations == result.iterations_asked == 100
+    assert result.ended == "budget"
 
 
 @pytest.mark.parametrize(("N_m", "T_m"), [(1, 419), (3, 4), (2, 5), (7, 1), (60, 1000)])
@@ -157,8 +158,8 @@ def test_tiny_segments_end_in_a_finite_result(geometry: Geometry) -> None:
 def test_what_cannot_be_is_refused_with_what_can() -> None:
     good = segment()
     for error, match, call in (
-        (UsageError, "possible: admm, twist", {"solver": "gap"}),
-        (UsageError, "possible: fast, balanced", {"preset": "magic"}),
+        (UsageError, "possible: admm, twist, twist-band", {"solver": "gap"}),
+        (UsageError, "possible: fast, balanced, best", {"preset": "magic"}),
         (UsageError, "bandwidth 0", {"bandwidth": 0.0}),
         (UsageError, "TV weight nan", {"tv_weight": float("nan")}),
         (UsageError, "budget of -1", {"budget_s": -1.0}),

@@ -8,7 +8,7 @@ import pytest
 from acquire.errors import NumericsError
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
-from acquire.recon.admm import Admm, AdmmParameters, conjugate_gradients
+from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import InBasis
 from acquire.recon.basis import TemporalBasis
 from acquire.recon.problem import MaskedOperator
@@ -42,15 +42,6 @@ class Small:
 @pytest.fixture(scope="module")
 def small() -> Small:
     return Small()
-
-
-def test_conjugate_gradients_solve_exactly_in_as_many_steps_as_unknowns() -> None:
-    rng = np.random.default_rng(0)
-    root = rng.standard_normal((6, 6))
-    matrix, right = root @ root.T + np.eye(6), rng.standard_normal(6)
-    solution = conjugate_gradients(lambda x: matrix @ x, right, rng.standard_normal(6), 6)
-    np.testing.assert_allclose(solution, np.linalg.solve(matrix, right), atol=1e-8)
-    np.testing.assert_array_equal(conjugate_gradients(lambda x: matrix @ x, 0 * right, 0 * right, 3), 0)
 
 
 def test_admm_data_step_is_the_ridge_solution(small: Small) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from acquire.evaluate.figures import HIGHLIGHT, WIDTH_IN, _bare, _stamp
+from acquire.evaluate.figures import HIGHLIGHT, WIDTH_IN, bare, stamp
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from numpy.typing import NDArray
 
-bare, stamp = _bare, _stamp
 FRAME_IN = 1.55
 
 

@@ -12,7 +12,7 @@ from acquire.evaluate.metrics import psnr
 from acquire.evaluate.paper.bars import THRESHOLD, contrasts, last_resolved
 from acquire.evaluate.paper.drawing import canvas, correlation, show
 from acquire.evaluate.paper.studio import PaperFigure, Picture, Row, scene_of
-from acquire.recon.still import intensity
+from acquire.recon import reconstruct
 from acquire.sim.scene import SeparableScene
 
 if TYPE_CHECKING:
@@ -111,7 +111,10 @@ def _pulses(studio: Studio, khz: int, kind: str) -> Curves:
     assert isinstance(scene, SeparableScene)
     factor = scene.size // geometry.size
     binned = scene.masks[0].reshape(geometry.size, factor, geometry.size, factor).sum(axis=(1, 3))
-    found = intensity(segment, binned)[geometry.trusted]
+    result = reconstruct(segment, geometry.size, 1, static_image=binned)
+    level = factor * binned.mean()  # a coarse step collects the light of its fine sub-steps
+    light = np.where(segment.code > 0, result.video[:, 0, 0] / level, np.nan)
+    found = light[geometry.trusted]
     first = factor * (geometry.substeps * FIRST + geometry.trusted.start)
     count = factor * len(found)
     times = (first + np.arange(count)) * segment.substep_ns / factor * 1e-3
@@ -151,7 +154,7 @@ def _pulse_curves(curves: dict[int, dict[str, Curves]]) -> Figure:
             curve = curves[khz][kind]
             times = curve.times_us - origin
             ax.step(times, curve.true, where="post", color=THEORY, lw=1.0)
-            ax.step(times, curve.found, where="post", color=COLOUR[kind], lw=3.0)
+            ax.hlines(curve.found, times, times + np.diff(times).mean(), color=COLOUR[kind], lw=3.0)
             ax.set_title(f"{kind}, {khz} kHz", fontsize=9.5)
             ax.set(xlim=(0, SHOWN_US), ylim=(-0.25, 1.3))
         line[0].set_ylabel("light")

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from acquire.evaluate.figures import SOLVER_COLOURS, THEORY
+from acquire.evaluate.figures import SOLVER_COLOURS, THEORY, stamp
 from acquire.evaluate.metrics import psnr, ssim
-from acquire.evaluate.paper.drawing import canvas, show, stamp
+from acquire.evaluate.paper.drawing import canvas, show
 from acquire.evaluate.paper.studio import PaperFigure, Picture, Row, true_voxels
 
 if TYPE_CHECKING:

@@ -1,0 +1,68 @@
+"""How fast the scene changes, from the lines alone: a tentative reconstruction in coarse voxels.
+
+A few iterations on about 24 × 24 voxels with half of all cosines cost a second. What the coarse voxels cannot
+hold spreads over all coefficients evenly, so the upper half of them shows how high that floor reaches; the
+bandwidth ends with the last coefficient that rises above it, with a margin. A scene that reaches into the
+upper half gives itself away by peaks there; then all of the half is used.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.recon.admm import Admm, AdmmParameters
+from acquire.recon.band import band_operator
+from acquire.recon.basis import TemporalBasis
+from acquire.recon.problem import pose
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.lines import Segment
+
+COARSE_SIDE = 24
+ITERATIONS = 15
+ABOVE_FLOOR = 1.3
+"""Relative to the highest coefficient of the floor."""
+PEAK = 25.0
+"""The floor's highest coefficient is 5 to 15 times its median; beyond this it is no floor."""
+MARGIN = 1.25
+FEWEST_COEFFICIENTS = 32
+LARGEST_SHARE = 0.5
+
+
+def estimate_coefficients(segment: Segment, spatial_merge: int, temporal_merge: int) -> int:
+    """How many of the first cosines of the frames' time axis hold the scene.
+
+    At least 32 (or as many as there are frames), at most half of them.
+    """
+    frames = segment.geometry.video_shape(spatial_merge, temporal_merge)[0]
+    most = int(LARGEST_SHARE * frames)
+    if most <= FEWEST_COEFFICIENTS:
+        return min(frames, FEWEST_COEFFICIENTS)
+    merge = max(spatial_merge, -(-segment.geometry.size // COARSE_SIDE))
+    energy = np.square(_tentative(segment, merge, temporal_merge, most), dtype=np.float64).sum((1, 2))
+    return int(np.clip(MARGIN * _end_of_signal(energy), FEWEST_COEFFICIENTS, most))
+
+
+def _tentative(segment: Segment, merge: int, temporal_merge: int, count: int) -> NDArray[Any]:
+    frames, side, _ = segment.geometry.video_shape(merge, temporal_merge)
+    basis = TemporalBasis(frames, count)
+    problem = pose(segment, merge, temporal_merge, hold_out=0.0)
+    operator = problem.masked(band_operator(segment.geometry, segment.code, basis, merge, temporal_merge))
+    parameters = AdmmParameters(grid_per_coefficient=1)
+    solver = Admm(operator, problem.used_samples, (count, side, side), basis, parameters)
+    for _ in range(ITERATIONS):
+        solver.step()
+    return solver.theta
+
+
+def _end_of_signal(energy: NDArray[np.float64]) -> int:
+    """The coefficient after the last that rises above the floor; all of them if there is no floor."""
+    floor = energy[len(energy) // 2 :]
+    if floor.max() > PEAK * np.median(floor):
+        return len(energy)
+    above = np.flatnonzero(energy > ABOVE_FLOOR * floor.max())
+    return int(above[-1]) + 1 if len(above) else len(energy)

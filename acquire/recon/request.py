@@ -1,0 +1,84 @@
+"""A checked call of `reconstruct`: solvers, presets, limits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+import numpy as np
+
+from acquire.errors import UsageError
+from acquire.geometry import is_integer
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.recon.denoisers import Denoiser
+
+Solver = Literal["admm", "twist", "twist-band"]
+Preset = Literal["fast", "balanced", "best"]
+
+ITERATIONS: dict[str, dict[str, int]] = {
+    "admm": {"fast": 40, "balanced": 100, "best": 300},
+    "twist": {"fast": 60, "balanced": 200, "best": 400},
+    "twist-band": {"fast": 60, "balanced": 200, "best": 400},
+}
+"""Most iterations per solver and preset; ADMM ends sooner when the held-out samples say so."""
+
+
+class Stop(Protocol):
+    """Asked after every iteration; a `threading.Event` is one."""
+
+    def is_set(self) -> bool: ...
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Request:
+    """What is asked of a reconstruction, refused here if it cannot be."""
+
+    spatial_merge: int
+    temporal_merge: int
+    solver: Solver
+    iterations: int
+    bandwidth: float | None = None
+    tv_weight: float | None = None
+    budget_s: float | None = None
+    initial: NDArray[Any] | None = None
+    static_image: NDArray[Any] | None = None
+    denoiser: Denoiser | None = None
+
+    def __post_init__(self) -> None:
+        if self.bandwidth is not None and not 0 < self.bandwidth <= 1:
+            raise UsageError(f"bandwidth {self.bandwidth}", possible="more than 0, up to 1 (frames' Nyquist)")
+        if self.tv_weight is not None and not 0 <= self.tv_weight < float("inf"):
+            raise UsageError(f"TV weight {self.tv_weight}", possible="a finite number of at least 0")
+        if self.budget_s is not None and not self.budget_s > 0:
+            raise UsageError(f"budget of {self.budget_s} s", possible="more than 0")
+        if not is_integer(self.iterations) or self.iterations < 1:
+            raise UsageError(f"{self.iterations!r} iterations", possible="an integer of at least 1")
+        for option, given in (("initial", self.initial), ("denoiser", self.denoiser)):
+            if given is not None and self.solver != "admm":
+                raise UsageError(f"{option} for solver {self.solver!r}", possible="solver 'admm'")
+
+    def check_shapes(self, size: int, video_shape: tuple[int, int, int]) -> None:
+        """Raise UsageError unless the given arrays are finite and fit the segment."""
+        _check_array("initial video", self.initial, video_shape)
+        _check_array("static image", self.static_image, (size, size))
+
+
+def preset_iterations(solver: str, preset: str) -> int:
+    """Most iterations of a preset; UsageError for names that are none."""
+    if solver not in ITERATIONS:
+        raise UsageError(f"solver {solver!r}", possible=", ".join(ITERATIONS))
+    if preset not in ITERATIONS[solver]:
+        raise UsageError(f"preset {preset!r}", possible=", ".join(ITERATIONS[solver]))
+    return ITERATIONS[solver][preset]
+
+
+def _check_array(what: str, given: NDArray[Any] | None, shape: tuple[int, ...]) -> None:
+    if given is None:
+        return
+    if np.shape(given) != shape:
+        raise UsageError(f"{what} of shape {np.shape(given)}", possible=f"{shape}")
+    if not np.isfinite(given).all():
+        raise UsageError(f"{what} with values that are not finite")

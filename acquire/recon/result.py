@@ -1,0 +1,64 @@
+"""What a reconstruction gives back: the video, how it came about, and what can be said without the truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """Where a reconstruction stands after an iteration; ``stage`` says what it is doing."""
+
+    iteration: int
+    iterations: int
+    seconds: float
+    stage: str = "solve"
+
+
+@dataclass(frozen=True, slots=True)
+class Quality:
+    """What can be said without the truth.
+
+    ``misfit`` is the relative RMS residual of the samples used, ``prediction`` that of samples kept from the
+    solver (NaN where none were), ``coverage`` the share of samples that were usable.
+    """
+
+    misfit: float
+    prediction: float
+    coverage: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Reconstruction:
+    """A reconstructed video and how it came about.
+
+    Attributes
+    ----------
+    video : (time, row, column) float32 in scene units, over the whole span; only the frames in ``trusted``
+        were sampled in full (Fig. 5). That interval is nominal: it follows from the geometry alone, whatever
+        lines were lost, samples masked, or the code does; ``quality`` says how well it went.
+    time_ns : the begin of each frame
+    iterations : fewer than ``iterations_asked`` where the budget, ``stop`` or the data ended it (``ended``)
+    frame_error : (time,) relative RMS residual of the samples that saw each frame; NaN where none did
+    masked : samples left out, by cause
+    warnings : what a user should know before believing the video, in sentences
+    """
+
+    video: NDArray[np.float32]
+    time_ns: NDArray[np.int64]
+    trusted: slice
+    seconds: float
+    iterations: int
+    iterations_asked: int
+    solver: str
+    quality: Quality
+    frame_error: NDArray[np.float32]
+    ended: str = "done"
+    masked: dict[str, int] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    parameters: dict[str, Any] = field(default_factory=dict)

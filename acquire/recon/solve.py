@@ -1,0 +1,218 @@
+"""How each solver goes about a problem: its stages, and when it has seen enough.
+
+    admm        cosines ── few patterns? ── yes ─▶ patterns and curves at full resolution
+                                └────────── no ──▶ more of the same
+    twist       the paper's, on all frames
+    twist-band  the same algorithm with admm's band and sign
+    (static image known)  one curve, least squares
+
+Held-out samples end the refinement: at full resolution the model has no error of its own to fit, so they
+are predicted better as long as the picture gets better.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, replace
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from acquire.forward import DualArm, merge_video
+from acquire.recon.admm import Admm, AdmmParameters
+from acquire.recon.band import InBasis, band_operator
+from acquire.recon.bandwidth import estimate_coefficients
+from acquire.recon.basis import TemporalBasis
+from acquire.recon.patterns import CurveOperator, Refinement, find_patterns, fit_curves
+from acquire.recon.twist import Twist, TwistParameters
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.lines import Segment
+    from acquire.recon.basis import Basis
+    from acquire.recon.clock import IterationClock
+    from acquire.recon.problem import Operator, Problem
+    from acquire.recon.request import Request
+
+FIRST_LOOK = 30
+"""Iterations in the cosines before patterns are looked for."""
+FIRST_LOOK_SHARE = 0.45
+"""Of a budget, the most that the first look may take."""
+PLAIN_ITERATIONS = 80
+"""Of scenes that are not a few patterns: from here on, more iterations fit what voxels cannot hold."""
+LEAST_GAIN = 0.01
+"""Relative gain of the held-out prediction in a round below which a refinement has converged."""
+STATIC_CURVE_STEPS = 200
+
+
+class Estimate(Protocol):
+    """A solver's state of knowledge: dimensionless video, and the lines that it predicts."""
+
+    def predict(self) -> NDArray[Any]: ...
+
+    def video(self) -> NDArray[Any]: ...
+
+    def facts(self) -> dict[str, Any]: ...
+
+
+class InBand:
+    """Coefficient frames of an iterative solver as an estimate."""
+
+    def __init__(self, solver: Admm | Twist, operator: Operator, basis: Basis, problem: Problem) -> None:
+        self._solver, self._operator, self._basis, self._problem = solver, operator, basis, problem
+        self.parameters: AdmmParameters | TwistParameters | None = None
+
+    def predict(self) -> NDArray[Any]:
+        return self._operator.forward(self._solver.theta) / np.float32(self._problem.norm)
+
+    def video(self) -> NDArray[Any]:
+        return self._basis.synthesize(self._solver.theta)
+
+    def facts(self) -> dict[str, Any]:
+        given = {} if self.parameters is None else asdict(self.parameters)
+        return {"temporal_coefficients": self._basis.count} | given
+
+
+class Refined:
+    """A refinement as an estimate."""
+
+    def __init__(self, refinement: Refinement, coefficients: int, parameters: AdmmParameters) -> None:
+        self._refinement, self._coefficients, self._parameters = refinement, coefficients, parameters
+
+    def predict(self) -> NDArray[Any]:
+        return self._refinement.predict()
+
+    def video(self) -> NDArray[Any]:
+        return self._refinement.video()
+
+    def facts(self) -> dict[str, Any]:
+        found = {"temporal_coefficients": self._coefficients, "patterns": self._refinement.rank}
+        return found | asdict(self._parameters)
+
+
+def solve_admm(segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> Estimate:
+    """The default: cosines first, then patterns and curves where the scene is of a few."""
+    N_m, T_m = request.spatial_merge, request.temporal_merge
+    frames, side, _ = segment.geometry.video_shape(N_m, T_m)
+    basis = TemporalBasis(frames, _coefficients(segment, request, frames))
+    operator = band_operator(segment.geometry, segment.code, basis, N_m, T_m)
+    parameters = _weighted(AdmmParameters(), request.tv_weight)
+    start = None if request.initial is None else basis.analyze(request.initial / np.float32(problem.scale))
+    solver = Admm(
+        problem.masked(operator),
+        problem.used_samples,
+        (basis.count, side, side),
+        basis,
+        parameters,
+        start=start,
+        denoiser=request.denoiser,
+    )
+    for _ in clock.run(min(FIRST_LOOK, -(-request.iterations // 2)), "first look", FIRST_LOOK_SHARE):
+        solver.step()
+    refined = None if request.denoiser else _refine(segment, problem, request, (basis, solver.theta), clock)
+    if refined is not None:
+        return refined
+    for _ in clock.run(PLAIN_ITERATIONS - clock.done, "solve"):
+        solver.step()
+    estimate = InBand(solver, operator, basis, problem)
+    estimate.parameters = parameters
+    return estimate
+
+
+def _refine(
+    segment: Segment,
+    problem: Problem,
+    request: Request,
+    first: tuple[TemporalBasis, NDArray[Any]],
+    clock: IterationClock,
+) -> Estimate | None:
+    basis, theta = first
+    found = find_patterns(theta) if clock.done < clock.iterations else None
+    if found is None:
+        return None
+    merges = (request.spatial_merge, request.temporal_merge)
+    refinement = Refinement(segment, problem, basis, found, merges)
+    parameters = refinement.parameters
+    before = np.inf
+    for _ in clock.run(clock.iterations - clock.done, "refine"):
+        refinement.step()
+        if not refinement.at_round_end:
+            continue
+        now = problem.prediction_error(refinement.predict())
+        if now > (1 - LEAST_GAIN) * before:
+            clock.converged()
+            break
+        before = now
+    return Refined(refinement, basis.count, parameters)
+
+
+def solve_twist(segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> Estimate:
+    """The paper's solver; ``twist-band`` with the band and the sign of the default."""
+    N_m, T_m = request.spatial_merge, request.temporal_merge
+    shape = segment.geometry.video_shape(N_m, T_m)
+    banded = request.solver == "twist-band"
+    basis = TemporalBasis(shape[0], _coefficients(segment, request, shape[0]) if banded else shape[0])
+    operator: Operator
+    if banded:
+        operator = band_operator(segment.geometry, segment.code, basis, N_m, T_m)
+    else:
+        operator = InBasis(DualArm(segment.geometry, segment.code, N_m, T_m), basis)
+    parameters = TwistParameters()
+    if request.tv_weight is not None:
+        parameters = replace(parameters, tv_weight=request.tv_weight)
+    solver = Twist(
+        problem.masked(operator),
+        problem.used_samples,
+        (basis.count, *shape[1:]),
+        parameters,
+        basis if banded else None,
+    )
+    for _ in clock.run(request.iterations, "solve"):
+        solver.step()
+    estimate = InBand(solver, operator, basis, problem)
+    estimate.parameters = parameters
+    return estimate
+
+
+class Lit:
+    """A known image with a curve: X = s(t)·image.
+
+    Frames that the code leaves dark are not observed: their light is interpolated from those beside them.
+    """
+
+    def __init__(
+        self, segment: Segment, problem: Problem, request: Request, image: NDArray[Any], clock: IterationClock
+    ) -> None:
+        frames = segment.geometry.video_shape(request.spatial_merge, request.temporal_merge)[0]
+        self._image, self._merge, self._problem = image.astype(np.float32), request.spatial_merge, problem
+        basis, patterns = TemporalBasis(frames, frames), self._image[None] / np.linalg.norm(self._image)
+        self._operator = CurveOperator(segment, patterns, basis, request.temporal_merge)
+        coefficients = np.zeros((frames, 1), np.float32)
+        for _ in clock.run(1, "light"):
+            coefficients = fit_curves(
+                segment, problem, patterns, basis, request.temporal_merge, coefficients, STATIC_CURVE_STEPS
+            )
+        self._coefficients = coefficients
+        seen = np.add.reduceat(segment.code, np.arange(0, len(segment.code), request.temporal_merge)) > 0
+        light = basis.synthesize(coefficients)[:, 0] / np.linalg.norm(self._image)
+        self._light = np.interp(np.arange(frames), np.flatnonzero(seen), light[seen]).astype(np.float32)
+
+    def predict(self) -> NDArray[Any]:
+        return self._operator.forward(self._coefficients) / np.float32(self._problem.norm)
+
+    def video(self) -> NDArray[Any]:
+        video: NDArray[Any] = self._light[:, None, None] * merge_video(self._image[None], self._merge, 1)
+        return video
+
+    def facts(self) -> dict[str, Any]:
+        return {"patterns": 1}
+
+
+def _coefficients(segment: Segment, request: Request, frames: int) -> int:
+    if request.bandwidth is None:
+        return estimate_coefficients(segment, request.spatial_merge, request.temporal_merge)
+    return min(frames, max(1, round(request.bandwidth * frames)))
+
+
+def _weighted(parameters: AdmmParameters, tv_weight: float | None) -> AdmmParameters:
+    return parameters if tv_weight is None else replace(parameters, tv_weight=tv_weight)

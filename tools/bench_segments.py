@@ -1,0 +1,64 @@
+"""What a long stretch takes: seconds and the largest memory of any process, by the length of the stream.
+
+Usage: python tools/bench_segments.py [--lines 1000 4000] [--iterations 10]
+
+Scene #1 at N_m = 3, T_m = 1, in sub-segments on all cores. Memory is bounded by a sub-segment, so its peak
+must not grow with the length; seconds must grow no faster than it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import resource
+import tempfile
+import time
+from pathlib import Path
+
+from acquire.config import load_rig, load_scene
+from acquire.recon.segments import Voxels
+from acquire.reconstruct import Options, Watcher, by_lines, combine, in_voxels, open_pool
+from acquire.simulate import simulate
+from acquire.store import open_recording
+
+
+def measure(path: Path, lines: int, iterations: int, answer: multiprocessing.queues.Queue) -> None:
+    """Reconstruct the first lines; seconds, sub-segments, peak of this process and of its workers in MB."""
+    recording = open_recording(path)
+    request = in_voxels(by_lines(recording, 0, lines), Voxels(3, 1))
+    tasks = len(request.stretches)
+    watcher, began = Watcher(tasks), time.perf_counter()
+    with open_pool(tasks, watch=watcher) as pool:
+        combine(
+            recording, request, path.with_name(f"{lines}.zarr"), Options(iterations=iterations), pool, watcher
+        )
+    seconds = time.perf_counter() - began
+    peaks = [
+        resource.getrusage(who).ru_maxrss / 1024 for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    ]
+    answer.put((seconds, tasks, *peaks))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--lines", type=int, nargs="+", default=[1000, 4000])
+    parser.add_argument("--iterations", type=int, default=10)
+    asked = parser.parse_args()
+    context = multiprocessing.get_context("spawn")
+    with tempfile.TemporaryDirectory() as directory:
+        path = Path(directory) / "stream.zarr"
+        simulate(load_rig("rig-demo"), load_scene("scene-leds"), path, max(asked.lines))
+        print(f"{'lines':>8}{'frames/s':>10}{'pieces':>8}{'s':>8}{'MB here':>9}{'MB worker':>11}")
+        for lines in asked.lines:
+            answer = context.Queue()
+            process = context.Process(target=measure, args=(path, lines, asked.iterations, answer))
+            process.start()
+            seconds, tasks, here, worker = answer.get()
+            process.join()
+            print(f"{lines:8}{3 * lines / seconds:10.0f}{tasks:8}{seconds:8.1f}{here:9.0f}{worker:11.0f}")
+
+
+if __name__ == "__main__":
+    main()
