@@ -1,9 +1,9 @@
 """How fast the scene changes, from the lines alone: a tentative reconstruction in coarse voxels.
 
-A few iterations on about 24 × 24 voxels with half of all cosines cost a second. What the coarse voxels cannot
+A few iterations on about 24 × 24 voxels with a quarter of all cosines cost a second. What the coarse voxels cannot
 hold spreads over all coefficients evenly, so the upper half of them shows how high that floor reaches; the
 bandwidth ends with the last coefficient that rises above it, with a margin. A scene that reaches into the
-upper half gives itself away by peaks there; then all of the half is used.
+upper half gives itself away by peaks there; then all of the quarter is used.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ if TYPE_CHECKING:
     from acquire.lines import Segment
 
 COARSE_SIDE = 24
-ITERATIONS = 15
+ITERATIONS = 12
 ABOVE_FLOOR = 1.3
 """Relative to the highest coefficient of the floor."""
 PEAK = 25.0
 """The floor's highest coefficient is 5 to 15 times its median; beyond this it is no floor."""
 MARGIN = 1.25
 FEWEST_COEFFICIENTS = 32
-LARGEST_SHARE = 0.5
+LARGEST_SHARE = 0.25
 
 
 def estimate_coefficients(segment: Segment, spatial_merge: int, temporal_merge: int) -> int:
     """How many of the first cosines of the frames' time axis hold the scene.
 
-    At least 32 (or as many as there are frames), at most half of them.
+    At least 32 (or as many as there are frames), at most a quarter of them (or 32).
     """
     frames = segment.geometry.video_shape(spatial_merge, temporal_merge)[0]
     most = int(LARGEST_SHARE * frames)

@@ -22,7 +22,8 @@ from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import InBasis, band_operator
 from acquire.recon.bandwidth import estimate_coefficients
 from acquire.recon.basis import TemporalBasis
-from acquire.recon.patterns import CurveOperator, Refinement, find_patterns, fit_curves
+from acquire.recon.curves import CurveOperator, fit_curves
+from acquire.recon.patterns import Refinement, find_patterns
 from acquire.recon.twist import Twist, TwistParameters
 
 if TYPE_CHECKING:
@@ -34,15 +35,16 @@ if TYPE_CHECKING:
     from acquire.recon.problem import Operator, Problem
     from acquire.recon.request import Request
 
-FIRST_LOOK = 30
+FIRST_LOOK = 60
 """Iterations in the cosines before patterns are looked for."""
-FIRST_LOOK_SHARE = 0.45
+FIRST_LOOK_SHARE = 0.6
 """Of a budget, the most that the first look may take."""
 PLAIN_ITERATIONS = 80
 """Of scenes that are not a few patterns: from here on, more iterations fit what voxels cannot hold."""
-LEAST_GAIN = 0.01
-"""Relative gain of the held-out prediction in a round below which a refinement has converged."""
-STATIC_CURVE_STEPS = 200
+LEAST_GAIN = 0.003
+"""Relative gain of the held-out prediction in a round below which the round was in vain."""
+PATIENCE = 3
+"""Rounds in vain that end a refinement."""
 
 
 class Estimate(Protocol):
@@ -107,7 +109,7 @@ def solve_admm(segment: Segment, problem: Problem, request: Request, clock: Iter
         start=start,
         denoiser=request.denoiser,
     )
-    for _ in clock.run(min(FIRST_LOOK, -(-request.iterations // 2)), "first look", FIRST_LOOK_SHARE):
+    for _ in clock.run(min(FIRST_LOOK, -(-3 * request.iterations // 5)), "first look", FIRST_LOOK_SHARE):
         solver.step()
     refined = None if request.denoiser else _refine(segment, problem, request, (basis, solver.theta), clock)
     if refined is not None:
@@ -133,16 +135,17 @@ def _refine(
     merges = (request.spatial_merge, request.temporal_merge)
     refinement = Refinement(segment, problem, basis, found, merges)
     parameters = refinement.parameters
-    before = np.inf
+    best, idle = np.inf, 0
     for _ in clock.run(clock.iterations - clock.done, "refine"):
         refinement.step()
         if not refinement.at_round_end:
             continue
         now = problem.prediction_error(refinement.predict())
-        if now > (1 - LEAST_GAIN) * before:
+        idle = 0 if now < (1 - LEAST_GAIN) * best else idle + 1
+        best = min(best, now)
+        if idle == PATIENCE:
             clock.converged()
             break
-        before = now
     return Refined(refinement, basis.count, parameters)
 
 
@@ -185,16 +188,15 @@ class Lit:
     ) -> None:
         frames = segment.geometry.video_shape(request.spatial_merge, request.temporal_merge)[0]
         self._image, self._merge, self._problem = image.astype(np.float32), request.spatial_merge, problem
-        basis, patterns = TemporalBasis(frames, frames), self._image[None] / np.linalg.norm(self._image)
+        basis = TemporalBasis(frames, frames)
+        patterns = self._image[None] / np.linalg.norm(self._image)
         self._operator = CurveOperator(segment, patterns, basis, request.temporal_merge)
-        coefficients = np.zeros((frames, 1), np.float32)
+        coefficients = np.zeros((frames, 1))
         for _ in clock.run(1, "light"):
-            coefficients = fit_curves(
-                segment, problem, patterns, basis, request.temporal_merge, coefficients, STATIC_CURVE_STEPS
-            )
-        self._coefficients = coefficients
+            coefficients = fit_curves(segment, problem, patterns, basis, request.temporal_merge, coefficients)
+        self._coefficients = coefficients.astype(np.float32)
         seen = np.add.reduceat(segment.code, np.arange(0, len(segment.code), request.temporal_merge)) > 0
-        light = basis.synthesize(coefficients)[:, 0] / np.linalg.norm(self._image)
+        light = basis.synthesize(self._coefficients)[:, 0] / np.linalg.norm(self._image)
         self._light = np.interp(np.arange(frames), np.flatnonzero(seen), light[seen]).astype(np.float32)
 
     def predict(self) -> NDArray[Any]:
