@@ -1,8 +1,8 @@
 """How fast the scene changes, from the lines alone: a tentative reconstruction in coarse voxels.
 
-A few iterations on about 24 × 24 voxels with a quarter of all cosines cost a second. What the coarse voxels cannot
-hold spreads over all coefficients evenly, so the upper half of them shows how high that floor reaches; the
-bandwidth ends with the last coefficient that rises above it, with a margin. A scene that reaches into the
+A few iterations on about 24 × 24 voxels with a quarter of all cosines cost a second. What the coarse voxels
+cannot hold spreads over all coefficients evenly, so the upper half of them shows how high that floor reaches;
+the bandwidth ends with the last coefficient that rises above it, with a margin. A scene that reaches into the
 upper half gives itself away by peaks there; then all of the quarter is used.
 """
 

@@ -41,6 +41,10 @@ FIRST_LOOK_SHARE = 0.6
 """Of a budget, the most that the first look may take."""
 PLAIN_ITERATIONS = 80
 """Of scenes that are not a few patterns: from here on, more iterations fit what voxels cannot hold."""
+USUAL_FRAMES = 980
+FEW_FRAMES = 32
+HELD_BACK = 100.0
+"""Factor of the penalties for few frames."""
 LEAST_GAIN = 0.003
 """Relative gain of the held-out prediction in a round below which the round was in vain."""
 PATIENCE = 3
@@ -98,7 +102,7 @@ def solve_admm(segment: Segment, problem: Problem, request: Request, clock: Iter
     frames, side, _ = segment.geometry.video_shape(N_m, T_m)
     basis = TemporalBasis(frames, _coefficients(segment, request, frames))
     operator = band_operator(segment.geometry, segment.code, basis, N_m, T_m)
-    parameters = _weighted(AdmmParameters(), request.tv_weight)
+    parameters = _weighted(_defaults(frames), request.tv_weight)
     start = None if request.initial is None else basis.analyze(request.initial / np.float32(problem.scale))
     solver = Admm(
         problem.masked(operator),
@@ -214,6 +218,19 @@ def _coefficients(segment: Segment, request: Request, frames: int) -> int:
     if request.bandwidth is None:
         return estimate_coefficients(segment, request.spatial_merge, request.temporal_merge)
     return min(frames, max(1, round(request.bandwidth * frames)))
+
+
+def _defaults(frames: int) -> AdmmParameters:
+    """Parameters for a video of so many frames.
+
+    Coefficients grow with the root of the frames, and so does the threshold λ/ρ that suits them. A handful of
+    frames of a moving scene cannot explain its lines: its penalties are higher, which fits less of that.
+    """
+    usual = AdmmParameters()
+    threshold = usual.tv_weight / usual.tv_penalty * min(1.0, frames / USUAL_FRAMES) ** 0.5
+    penalty = usual.tv_penalty * (HELD_BACK if 1 < frames <= FEW_FRAMES else 1.0)
+    sign = usual.sign_penalty * penalty / usual.tv_penalty
+    return replace(usual, tv_weight=threshold * penalty, tv_penalty=penalty, sign_penalty=sign)
 
 
 def _weighted(parameters: AdmmParameters, tv_weight: float | None) -> AdmmParameters:
