@@ -39,6 +39,8 @@ FIRST_LOOK = 60
 """Iterations in the cosines before patterns are looked for."""
 FIRST_LOOK_SHARE = 0.6
 """Of a budget, the most that the first look may take."""
+TENTATIVE_SHARE = 0.15
+"""Of a budget, after which the search for the bandwidth hurries."""
 PLAIN_ITERATIONS = 80
 """Of scenes that are not a few patterns: from here on, more iterations fit what voxels cannot hold."""
 USUAL_FRAMES = 980
@@ -100,7 +102,7 @@ def solve_admm(segment: Segment, problem: Problem, request: Request, clock: Iter
     """The default: cosines first, then patterns and curves where the scene is of a few."""
     N_m, T_m = request.spatial_merge, request.temporal_merge
     frames, side, _ = segment.geometry.video_shape(N_m, T_m)
-    basis = TemporalBasis(frames, _coefficients(segment, request, frames))
+    basis = TemporalBasis(frames, _coefficients(segment, request, clock))
     operator = band_operator(segment.geometry, segment.code, basis, N_m, T_m)
     parameters = _weighted(_defaults(frames), request.tv_weight)
     start = None if request.initial is None else basis.analyze(request.initial / np.float32(problem.scale))
@@ -158,7 +160,7 @@ def solve_twist(segment: Segment, problem: Problem, request: Request, clock: Ite
     N_m, T_m = request.spatial_merge, request.temporal_merge
     shape = segment.geometry.video_shape(N_m, T_m)
     banded = request.solver == "twist-band"
-    basis = TemporalBasis(shape[0], _coefficients(segment, request, shape[0]) if banded else shape[0])
+    basis = TemporalBasis(shape[0], _coefficients(segment, request, clock) if banded else shape[0])
     operator: Operator
     if banded:
         operator = band_operator(segment.geometry, segment.code, basis, N_m, T_m)
@@ -214,9 +216,11 @@ class Lit:
         return {"patterns": 1}
 
 
-def _coefficients(segment: Segment, request: Request, frames: int) -> int:
+def _coefficients(segment: Segment, request: Request, clock: IterationClock) -> int:
+    N_m, T_m = request.spatial_merge, request.temporal_merge
     if request.bandwidth is None:
-        return estimate_coefficients(segment, request.spatial_merge, request.temporal_merge)
+        return estimate_coefficients(segment, N_m, T_m, lambda: clock.spent(TENTATIVE_SHARE))
+    frames = segment.geometry.video_shape(N_m, T_m)[0]
     return min(frames, max(1, round(request.bandwidth * frames)))
 
 
