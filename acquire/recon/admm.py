@@ -44,7 +44,7 @@ class AdmmParameters:
     relaxation: float = 1.7
     gradient_steps: int = 2
     tv_iterations: int = 10
-    grid_per_coefficient: int = 2
+    grid_per_coefficient: int = 1
 
 
 class Admm:
@@ -66,17 +66,25 @@ class Admm:
         emphasis: NDArray[Any] | float = 1.0,
         denoiser: Denoiser | None = None,
     ) -> None:
-        self._operator, self._samples, self._parameters = operator, samples, parameters
+        self._samples, self._parameters = samples, parameters
         self._denoiser = denoiser or FrameTv(theta_shape, parameters.tv_iterations, samples.dtype)
         self._strength = np.asarray(emphasis, samples.dtype) * (parameters.tv_weight / parameters.tv_penalty)
-        grid = min(basis.frames, parameters.grid_per_coefficient * basis.cosines)
-        self._grid = basis.matrix(grid)
-        self.theta = np.zeros(theta_shape, samples.dtype) if start is None else start.astype(samples.dtype)
-        self._tv_multiplier = np.zeros_like(self.theta)
-        self._sign = np.maximum(np.tensordot(self._grid.T, self.theta, 1), 0)
-        self._sign_multiplier = np.zeros_like(self._sign)
         self._w = np.zeros_like(samples)
-        self._lifted = np.zeros_like(self.theta)  # BᵀW·w
+        first = np.zeros(theta_shape, samples.dtype) if start is None else start.astype(samples.dtype)
+        self.rebase(operator, basis, first)
+        self._tv_multiplier = np.zeros_like(first)
+        self._sign = np.maximum(np.tensordot(self._grid.T, first, 1), 0)
+        self._sign_multiplier = np.zeros_like(self._sign)
+
+    def rebase(self, operator: MaskedOperator, basis: Basis, theta: NDArray[Any]) -> None:
+        """Go on in another basis of as many rows and cosines, not far from the last.
+
+        Multipliers and w stay: those of the sign live on instants, w on the lines, and TV's follow slowly.
+        """
+        self._operator, self.theta = operator, theta
+        grid = min(basis.frames, self._parameters.grid_per_coefficient * basis.cosines)
+        self._grid = basis.matrix(grid)
+        self._lifted = operator.adjoint(self._w)  # BᵀW·w
 
     def step(self) -> None:
         """One iteration.

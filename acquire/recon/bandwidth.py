@@ -1,9 +1,9 @@
 """How fast the scene changes, from the lines alone: a tentative reconstruction in coarse voxels.
 
-A few iterations on about 24 × 24 voxels with half of all cosines cost a second. What the coarse voxels cannot
-hold spreads over all coefficients evenly, so the upper half of them shows how high that floor reaches; the
-bandwidth ends with the last coefficient that rises above it, with a margin. A scene that reaches into the
-upper half gives itself away by peaks there; then all of the half is used.
+A few iterations on about 24 × 24 voxels with a quarter of all cosines cost a second. What the coarse voxels
+cannot hold spreads over all coefficients evenly, so the upper half of them shows how high that floor reaches;
+the bandwidth ends with the last coefficient that rises above it, with a margin. A scene that reaches into the
+upper half gives itself away by peaks there; then all of the quarter is used.
 """
 
 from __future__ import annotations
@@ -18,43 +18,54 @@ from acquire.recon.basis import TemporalBasis
 from acquire.recon.problem import pose
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from acquire.lines import Segment
 
 COARSE_SIDE = 24
-ITERATIONS = 15
+ITERATIONS, FEWEST_ITERATIONS = 12, 5
 ABOVE_FLOOR = 1.3
 """Relative to the highest coefficient of the floor."""
 PEAK = 25.0
 """The floor's highest coefficient is 5 to 15 times its median; beyond this it is no floor."""
 MARGIN = 1.25
 FEWEST_COEFFICIENTS = 32
-LARGEST_SHARE = 0.5
+LARGEST_SHARE = 0.25
 
 
-def estimate_coefficients(segment: Segment, spatial_merge: int, temporal_merge: int) -> int:
-    """How many of the first cosines of the frames' time axis hold the scene.
+def estimate_coefficients(
+    segment: Segment, spatial_merge: int, temporal_merge: int, hurry: Callable[[], bool] = lambda: False
+) -> int:
+    """How many of the first cosines of the frames' time axis hold the scene; sooner done where ``hurry()``.
 
-    At least 32 (or as many as there are frames), at most half of them.
+    At least 32 (or as many as there are frames), at most a quarter of them (or 32).
     """
     frames = segment.geometry.video_shape(spatial_merge, temporal_merge)[0]
     most = int(LARGEST_SHARE * frames)
     if most <= FEWEST_COEFFICIENTS:
         return min(frames, FEWEST_COEFFICIENTS)
     merge = max(spatial_merge, -(-segment.geometry.size // COARSE_SIDE))
-    energy = np.square(_tentative(segment, merge, temporal_merge, most), dtype=np.float64).sum((1, 2))
+    energy = np.square(_tentative(segment, (merge, temporal_merge), most, hurry), dtype=np.float64).sum(
+        (1, 2)
+    )
     return int(np.clip(MARGIN * _end_of_signal(energy), FEWEST_COEFFICIENTS, most))
 
 
-def _tentative(segment: Segment, merge: int, temporal_merge: int, count: int) -> NDArray[Any]:
+def _tentative(
+    segment: Segment, merges: tuple[int, int], count: int, hurry: Callable[[], bool]
+) -> NDArray[Any]:
+    merge, temporal_merge = merges
     frames, side, _ = segment.geometry.video_shape(merge, temporal_merge)
     basis = TemporalBasis(frames, count)
     problem = pose(segment, merge, temporal_merge, hold_out=0.0)
     operator = problem.masked(band_operator(segment.geometry, segment.code, basis, merge, temporal_merge))
     parameters = AdmmParameters(grid_per_coefficient=1)
     solver = Admm(operator, problem.used_samples, (count, side, side), basis, parameters)
-    for _ in range(ITERATIONS):
+    for made in range(ITERATIONS):
+        if made >= FEWEST_ITERATIONS and hurry():
+            break
         solver.step()
     return solver.theta
 

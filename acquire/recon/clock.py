@@ -47,6 +47,10 @@ class IterationClock:
             if self._progress is not None:
                 self._progress(Progress(self.done, self.iterations, self.seconds, stage))
 
+    def spent(self, share: float) -> bool:
+        """Whether that share of the budget is gone."""
+        return self._budget_s is not None and self.seconds > share * self._budget_s
+
     def converged(self) -> None:
         """Nothing is to be gained from more iterations."""
         self.ended = "converged"

@@ -45,9 +45,10 @@ def frame_error(
 def judge(segment: Segment, problem: Problem, quality: Quality, trusted: slice) -> tuple[str, ...]:
     """Sentences for the user: why this video may not be believed."""
     found = []
-    if quality.misfit > POOR_MISFIT:
+    missed = float(np.nanmax([quality.misfit, quality.prediction]))
+    if missed > POOR_MISFIT:
         found.append(
-            f"the video misses the lines by {quality.misfit:.0%}: too few iterations, or the code's place, "
+            f"the video misses the lines by {missed:.0%}: too few iterations, or the code's place, "
             "the arms' orientation or the black level is wrong"
         )
     if quality.coverage < POOR_COVERAGE:
@@ -59,6 +60,6 @@ def judge(segment: Segment, problem: Problem, quality: Quality, trusted: slice) 
             f"the light is on in {density:.0%} of the sub-steps: 50 % resolves fast changes best, "
             "very few leave frames unseen and very many leave them alike"
         )
-    if trusted.start >= trusted.stop:
+    if trusted.start >= trusted.stop and segment.geometry.lines < segment.geometry.stages:
         found.append("no frame is sampled in full: the segment has fewer lines than stages")
     return tuple(found)

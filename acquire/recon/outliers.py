@@ -24,6 +24,8 @@ SPIKE_DEVIATIONS = 20.0
 SPIKE_LEVEL = 0.5
 """A spike also differs by this share of the samples' 99th percentile, so that quiet scenes have none."""
 HOT_RATIO = 10.0
+FEWEST_VARYING = 0.1
+"""Share of an arm's columns that must vary for one that does not to be suspicious."""
 FEWEST_LINES = 16
 """Of fewer lines, columns say too little about themselves."""
 
@@ -60,10 +62,10 @@ def _stuck(samples: NDArray[np.float64], left: NDArray[np.bool_]) -> NDArray[np.
         return np.zeros_like(left)
     low = np.where(left, samples, np.inf).min(axis=1, keepdims=True)
     high = np.where(left, samples, -np.inf).max(axis=1, keepdims=True)
-    usual = np.median((high > low).astype(np.float64), axis=2, keepdims=True)
+    usual = (high > low).mean(axis=2, keepdims=True) > FEWEST_VARYING
     dark = (high <= low) & (np.abs(high) <= 1e-3 * np.abs(samples).max(axis=(1, 2), keepdims=True))
     lonely = _between_lit(dark, samples)
-    return np.asarray(np.broadcast_to((high <= low) & (usual > 0) & (~dark | lonely), samples.shape))
+    return np.asarray(np.broadcast_to((high <= low) & usual & (~dark | lonely), samples.shape))
 
 
 def _between_lit(dark: NDArray[np.bool_], samples: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -20,34 +20,34 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
-from acquire.forward import block_bounds, merge_video
-from acquire.forward.kernels import blocks_to_pixels
+from acquire.forward import merge_video
 from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import band_operator
 from acquire.recon.basis import LearnedBasis
+from acquire.recon.curves import fit_curves
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.lines import Segment
     from acquire.recon.basis import TemporalBasis
-    from acquire.recon.problem import Operator, Problem
+    from acquire.recon.problem import MaskedOperator, Operator, Problem
 
 LARGEST_RANK = 12
 TAIL = 16
 """Singular values from here on are taken as the floor of what the first reconstruction left over."""
-ABOVE_TAIL = 3.0
-LARGEST_REST = 0.02
+ABOVE_TAIL = 2.5
+LARGEST_REST = 0.035
 """Share of the energy that the patterns may leave out; more, and the scene is not one of a few patterns."""
 FADING = 0.5
 """λ of a pattern is relative to (largest / its) singular value to this power: weak patterns are smoother."""
 
 PARAMETERS = AdmmParameters(tv_penalty=2e-3, sign_penalty=6e-4, grid_per_coefficient=1)
-ROUND = 10
+ROUND = 5
 """ADMM iterations before the curves are fitted again."""
-CURVE_STEPS = 8
+FIRST_RIDGE, LAST_RIDGE, RIDGE_DECAY = 1e-2, 1e-4, 0.85
+"""The curves' fit is held back at first, when the patterns are still wrong (Levenberg's damping)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,16 +56,6 @@ class Patterns:
 
     curves: NDArray[Any]
     patterns: NDArray[Any]
-
-    @classmethod
-    def of(cls, curves: NDArray[Any], patterns: NDArray[Any]) -> Patterns:
-        """The same product in that form (thin QR of both sides, SVD of what is between)."""
-        rank, side, _ = patterns.shape
-        left, r_left = np.linalg.qr(curves.astype(np.float64))
-        right, r_right = np.linalg.qr(patterns.reshape(rank, -1).T.astype(np.float64))
-        u, s, vt = np.linalg.svd(r_left @ r_right.T)
-        shaped = ((s[:, None] * vt) @ right.T).reshape(rank, side, side)
-        return cls((left @ u).astype(curves.dtype), shaped.astype(patterns.dtype))
 
 
 def find_patterns(theta: NDArray[Any]) -> Patterns | None:
@@ -97,9 +87,9 @@ class Refinement:
     ) -> None:
         self._segment, self._problem, self._cosines = segment, problem, cosines
         self._spatial_merge, self._temporal_merge = merges
-        self.parameters, self._steps = parameters, 0
+        self.parameters, self._steps, self._ridge = parameters, 0, FIRST_RIDGE
         self._now = Patterns(found.curves, _hold(found.patterns, segment.geometry.size, merges[0]))
-        self._begin_round()
+        self._admm = self._begin()
 
     @property
     def rank(self) -> int:
@@ -116,7 +106,7 @@ class Refinement:
         self._steps += 1
         if self.at_round_end:
             self._fit_curves()
-            self._begin_round()
+            self._admm.rebase(*self._operators(), self._now.patterns)
 
     def predict(self) -> NDArray[Any]:
         """The lines of the estimate, as `Problem.samples`."""
@@ -127,16 +117,22 @@ class Refinement:
         merged = merge_video(self._now.patterns, self._spatial_merge, 1)
         return LearnedBasis(self._cosines, self._now.curves).synthesize(merged)
 
-    def _begin_round(self) -> None:
+    def _operators(self) -> tuple[MaskedOperator, LearnedBasis]:
+        """The patterns' operator and the basis of their curves, as these are now."""
         basis = LearnedBasis(self._cosines, self._now.curves)
         geometry, code = self._segment.geometry, self._segment.code
         self._operator: Operator = band_operator(geometry, code, basis, 1, self._temporal_merge)
+        return self._problem.masked(self._operator), basis
+
+    def _begin(self) -> Admm:
+        operator, basis = self._operators()
         size = np.sqrt(np.square(self._now.patterns, dtype=np.float64).sum((1, 2)))
         emphasis = (size.max() / np.maximum(size, 1e-6 * size.max() + 1e-30)) ** FADING
-        self._admm = Admm(
-            self._problem.masked(self._operator),
+        n = self._segment.geometry.size
+        return Admm(
+            operator,
             self._problem.used_samples,
-            (self.rank, geometry.size, geometry.size),
+            (self.rank, n, n),
             basis,
             self.parameters,
             start=self._now.patterns,
@@ -144,91 +140,24 @@ class Refinement:
         )
 
     def _fit_curves(self) -> None:
-        now = Patterns.of(self._now.curves, self._now.patterns)
-        # orthonormal patterns make the fit well conditioned; their sizes go to the curves
-        size = np.maximum(np.linalg.norm(now.patterns, axis=(1, 2)), 1e-30)
-        unit = now.patterns / size[:, None, None]
-        curves = fit_curves(
-            self._segment, self._problem, unit, self._cosines, self._temporal_merge, now.curves * size
-        )
-        self._now = Patterns.of(curves, unit)
+        """New curves for the patterns, made orthonormal again with as little turning as possible."""
+        flat = self._now.patterns.reshape(self.rank, -1)
+        gram = (flat @ flat.T).astype(np.float64)
+        root = np.linalg.cholesky(gram + 1e-6 * np.trace(gram) * np.eye(self.rank))
+        # orthonormal patterns make the fit well conditioned; their sizes go to the curves meanwhile
+        unit = np.linalg.solve(root, flat).astype(np.float32).reshape(self._now.patterns.shape)
+        merge = self._temporal_merge
+        start = self._now.curves @ root
+        fitted = fit_curves(self._segment, self._problem, unit, self._cosines, merge, start, self._ridge)
+        self._ridge = max(LAST_RIDGE, RIDGE_DECAY * self._ridge)
+        left, middle, right = np.linalg.svd(np.linalg.solve(root.T, fitted.T).T, full_matrices=False)
+        turned = (right.T * middle) @ right @ flat
+        self._now = Patterns((left @ right).astype(np.float32), _as(turned, self._now.patterns))
 
 
-def fit_curves(
-    segment: Segment,
-    problem: Problem,
-    patterns: NDArray[Any],
-    cosines: TemporalBasis,
-    temporal_merge: int,
-    start: NDArray[Any],
-    steps: int = CURVE_STEPS,
-) -> NDArray[Any]:
-    """Curves (K, R) that explain the samples best with ``patterns`` (R, n, n), by conjugate gradients."""
-    operator = problem.masked(CurveOperator(segment, patterns, cosines, temporal_merge))
-    curves: NDArray[Any] = start.astype(np.float32)
-    residual = problem.used_samples - operator.forward(curves)
-    gradient = operator.adjoint(residual)
-    direction, energy = gradient, float(np.vdot(gradient, gradient))
-    for _ in range(steps):
-        image = operator.forward(direction)
-        power = float(np.vdot(image, image))
-        if not power:
-            break
-        curves = curves + (energy / power) * direction
-        residual = residual - (energy / power) * image
-        gradient = operator.adjoint(residual)
-        energy, before = float(np.vdot(gradient, gradient)), energy
-        direction = gradient + (energy / before) * direction
-    return curves
-
-
-class CurveOperator:
-    """Lines of patterns whose curves are the unknown: (K, R) → (2, L_R, M), and the transpose.
-
-    Line i is Σ_{k,s} E(iS + s)·u_k(iS + s)·P_k(s), with P_k the pattern's rows summed over S steps: one
-    matrix product, of windows of the lit curves with P.
-    """
-
-    def __init__(
-        self, segment: Segment, patterns: NDArray[Any], cosines: TemporalBasis, temporal_merge: int
-    ) -> None:
-        self._geometry, self._code, self._cosines = segment.geometry, segment.code, cosines
-        self._frame = np.arange(segment.geometry.span) // temporal_merge
-        self._begins = block_bounds(segment.geometry.span, temporal_merge)[0]
-        views = (patterns, np.rot90(patterns, 1, axes=(1, 2)))
-        self._profiles = [_profiles(np.ascontiguousarray(view), segment) for view in views]
-        self._matrix = cosines.matrix()
-
-    def forward(self, curves: NDArray[Any]) -> NDArray[Any]:
-        """Lines of the curves (K, R)."""
-        lit = (self._matrix.T @ curves)[self._frame] * self._code[:, None].astype(curves.dtype)
-        width = self._geometry.size + self._geometry.substeps - 1
-        windows = sliding_window_view(lit, width, axis=0)[:: self._geometry.substeps]
-        flat = windows[: self._geometry.lines].reshape(self._geometry.lines, -1)
-        return np.stack([flat @ profile for profile in self._profiles])
-
-    def adjoint(self, lines: NDArray[Any]) -> NDArray[Any]:
-        """(2, L_R, M) → (K, R)."""
-        width = self._geometry.size + self._geometry.substeps - 1
-        back = lines[0] @ self._profiles[0].T + lines[1] @ self._profiles[1].T
-        windows = back.reshape(self._geometry.lines, -1, width).transpose(0, 2, 1)
-        light = np.zeros((self._geometry.span, windows.shape[2]), lines.dtype)
-        for i, window in enumerate(windows):
-            light[i * self._geometry.substeps :][:width] += window
-        light *= self._code[:, None].astype(lines.dtype)
-        curves: NDArray[Any] = self._matrix @ np.add.reduceat(light, self._begins, axis=0)
-        return curves
-
-
-def _profiles(view: NDArray[Any], segment: Segment) -> NDArray[Any]:
-    """P_k(s) = Σ_u Z_k(s − u), columns merged to pixels: (R·(n + S − 1), M)."""
-    rank, n, _ = view.shape
-    S = segment.geometry.substeps
-    pixels = blocks_to_pixels(view.reshape(rank * n, n), n, S, 1).reshape(rank, n, -1)
-    summed = np.zeros((rank, n + S - 1, pixels.shape[2]), view.dtype)
-    for u in range(S):
-        summed[:, u : u + n] += pixels
-    return summed.reshape(-1, pixels.shape[2])
+def _as(flat: NDArray[Any], patterns: NDArray[Any]) -> NDArray[Any]:
+    shaped: NDArray[Any] = flat.reshape(patterns.shape).astype(patterns.dtype)
+    return shaped
 
 
 def _hold(patterns: NDArray[Any], n: int, merge: int) -> NDArray[Any]:

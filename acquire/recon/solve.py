@@ -22,7 +22,8 @@ from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import InBasis, band_operator
 from acquire.recon.bandwidth import estimate_coefficients
 from acquire.recon.basis import TemporalBasis
-from acquire.recon.patterns import CurveOperator, Refinement, find_patterns, fit_curves
+from acquire.recon.curves import CurveOperator, fit_curves
+from acquire.recon.patterns import Refinement, find_patterns
 from acquire.recon.twist import Twist, TwistParameters
 
 if TYPE_CHECKING:
@@ -34,15 +35,22 @@ if TYPE_CHECKING:
     from acquire.recon.problem import Operator, Problem
     from acquire.recon.request import Request
 
-FIRST_LOOK = 30
+FIRST_LOOK = 60
 """Iterations in the cosines before patterns are looked for."""
-FIRST_LOOK_SHARE = 0.45
+FIRST_LOOK_SHARE = 0.6
 """Of a budget, the most that the first look may take."""
+TENTATIVE_SHARE = 0.15
+"""Of a budget, after which the search for the bandwidth hurries."""
 PLAIN_ITERATIONS = 80
 """Of scenes that are not a few patterns: from here on, more iterations fit what voxels cannot hold."""
-LEAST_GAIN = 0.01
-"""Relative gain of the held-out prediction in a round below which a refinement has converged."""
-STATIC_CURVE_STEPS = 200
+USUAL_FRAMES = 980
+FEW_FRAMES = 32
+HELD_BACK = 100.0
+"""Factor of the penalties for few frames."""
+LEAST_GAIN = 0.003
+"""Relative gain of the held-out prediction in a round below which the round was in vain."""
+PATIENCE = 3
+"""Rounds in vain that end a refinement."""
 
 
 class Estimate(Protocol):
@@ -94,9 +102,9 @@ def solve_admm(segment: Segment, problem: Problem, request: Request, clock: Iter
     """The default: cosines first, then patterns and curves where the scene is of a few."""
     N_m, T_m = request.spatial_merge, request.temporal_merge
     frames, side, _ = segment.geometry.video_shape(N_m, T_m)
-    basis = TemporalBasis(frames, _coefficients(segment, request, frames))
+    basis = TemporalBasis(frames, _coefficients(segment, request, clock))
     operator = band_operator(segment.geometry, segment.code, basis, N_m, T_m)
-    parameters = _weighted(AdmmParameters(), request.tv_weight)
+    parameters = _weighted(_defaults(frames), request.tv_weight)
     start = None if request.initial is None else basis.analyze(request.initial / np.float32(problem.scale))
     solver = Admm(
         problem.masked(operator),
@@ -107,7 +115,7 @@ def solve_admm(segment: Segment, problem: Problem, request: Request, clock: Iter
         start=start,
         denoiser=request.denoiser,
     )
-    for _ in clock.run(min(FIRST_LOOK, -(-request.iterations // 2)), "first look", FIRST_LOOK_SHARE):
+    for _ in clock.run(min(FIRST_LOOK, -(-3 * request.iterations // 5)), "first look", FIRST_LOOK_SHARE):
         solver.step()
     refined = None if request.denoiser else _refine(segment, problem, request, (basis, solver.theta), clock)
     if refined is not None:
@@ -133,16 +141,17 @@ def _refine(
     merges = (request.spatial_merge, request.temporal_merge)
     refinement = Refinement(segment, problem, basis, found, merges)
     parameters = refinement.parameters
-    before = np.inf
+    best, idle = np.inf, 0
     for _ in clock.run(clock.iterations - clock.done, "refine"):
         refinement.step()
         if not refinement.at_round_end:
             continue
         now = problem.prediction_error(refinement.predict())
-        if now > (1 - LEAST_GAIN) * before:
+        idle = 0 if now < (1 - LEAST_GAIN) * best else idle + 1
+        best = min(best, now)
+        if idle == PATIENCE:
             clock.converged()
             break
-        before = now
     return Refined(refinement, basis.count, parameters)
 
 
@@ -151,7 +160,7 @@ def solve_twist(segment: Segment, problem: Problem, request: Request, clock: Ite
     N_m, T_m = request.spatial_merge, request.temporal_merge
     shape = segment.geometry.video_shape(N_m, T_m)
     banded = request.solver == "twist-band"
-    basis = TemporalBasis(shape[0], _coefficients(segment, request, shape[0]) if banded else shape[0])
+    basis = TemporalBasis(shape[0], _coefficients(segment, request, clock) if banded else shape[0])
     operator: Operator
     if banded:
         operator = band_operator(segment.geometry, segment.code, basis, N_m, T_m)
@@ -185,16 +194,15 @@ class Lit:
     ) -> None:
         frames = segment.geometry.video_shape(request.spatial_merge, request.temporal_merge)[0]
         self._image, self._merge, self._problem = image.astype(np.float32), request.spatial_merge, problem
-        basis, patterns = TemporalBasis(frames, frames), self._image[None] / np.linalg.norm(self._image)
+        basis = TemporalBasis(frames, frames)
+        patterns = self._image[None] / np.linalg.norm(self._image)
         self._operator = CurveOperator(segment, patterns, basis, request.temporal_merge)
-        coefficients = np.zeros((frames, 1), np.float32)
+        coefficients = np.zeros((frames, 1))
         for _ in clock.run(1, "light"):
-            coefficients = fit_curves(
-                segment, problem, patterns, basis, request.temporal_merge, coefficients, STATIC_CURVE_STEPS
-            )
-        self._coefficients = coefficients
+            coefficients = fit_curves(segment, problem, patterns, basis, request.temporal_merge, coefficients)
+        self._coefficients = coefficients.astype(np.float32)
         seen = np.add.reduceat(segment.code, np.arange(0, len(segment.code), request.temporal_merge)) > 0
-        light = basis.synthesize(coefficients)[:, 0] / np.linalg.norm(self._image)
+        light = basis.synthesize(self._coefficients)[:, 0] / np.linalg.norm(self._image)
         self._light = np.interp(np.arange(frames), np.flatnonzero(seen), light[seen]).astype(np.float32)
 
     def predict(self) -> NDArray[Any]:
@@ -208,10 +216,25 @@ class Lit:
         return {"patterns": 1}
 
 
-def _coefficients(segment: Segment, request: Request, frames: int) -> int:
+def _coefficients(segment: Segment, request: Request, clock: IterationClock) -> int:
+    N_m, T_m = request.spatial_merge, request.temporal_merge
     if request.bandwidth is None:
-        return estimate_coefficients(segment, request.spatial_merge, request.temporal_merge)
+        return estimate_coefficients(segment, N_m, T_m, lambda: clock.spent(TENTATIVE_SHARE))
+    frames = segment.geometry.video_shape(N_m, T_m)[0]
     return min(frames, max(1, round(request.bandwidth * frames)))
+
+
+def _defaults(frames: int) -> AdmmParameters:
+    """Parameters for a video of so many frames.
+
+    Coefficients grow with the root of the frames, and so does the threshold λ/ρ that suits them. A handful of
+    frames of a moving scene cannot explain its lines: its penalties are higher, which fits less of that.
+    """
+    usual = AdmmParameters()
+    threshold = usual.tv_weight / usual.tv_penalty * min(1.0, frames / USUAL_FRAMES) ** 0.5
+    penalty = usual.tv_penalty * (HELD_BACK if 1 < frames <= FEW_FRAMES else 1.0)
+    sign = usual.sign_penalty * penalty / usual.tv_penalty
+    return replace(usual, tv_weight=threshold * penalty, tv_penalty=penalty, sign_penalty=sign)
 
 
 def _weighted(parameters: AdmmParameters, tv_weight: float | None) -> AdmmParameters:

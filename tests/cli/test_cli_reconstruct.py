@@ -182,7 +182,9 @@ def cluster(tmp_path: Path) -> Iterator[str]:
     file = tmp_path / "scheduler.json"
     common = ["--scheduler-file", str(file), "--no-dashboard"]
     commands = [["scheduler", "--host", "127.0.0.1", "--port", "0", *common]]
-    commands += [["worker", "--nthreads", "1", "--no-nanny", "--host", "127.0.0.1", *common]] * 2
+    commands += [
+        ["worker", "--death-timeout", "30", "--nthreads", "1", "--no-nanny", "--host", "127.0.0.1", *common]
+    ] * 2
     processes = [
         subprocess.Popen(
             [sys.executable, "-m", "dask", *command],

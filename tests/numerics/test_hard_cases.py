@@ -1,0 +1,194 @@
+"""Hard cases: a good result, a masked one that says so, or an error; never NaN, never silent nonsense."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from acquire.codes import mix_seed, prbs
+from acquire.errors import AcquireError, NumericsError, UsageError
+from acquire.forward import DualArm, merge_video
+from acquire.geometry import Geometry
+from acquire.lines import Segment
+from acquire.recon import Reconstruction, reconstruct
+from acquire.recon.problem import MaskedOperator, pose
+from acquire.recon.twist import Twist, TwistParameters
+
+GEOMETRY = Geometry(16, 3, 80)
+SOLVERS = ("admm", "twist", "twist-band")
+
+
+def scene(geometry: Geometry = GEOMETRY) -> np.ndarray:
+    """A slow square and a faster bar: (T, n, n)."""
+    n, t = geometry.size, np.arange(geometry.span)
+    video = np.zeros((geometry.span, n, n), np.float32)
+    video[:, n // 8 : n // 2, n // 8 : n // 2] = (0.6 + 0.3 * np.sin(2 * np.pi * t / 140))[:, None, None]
+    video[:, 5 * n // 8 : 7 * n // 8, n // 4 : n // 2] += (0.5 + 0.4 * np.sin(2 * np.pi * t / 60))[
+        :, None, None
+    ]
+    return video
+
+
+CODE = prbs(64, mix_seed(5, 64), 0, GEOMETRY.span)
+TRUTH = scene()
+CLEAN = DualArm(GEOMETRY, CODE).forward(TRUTH).astype(np.float32)
+
+
+def segment(lines: np.ndarray = CLEAN, code: np.ndarray = CODE, geometry: Geometry = GEOMETRY) -> Segment:
+    return Segment(
+        lines=lines,
+        mask=np.ones(geometry.lines_shape, bool),
+        code=code,
+        geometry=geometry,
+        time_ns=np.arange(geometry.lines, dtype=np.int64) * 30_000,
+        substep_ns=10_000.0,
+    )
+
+
+def solve(
+    given: Segment, solver: str = "admm", merges: tuple[int, int] = (3, 1), **options: object
+) -> Reconstruction:
+    result = reconstruct(given, *merges, solver=solver, **{"iterations": 40} | options)
+    assert np.isfinite(result.video).all()
+    assert np.isfinite(result.quality.misfit)
+    return result
+
+
+def psnr(result: Reconstruction, scale: float = 1.0) -> float:
+    truth = merge_video(TRUTH, 3, 1)[result.trusted]
+    error = np.mean((result.video[result.trusted].astype(np.float64) / scale - truth) ** 2)
+    return float(10 * np.log10(truth.max() ** 2 / error))
+
+
+@pytest.fixture(scope="module")
+def clean_db() -> float:
+    return psnr(solve(segment()))
+
+
+def test_the_clean_case_is_good(clean_db: float) -> None:
+    assert clean_db > 22
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e7, -1e7])
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_wild_samples_are_masked_and_counted(value: float, solver: str) -> None:
+    lines = CLEAN.copy()
+    lines[0, 30, 4] = lines[1, 50, 9] = value
+    result = solve(segment(lines), solver, iterations=10)
+    assert sum(result.masked.values()) == 2
+    assert result.quality.coverage == pytest.approx(1 - 2 / lines.size)
+
+
+def test_a_wild_sample_costs_nothing(clean_db: float) -> None:
+    lines = CLEAN.copy()
+    lines[0, 30, 4] = 1e7
+    assert psnr(solve(segment(lines))) > clean_db - 2
+
+
+@pytest.mark.parametrize(("value", "cause"), [(1e7, "hot column"), (0.0, "stuck column")])
+def test_a_hot_and_a_dead_column_are_found(value: float, cause: str, clean_db: float) -> None:
+    lines = CLEAN.copy()
+    lines[0, :, 4] = value
+    result = solve(segment(lines))
+    assert result.masked[cause] == GEOMETRY.lines
+    assert psnr(result) > clean_db - 4
+
+
+def test_lost_lines_and_half_saturation_are_masked(clean_db: float) -> None:
+    lost = segment()
+    lost.mask[:, 30:33] = False
+    assert psnr(solve(lost)) > clean_db - 3
+    level = np.median(CLEAN)
+    clipped = replace(segment(np.minimum(CLEAN, level)), mask=level > CLEAN)
+    result = solve(clipped)
+    assert result.quality.coverage == pytest.approx(0.5, abs=0.05)
+    assert any("samples could be used" in warning for warning in result.warnings)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+def test_an_all_zero_code_is_refused(solver: str) -> None:
+    dark = segment(np.zeros_like(CLEAN), np.zeros_like(CODE))
+    with pytest.raises(NumericsError, match="dark"):
+        solve(dark, solver)
+
+
+@pytest.mark.parametrize("density", [0.01, 0.99, 1.0])
+def test_extreme_codes_are_solved_and_said(density: float) -> None:
+    rng = np.random.default_rng(0)
+    code = (rng.random(GEOMETRY.span) < density).astype(np.uint8)
+    code[100] = 1
+    lines = DualArm(GEOMETRY, code).forward(TRUTH).astype(np.float32)
+    assert any("sub-steps" in warning for warning in solve(segment(lines, code)).warnings)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("weight", [0.0, 1e-30, 1e8])
+def test_any_weight_is_finite(solver: str, weight: float) -> None:
+    solve(segment(), solver, tv_weight=weight, iterations=5)
+
+
+@pytest.mark.parametrize("factor", [1e-6, 65535.0])
+def test_units_do_not_matter(factor: float, clean_db: float) -> None:
+    assert psnr(solve(segment(CLEAN * np.float32(factor))), factor) == pytest.approx(clean_db, abs=1)
+
+
+@pytest.mark.parametrize("solver", SOLVERS)
+@pytest.mark.parametrize("geometry", [Geometry(8, 3, 1), Geometry(1, 3, 40), Geometry(1, 1, 1)])
+def test_one_line_and_one_stage(geometry: Geometry, solver: str) -> None:
+    code = np.ones(geometry.span, np.uint8)
+    lines = DualArm(geometry, code).forward(
+        np.ones((geometry.span, geometry.size, geometry.size), np.float32)
+    )
+    result = solve(segment(lines, code, geometry), solver, (1, 1), iterations=10)
+    if geometry.lines < geometry.stages:
+        assert any("fewer lines than stages" in warning for warning in result.warnings)
+
+
+@pytest.mark.parametrize("merges", [(3, 1000), (5, 1), (7, 13), (48, 1), (1, GEOMETRY.span)])
+def test_merges_that_divide_nothing(merges: tuple[int, int]) -> None:
+    result = solve(segment(), merges=merges, iterations=10)
+    assert result.video.shape == GEOMETRY.video_shape(*merges)
+    assert result.frame_error.shape == result.video.shape[:1]
+
+
+def test_inconsistent_data_are_said() -> None:
+    noise = np.random.default_rng(1).random(CLEAN.shape).astype(np.float32) * CLEAN.max()
+    assert any("misses the lines" in warning for warning in solve(segment(noise), merges=(5, 287)).warnings)
+
+
+def test_a_wrong_orientation_is_said() -> None:
+    turned = np.stack([CLEAN[0], CLEAN[1, :, ::-1]])
+    assert any("orientation" in warning for warning in solve(segment(turned)).warnings)
+    assert not solve(segment()).warnings
+
+
+def test_twist_survives_an_underestimated_norm() -> None:
+    """Monotone: where the step is too long nothing is taken, so the objective never rises."""
+    problem = pose(segment(), 3, 1, hold_out=0.0)
+    whole = DualArm(GEOMETRY, CODE, 3, 1)
+    loud = MaskedOperator(whole, problem.weight / np.float32(0.7 * problem.norm))
+    solver = Twist(loud, problem.used_samples, whole.video_shape, TwistParameters())
+    start = solver.objective
+    for _ in range(20):
+        solver.step()
+    assert np.isfinite(solver.theta).all()
+    assert solver.objective <= start
+
+
+def test_a_million_substeps_in_float32() -> None:
+    geometry = Geometry(2, 3, 333_333)
+    code = prbs(64, mix_seed(1, 64), 0, geometry.span)
+    whole = DualArm(geometry, code, 6, 1)
+    video = np.ones(whole.video_shape, np.float32)
+    lines = whole.forward(video)
+    result = solve(segment(lines, code, geometry), merges=(6, 1000), iterations=25, bandwidth=0.03)
+    assert np.abs(np.median(result.video[result.trusted]) - 1) < 0.1
+
+
+def test_solvers_refuse_rather_than_return_nan() -> None:
+    with pytest.raises(UsageError, match="no sample"):
+        solve(segment(np.full_like(CLEAN, np.nan)))
+    with pytest.raises(AcquireError):
+        solve(segment(), initial=np.full(GEOMETRY.video_shape(3, 1), np.nan))

@@ -1,0 +1,148 @@
+"""Patterns and curves, the search for the bandwidth, warm starts, a known image, denoisers, and a stop."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from acquire.codes import mix_seed, prbs
+from acquire.errors import UsageError
+from acquire.forward import DualArm
+from acquire.geometry import Geometry
+from acquire.lines import Segment
+from acquire.recon import HaarShrink, Progress, reconstruct
+from acquire.recon.bandwidth import estimate_coefficients
+from acquire.recon.basis import TemporalBasis
+from acquire.recon.curves import CurveOperator, fit_curves
+from acquire.recon.patterns import find_patterns
+from acquire.recon.problem import pose
+
+GEOMETRY = Geometry(12, 3, 72)
+CODE = prbs(64, mix_seed(3, 64), 0, GEOMETRY.span)
+IMAGES = np.zeros((2, 36, 36), np.float32)
+IMAGES[0, 4:19, 4:19] = 1
+IMAGES[1, 20:33, 10:31] = 1
+INSTANTS = np.arange(GEOMETRY.span)
+LIGHT = 0.5 + 0.4 * np.sin(2 * np.pi * np.outer((1 / 120, 1 / 45), INSTANTS)).astype(np.float32)
+TRUTH = np.einsum("kt,krc->trc", LIGHT, IMAGES)
+
+
+def segment(video: np.ndarray = TRUTH) -> Segment:
+    return Segment(
+        lines=DualArm(GEOMETRY, CODE).forward(video.astype(np.float32)),
+        mask=np.ones(GEOMETRY.lines_shape, bool),
+        code=CODE,
+        geometry=GEOMETRY,
+        time_ns=np.arange(GEOMETRY.lines, dtype=np.int64) * 30_000,
+    )
+
+
+@pytest.mark.parametrize("merge", [1, 4, 7])
+def test_curve_operator_is_the_sensing_matrix_of_the_patterns(merge: int) -> None:
+    frames = GEOMETRY.video_shape(1, merge)[0]
+    cosines = TemporalBasis(frames, min(9, frames))
+    operator = CurveOperator(segment(), IMAGES, cosines, merge)
+    rng = np.random.default_rng(0)
+    curves = rng.standard_normal((cosines.count, 2)).astype(np.float32)
+    video = np.tensordot(cosines.synthesize(curves), IMAGES, 1).astype(np.float32)
+    expected = DualArm(GEOMETRY, CODE, 1, merge).forward(video)
+    np.testing.assert_allclose(operator.forward(curves), expected, rtol=1e-4, atol=1e-3)
+    lines = rng.standard_normal(GEOMETRY.lines_shape).astype(np.float32)
+    left, right = np.vdot(operator.forward(curves), lines), np.vdot(curves, operator.adjoint(lines))
+    assert left == pytest.approx(right, rel=1e-4)
+    unit = np.eye(2 * cosines.count, dtype=np.float32).reshape(-1, 2, cosines.count).transpose(0, 2, 1)
+    matrix = np.stack([operator.forward(e).ravel() for e in unit], axis=1).astype(np.float64)
+    np.testing.assert_allclose(
+        operator.gram(), matrix.T @ matrix, rtol=1e-3, atol=1e-4 * np.abs(matrix).max() ** 2
+    )
+
+
+def test_curves_of_known_patterns_are_exact_even_where_samples_are_lost() -> None:
+    holed = segment()
+    holed.mask[0, 20:24] = False
+    cosines = TemporalBasis(GEOMETRY.span, 40)
+    problem = pose(holed, 1, 1, hold_out=0.0)
+    wanted = cosines.analyze((LIGHT.T / problem.scale).astype(np.float32))
+    held = segment(np.tensordot(cosines.synthesize(wanted) * problem.scale, IMAGES, 1))
+    problem = replace(problem, samples=np.where(holed.mask, held.lines / (problem.scale * problem.norm), 0))
+    problem = replace(problem, samples=problem.samples.astype(np.float32))
+    found = fit_curves(holed, problem, IMAGES, cosines, 1, np.zeros(wanted.shape))
+    seen = cosines.synthesize(found.astype(np.float32))[GEOMETRY.trusted]
+    np.testing.assert_allclose(seen, cosines.synthesize(wanted)[GEOMETRY.trusted], atol=0.02 / problem.scale)
+
+
+def test_a_scene_of_two_patterns_is_recognised_and_amplitudes_are_kept() -> None:
+    result = reconstruct(segment(), 3, 1, "best", iterations=120)
+    assert 2 <= result.parameters["patterns"] <= 6
+    region = result.video[result.trusted][:, 7:10, 5:9].mean((1, 2))
+    assert np.ptp(region) == pytest.approx(np.ptp(LIGHT[1, GEOMETRY.trusted]), rel=0.1)
+
+
+def test_noise_is_not_a_few_patterns() -> None:
+    frames = np.random.default_rng(0).standard_normal((40, 12, 12)).astype(np.float32)
+    assert find_patterns(frames) is None
+    assert find_patterns(frames[:10]) is None
+
+
+def test_the_bandwidth_is_found_from_the_lines() -> None:
+    slow = estimate_coefficients(segment(), 3, 1)
+    assert slow == 32
+    fast = TRUTH * (0.5 + 0.5 * np.sin(2 * np.pi * INSTANTS / 9))[:, None, None]
+    assert estimate_coefficients(segment(fast), 3, 1) > slow
+    assert estimate_coefficients(segment(), 3, 50) == GEOMETRY.video_shape(3, 50)[0]
+
+
+def test_a_warm_start_begins_where_the_last_ended() -> None:
+    first = reconstruct(segment(), 3, 1, iterations=50)
+    cold = reconstruct(segment(), 3, 1, iterations=2)
+    warm = reconstruct(segment(), 3, 1, iterations=2, initial=first.video)
+    truth = TRUTH.reshape(-1, 12, 3, 12, 3).mean((2, 4))
+
+    def error(video: np.ndarray) -> float:
+        return float(np.mean((video - truth)[GEOMETRY.trusted] ** 2))
+
+    assert error(warm.video) < 0.7 * error(cold.video)
+
+
+def test_with_a_known_image_the_light_is_followed() -> None:
+    light = np.random.default_rng(2).random(GEOMETRY.span).astype(np.float32)
+    image = IMAGES.sum(0) + 0.2
+    result = reconstruct(segment(light[:, None, None] * image), 3, 1, static_image=5 * image)
+    lit = np.flatnonzero(CODE[GEOMETRY.trusted])
+    found = result.video[result.trusted].mean((1, 2))[lit] / image.mean()
+    np.testing.assert_allclose(found, light[GEOMETRY.trusted][lit], atol=0.05)
+
+
+def test_another_denoiser_takes_the_place_of_total_variation() -> None:
+    result = reconstruct(segment(), 3, 1, iterations=30, denoiser=HaarShrink())
+    assert "patterns" not in result.parameters
+    assert result.quality.prediction < 0.3
+    frames = np.random.default_rng(0).random((2, 12, 9)).astype(np.float32)
+    np.testing.assert_allclose(HaarShrink().prox(frames, 0.0), frames, atol=1e-6)
+    flat = HaarShrink(1).prox(frames, 1e3)
+    assert flat.std() < frames.std()
+    assert flat.mean() == pytest.approx(frames.mean(), rel=1e-5)
+
+
+def test_a_stop_keeps_the_best_so_far() -> None:
+    stop = threading.Event()
+
+    def seen(progress: Progress) -> None:
+        if progress.iteration == 4:
+            stop.set()
+
+    result = reconstruct(segment(), 3, 1, progress=seen, stop=stop)
+    assert (result.iterations, result.ended) == (4, "stopped")
+    assert np.isfinite(result.video).all()
+    assert result.frame_error.shape == (GEOMETRY.span,)
+
+
+def test_arrays_that_do_not_fit_are_refused() -> None:
+    for option, shape in (("initial", (3, 3, 3)), ("static_image", (12, 12))):
+        with pytest.raises(UsageError, match="shape"):
+            reconstruct(segment(), 3, 1, **{option: np.zeros(shape)})
+    with pytest.raises(UsageError, match="denoiser"):
+        reconstruct(segment(), 3, 1, solver="twist", denoiser=HaarShrink())
