@@ -41,11 +41,12 @@ def search_rate(
     first_hz: float,
     seconds: float = RUN_S,
     tell: Callable[[Trial], object] | None = None,
+    most_runs: int = MOST_RUNS,
 ) -> list[Trial]:
     """Every run in its order, from ``first_hz`` on; `best` picks the result."""
     trials: list[Trial] = []
     good, bad, rate = 0.0, float("inf"), first_hz
-    while len(trials) < MOST_RUNS and bad > good * NEAR:
+    while len(trials) < most_runs and bad > good * NEAR:
         trial = _try(replace(load, line_rate_hz=rate), directory, seconds)
         trials.append(trial)
         if tell is not None:

@@ -34,12 +34,13 @@ def bench(
         Path | None, typer.Option(help="Where to record; else the configuration's directory.")
     ] = None,
     seconds: Annotated[float, typer.Option(help="Duration of each run.")] = 2.0,
+    runs: Annotated[int, typer.Option(min=1, max=100, help="Most runs.")] = 9,
     json: JsonFlag = False,
 ) -> None:
     """Search the highest line rate without a loss.
 
-    Cameras show stored lines, everything else is as in a run. Up to nine runs, each with processes, rings and
-    a recording of its own, which is removed again. Exit code 6 where no rate that is tried can be held.
+    Cameras show stored lines, everything else is as in a run. Every run has processes, rings and a
+    recording of its own, which is removed again. Exit code 6 where no rate that is tried can be held.
 
     Example: [bold]acquire bench --config rig-vt-4k5c-h100 --out /data[/]
     """
@@ -55,7 +56,7 @@ def bench(
     parts = measure_parts(load, directory)
     if not json:
         _show_parts(load, parts, directory)
-    trials = search_rate(load, directory, parts.line_rate_hz, seconds, None if json else _tell)
+    trials = search_rate(load, directory, parts.line_rate_hz, seconds, None if json else _tell, runs)
     found = best(trials)
     if json:
         print_json(_facts(load, parts, trials, found))

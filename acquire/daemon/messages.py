@@ -168,6 +168,7 @@ class Status(_Message):
     last: LastRecording | None
     fault: str | None
     capacity: CapacityStatus | None = None
+    processes: dict[str, int] = Field(default={}, description="of the run: name → process number")
 
 
 class ErrorMessage(_Message):

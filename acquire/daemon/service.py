@@ -13,6 +13,7 @@ import os
 import threading
 import time
 from datetime import UTC, datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from acquire import __version__
@@ -27,7 +28,6 @@ from acquire.stream import CaptureStatus
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-    from pathlib import Path
 
     from acquire.config import RigConfig
     from acquire.daemon.messages import CapacityStatus, StartRequest
@@ -278,6 +278,9 @@ class Service:
         if self._target is None:
             return
         (path, _), self._target = self._target, None
+        if self._seen.path not in (None, str(path)):
+            log.warning("%s was cut off; acquire recover %s seals it", path, path)
+        path = Path(self._seen.path or path)
         self._last = LastRecording(
             path=path,
             lines=self._seen.committed_lines,
@@ -337,6 +340,7 @@ class Service:
             last=self._last,
             fault=self._fault,
             capacity=self._capacity,
+            processes={} if self._run is None else self._seen.pids,
         )
 
     def _recording(self) -> RecordingStatus | None:
@@ -344,7 +348,7 @@ class Service:
             return None
         path, budget = self._target
         return RecordingStatus(
-            path=path,
+            path=Path(self._seen.path or path),
             first_line=self._seen.first_line,
             budget_lines=budget,
             recorded_lines=self._seen.recorded_lines,

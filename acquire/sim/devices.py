@@ -193,20 +193,22 @@ class SimulatedCamera:
         first_line = self._first_pulse + self._delivered - self._depth_lines
         lines = self._light.read(first_line, count)
         if not lines.missing.any():
-            block = CameraBlock(self._delivered, lines.pixels, np.zeros(count, np.uint16))
+            time_ns = int(self.times_ns(self._delivered, 1)[0])
+            block = CameraBlock(self._delivered, lines.pixels, np.zeros(count, np.uint16), time_ns=time_ns)
             self._delivered += count
             return block
         self._lost += int(lines.missing.sum())
-        self._ready.extend(_whole_runs(self._delivered, lines))
+        self._ready.extend(_whole_runs(self._delivered, lines, self.times_ns(self._delivered, count)))
         self._delivered += count
         return self._ready.popleft() if self._ready else None
 
 
-def _whole_runs(first: int, lines: Readout) -> Iterator[CameraBlock]:
+def _whole_runs(first: int, lines: Readout, times_ns: NDArray[np.int64]) -> Iterator[CameraBlock]:
     """The stretches between lines that did not come."""
     edges = np.flatnonzero(np.diff(lines.missing, prepend=True, append=True))
     for begin, end in edges.reshape(-1, 2).tolist():
-        yield CameraBlock(first + begin, lines.pixels[begin:end], np.zeros(end - begin, np.uint16))
+        flags = np.zeros(end - begin, np.uint16)
+        yield CameraBlock(first + begin, lines.pixels[begin:end], flags, time_ns=int(times_ns[begin]))
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,11 +21,12 @@ from acquire.lines import ARMS
 from acquire.stream import grabber, recorder, watcher
 from acquire.stream.ledger import Counted, account
 from acquire.stream.losses import Cause
-from acquire.stream.messages import Begin, End, Extend, Interrupt, Note, Quit, Ready, RunStarted
+from acquire.stream.messages import Begin, Extend, Interrupt, Note, Quit, Ready, RunStarted
 from acquire.stream.plan import CaptureStatus
 from acquire.stream.process import Worker
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.shared import Counters
+from acquire.stream.succession import Succession
 from acquire.stream.supervisor import RECORDER, Supervisor
 from acquire.stream.window import NOW
 from acquire.stream.witness import TRIGGER, TRIGGER_COUNTERS, WATCHER
@@ -137,7 +138,7 @@ class Capture:
         if supervisor.began is None:
             raise StateError("stop: nothing has been recorded", possible="start")
         if supervisor.recording:
-            self._workers[RECORDER].post(End(reason))
+            supervisor.end_recording(reason)
 
     def poll(self) -> CaptureStatus:
         """What is seen at this moment; after `close`, what was seen last."""
@@ -196,6 +197,10 @@ class Capture:
             self._plan.stall_timeout_s,
             self._plan.margin_lines,
             self._plan.grabbers,
+            Succession(
+                {RECORDER: self._next_recorder, WATCHER: self._new_watcher}
+                | {name: partial(self._next_grabber, name) for name in self._plan.grabbers}
+            ),
         )
         self._supervisor.start()
 
@@ -210,6 +215,13 @@ class Capture:
             self._counters[arm] = Counters(grabber.COUNTERS)
 
     def _spawn(self) -> None:
+        self._workers[RECORDER] = self._new_recorder()
+        if self._plan.watch is not None:
+            self._workers[WATCHER] = self._new_watcher()
+        for name in self._plan.grabbers:
+            self._workers[name] = self._new_grabber(name)
+
+    def _new_recorder(self) -> Worker:
         plan = self._plan
         what = recorder.RecorderPlan(
             plan.run,
@@ -219,16 +231,40 @@ class Capture:
             plan.max_skew_lines,
             plan.realtime,
         )
-        self._workers[RECORDER] = Worker(
+        return Worker(
             RECORDER, recorder.record, what, self._rings, self._tags, self._counters[RECORDER], self._others()
         )
-        if plan.watch is not None:
-            self._workers[WATCHER] = Worker(
-                WATCHER, watcher.watch, plan.watch, self._rings, self._counters[WATCHER]
-            )
-        for name, arms in plan.grabbers.items():
-            tasks = [(self._grabber_plan(arm), self._rings[arm], self._counters[arm]) for arm in arms]
-            self._workers[name] = Worker(f"grabber {name}", grabber.grab, *tasks)
+
+    def _new_watcher(self) -> Worker:
+        counters = self._counters[WATCHER]
+        for arm in ARMS:
+            counters[f"verdict_{arm}"] = 0
+        return Worker(WATCHER, watcher.watch, self._plan.watch, self._rings, counters)
+
+    def _new_grabber(self, name: str, *, successor: bool = False) -> Worker:
+        tasks = [
+            (replace(self._grabber_plan(arm), successor=successor), self._rings[arm], self._counters[arm])
+            for arm in self._plan.grabbers[name]
+        ]
+        return Worker(f"grabber {name}", grabber.grab, *tasks)
+
+    def _next_recorder(self) -> Worker:
+        recorded = self._counters[RECORDER]
+        for arm in ARMS:  # what was written and not committed is in no recording
+            lines = max(0, recorded[f"rows_{arm}"] - recorded["committed"])
+            recorded.add(f"stored_{arm}", -lines)
+            recorded.add(f"discarded_{arm}", lines)
+        worker = self._new_recorder()
+        worker.post(RunStarted(self.clock))
+        return worker
+
+    def _next_grabber(self, name: str) -> Worker | None:
+        """Only a camera that tells time can be numbered again."""
+        arms = self._plan.grabbers[name]
+        self._settle_books(arms)
+        if not all(self._counters[arm]["stamp_ns"] for arm in arms):
+            return None
+        return self._new_grabber(name, successor=True)
 
     def _others(self) -> dict[str, Counters]:
         return {name: counters for name, counters in self._counters.items() if name != RECORDER}
@@ -261,6 +297,7 @@ class Capture:
             ring={arm: self._ring_counts(arm) for arm in ARMS},
             lines={arm: self._line_counts(arm, began=began is not None) for arm in ARMS},
             fault=supervisor.fault,
+            pids={name: pid for name, pid in self.pids.items() if pid is not None},
         )
         if began is None:
             return status
@@ -269,6 +306,7 @@ class Capture:
             recording=supervisor.recording,
             draining=supervisor.recording and bool(counters["draining"]),
             done=sealed is not None,
+            path=None if supervisor.path is None else str(supervisor.path),
             first_line=began.first_line,
             recorded_lines=counters["recorded"],
             committed_lines=counters["committed"],
@@ -287,7 +325,11 @@ class Capture:
         return {
             str(Cause.CAMERA): grabbed[Cause.CAMERA],
             str(Cause.RING_FULL): self._rings[arm].statistics().dropped_lines,
-            **{str(cause): grabbed[cause] for cause in grabber.CAMERA_CAUSES[1:] if grabbed[cause]},
+            **{
+                str(cause): grabbed[cause]
+                for cause in (*grabber.CAMERA_CAUSES[1:], Cause.GRABBER_LOST)
+                if grabbed[cause]
+            },
         }
 
     def _account(self, arm: str, supervisor: Supervisor) -> ArmLedger:
@@ -361,8 +403,14 @@ class Capture:
             worker.post(Quit())
         _run_all(*(partial(worker.end, deadline) for worker in order))
 
+    def _settle_books(self, arms: tuple[str, ...]) -> None:
+        for arm in arms:
+            grabber.settle_books(self._rings[arm], self._counters[arm])
+
     def _empty_rings(self) -> None:
         """Nobody will take what the last of the grabbers left."""
+        for name in self._supervisor.dead if self._supervisor else ():
+            self._settle_books(self._plan.grabbers.get(name, ()))
         for arm, ring in self._rings.items():
             self._left_over[arm] = ring.empty()
         self._emptied = True

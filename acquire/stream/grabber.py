@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.camera.base import CameraLoss, LossCause
+from acquire.camera.base import LossCause
 from acquire.errors import AcquireError, CameraError, CameraLostError
 from acquire.lines import LineFlag
 from acquire.stream.lineclock import LineClock
@@ -28,14 +28,15 @@ from acquire.stream.process import become_urgent
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from acquire.camera.base import Camera, CameraBlock, CameraOpener
+    from acquire.camera.base import Camera, CameraBlock, CameraLoss, CameraOpener
     from acquire.stream.process import Mailbox
     from acquire.stream.ring import Ring
     from acquire.stream.shared import Counters
 
 CAMERA_CAUSES = (Cause.CAMERA, *(Cause(cause) for cause in LossCause))
 COUNTERS = (
-    "delivered", "preroll", *CAMERA_CAUSES, "next_line", "reopened", "stamp_line", "stamp_ns", "drift_ppb",
+    "delivered", "preroll", *CAMERA_CAUSES, Cause.GRABBER_LOST,
+    "next_line", "reopened", "stamp_line", "stamp_ns", "drift_ppb",
 )  # fmt: skip
 """Lines since arm: delivered by the camera (preroll included), discarded as preroll, lost by cause; the line
 that comes next. How often the camera was opened again; a line and its time by the camera's clock, and how
@@ -54,7 +55,8 @@ class GrabberPlan:
     A jump of the camera's count by more than ``max_jump_lines`` is a broken count, not a loss. A camera that
     is gone is waited for as long as ``reopen_timeout_s``; ``line_period_ns`` is the trigger's. ``columns``
     are the arm's on a camera that has both arms, None on one of its own. ``realtime``: it runs before
-    everything else on the host, where that is allowed.
+    everything else on the host, where that is allowed. ``successor``: of a grabber that died; its ring and
+    counters are as that one left them.
     """
 
     arm: str
@@ -66,6 +68,7 @@ class GrabberPlan:
     line_period_ns: float = 0.0
     columns: tuple[int, int] | None = None
     realtime: bool = False
+    successor: bool = False
 
 
 def grab(mailbox: Mailbox, *arms: tuple[GrabberPlan, Ring, Counters]) -> None:
@@ -75,11 +78,12 @@ def grab(mailbox: Mailbox, *arms: tuple[GrabberPlan, Ring, Counters]) -> None:
     """
     plan = arms[0][0]
     urgent = plan.realtime and become_urgent()  # first: threads of a driver are as urgent as who starts them
-    camera = plan.opener()
+    camera = _open_again(mailbox, plan, "its grabber died") if plan.successor else plan.opener()
     intakes = [Intake(*arm) for arm in arms]
     try:
         facts = {**camera.settings(), "identity": asdict(camera.identify()), "realtime": urgent}
-        camera.arm()
+        if not plan.successor:
+            camera.arm()
         mailbox.post(Ready(facts))
         while True:
             try:
@@ -97,20 +101,23 @@ def grab(mailbox: Mailbox, *arms: tuple[GrabberPlan, Ring, Counters]) -> None:
 
 
 def _reopen(mailbox: Mailbox, plan: GrabberPlan, camera: Camera, lost: CameraLostError) -> Camera:
-    """The camera, open and armed again; CameraLostError when it does not come back in time."""
-    deadline = time.monotonic() + plan.reopen_timeout_s
+    """The camera, open and armed again."""
     with contextlib.suppress(AcquireError):
         _let_go(camera)
-    while True:
+    return _open_again(mailbox, plan, lost.message)
+
+
+def _open_again(mailbox: Mailbox, plan: GrabberPlan, why: str) -> Camera:
+    """The camera, open and armed; CameraLostError when that does not succeed in time."""
+    deadline = time.monotonic() + plan.reopen_timeout_s
+    while (camera := _try_open(plan)) is None:
         if time.monotonic() >= deadline:
             raise CameraLostError(
-                f"camera {plan.arm} is gone: {lost.message}",
-                hint=f"it was waited for {plan.reopen_timeout_s:g} s",
-            ) from lost
+                f"camera {plan.arm} is gone: {why}", hint=f"it was waited for {plan.reopen_timeout_s:g} s"
+            )
         mailbox.take()
-        if (again := _try_open(plan)) is not None:
-            return again
         time.sleep(_REOPEN_PAUSE_S)
+    return camera
 
 
 def _try_open(plan: GrabberPlan) -> Camera | None:
@@ -148,6 +155,11 @@ def _pump(mailbox: Mailbox, camera: Camera, intakes: list[Intake]) -> None:
             camera.release(block)
 
 
+def settle_books(ring: Ring, counters: Counters) -> None:
+    """For a grabber that died: lines that it had counted, and did not commit, were not delivered."""
+    counters["delivered"] = counters["preroll"] + ring.statistics().dropped_lines + ring.committed_lines
+
+
 class Intake:
     """From camera blocks to ring slots: numbering, preroll, losses, saturation. Single copy, no I/O."""
 
@@ -160,6 +172,17 @@ class Intake:
         self._shift = -plan.depth_lines
         self._clock = LineClock(plan.line_period_ns)
         self._away = False
+        self._away_for = Cause.DEVICE_LOST
+        if plan.successor:
+            self._take_over()
+
+    def _take_over(self) -> None:
+        """Go on for a grabber that died: what comes after its last slot is lost."""
+        ring, counters = self._ring, self._counters
+        self._next = ring.newest_line
+        self._clock.take_over(counters["stamp_line"], counters["stamp_ns"], counters["drift_ppb"])
+        self._away_for = Cause.GRABBER_LOST
+        self.realign()
 
     def realign(self) -> None:
         """The camera was opened again: it counts from 0, and its next time stamp says from which line."""
@@ -171,9 +194,11 @@ class Intake:
         if self._plan.columns is not None:
             block = replace(block, pixels=block.pixels[:, slice(*self._plan.columns)])
         self._check(block)
-        losses = self._come_back(block) if self._away else block.losses
+        if self._away:
+            self._come_back(block)
+            block = replace(block, losses=())
         first = block.first_line + self._shift
-        self._note_jump(first, losses)
+        self._note_jump(first, block.losses)
         if block.time_ns is not None:
             self._stamp(first, block.time_ns)
         count = len(block.flags)
@@ -201,8 +226,8 @@ class Intake:
                 possible=f"(lines, {shape.width}) {shape.dtype} with a flag per line",
             )
 
-    def _come_back(self, block: CameraBlock) -> tuple[CameraLoss, ...]:
-        """Number a camera that was away by its time stamps."""
+    def _come_back(self, block: CameraBlock) -> None:
+        """Number a camera that was away by its time stamps; what it missed is lost."""
         line = None if block.time_ns is None else self._clock.line_at(block.time_ns)
         if line is None:
             raise CameraError(
@@ -211,7 +236,10 @@ class Intake:
             )
         self._away = False
         self._shift = line - block.first_line
-        return (CameraLoss(LossCause.DEVICE_LOST, line - self._next),)
+        if 0 <= line - self._next <= self._plan.max_jump_lines:
+            self._lose(self._next, line - self._next, self._away_for)
+            self._next = line
+        self._away_for = Cause.DEVICE_LOST
 
     def _note_jump(self, first: int, losses: tuple[CameraLoss, ...]) -> None:
         jump = first - self._next

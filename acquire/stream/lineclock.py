@@ -38,6 +38,12 @@ class LineClock:
         self._last: Stamp | None = None
         self._jitter_ns = 0.0
 
+    def take_over(self, line: int, time_ns: int, drift_ppb: int) -> None:
+        """Go on for a clock that had noted ``line`` last, and knew the drift."""
+        period_ns = self._nominal_ns * (1 + drift_ppb / 1e9)
+        self._first = self._middle = Stamp(line - _FRESH_LINES, time_ns - round(_FRESH_LINES * period_ns))
+        self._last = Stamp(line, time_ns)
+
     def note(self, line: int, time_ns: int) -> None:
         """A block that began at ``line``. Stamps come in order."""
         stamp = Stamp(line, time_ns)

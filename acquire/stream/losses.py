@@ -22,6 +22,8 @@ class Cause(StrEnum):
     MISSED_TRIGGER = LossCause.MISSED_TRIGGER.value
     DEVICE_LOST = LossCause.DEVICE_LOST.value
     """What the camera told: see `acquire.camera.base.LossCause`."""
+    GRABBER_LOST = "grabber_lost"
+    """The grabber's process died; another took its place."""
     RING_FULL = "ring_full"
     """The recorder was late: the grabber found no free slot."""
     MIXED = "mixed"

@@ -127,6 +127,7 @@ class CaptureStatus:
     recording : a recording is being written
     draining : its last line is known
     done : the latest recording is closed; ``condition``, ``end_reason`` and ``ledger`` are final
+    path : of the latest recording; another than was asked for, when its recorder was killed and replaced
     first_line : the trigger's number of its row 0, or None before the first recording
     recorded_lines, committed_lines : rows that both arms have; rows that a reader finds
     ring : arm → slots, fill, peak, drops (blocks), dropped_lines, all since arm
@@ -138,17 +139,20 @@ class CaptureStatus:
         ``check`` of the code, where it is made: verdict, shift, and the line after the last looked at
     accounts : arm → what became of every pulse since arm
     fault : what failed first, or None
+    pids : process numbers: of the recorder, and of each grabber
     """
 
     recording: bool = False
     draining: bool = False
     done: bool = False
+    path: str | None = None
     first_line: int | None = None
     recorded_lines: int = 0
     committed_lines: int = 0
     ring: dict[str, dict[str, int]] = field(default_factory=dict)
     lines: dict[str, dict[str, Any]] = field(default_factory=dict)
     fault: str | None = None
+    pids: dict[str, int] = field(default_factory=dict)
     condition: RunCondition | None = None
     end_reason: str | None = None
     ledger: dict[str, Any] = field(default_factory=dict)

@@ -55,11 +55,13 @@ if TYPE_CHECKING:
 
 COUNTERS = (
     *("recorded", "committed", "draining", "rows_a", "rows_b", "missing_a", "missing_b"),
-    *("discarded_a", "discarded_b", "stored_a", "stored_b", "turns"),
+    *("discarded_a", "discarded_b", "stored_a", "stored_b", "turns", "awaited_a", "awaited_b"),
 )
 """Of the latest recording: rows in both arms, rows that a reader finds, whether its last line is known; per
 arm the rows written and those of them that are missing. Since armed: per arm the lines taken from its ring
-that no recording holds, and those that one does; turns of the loop, which stand still when it hangs."""
+that no recording holds, and those that one does; turns of the loop, which stand still when it hangs. The
+owner alone counts how often it has seen that an arm's next grabber is only starting: its silence means
+nothing then."""
 
 _WAIT_S = 0.02
 _COMMIT_INTERVAL_S = 0.1
@@ -310,7 +312,7 @@ class Recorder:
 
     def _drain(self, name: str, arm: Arm) -> bool:
         """Take what the arm has, some blocks at most; says whether there was any."""
-        arm.watch(time.monotonic())
+        arm.watch(time.monotonic(), self._counters[f"awaited_{name}"])
         if self._opening is not None and self._opening.span is not None:
             return False  # it waits for the recording
         for taken in range(_BLOCKS_PER_TURN):

@@ -4,7 +4,7 @@ observers that it does not.
 ::
 
     control   head peak drops newest | tail | cursor peak lost | …   words of 8 bytes, a cache line per writer
-    headers   sequence first_line count time losses                     one per slot
+    headers   sequence first_line count time total losses               one per slot
     flags     (slot, row) uint16
     pixels    (slot, row, pixel)
 
@@ -52,7 +52,7 @@ _HEAD, _PEAK, _DROPPED_BLOCKS, _DROPPED_LINES, _NEWEST = range(5)
 _TAIL = 8
 _OBSERVERS = 16
 _LINE_WORDS = 8
-_SEQUENCE, _FIRST_LINE, _COUNT, _TIME_NS, _LOSS_COUNT, _LOSSES = range(6)
+_SEQUENCE, _FIRST_LINE, _COUNT, _TIME_NS, _TOTAL, _LOSS_COUNT, _LOSSES = range(7)
 _HEADER_WORDS = 32
 _PAGE_BYTES = 4096
 _CAUSES = tuple(Cause)
@@ -182,10 +182,10 @@ class Ring:
 
     def commit(self, first_line: int, count: int, losses: Sequence[Loss] = ()) -> None:
         """Hand the claimed slot's first ``count`` rows over, as lines from ``first_line``."""
-        head = self._control[_HEAD]
+        head, total = self._control[_HEAD], self.committed_lines + count
         header = self._headers[head % self.shape.slots]
         header[_FIRST_LINE], header[_COUNT] = first_line, count
-        header[_TIME_NS] = time.monotonic_ns()
+        header[_TIME_NS], header[_TOTAL] = time.monotonic_ns(), total
         _write_losses(header, losses)
         header[_SEQUENCE] = 2 * head + 2
         self._control[_NEWEST] = first_line + count
@@ -259,6 +259,12 @@ class Ring:
     def newest_line(self) -> int:
         """The line after the last committed one; 0 before the first."""
         return int(self._control[_NEWEST])
+
+    @property
+    def committed_lines(self) -> int:
+        """Lines that were committed so far; right after a producer's death at any instant, too."""
+        head = self._control[_HEAD]
+        return int(self._header(head - 1)[_TOTAL]) if head else 0
 
     @property
     def history_line(self) -> int:

@@ -39,12 +39,13 @@ class Arm:
         self.ring = ring
         self.alive_s = time.monotonic()
         self._newest = ring.newest_line
+        self._awaited = 0
 
-    def watch(self, now_s: float) -> None:
-        """Note life: something new, or something that still waits to be taken."""
+    def watch(self, now_s: float, awaited: int = 0) -> None:
+        """Note life: something new, something that still waits to be taken, or that ``awaited`` has grown."""
         newest = self.ring.newest_line
-        if newest != self._newest or self.ring.fill:
-            self._newest = newest
+        if newest != self._newest or self.ring.fill or awaited != self._awaited:
+            self._newest, self._awaited = newest, awaited
             self.alive_s = now_s
 
     def revive(self, now_s: float) -> None:

@@ -12,13 +12,25 @@ from typing import TYPE_CHECKING
 
 from acquire.errors import AcquireError, DeviceError, TriggerError
 from acquire.lines import ARMS
-from acquire.stream.messages import Began, Checked, Failed, Interrupt, Note, Refused, Sealed
+from acquire.stream.messages import (
+    Began,
+    Checked,
+    End,
+    Failed,
+    Interrupt,
+    Note,
+    Ready,
+    Refused,
+    Sealed,
+)
 from acquire.stream.stalls import Excess, Heartbeat
+from acquire.stream.succession import Succession, continuation, obituary
 from acquire.stream.tagger import tag_rows
 from acquire.stream.witness import TRIGGER, TRIGGER_COUNTERS, WATCHER
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from pathlib import Path
 
     from acquire.stream.messages import Begin
     from acquire.stream.process import Worker
@@ -46,6 +58,7 @@ class Supervisor:
     began : the answer to the latest `begin`, unless that was refused
     sealed : how the latest recording ended
     fault : what failed first
+    path : where the latest recording is: not where it was begun, if its recorder was killed meanwhile
     """
 
     def __init__(
@@ -57,12 +70,18 @@ class Supervisor:
         stall_timeout_s: float,
         margin_lines: int | None = None,
         grabbers: Mapping[str, tuple[str, ...]] | None = None,
+        succession: Succession | None = None,
     ) -> None:
         self.began: Began | None = None
         self.sealed: Sealed | None = None
         self.fault: str | None = None
+        self.path: Path | None = None
         self._trigger = trigger
         self._workers = workers
+        self._succession = succession or Succession({})
+        self._counters = counters
+        self._begin: Begin | None = None
+        self._end_reason: str | None = None
         self._tags = tags
         self._stall_timeout_s = stall_timeout_s
         self._loop = Heartbeat(counters[RECORDER], "turns")
@@ -91,6 +110,11 @@ class Supervisor:
         """Issued by the trigger, as far as its tags tell."""
         return 0 if self._newest_pulse is None else self._newest_pulse + 1
 
+    @property
+    def dead(self) -> frozenset[str]:
+        """Processes that died, and whose place nobody took."""
+        return frozenset(self._dead)
+
     def start(self) -> None:
         self._thread.start()
 
@@ -107,16 +131,22 @@ class Supervisor:
     def begin(self, message: Begin) -> None:
         """Have the recorder begin; returns when it has. Raises what it refuses with."""
         with self._news:
-            self.began = self.sealed = self._refused = None
+            self.began = self.sealed = self._refused = self._begin = self._end_reason = None
             self._workers[RECORDER].post(message)
             self._news.wait_for(lambda: self.began or self._refused or self.fault, _ANSWER_S)
             if self.began is not None:
+                self._begin, self.path = message, message.path
                 return
             if self._refused is not None:
                 raise self._refused.error
         if self.fault is None:
             self._fail(f"recorder: no answer within {_ANSWER_S:g} s")
         raise DeviceError(f"start: {self.fault}")
+
+    def end_recording(self, reason: str) -> None:
+        """Have the recording end at the newest line; a recorder that is only starting will hear of it."""
+        self._end_reason = reason
+        self._workers[RECORDER].post(End(reason))
 
     def happened(self, note: Note) -> None:
         """Tell the recorder, and whoever asks with `take_events`."""
@@ -192,6 +222,7 @@ class Supervisor:
     def _watch(self, now_s: float) -> None:
         """A recorder that hangs is a fault. So is a silent arm; in a recording, the recorder judges it."""
         limit_s = self._stall_timeout_s
+        self._bear_with_successors()
         if self._loop.look(now_s) > limit_s:
             self._fail(f"{self._workers[RECORDER].name}: no sign of life for {limit_s:g} s")
         self._watch_counts(now_s)
@@ -203,6 +234,16 @@ class Supervisor:
             # Arms that fall silent together do so to within a block: half the limit tells both from one.
             arms = " and ".join(arm for arm in ARMS if silent_s[arm] > limit_s / 2)
             self._fail(f"arm {arms}: no line for {limit_s:g} s")
+
+    def _bear_with_successors(self) -> None:
+        for name in self._workers:
+            if self._succession.is_late(name):
+                self._fail(f"{self._workers[name].name}: its successor was not ready in time", name)
+            elif self._succession.is_starting(name):
+                self._loop.revive()
+                for arm in self._arms_of.get(name, ()):
+                    self._cameras[arm].revive()
+                    self._counters[RECORDER].add(f"awaited_{arm}", 1)
 
     def _watch_counts(self, now_s: float) -> None:
         pulse = self._newest_pulse
@@ -218,6 +259,8 @@ class Supervisor:
         while (message := worker.message()) is not None:
             self._note(name, message)
         if death and name not in self._dead:
+            if name not in self._last_words and self._succeed(name, worker, death):
+                return
             self._dead.add(name)
             if name == WATCHER:
                 self._lose_watcher(self._last_words.get(name, death))
@@ -230,11 +273,39 @@ class Supervisor:
             self._counters[WATCHER][f"verdict_{arm}"] = 0
         self.happened(Note((self._newest_pulse or 0) + 1, "unwatched", f"watcher: {why}"))
 
+    def _succeed(self, name: str, worker: Worker, death: str) -> bool:
+        """Put another process in the place of one that was killed."""
+        if self.fault is not None or self._ending.is_set():
+            return False
+        successor = self._succession.successor(name)
+        if successor is None:
+            return False
+        self._workers[name] = successor
+        worker.end(time.monotonic())
+        for arm in self._arms_of.get(name, ()):
+            self._cameras[arm].revive()
+        self._loop.revive()
+        if name == RECORDER and self._begin is not None and self.began is not None and self.sealed is None:
+            committed = self._counters[RECORDER]["committed"]
+            self._begin = continuation(self._begin, self.began.first_line, committed, death)
+            self.path = self._begin.path
+            successor.post(self._begin)
+        newest = max(self._counters[arm]["next_line"] for arm in ARMS)
+        self.happened(obituary(worker.name, death, max(newest, 0)))
+        return True
+
     def _note(self, name: str, message: object) -> None:
         with self._news:
             match message:
+                case Ready():
+                    self._succession.ready(name)
                 case Began():
                     self.began = message
+                    if self._end_reason is not None:
+                        self._workers[RECORDER].post(End(self._end_reason))
+                case Refused(error) if self._begin is not None:
+                    self._last_words[name] = f"the recording cannot go on: {error}"
+                    self.fault = self.fault or f"{self._workers[name].name}: {self._last_words[name]}"
                 case Refused():
                     self._refused = message
                 case Sealed():

@@ -49,7 +49,7 @@ pixel_format = "Mono12"
 responsivity_dn = 40.0
 [stream]
 block_lines = 64
-ring_slots = 64
+ring_slots = 1024
 [recording]
 directory = "{directory}"
 chunk_lines = 256

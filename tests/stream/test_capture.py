@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -327,7 +326,8 @@ def test_a_camera_that_does_not_wait_for_the_trigger_is_a_fault() -> None:
         assert "the camera does not wait for it" in str(capture.poll().fault)
 
 
-def test_a_killed_recorder_leaves_what_was_committed(tmp_path: Path) -> None:
+def test_a_killed_recorder_leaves_what_was_committed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("acquire.stream.succession.MOST", 0)  # nobody takes its place
     with armed(make_bench()) as capture:
         capture.start(tmp_path / "r.zarr", make_spec())
         until(lambda: capture.poll().committed_lines > 1000, "commits")
@@ -382,7 +382,7 @@ def test_close_seals_what_is_being_recorded(tmp_path: Path) -> None:
 def test_a_write_error_aborts_and_the_rings_are_emptied_all_the_same(tmp_path: Path) -> None:
     with armed(make_bench()) as capture:
         record_until(capture, tmp_path / "r.zarr", 1000)
-        shutil.rmtree(tmp_path / "r.zarr")
+        (tmp_path / "r.zarr").rename(tmp_path / "away.zarr")
         status = sealed(capture)
         assert status.condition is RunCondition.ABORTED
         assert status.end_reason is not None
@@ -454,7 +454,7 @@ def test_arm_undoes_everything_when_something_fails(fault: str, kind: type[Acqui
     bench.trigger.refuse = fault == "trigger"
     capture = Capture(bench.plan, bench.trigger)
     with pytest.raises(kind) as failure:
-        capture.arm(timeout_s=3.0)
+        capture.arm(timeout_s=10.0 if fault == "hang" else 60.0)
     assert str(failure.value) == text
     assert bench.trigger.stops == (fault == "trigger")
     assert capture.poll() == CaptureStatus()

@@ -1,0 +1,101 @@
+"""Who takes the place of a process that was killed, how often, and how the recording goes on.
+
+::
+
+    grabber killed   ─▶ another opens the camera; the line it goes on with follows from the time stamps,
+                        and what came between is a gap, `Cause.GRABBER_LOST`
+    recorder killed  ─▶ another begins a recording beside the one that was cut off, from the first line on
+                        that this one's last commit does not cover, as far as the ring still holds it
+
+A process that ended with a word of its own (an error of its camera, a full disk) has said why it cannot go
+on; nobody takes its place.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from acquire.stream.messages import Note
+from acquire.stream.window import Window
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+
+    from acquire.stream.messages import Begin
+    from acquire.stream.process import Worker
+
+MOST = 5
+"""Successors of one process in a run: what dies more often has a reason."""
+READY_S = 20.0
+"""How long a successor may take until it is ready."""
+
+
+@dataclass(slots=True)
+class Line:
+    """The processes that had one place, one after the other."""
+
+    spawn: Callable[[], Worker | None]
+    successors: int = 0
+    ready_by_s: float | None = None
+
+
+class Succession:
+    """The successors of a run's processes.
+
+    Parameters
+    ----------
+    spawn : name → starts a successor; gives None where nobody can go on
+    """
+
+    def __init__(self, spawn: Mapping[str, Callable[[], Worker | None]]) -> None:
+        self._lines = {name: Line(start) for name, start in spawn.items()}
+
+    def successor(self, name: str) -> Worker | None:
+        """A new process in the place of one that was killed, or None."""
+        line = self._lines.get(name)
+        if line is None or line.successors >= MOST:
+            return None
+        worker = line.spawn()
+        if worker is not None:
+            line.successors += 1
+            line.ready_by_s = time.monotonic() + READY_S
+        return worker
+
+    def is_starting(self, name: str) -> bool:
+        """A successor is not ready yet: its silence means nothing."""
+        return self._lines[name].ready_by_s is not None if name in self._lines else False
+
+    def is_late(self, name: str) -> bool:
+        """A successor has not become ready in time."""
+        ready_by_s = self._lines[name].ready_by_s if name in self._lines else None
+        return ready_by_s is not None and time.monotonic() > ready_by_s
+
+    def ready(self, name: str) -> None:
+        """The process has said that it is ready."""
+        if name in self._lines:
+            self._lines[name].ready_by_s = None
+
+
+def continuation(begin: Begin, first_line: int, committed_lines: int, why: str) -> Begin:
+    """What has a recorder go on with a recording that was cut off after ``committed_lines`` lines."""
+    at = first_line + committed_lines
+    left = None if begin.lines is None else max(1, begin.lines - committed_lines)
+    text = f"goes on from {begin.path.name}: its recorder was {why}"
+    window = Window(at, post_lines=left, exact=False, kind="resumed", text=text)
+    return replace(begin, path=free_name(begin.path), lines=None, window=window)
+
+
+def free_name(path: Path) -> Path:
+    """The first of NAME-2, NAME-3 … beside ``path`` that does not exist."""
+    number = 2
+    while (found := path.with_name(f"{path.stem}-{number}{path.suffix}")).exists():
+        number += 1
+    return found
+
+
+def obituary(worker: str, why: str, line: int) -> Note:
+    """The event of a succession."""
+    return Note(line, "fault", f"{worker}: {why}; another took its place")

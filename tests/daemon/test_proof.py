@@ -1,0 +1,87 @@
+"""A run that the host cannot record is refused before anything is touched, with numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from acquire.capacity.parts import Pace, Parts
+from acquire.config import load_rig
+from acquire.daemon import proof
+from acquire.daemon.messages import ArmRequest, CapacityStatus
+from acquire.daemon.proof import Proof
+from acquire.daemon.service import Service
+from acquire.daemon.states import State
+from acquire.errors import UsageError
+
+
+@pytest.fixture
+def measured(monkeypatch: pytest.MonkeyPatch) -> dict[str, float]:
+    """A host whose recorder takes ``rate`` lines per second; how often it was asked."""
+    found = {"rate": 1e6, "times": 0}
+
+    def measure(load: object, directory: Path) -> Parts:
+        found["times"] += 1
+        fast, slow = Pace(1e9, 1e-9), Pace(found["rate"], 1e-9)
+        return Parts(load, ring=fast, codec=fast, recorder=slow, cores=2)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(proof, "measure_parts", measure)
+    return found
+
+
+def make_proof(directory: Path) -> Proof:
+    return Proof(load_rig("rig-demo", {"recording.directory": str(directory)}))
+
+
+def test_enough_is_told_and_measured_once(measured: dict[str, float], tmp_path: Path) -> None:
+    prove = make_proof(tmp_path)
+    for _ in range(3):
+        found = prove(force=False)
+        assert (found.sustained_hz, found.limit, found.warning) == (1_000_000, "recorder", None)
+    assert measured["times"] == 1
+
+
+def test_what_is_old_is_measured_again(
+    measured: dict[str, float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prove = make_proof(tmp_path)
+    prove(force=False)
+    monkeypatch.setattr(proof, "VALID_S", 0.0)
+    prove(force=False)
+    assert measured["times"] == 2
+
+
+def test_a_rate_above_it_is_refused_unless_forced(measured: dict[str, float], tmp_path: Path) -> None:
+    measured["rate"] = 20_000.0
+    prove = make_proof(tmp_path)
+    with pytest.raises(UsageError) as refused:
+        prove(force=False)
+    assert "33333.3 lines/s" in refused.value.message
+    assert "2e+04 lines/s, limited by recorder" in refused.value.possible
+    assert "--force" in refused.value.hint
+    assert "33333.3" in str(prove(force=True).warning)
+
+
+def test_a_rate_close_to_it_is_a_warning(measured: dict[str, float], tmp_path: Path) -> None:
+    measured["rate"] = 40_000.0
+    assert "limited by recorder" in str(make_proof(tmp_path)(force=False).warning)
+
+
+def test_where_nothing_can_be_written_nothing_is_proved(tmp_path: Path) -> None:
+    found = make_proof(tmp_path / "absent")(force=False)
+    assert found.sustained_hz is None
+    assert "does not exist" in str(found.warning)
+
+
+def test_the_service_stays_idle_and_asks_no_device(tmp_path: Path) -> None:
+    def too_slow(*, force: bool) -> CapacityStatus:
+        raise UsageError(f"too slow, {force}")
+
+    def no_run() -> None:
+        raise AssertionError("devices were opened")
+
+    service = Service(load_rig("rig-demo"), no_run, too_slow)  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match="too slow, True"):
+        service.arm(ArmRequest(force=True))
+    assert service.status().state is State.IDLE

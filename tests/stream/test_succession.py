@@ -1,0 +1,153 @@
+"""Processes of a run that are killed while it records: others take their place, no line goes unaccounted."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from acquire.config import RigConfig, builtin_directory, load_rig
+from acquire.daemon.plan import Run
+from acquire.lines import ARMS, LineFlag
+from acquire.rig import Rig
+from acquire.sim.pattern import Pattern
+from acquire.store import open_recording
+from acquire.store.recover import recover
+
+WAIT_S = 60.0
+RIG = """
+name = "pattern"
+[geometry]
+stages = 8
+substeps = 2
+[trigger]
+substep_ticks = 4500         # lines at 10 kHz
+tag_every_lines = 64
+[cameras.a]
+driver = "pattern"
+serial = "A"
+[cameras.b]
+driver = "pattern"
+serial = "B"
+[stream]
+block_lines = 64
+ring_slots = 1024
+reopen_s = 20.0
+[recording]
+chunk_lines = 256
+[simulation]
+scene = "{scene}"
+"""
+
+
+@pytest.fixture
+def config(tmp_path: Path) -> RigConfig:
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG.format(scene=builtin_directory() / "scene-leds.toml"))
+    return load_rig(path)
+
+
+@pytest.fixture
+def run(config: RigConfig) -> Iterator[Run]:
+    with Rig(config) as rig:
+        run = Run(config, rig)
+        try:
+            run.arm()
+            yield run
+        finally:
+            run.close()
+
+
+def until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def kill(run: Run, name: str) -> int:
+    pid = run._capture.pids[name]
+    assert pid is not None
+    os.kill(pid, signal.SIGKILL)
+    return pid
+
+
+def check(path: Path) -> set[str]:
+    """Every row holds its line, or is flagged and listed; the causes of what is missing."""
+    recording = open_recording(path)
+    listed = {arm: np.zeros(recording.lines, bool) for arm in ARMS}
+    for gap in recording.gaps:
+        first = gap.first_line - recording.first_line
+        listed[gap.arm][first : first + gap.count] = True
+    for arm in ARMS:
+        stream = recording.camera(arm)
+        missing = (stream.flags[:] & LineFlag.MISSING) != 0
+        np.testing.assert_array_equal(missing, listed[arm])
+        expected = Pattern(arm, 8, "uint16", 4095).lines(recording.first_line, recording.lines).copy()
+        expected[missing] = 0
+        np.testing.assert_array_equal(stream.lines[:], expected)
+    return {gap.cause for gap in recording.gaps}
+
+
+def check_books(run: Run) -> None:
+    for arm in run.poll().lines.values():
+        told = arm["preroll"] + arm["lost"]["ring_full"] + arm["discarded"] + arm["recorded"] - arm["missing"]
+        assert arm["delivered"] == told
+
+
+def test_a_grabber_that_is_killed_is_replaced_and_the_gap_is_recorded(run, tmp_path):
+    run.start(tmp_path / "r.zarr", None)
+    until(lambda: run.poll().recorded_lines > 2000)
+    kill(run, "b")
+    until(lambda: run.poll().lines["b"]["reopened"] == 1)
+    goal = run.poll().recorded_lines + 3000
+    until(lambda: run.poll().recorded_lines > goal)
+    assert run.poll().fault is None
+    run.stop("stopped")
+    until(lambda: run.poll().done)
+    run.close()
+    assert run.poll().condition == "INCOMPLETE"
+    assert check(tmp_path / "r.zarr") == {"grabber_lost"}
+    check_books(run)
+    assert any("another took its place" in event.text for event in open_recording(tmp_path / "r.zarr").events)
+
+
+def test_a_recorder_that_is_killed_is_replaced_and_no_line_is_lost(run, tmp_path):
+    lines = 30_000
+    run.start(tmp_path / "r.zarr", lines)
+    until(lambda: run.poll().committed_lines > 2000)
+    first = run.poll().first_line
+    kill(run, "recorder")
+    until(lambda: run.poll().done)
+    seen = run.poll()
+    assert seen.fault is None
+    assert seen.path == str(tmp_path / "r-2.zarr")
+    recover(tmp_path / "r.zarr")
+    one, two = (open_recording(tmp_path / name) for name in ("r.zarr", "r-2.zarr"))
+    assert one.first_line == first
+    assert one.first_line < two.first_line <= one.first_line + one.lines
+    assert two.first_line + two.lines == first + lines
+    assert check(tmp_path / "r.zarr") == check(tmp_path / "r-2.zarr") == set()
+    assert seen.condition == "GOOD"
+    assert any(event.kind == "resumed" and "SIGKILL" in event.text for event in two.events)
+
+
+def test_what_is_killed_again_and_again_is_given_up(run, tmp_path, monkeypatch):
+    monkeypatch.setattr("acquire.stream.succession.MOST", 1)
+    run.start(tmp_path / "r.zarr", None)
+    first = kill(run, "a")
+    until(lambda: run.poll().lines["a"]["reopened"] == 1)
+    assert run._capture.pids["a"] != first
+    kill(run, "a")
+    until(lambda: run.poll().fault is not None)
+    assert "killed by SIGKILL" in run.poll().fault
+    until(lambda: run.poll().done)
+    run.close()
+    assert run.poll().condition == "INTERRUPTED"
+    check(tmp_path / "r.zarr")
+    check_books(run)
