@@ -2,16 +2,19 @@
 
 ::
 
-    camera a ─▶ grabber a ─▶ ring a ─┐
-    camera b ─▶ grabber b ─▶ ring b ─┼─▶ recorder ─▶ Zarr
-    trigger  ─▶ supervisor ─▶ tags ──┘   (session, tagger)
+    camera a ─▶ grabber a ─▶ ring a ─┬──────▶ recorder ─▶ Zarr
+    camera b ─▶ grabber b ─▶ ring b ─┤   ┌──▶ (session, tagger)
+    trigger  ─▶ supervisor ─▶ tags ──┼───┘       ▲ verdicts
+                    ▲                └··▶ watcher┘
+                    └── events ─────────────┘     (check of the code, thresholds)
 
-Grabbers and recorder are processes, the supervisor is a thread; `Capture` owns them all. Rings are shared
-memory: nothing between a camera's buffer and the recorder's is sent, and nothing waits for a reader.
+Grabbers, recorder and watcher are processes, the supervisor is a thread; `Capture` owns them all. Rings are
+shared memory: nothing between a camera's buffer and the recorder's is sent, and no camera waits for a reader.
 
 `shared` memory, counters · `losses` causes · `ring` · `observer` of a ring · `process` children and their
 pipe · `messages` · `grabber` · `tagger` · `window` of lines around an event · `session` one recording ·
-`recorder` · `plan` · `supervisor` · `capture`
+`recorder` · `lightcheck`, `threshold`, `watcher` · `witness` what others counted · `ledger` of every pulse ·
+`plan` · `succession` of what was killed · `supervisor` · `capture`
 """
 
 from acquire.stream.capture import Capture

@@ -198,7 +198,7 @@ class Capture:
             self._plan.margin_lines,
             self._plan.grabbers,
             Succession(
-                {RECORDER: self._next_recorder}
+                {RECORDER: self._next_recorder, WATCHER: self._new_watcher}
                 | {name: partial(self._next_grabber, name) for name in self._plan.grabbers}
             ),
         )
@@ -217,9 +217,7 @@ class Capture:
     def _spawn(self) -> None:
         self._workers[RECORDER] = self._new_recorder()
         if self._plan.watch is not None:
-            self._workers[WATCHER] = Worker(
-                WATCHER, watcher.watch, self._plan.watch, self._rings, self._counters[WATCHER]
-            )
+            self._workers[WATCHER] = self._new_watcher()
         for name in self._plan.grabbers:
             self._workers[name] = self._new_grabber(name)
 
@@ -236,6 +234,12 @@ class Capture:
         return Worker(
             RECORDER, recorder.record, what, self._rings, self._tags, self._counters[RECORDER], self._others()
         )
+
+    def _new_watcher(self) -> Worker:
+        counters = self._counters[WATCHER]
+        for arm in ARMS:
+            counters[f"verdict_{arm}"] = 0
+        return Worker(WATCHER, watcher.watch, self._plan.watch, self._rings, counters)
 
     def _new_grabber(self, name: str, *, successor: bool = False) -> Worker:
         tasks = [

@@ -257,6 +257,12 @@ class Supervisor:
                 return
             self._fail(f"{worker.name}: {self._last_words.get(name, death)}", name)
 
+    def _lose_watcher(self, why: str) -> None:
+        """Lines come and are recorded all the same; what it said last does not hold for them."""
+        for arm in ARMS:
+            self._counters[WATCHER][f"verdict_{arm}"] = 0
+        self.happened(Note((self._newest_pulse or 0) + 1, "unwatched", f"watcher: {why}"))
+
     def _succeed(self, name: str, worker: Worker, death: str) -> bool:
         """Put another process in the place of one that was killed."""
         if self.fault is not None or self._ending.is_set():
@@ -277,12 +283,6 @@ class Supervisor:
         newest = max(self._counters[arm]["next_line"] for arm in ARMS)
         self.happened(obituary(worker.name, death, max(newest, 0)))
         return True
-
-    def _lose_watcher(self, why: str) -> None:
-        """Lines come and are recorded all the same; what it said last does not hold for them."""
-        for arm in ARMS:
-            self._counters[WATCHER][f"verdict_{arm}"] = 0
-        self.happened(Note((self._newest_pulse or 0) + 1, "unwatched", f"watcher: {why}"))
 
     def _note(self, name: str, message: object) -> None:
         with self._news:

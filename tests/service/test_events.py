@@ -21,7 +21,8 @@ from acquire.rig import Rig
 from acquire.store import Recording, open_recording
 
 PATIENCE_S = 60.0
-SETTINGS = {"stream.ring_seconds": 4.0, "recording.chunk_lines": 256}
+SETTINGS = {"stream.ring_seconds": 4.0, "stream.reopen_s": 30.0, "recording.chunk_lines": 256}
+"""Patience with cameras that compute their lines on a busy machine: an arm stalls after ``reopen_s``."""
 
 
 @contextmanager
