@@ -454,7 +454,7 @@ def test_arm_undoes_everything_when_something_fails(fault: str, kind: type[Acqui
     bench.trigger.refuse = fault == "trigger"
     capture = Capture(bench.plan, bench.trigger)
     with pytest.raises(kind) as failure:
-        capture.arm(timeout_s=3.0)
+        capture.arm(timeout_s=6.0)
     assert str(failure.value) == text
     assert bench.trigger.stops == (fault == "trigger")
     assert capture.poll() == CaptureStatus()
