@@ -36,7 +36,7 @@ driver = "pattern"
 serial = "B"
 [stream]
 block_lines = 64
-ring_slots = 1024
+ring_slots = 4096            # half a minute: a busy host takes its time to start a process
 reopen_s = 20.0
 [recording]
 chunk_lines = 256
