@@ -11,24 +11,20 @@ import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_validator
 
 from acquire.codes import TAPS, Code, ConstantCode, PrbsCode, mix_seed
+from acquire.device_config import CamerasConfig, TriggerConfig
+from acquire.effect_config import FrozenModel
 from acquire.errors import ConfigError
 from acquire.event_config import CheckConfig, EventsConfig
 from acquire.geometry import Geometry
 from acquire.plan_config import ReconstructionPlan
+from acquire.recording_config import RecordingConfig
 from acquire.scene_config import SceneConfig, SceneFile, VideoSceneConfig, anchored
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
-
-PIXEL_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16}
-"""SFNC PixelFormat → significant bits of an (unpacked) pixel."""
-
-
-GentlModule = Literal["remote", "interface", "device", "stream", "system"]
-"""Where a camera's features are: in the camera itself, or in a module of the host's side."""
 
 RING_RESERVE_SHARE = 4
 """Of the ring's slots, one part in so many stays free for the cameras while a recording takes the past."""
@@ -46,11 +42,7 @@ def default_socket() -> Path:
     return Path(runtime) / "acquire.sock" if runtime else Path(f"/tmp/acquire-{os.getuid()}.sock")  # noqa: S108
 
 
-class _Model(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class GeometryConfig(_Model):
+class GeometryConfig(FrozenModel):
     """The sensor as the model sees it."""
 
     stages: int = Field(ge=1, le=4096, description="M, TDI stages; also pixels per line")
@@ -60,7 +52,7 @@ class GeometryConfig(_Model):
         return Geometry(self.stages, self.substeps, lines)
 
 
-class PrbsConfig(_Model):
+class PrbsConfig(FrozenModel):
     """Maximal-length pseudo-random exposure code."""
 
     kind: Literal["prbs"] = "prbs"
@@ -83,7 +75,7 @@ class PrbsConfig(_Model):
         return PrbsCode(self.degree, state)
 
 
-class ConstantCodeConfig(_Model):
+class ConstantCodeConfig(FrozenModel):
     """Light always on or off."""
 
     kind: Literal["constant"]
@@ -93,142 +85,7 @@ class ConstantCodeConfig(_Model):
         return ConstantCode(self.value)
 
 
-class LineOutputConfig(_Model):
-    """The line trigger of one camera, in ticks of the trigger's clock."""
-
-    enable: bool = True
-    delay_ticks: int = Field(default=0, ge=0, lt=2**24, description="from the line's start to the pulse")
-    width_ticks: int | None = Field(
-        default=None, ge=1, lt=2**24, description="absent: a third of the distance of pulses, at most 90"
-    )
-    active: Literal["high", "low"] = "high"
-    direction: Literal["forward", "reverse"] = "forward"
-    strobe: bool = Field(default=False, description="the camera answers every pulse: count those it misses")
-
-
-class LightOutputConfig(_Model):
-    """The LED output: code bit AND window AND scene gate."""
-
-    enable: bool = True
-    lead_ticks: int = Field(default=0, ge=0, le=255, description="by which light precedes its sub-step")
-    open_ticks: int = Field(default=0, ge=0, lt=2**24, description="of a sub-step, from which light may be")
-    close_ticks: int | None = Field(
-        default=None, ge=1, lt=2**24, description="from which it may not; absent: the sub-step's end"
-    )
-    scene_gate: bool = Field(default=False, description="only while the scene gate input allows it")
-    active: Literal["high", "low"] = "high"
-
-
-class TriggerConfig(_Model):
-    """The sync trigger and its timing."""
-
-    driver: Literal["simulated", "rtl", "serial", "usb"] = "simulated"
-    url: str = Field(default="", description="driver 'serial': /dev/tty…, socket://host:port")
-    baud: int = Field(default=3_000_000, ge=9600, description="driver 'serial'")
-    flow_control: Literal["none", "rts-cts"] = Field(
-        default="none", description="driver 'serial'; 'rts-cts' where the board wires both lines"
-    )
-    serial: str = Field(default="", description="driver 'usb': serial number; absent: any")
-    clock_hz: int = Field(default=90_000_000, ge=1_000_000, le=1_000_000_000)
-    substep_ticks: int = Field(default=900, ge=5, lt=2**24, description="duration of a sub-step in ticks")
-    tag_every_lines: int = Field(default=256, ge=1, le=65536)
-    line_start: Literal["per-line", "per-substep"] = Field(
-        default="per-line", description="when the cameras are triggered"
-    )
-    camera_min_period_ticks: int = Field(
-        default=0, ge=0, lt=2**32, description="closest pulses that the cameras stand; 0: any"
-    )
-    line_budget: int = Field(
-        default=0, ge=0, lt=2**48, description="lines after which a run ends; 0: endless"
-    )
-    watchdog_ticks: int = Field(
-        default=0, ge=0, lt=2**32, description="of silence of the host after which a run ends; 0: never"
-    )
-    external_start: Literal["off", "rising", "falling"] = "off"
-    external_timeout_s: float = Field(default=10.0, gt=0, description="wait for the external start")
-    light: LightOutputConfig = LightOutputConfig()
-    a: LineOutputConfig = LineOutputConfig()
-    b: LineOutputConfig = LineOutputConfig()
-
-    @model_validator(mode="after")
-    def _port_known(self) -> TriggerConfig:
-        if self.driver == "serial" and not self.url:
-            raise ValueError("driver 'serial' needs a url: /dev/ttyUSB0, socket://host:port")
-        return self
-
-
-class CameraConfig(_Model):
-    """One camera. DN = black level + responsivity · Y, with Y of Eq. (1)."""
-
-    driver: Literal["simulated", "pattern", "gentl-simulated", "gige-simulated", "harvesters", "aravis"] = (
-        Field(
-            default="simulated",
-            description="'harvesters': through the maker's GenTL producer; 'aravis': GigE and USB3 Vision; "
-            "'gentl-simulated', 'gige-simulated': simulated cameras through either; "
-            "'pattern': stored lines in place of the scene, at any rate, for loads",
-        )
-    )
-    serial: str = "simulated"
-    model: str = Field(default="", description="what the camera must be; absent: any")
-    cti: str = Field(
-        default="",
-        description="GenTL producer; absent: those of GENICAM_GENTL64_PATH. 'aravis': the camera's address",
-    )
-    settings: tuple[tuple[GentlModule, str, bool | int | float | str], ...] = Field(
-        default=(), description="[module, feature, value] in the order in which they are written"
-    )
-    buffer_s: float = Field(default=0.5, ge=0.2, le=60, description="lines that the driver can hold")
-    first_column: int = Field(default=0, ge=0, description="layout 'compact': where the arm's image begins")
-    frame_id_bits: int = Field(default=0, ge=0, le=64, description="0: found when the ids wrap")
-    frame_id_first: Literal[0, 1] | None = Field(
-        default=None, description="of the first frame; absent: whichever comes first"
-    )
-    pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16"] = "Mono12"
-    black_level_dn: float = Field(default=0.0, ge=0)
-    responsivity_dn: float = Field(default=1.0, gt=0, description="DN per unit of scene light and sub-step")
-
-    @property
-    def bits(self) -> int:
-        return PIXEL_BITS[self.pixel_format]
-
-    @property
-    def white_dn(self) -> int:
-        """The largest value a pixel can take; a pixel that has it is saturated."""
-        return (1 << self.bits) - 1
-
-    @property
-    def dtype(self) -> Literal["uint8", "uint16"]:
-        return "uint8" if self.bits == 8 else "uint16"
-
-
-class CamerasConfig(_Model):
-    """The camera of either arm; or one that has both, opened as table a says: of b only the image counts."""
-
-    layout: Literal["dual", "compact"] = "dual"
-    a: CameraConfig
-    b: CameraConfig
-
-    def arm(self, name: str) -> CameraConfig:
-        return {"a": self.a, "b": self.b}[name]
-
-    @model_validator(mode="after")
-    def _alike(self) -> CamerasConfig:
-        if self.a.pixel_format != self.b.pixel_format:
-            raise ValueError(
-                f"both arms need one pixel_format, not {self.a.pixel_format} and {self.b.pixel_format}"
-            )
-        if self.layout == "compact" and (self.a.serial, self.a.driver) != (self.b.serial, self.b.driver):
-            raise ValueError("layout 'compact' is one camera: both arms need its serial and driver")
-        if (
-            self.layout == "dual"
-            and self.a.serial == self.b.serial
-            and (self.a.driver, self.b.driver) != ("simulated", "simulated")
-        ):
-            raise ValueError(f"both arms have the camera with serial {self.a.serial!r}")
-        return self
-
-
-class StreamConfig(_Model):
+class StreamConfig(FrozenModel):
     """The capture path between camera and disk."""
 
     block_lines: int = Field(default=256, ge=1, le=65536, description="lines per camera block and ring slot")
@@ -244,49 +101,13 @@ class StreamConfig(_Model):
     )
 
 
-class RetentionConfig(_Model):
-    """What of an endless recording is kept; the oldest lines go first, in whole files."""
-
-    max_gb: float | None = Field(default=None, gt=0, description="that one recording may take of the disk")
-    max_age_s: float | None = Field(default=None, gt=0, description="of lines behind the newest")
-    hold_events: tuple[str, ...] = Field(default=("mark",), description="kinds of events that keep lines")
-    hold_before_s: float = Field(default=2.0, ge=0, description="kept before such an event")
-    hold_after_s: float = Field(default=2.0, ge=0, description="kept after it")
-    segment_lines: int = Field(
-        default=512, ge=1, description="longest segment to be reconstructed; so much is kept around a hold"
-    )
-
-
-class RecordingConfig(_Model):
-    """How recordings are written."""
-
-    directory: Path = Path()
-    chunk_lines: int = Field(default=4096, ge=16, le=2**20, description="lines per chunk, and per commit")
-    shard_chunks: int = Field(default=64, ge=1, le=255, description="chunks per file")
-    codec: Literal["none", "lz4", "zstd", "auto"] = Field(
-        default="none", description="'auto': the smallest that holds the rate here, measured at arm"
-    )
-    fsync: Literal["commit", "seal"] = Field(
-        default="seal", description="when bytes are forced to the medium"
-    )
-    commit_s: float = Field(
-        default=1.0, gt=0, le=60, description="lines that may wait for a commit, in seconds of the line rate"
-    )
-    reserve_gb: float = Field(
-        default=0.25,
-        ge=0,
-        description="of the disk left free; a recording is sealed before that",
-    )
-    retention: RetentionConfig | None = Field(default=None, description="absent: all is kept")
-
-
-class ControlConfig(_Model):
+class ControlConfig(FrozenModel):
     """Where the daemon listens."""
 
     socket: Path = Field(default_factory=default_socket)
 
 
-class SimulationConfig(_Model):
+class SimulationConfig(FrozenModel):
     """What simulated devices see, and how fast their time runs."""
 
     scene: str = Field(description="a scene file, beside this file or one of the built-in ones")
@@ -301,7 +122,7 @@ def _prbs_unless_said(value: Any) -> Any:
     return {"kind": "prbs", **value} if isinstance(value, dict) else value
 
 
-class RigConfig(_Model):
+class RigConfig(FrozenModel):
     """A whole instrument: everything the daemon needs to know."""
 
     name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")

@@ -14,7 +14,8 @@ from acquire.camera.aravis import AravisOpener
 from acquire.camera.harvesters import HarvestersOpener
 from acquire.camera.spec import spec_of
 from acquire.codes import ConstantCode
-from acquire.config import LightOutputConfig, load_scene
+from acquire.config import load_scene
+from acquire.device_config import LightOutputConfig
 from acquire.errors import ConfigError, TriggerError
 from acquire.lines import ARMS
 from acquire.sim import rtl
@@ -43,7 +44,8 @@ if TYPE_CHECKING:
     from types import TracebackType
 
     from acquire.camera.base import CameraOpener
-    from acquire.config import RigConfig, TriggerConfig
+    from acquire.config import RigConfig
+    from acquire.device_config import TriggerConfig
     from acquire.scene_config import SceneConfig
     from acquire.sim.scene import Scene
     from acquire.trigger.base import Trigger

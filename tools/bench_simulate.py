@@ -22,7 +22,8 @@ import numpy as np
 from scipy import sparse
 
 from acquire.codes import PrbsCode, mix_seed
-from acquire.config import CameraConfig, GeometryConfig, load_scene
+from acquire.config import GeometryConfig, load_scene
+from acquire.device_config import CameraConfig
 from acquire.lines import ARMS
 from acquire.scene_config import SceneFile
 from acquire.sim.blas import limit_blas_threads

@@ -29,7 +29,7 @@ from typing import TYPE_CHECKING, Any
 
 from acquire.camera.base import CameraBlock
 from acquire.capacity.load import Load, capture_plan, recording_spec
-from acquire.config import TriggerConfig
+from acquire.device_config import TriggerConfig
 from acquire.errors import CameraLostError
 from acquire.lines import ARMS
 from acquire.sim.clock import Wire

@@ -22,7 +22,8 @@ import numpy as np
 
 from acquire.capacity.latency import Latencies, TimedOpener
 from acquire.codes import PrbsCode, mix_seed
-from acquire.config import CameraConfig, GeometryConfig, TriggerConfig
+from acquire.config import GeometryConfig
+from acquire.device_config import CameraConfig, TriggerConfig
 from acquire.errors import DataError
 from acquire.lines import ARMS
 from acquire.sim.clock import Wire

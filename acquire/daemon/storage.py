@@ -14,7 +14,8 @@ from acquire.store import Retention, choose_codec, measure_disk
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from acquire.config import RetentionConfig, RigConfig
+    from acquire.config import RigConfig
+    from acquire.recording_config import RetentionConfig
     from acquire.store import CodecChoice
 
 SAMPLE_BYTES = 4 * 2**20

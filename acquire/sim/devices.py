@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.codes import Code
-    from acquire.config import CameraConfig, GeometryConfig
+    from acquire.config import GeometryConfig
+    from acquire.device_config import CameraConfig
     from acquire.scene_config import SceneConfig
     from acquire.sim.clock import PulseTrain, Reading, Wire
     from acquire.sim.pins import PinWire

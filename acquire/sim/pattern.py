@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.codes import Code
-    from acquire.config import CameraConfig, GeometryConfig
+    from acquire.config import GeometryConfig
+    from acquire.device_config import CameraConfig
     from acquire.sim.clock import PulseTrain, Wire
     from acquire.sim.pins import PinWire
 

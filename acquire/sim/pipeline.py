@@ -34,7 +34,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.codes import Code
-    from acquire.config import CameraConfig, GeometryConfig
+    from acquire.config import GeometryConfig
+    from acquire.device_config import CameraConfig
     from acquire.scene_config import OpticsConfig, SceneConfig
     from acquire.sim.scene import Scene
     from acquire.sim.stopwatch import Stopwatch

@@ -32,7 +32,7 @@ from acquire.trigger.tags import TagReader, signed_ticks
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from acquire.config import TriggerConfig
+    from acquire.device_config import TriggerConfig
     from acquire.trigger.base import TriggerRun
     from acquire.trigger.transports import Transport
 

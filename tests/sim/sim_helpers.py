@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.codes import PrbsCode, mix_seed
-from acquire.config import CameraConfig, GeometryConfig
+from acquire.config import GeometryConfig
+from acquire.device_config import CameraConfig
 from acquire.scene_config import ConstantDrive, LedConfig, LedSceneConfig, SineDrive
 from acquire.sim.devices import SimulatedOptics
 from acquire.trigger.base import TriggerRun

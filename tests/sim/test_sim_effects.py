@@ -11,7 +11,8 @@ import pytest
 from sim_helpers import CODE
 
 from acquire.codes import ConstantCode
-from acquire.config import CameraConfig, GeometryConfig
+from acquire.config import GeometryConfig
+from acquire.device_config import CameraConfig
 from acquire.errors import UsageError
 from acquire.scene_config import FunctionSceneConfig, LedSceneConfig, SceneFile
 from acquire.sim.effects import ORDER, in_order

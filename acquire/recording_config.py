@@ -1,0 +1,46 @@
+"""Models of a rig's ``[recording]``: how recordings are written, and what of an endless one is kept."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import Field
+
+from acquire.effect_config import FrozenModel
+
+
+class RetentionConfig(FrozenModel):
+    """What of an endless recording is kept; the oldest lines go first, in whole files."""
+
+    max_gb: float | None = Field(default=None, gt=0, description="that one recording may take of the disk")
+    max_age_s: float | None = Field(default=None, gt=0, description="of lines behind the newest")
+    hold_events: tuple[str, ...] = Field(default=("mark",), description="kinds of events that keep lines")
+    hold_before_s: float = Field(default=2.0, ge=0, description="kept before such an event")
+    hold_after_s: float = Field(default=2.0, ge=0, description="kept after it")
+    segment_lines: int = Field(
+        default=512, ge=1, description="longest segment to be reconstructed; so much is kept around a hold"
+    )
+
+
+class RecordingConfig(FrozenModel):
+    """How recordings are written."""
+
+    directory: Path = Path()
+    chunk_lines: int = Field(default=4096, ge=16, le=2**20, description="lines per chunk, and per commit")
+    shard_chunks: int = Field(default=64, ge=1, le=255, description="chunks per file")
+    codec: Literal["none", "lz4", "zstd", "auto"] = Field(
+        default="none", description="'auto': the smallest that holds the rate here, measured at arm"
+    )
+    fsync: Literal["commit", "seal"] = Field(
+        default="seal", description="when bytes are forced to the medium"
+    )
+    commit_s: float = Field(
+        default=1.0, gt=0, le=60, description="lines that may wait for a commit, in seconds of the line rate"
+    )
+    reserve_gb: float = Field(
+        default=0.25,
+        ge=0,
+        description="of the disk left free; a recording is sealed before that",
+    )
+    retention: RetentionConfig | None = Field(default=None, description="absent: all is kept")
