@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from acquire.lines import Segment
 
 COARSE_SIDE = 24
-ITERATIONS, FEWEST_ITERATIONS = 12, 5
+ITERATIONS, FEWEST_ITERATIONS = 12, 10
 PEAK = 25.0
 """The floor's highest coefficient is 5 to 15 times its median; beyond this it is no floor."""
 MARGIN = 1.25
