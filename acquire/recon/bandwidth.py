@@ -25,9 +25,7 @@ if TYPE_CHECKING:
     from acquire.lines import Segment
 
 COARSE_SIDE = 24
-ITERATIONS, FEWEST_ITERATIONS = 12, 5
-ABOVE_FLOOR = 1.3
-"""Relative to the highest coefficient of the floor."""
+ITERATIONS, FEWEST_ITERATIONS = 12, 10
 PEAK = 25.0
 """The floor's highest coefficient is 5 to 15 times its median; beyond this it is no floor."""
 MARGIN = 1.25
@@ -75,5 +73,5 @@ def _end_of_signal(energy: NDArray[np.float64]) -> int:
     floor = energy[len(energy) // 2 :]
     if floor.max() > PEAK * np.median(floor):
         return len(energy)
-    above = np.flatnonzero(energy > ABOVE_FLOOR * floor.max())
+    above = np.flatnonzero(energy > floor.max())
     return int(above[-1]) + 1 if len(above) else len(energy)

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 LARGEST_RANK = 12
 TAIL = 16
 """Singular values from here on are taken as the floor of what the first reconstruction left over."""
-ABOVE_TAIL = 2.5
+ABOVE_TAIL = 3.0
 LARGEST_REST = 0.035
 """Share of the energy that the patterns may leave out; more, and the scene is not one of a few patterns."""
 FADING = 0.5

@@ -35,13 +35,13 @@ if TYPE_CHECKING:
     from acquire.recon.problem import Operator, Problem
     from acquire.recon.request import Request
 
-FIRST_LOOK = 60
+FIRST_LOOK = 90
 """Iterations in the cosines before patterns are looked for."""
-FIRST_LOOK_SHARE = 0.6
+FIRST_LOOK_SHARE = 0.9
 """Of a budget, the most that the first look may take."""
 TENTATIVE_SHARE = 0.15
 """Of a budget, after which the search for the bandwidth hurries."""
-PLAIN_ITERATIONS = 80
+PLAIN_ITERATIONS = 90
 """Of scenes that are not a few patterns: from here on, more iterations fit what voxels cannot hold."""
 USUAL_FRAMES = 980
 FEW_FRAMES = 32
@@ -49,7 +49,7 @@ HELD_BACK = 100.0
 """Factor of the penalties for few frames."""
 LEAST_GAIN = 0.003
 """Relative gain of the held-out prediction in a round below which the round was in vain."""
-PATIENCE = 3
+PATIENCE = 6
 """Rounds in vain that end a refinement."""
 
 
@@ -115,7 +115,7 @@ def solve_admm(segment: Segment, problem: Problem, request: Request, clock: Iter
         start=start,
         denoiser=request.denoiser,
     )
-    for _ in clock.run(min(FIRST_LOOK, -(-3 * request.iterations // 5)), "first look", FIRST_LOOK_SHARE):
+    for _ in clock.run(min(FIRST_LOOK, -(-4 * request.iterations // 5)), "first look", FIRST_LOOK_SHARE):
         solver.step()
     refined = None if request.denoiser else _refine(segment, problem, request, (basis, solver.theta), clock)
     if refined is not None:

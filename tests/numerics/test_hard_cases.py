@@ -17,6 +17,8 @@ from acquire.recon.problem import MaskedOperator, pose
 from acquire.recon.twist import Twist, TwistParameters
 
 GEOMETRY = Geometry(16, 3, 80)
+GOOD_DB = 25.0
+"""A picture in which both shapes and both curves are right; unmasked, each fault leaves less."""
 SOLVERS = ("admm", "twist", "twist-band")
 
 
@@ -68,7 +70,7 @@ def clean_db() -> float:
 
 
 def test_the_clean_case_is_good(clean_db: float) -> None:
-    assert clean_db > 22
+    assert clean_db > GOOD_DB
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e7, -1e7])
@@ -88,18 +90,18 @@ def test_a_wild_sample_costs_nothing(clean_db: float) -> None:
 
 
 @pytest.mark.parametrize(("value", "cause"), [(1e7, "hot column"), (0.0, "stuck column")])
-def test_a_hot_and_a_dead_column_are_found(value: float, cause: str, clean_db: float) -> None:
+def test_a_hot_and_a_dead_column_are_found(value: float, cause: str) -> None:
     lines = CLEAN.copy()
     lines[0, :, 4] = value
     result = solve(segment(lines))
     assert result.masked[cause] == GEOMETRY.lines
-    assert psnr(result) > clean_db - 4
+    assert psnr(result) > GOOD_DB
 
 
-def test_lost_lines_and_half_saturation_are_masked(clean_db: float) -> None:
+def test_lost_lines_and_half_saturation_are_masked() -> None:
     lost = segment()
     lost.mask[:, 30:33] = False
-    assert psnr(solve(lost)) > clean_db - 3
+    assert psnr(solve(lost)) > GOOD_DB
     level = np.median(CLEAN)
     clipped = replace(segment(np.minimum(CLEAN, level)), mask=level > CLEAN)
     result = solve(clipped)
