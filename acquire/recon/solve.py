@@ -47,6 +47,9 @@ USUAL_FRAMES = 980
 FEW_FRAMES = 32
 HELD_BACK = 100.0
 """Factor of the penalties for few frames."""
+STILL = AdmmParameters(tv_weight=5e-6, tv_penalty=1e-5, sign_penalty=3e-6, gradient_steps=6)
+"""For a single frame. All sub-steps add up in it, so that the mean light has an eigenvalue some thousand
+times that of a detail: lower penalties let details through, more gradient steps reach them."""
 LEAST_GAIN = 0.003
 """Relative gain of the held-out prediction in a round below which the round was in vain."""
 PATIENCE = 6
@@ -230,9 +233,11 @@ def _defaults(frames: int) -> AdmmParameters:
     Coefficients grow with the root of the frames, and so does the threshold λ/ρ that suits them. A handful of
     frames of a moving scene cannot explain its lines: its penalties are higher, which fits less of that.
     """
+    if frames == 1:
+        return STILL
     usual = AdmmParameters()
     threshold = usual.tv_weight / usual.tv_penalty * min(1.0, frames / USUAL_FRAMES) ** 0.5
-    penalty = usual.tv_penalty * (HELD_BACK if 1 < frames <= FEW_FRAMES else 1.0)
+    penalty = usual.tv_penalty * (HELD_BACK if frames <= FEW_FRAMES else 1.0)
     sign = usual.sign_penalty * penalty / usual.tv_penalty
     return replace(usual, tv_weight=threshold * penalty, tv_penalty=penalty, sign_penalty=sign)
 
