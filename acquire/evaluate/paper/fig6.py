@@ -122,7 +122,7 @@ def _pulses(studio: Studio, khz: int, kind: str) -> Curves:
 
 
 def _static(pictures: dict[str, NDArray[Any]], still: NDArray[Any]) -> Figure:
-    drawing = canvas(3.5)
+    drawing = canvas(3.8)
     axes = drawing.subplots(1, 3)
     show(axes[0], pictures[INTER], title="(a) inter-line, 64 × 64")
     show(axes[1], pictures[INTRA], title="(b) intra-line, 192 × 192")
