@@ -108,7 +108,7 @@ def test_start_passes_everything_on(cli: Cli, answering: Callable[[Status], Fake
     assert cli("start", "--duration", 0.5).code == 0
     assert cli("start", "--pre", "2s", "--post", "250ms").code == 0
     assert cli("mark", "a bang").code == 0
-    budget = {"lines": None, "duration_s": None, "pre_s": 0.0, "post_s": None}
+    budget = {"lines": None, "duration_s": None, "pre_s": 0.0, "post_s": None, "resume": False}
     assert client.calls == [
         ("start", Path("x.zarr"), budget | {"lines": 5}),
         ("start", None, budget | {"duration_s": 0.5}),
