@@ -46,7 +46,11 @@ PLAIN_ITERATIONS = 90
 USUAL_FRAMES = 980
 FEW_FRAMES = 32
 HELD_BACK = 100.0
-"""Factor of the penalties for few frames."""
+"""Factor of the penalties for few frames, as long as they do not explain the lines."""
+TRIAL = 20
+"""Iterations after which few frames are asked whether they do."""
+EXPLAINED = 0.1
+"""Relative error of prediction below which they do."""
 STILL = AdmmParameters(tv_weight=5e-6, tv_penalty=1e-5, sign_penalty=3e-6, gradient_steps=6)
 """For a single frame. All sub-steps add up in it, so that the mean light has an eigenvalue some thousand
 times that of a detail: lower penalties let details through, more gradient steps reach them."""
@@ -69,19 +73,25 @@ class Estimate(Protocol):
 class InBand:
     """Coefficient frames of an iterative solver as an estimate."""
 
-    def __init__(self, solver: Admm | Twist, operator: Operator, basis: Basis, problem: Problem) -> None:
-        self._solver, self._operator, self._basis, self._problem = solver, operator, basis, problem
-        self.parameters: AdmmParameters | TwistParameters | None = None
+    def __init__(
+        self,
+        solver: Admm | Twist,
+        operator: Operator,
+        basis: Basis,
+        problem: Problem,
+        parameters: AdmmParameters | TwistParameters,
+    ) -> None:
+        self.solver, self._parameters = solver, parameters
+        self._operator, self._basis, self._problem = operator, basis, problem
 
     def predict(self) -> NDArray[Any]:
-        return self._operator.forward(self._solver.theta) / np.float32(self._problem.norm)
+        return self._operator.forward(self.solver.theta) / np.float32(self._problem.norm)
 
     def video(self) -> NDArray[Any]:
-        return self._basis.synthesize(self._solver.theta)
+        return self._basis.synthesize(self.solver.theta)
 
     def facts(self) -> dict[str, Any]:
-        given = {} if self.parameters is None else asdict(self.parameters)
-        return {"temporal_coefficients": self._basis.count} | given
+        return {"temporal_coefficients": self._basis.count} | asdict(self._parameters)
 
 
 class Refined:
@@ -103,30 +113,49 @@ class Refined:
 
 def solve_admm(segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> Estimate:
     """The default: cosines first, then patterns and curves where the scene is of a few."""
-    N_m, T_m = request.spatial_merge, request.temporal_merge
-    frames, side, _ = segment.geometry.video_shape(N_m, T_m)
+    frames = segment.geometry.video_shape(request.spatial_merge, request.temporal_merge)[0]
     basis = TemporalBasis(frames, _coefficients(segment, request, clock))
-    operator = band_operator(segment.geometry, segment.code, basis, N_m, T_m)
-    parameters = _weighted(_defaults(frames), request.tv_weight)
-    start = None if request.initial is None else basis.analyze(request.initial / np.float32(problem.scale))
-    solver = Admm(
-        problem.masked(operator),
-        problem.used_samples,
-        (basis.count, side, side),
-        basis,
-        parameters,
-        start=start,
-        denoiser=request.denoiser,
-    )
-    for _ in clock.run(min(FIRST_LOOK, -(-4 * request.iterations // 5)), "first look", FIRST_LOOK_SHARE):
-        solver.step()
-    refined = None if request.denoiser else _refine(segment, problem, request, (basis, solver.theta), clock)
+    estimate = _first_look(segment, problem, request, basis, clock)
+    theta = estimate.solver.theta
+    refined = None if request.denoiser else _refine(segment, problem, request, (basis, theta), clock)
     if refined is not None:
         return refined
     for _ in clock.run(PLAIN_ITERATIONS - clock.done, "solve"):
-        solver.step()
-    estimate = InBand(solver, operator, basis, problem)
-    estimate.parameters = parameters
+        estimate.solver.step()
+    return estimate
+
+
+def _first_look(
+    segment: Segment, problem: Problem, request: Request, basis: TemporalBasis, clock: IterationClock
+) -> InBand:
+    """In the cosines; few frames with lower penalties from where they turn out to explain the lines."""
+    N_m, T_m = request.spatial_merge, request.temporal_merge
+    frames, side, _ = segment.geometry.video_shape(N_m, T_m)
+    operator = band_operator(segment.geometry, segment.code, basis, N_m, T_m)
+
+    def begin(start: NDArray[Any] | None, *, explained: bool = False) -> InBand:
+        parameters = _weighted(_defaults(frames, explained=explained), request.tv_weight)
+        solver = Admm(
+            problem.masked(operator),
+            problem.used_samples,
+            (basis.count, side, side),
+            basis,
+            parameters,
+            start=start,
+            denoiser=request.denoiser,
+        )
+        return InBand(solver, operator, basis, problem, parameters)
+
+    start = None if request.initial is None else basis.analyze(request.initial / np.float32(problem.scale))
+    estimate = begin(start)
+    if 1 < frames <= FEW_FRAMES:
+        for _ in clock.run(TRIAL, "first look", FIRST_LOOK_SHARE):
+            estimate.solver.step()
+        if problem.prediction_error(estimate.predict()) < EXPLAINED:
+            estimate = begin(estimate.solver.theta, explained=True)
+    most = min(FIRST_LOOK, -(-4 * request.iterations // 5))
+    for _ in clock.run(most - clock.done, "first look", FIRST_LOOK_SHARE):
+        estimate.solver.step()
     return estimate
 
 
@@ -181,9 +210,7 @@ def solve_twist(segment: Segment, problem: Problem, request: Request, clock: Ite
     )
     for _ in clock.run(request.iterations, "solve"):
         solver.step()
-    estimate = InBand(solver, operator, basis, problem)
-    estimate.parameters = parameters
-    return estimate
+    return InBand(solver, operator, basis, problem, parameters)
 
 
 class Lit:
@@ -227,19 +254,25 @@ def _coefficients(segment: Segment, request: Request, clock: IterationClock) -> 
     return min(frames, max(1, round(request.bandwidth * frames)))
 
 
-def _defaults(frames: int) -> AdmmParameters:
+def _defaults(frames: int, *, explained: bool = False) -> AdmmParameters:
     """Parameters for a video of so many frames.
 
-    Coefficients grow with the root of the frames, and so does the threshold λ/ρ that suits them. A handful of
-    frames of a moving scene cannot explain its lines: its penalties are higher, which fits less of that.
+    Coefficients grow with the root of the frames, and so does the threshold λ/ρ that suits them. A handful
+    of frames of a moving scene cannot explain its lines: its penalties are higher, which fits less of that.
+    Where they do (``explained``), the scene rests, as a still does.
     """
     if frames == 1:
         return STILL
     usual = AdmmParameters()
     threshold = usual.tv_weight / usual.tv_penalty * min(1.0, frames / USUAL_FRAMES) ** 0.5
-    penalty = usual.tv_penalty * (HELD_BACK if frames <= FEW_FRAMES else 1.0)
-    sign = usual.sign_penalty * penalty / usual.tv_penalty
-    return replace(usual, tv_weight=threshold * penalty, tv_penalty=penalty, sign_penalty=sign)
+    penalty = usual.tv_penalty * (HELD_BACK if frames <= FEW_FRAMES and not explained else 1.0)
+    return replace(
+        usual,
+        tv_weight=threshold * penalty,
+        tv_penalty=penalty,
+        sign_penalty=usual.sign_penalty * penalty / usual.tv_penalty,
+        gradient_steps=STILL.gradient_steps if explained else usual.gradient_steps,
+    )
 
 
 def _weighted(parameters: AdmmParameters, tv_weight: float | None) -> AdmmParameters:
