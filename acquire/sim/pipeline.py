@@ -14,6 +14,7 @@ sensor under the fine scene.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -117,13 +118,14 @@ class Bench:
         return build_scene(self.scene, size * factor, self.substep_s / factor)
 
 
-class Camera:
+class Camera(ABC):
     """Something whose lines can be read; see `Bench.camera`."""
 
     stages: tuple[Stage, ...]
 
+    @abstractmethod
     def read(self, first_line: int, count: int) -> Readout:
-        raise NotImplementedError
+        """``count`` lines from ``first_line`` on."""
 
 
 class Sensor(Camera):

@@ -13,6 +13,7 @@ streaming simulation turns into small matrix products. Scenes compose::
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -69,7 +70,7 @@ def frames_at(scene: Scene, substeps: NDArray[np.int64]) -> NDArray[np.float32]:
     return scene.frames(first, int(substeps[-1]) - first + 1)[substeps - first]
 
 
-class MaskScene:
+class MaskScene(ABC):
     """Base of separable scenes; a subclass gives ``masks`` and ``intensity``."""
 
     masks: NDArray[np.float32]
@@ -78,8 +79,9 @@ class MaskScene:
     def size(self) -> int:
         return int(self.masks.shape[1])
 
+    @abstractmethod
     def intensity(self, first: int, count: int, substep_s: float | None = None) -> NDArray[np.float64]:
-        raise NotImplementedError
+        """See `SeparableScene`."""
 
     def frames(self, first: int, count: int) -> NDArray[np.float32]:
         """(count, row, column) float32."""

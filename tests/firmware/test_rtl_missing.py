@@ -10,6 +10,7 @@ import pytest
 import acquire.sim.rtl
 import firmware.cxxrtl
 from acquire.errors import UsageError
+from firmware.cxxrtl import library as build_library
 from firmware.top import Build
 
 
@@ -18,7 +19,7 @@ def test_without_a_compiler_the_reason_is_given(monkeypatch: pytest.MonkeyPatch,
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     assert firmware.cxxrtl.missing() == "g++ (Debian, Ubuntu: apt install g++)"
     with pytest.raises(UsageError, match=r"there is no g\+\+ \(Debian"):
-        firmware.cxxrtl.library(Build())
+        build_library(Build())
     assert not (tmp_path / "cache").exists()
 
 
