@@ -302,7 +302,7 @@ class Recording:
         usable = np.empty(samples.shape, np.bool_)
         for arm, white in enumerate(self._camera_numbers("white_dn")):
             np.less(samples[arm], math.ceil(white), out=usable[arm])  # whole numbers: many times faster
-        usable &= ((flags & UNUSABLE) == 0)[:, :, None]
+        usable[(flags & UNUSABLE) != 0] = False
         return usable
 
     def _checked_code(
