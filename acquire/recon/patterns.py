@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from acquire.arrays import host
 from acquire.forward import merge_video
 from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import band_operator
@@ -30,6 +31,7 @@ from acquire.recon.curves import fit_curves
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from acquire.arrays import Array
     from acquire.lines import Segment
     from acquire.recon.basis import TemporalBasis
     from acquire.recon.problem import MaskedOperator, Operator, Problem
@@ -52,10 +54,13 @@ FIRST_RIDGE, LAST_RIDGE, RIDGE_DECAY = 1e-2, 1e-4, 0.85
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patterns:
-    """Θ = curves·patterns: (K, R) orthonormal columns, and (R, row, column) that fall off in energy."""
+    """Θ = curves·patterns: (K, R) orthonormal columns, and (R, row, column) that fall off in energy.
+
+    Curves are the host's; patterns are where they were made.
+    """
 
     curves: NDArray[Any]
-    patterns: NDArray[Any]
+    patterns: Array
 
 
 def find_patterns(theta: NDArray[Any]) -> Patterns | None:
@@ -90,10 +95,11 @@ class Refinement:
         self.parameters, self._steps, self._ridge = parameters, 0, FIRST_RIDGE
         self._now = Patterns(found.curves, _hold(found.patterns, segment.geometry.size, merges[0]))
         self._admm = self._begin()
+        self._now = Patterns(found.curves, self._admm.theta)
 
     @property
     def rank(self) -> int:
-        return len(self._now.patterns)
+        return int(self._now.curves.shape[1])
 
     @property
     def at_round_end(self) -> bool:
@@ -107,15 +113,17 @@ class Refinement:
         if self.at_round_end:
             self._fit_curves()
             self._admm.rebase(*self._operators(), self._now.patterns)
+            self._now = Patterns(self._now.curves, self._admm.theta)
 
     def predict(self) -> NDArray[Any]:
         """The lines of the estimate, as `Problem.samples`."""
-        return self._operator.forward(self._now.patterns) / np.float32(self._problem.norm)
+        return host(self._operator.forward(self._now.patterns)) / self._problem.norm
 
     def video(self) -> NDArray[Any]:
         """Dimensionless voxels (T/T_m, n/N_m, n/N_m)."""
-        merged = merge_video(self._now.patterns, self._spatial_merge, 1)
-        return LearnedBasis(self._cosines, self._now.curves).synthesize(merged)
+        merged = merge_video(host(self._now.patterns), self._spatial_merge, 1)
+        basis = LearnedBasis(self._cosines, self._now.curves)
+        return host(basis.synthesize(basis.arrays.asarray(merged)))
 
     def _operators(self) -> tuple[MaskedOperator, LearnedBasis]:
         """The patterns' operator and the basis of their curves, as these are now."""
@@ -140,24 +148,22 @@ class Refinement:
         )
 
     def _fit_curves(self) -> None:
-        """New curves for the patterns, made orthonormal again with as little turning as possible."""
-        flat = self._now.patterns.reshape(self.rank, -1)
+        """New curves for the patterns, made orthonormal again with as little turning as possible.
+
+        A small problem in float64, solved on the host between two rounds.
+        """
+        shape, flat = self._now.patterns.shape, host(self._now.patterns).reshape(self.rank, -1)
         gram = (flat @ flat.T).astype(np.float64)
         root = np.linalg.cholesky(gram + 1e-6 * np.trace(gram) * np.eye(self.rank))
         # orthonormal patterns make the fit well conditioned; their sizes go to the curves meanwhile
-        unit = np.linalg.solve(root, flat).astype(np.float32).reshape(self._now.patterns.shape)
+        unit = np.linalg.solve(root, flat).astype(flat.dtype).reshape(shape)
         merge = self._temporal_merge
         start = self._now.curves @ root
         fitted = fit_curves(self._segment, self._problem, unit, self._cosines, merge, start, self._ridge)
         self._ridge = max(LAST_RIDGE, RIDGE_DECAY * self._ridge)
         left, middle, right = np.linalg.svd(np.linalg.solve(root.T, fitted.T).T, full_matrices=False)
         turned = (right.T * middle) @ right @ flat
-        self._now = Patterns((left @ right).astype(np.float32), _as(turned, self._now.patterns))
-
-
-def _as(flat: NDArray[Any], patterns: NDArray[Any]) -> NDArray[Any]:
-    shaped: NDArray[Any] = flat.reshape(patterns.shape).astype(patterns.dtype)
-    return shaped
+        self._now = Patterns((left @ right).astype(flat.dtype), turned.reshape(shape))
 
 
 def _hold(patterns: NDArray[Any], n: int, merge: int) -> NDArray[Any]:

@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from acquire.forward import DualArm, merge_video
+from acquire.arrays import host
+from acquire.forward import merge_video
 from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import InBasis, band_operator
 from acquire.recon.bandwidth import estimate_coefficients
@@ -29,6 +30,7 @@ from acquire.recon.twist import Twist, TwistParameters
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from acquire.arrays import Array
     from acquire.lines import Segment
     from acquire.recon.basis import Basis
     from acquire.recon.clock import IterationClock
@@ -85,10 +87,10 @@ class InBand:
         self._operator, self._basis, self._problem = operator, basis, problem
 
     def predict(self) -> NDArray[Any]:
-        return self._operator.forward(self.solver.theta) / np.float32(self._problem.norm)
+        return host(self._operator.forward(self.solver.theta)) / self._problem.norm
 
     def video(self) -> NDArray[Any]:
-        return self._basis.synthesize(self.solver.theta)
+        return host(self._basis.synthesize(self.solver.theta))
 
     def facts(self) -> dict[str, Any]:
         return {"temporal_coefficients": self._basis.count} | asdict(self._parameters)
@@ -114,7 +116,7 @@ class Refined:
 def solve_admm(segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> Estimate:
     """The default: cosines first, then patterns and curves where the scene is of a few."""
     frames = segment.geometry.video_shape(request.spatial_merge, request.temporal_merge)[0]
-    basis = TemporalBasis(frames, _coefficients(segment, request, clock))
+    basis = TemporalBasis(frames, _coefficients(segment, problem, request, clock), problem.arrays)
     estimate = _first_look(segment, problem, request, basis, clock)
     theta = estimate.solver.theta
     refined = None if request.denoiser else _refine(segment, problem, request, (basis, theta), clock)
@@ -133,7 +135,7 @@ def _first_look(
     frames, side, _ = segment.geometry.video_shape(N_m, T_m)
     operator = band_operator(segment.geometry, segment.code, basis, N_m, T_m)
 
-    def begin(start: NDArray[Any] | None, *, explained: bool = False) -> InBand:
+    def begin(start: Array | None, *, explained: bool = False) -> InBand:
         parameters = _weighted(_defaults(frames, explained=explained), request.tv_weight)
         solver = Admm(
             problem.masked(operator),
@@ -146,7 +148,9 @@ def _first_look(
         )
         return InBand(solver, operator, basis, problem, parameters)
 
-    start = None if request.initial is None else basis.analyze(request.initial / np.float32(problem.scale))
+    start = None
+    if request.initial is not None:
+        start = basis.analyze(problem.arrays.asarray(request.initial / problem.scale))
     estimate = begin(start)
     if 1 < frames <= FEW_FRAMES:
         for _ in clock.run(TRIAL, "first look", FIRST_LOOK_SHARE):
@@ -163,11 +167,11 @@ def _refine(
     segment: Segment,
     problem: Problem,
     request: Request,
-    first: tuple[TemporalBasis, NDArray[Any]],
+    first: tuple[TemporalBasis, Array],
     clock: IterationClock,
 ) -> Estimate | None:
     basis, theta = first
-    found = find_patterns(theta) if clock.done < clock.iterations else None
+    found = find_patterns(host(theta)) if clock.done < clock.iterations else None
     if found is None:
         return None
     merges = (request.spatial_merge, request.temporal_merge)
@@ -192,12 +196,10 @@ def solve_twist(segment: Segment, problem: Problem, request: Request, clock: Ite
     N_m, T_m = request.spatial_merge, request.temporal_merge
     shape = segment.geometry.video_shape(N_m, T_m)
     banded = request.solver == "twist-band"
-    basis = TemporalBasis(shape[0], _coefficients(segment, request, clock) if banded else shape[0])
-    operator: Operator
-    if banded:
-        operator = band_operator(segment.geometry, segment.code, basis, N_m, T_m)
-    else:
-        operator = InBasis(DualArm(segment.geometry, segment.code, N_m, T_m), basis)
+    count = _coefficients(segment, problem, request, clock) if banded else shape[0]
+    basis = TemporalBasis(shape[0], count, problem.arrays)
+    make = band_operator if banded else InBasis
+    operator = make(segment.geometry, segment.code, basis, N_m, T_m)
     parameters = TwistParameters()
     if request.tv_weight is not None:
         parameters = replace(parameters, tv_weight=request.tv_weight)
@@ -223,20 +225,21 @@ class Lit:
         self, segment: Segment, problem: Problem, request: Request, image: NDArray[Any], clock: IterationClock
     ) -> None:
         frames = segment.geometry.video_shape(request.spatial_merge, request.temporal_merge)[0]
-        self._image, self._merge, self._problem = image.astype(np.float32), request.spatial_merge, problem
-        basis = TemporalBasis(frames, frames)
+        self._problem, arrays = problem, problem.on_host().arrays
+        self._image, self._merge = image.astype(arrays.dtype), request.spatial_merge
+        basis = TemporalBasis(frames, frames, arrays)
         patterns = self._image[None] / np.linalg.norm(self._image)
         self._operator = CurveOperator(segment, patterns, basis, request.temporal_merge)
         coefficients = np.zeros((frames, 1))
         for _ in clock.run(1, "light"):
             coefficients = fit_curves(segment, problem, patterns, basis, request.temporal_merge, coefficients)
-        self._coefficients = coefficients.astype(np.float32)
+        self._coefficients = arrays.asarray(coefficients)
         seen = np.add.reduceat(segment.code, np.arange(0, len(segment.code), request.temporal_merge)) > 0
         light = basis.synthesize(self._coefficients)[:, 0] / np.linalg.norm(self._image)
-        self._light = np.interp(np.arange(frames), np.flatnonzero(seen), light[seen]).astype(np.float32)
+        self._light = np.interp(np.arange(frames), np.flatnonzero(seen), light[seen]).astype(arrays.dtype)
 
     def predict(self) -> NDArray[Any]:
-        return self._operator.forward(self._coefficients) / np.float32(self._problem.norm)
+        return self._operator.forward(self._coefficients) / self._problem.norm
 
     def video(self) -> NDArray[Any]:
         video: NDArray[Any] = self._light[:, None, None] * merge_video(self._image[None], self._merge, 1)
@@ -246,10 +249,10 @@ class Lit:
         return {"patterns": 1}
 
 
-def _coefficients(segment: Segment, request: Request, clock: IterationClock) -> int:
+def _coefficients(segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> int:
     N_m, T_m = request.spatial_merge, request.temporal_merge
     if request.bandwidth is None:
-        return estimate_coefficients(segment, N_m, T_m, lambda: clock.spent(TENTATIVE_SHARE))
+        return estimate_coefficients(segment, N_m, T_m, lambda: clock.spent(TENTATIVE_SHARE), problem.arrays)
     frames = segment.geometry.video_shape(N_m, T_m)[0]
     return min(frames, max(1, round(request.bandwidth * frames)))
 
