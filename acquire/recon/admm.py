@@ -68,7 +68,8 @@ class Admm:
     ) -> None:
         self._samples, self._parameters = samples, parameters
         self._denoiser = denoiser or FrameTv(theta_shape, parameters.tv_iterations, samples.dtype)
-        self._strength = np.asarray(emphasis, samples.dtype) * (parameters.tv_weight / parameters.tv_penalty)
+        self._emphasis = np.asarray(emphasis, samples.dtype)
+        self._strength = self._emphasis * (parameters.tv_weight / parameters.tv_penalty)
         self._w = np.zeros_like(samples)
         first = np.zeros(theta_shape, samples.dtype) if start is None else start.astype(samples.dtype)
         self.rebase(operator, basis, first)
@@ -85,6 +86,14 @@ class Admm:
         grid = min(basis.frames, self._parameters.grid_per_coefficient * basis.cosines)
         self._grid = basis.matrix(grid)
         self._lifted = operator.adjoint(self._w)  # BᵀW·w
+
+    def reweigh(self, parameters: AdmmParameters) -> None:
+        """Go on with other weights; multipliers, which are kept divided by ρ, stay what they are."""
+        old, self._parameters = self._parameters, parameters
+        kind = self._samples.dtype.type
+        self._tv_multiplier *= kind(old.tv_penalty / parameters.tv_penalty)
+        self._sign_multiplier *= kind(old.sign_penalty / parameters.sign_penalty)
+        self._strength = self._emphasis * kind(parameters.tv_weight / parameters.tv_penalty)
 
     def step(self) -> None:
         """One iteration.
