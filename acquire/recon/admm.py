@@ -67,7 +67,8 @@ class Admm:
         self._samples, self._parameters = samples, parameters
         self._denoiser = denoiser or FrameTv(parameters.tv_iterations)
         self._xp, arrays = namespace(samples), basis.arrays
-        self._strength = arrays.asarray(emphasis) * (parameters.tv_weight / parameters.tv_penalty)
+        self._emphasis = arrays.asarray(emphasis)
+        self._strength = self._emphasis * (parameters.tv_weight / parameters.tv_penalty)
         self._w = arrays.zeros(samples.shape)
         self.rebase(operator, basis, arrays.zeros(theta_shape) if start is None else start)
         self._tv_multiplier = arrays.zeros(theta_shape)
@@ -83,6 +84,13 @@ class Admm:
         grid = min(basis.frames, self._parameters.grid_per_coefficient * basis.cosines)
         self._grid = basis.arrays.asarray(basis.matrix(grid))
         self._lifted = operator.adjoint(self._w)  # BᵀW·w
+
+    def reweigh(self, parameters: AdmmParameters) -> None:
+        """Go on with other weights; multipliers, which are kept divided by ρ, stay what they are."""
+        old, self._parameters = self._parameters, parameters
+        self._tv_multiplier *= old.tv_penalty / parameters.tv_penalty
+        self._sign_multiplier *= old.sign_penalty / parameters.sign_penalty
+        self._strength = self._emphasis * (parameters.tv_weight / parameters.tv_penalty)
 
     def step(self) -> None:
         """One iteration.

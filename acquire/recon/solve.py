@@ -6,8 +6,8 @@
     twist-band  the same algorithm with admm's band and sign
     (static image known)  one curve, least squares
 
-Held-out samples end the refinement: at full resolution the model has no error of its own to fit, so they
-are predicted better as long as the picture gets better.
+Held-out samples end the refinement, and the round that predicted them best is the result: at full resolution
+the model has no error of its own to fit, so they are predicted better as long as the picture gets better.
 """
 
 from __future__ import annotations
@@ -84,23 +84,23 @@ class InBand:
         parameters: AdmmParameters | TwistParameters,
     ) -> None:
         self.solver, self._parameters = solver, parameters
-        self._operator, self._basis, self._problem = operator, basis, problem
+        self.basis, self._operator, self._problem = basis, operator, problem
 
     def predict(self) -> NDArray[Any]:
         return host(self._operator.forward(self.solver.theta)) / self._problem.norm
 
     def video(self) -> NDArray[Any]:
-        return host(self._basis.synthesize(self.solver.theta))
+        return host(self.basis.synthesize(self.solver.theta))
 
     def facts(self) -> dict[str, Any]:
-        return {"temporal_coefficients": self._basis.count} | asdict(self._parameters)
+        return {"temporal_coefficients": self.basis.count} | asdict(self._parameters)
 
 
 class Refined:
     """A refinement as an estimate."""
 
-    def __init__(self, refinement: Refinement, coefficients: int, parameters: AdmmParameters) -> None:
-        self._refinement, self._coefficients, self._parameters = refinement, coefficients, parameters
+    def __init__(self, refinement: Refinement, coefficients: int) -> None:
+        self._refinement, self._coefficients = refinement, coefficients
 
     def predict(self) -> NDArray[Any]:
         return self._refinement.predict()
@@ -110,7 +110,7 @@ class Refined:
 
     def facts(self) -> dict[str, Any]:
         found = {"temporal_coefficients": self._coefficients, "patterns": self._refinement.rank}
-        return found | asdict(self._parameters)
+        return found | asdict(self._refinement.parameters)
 
 
 def solve_admm(segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> Estimate:
@@ -118,8 +118,7 @@ def solve_admm(segment: Segment, problem: Problem, request: Request, clock: Iter
     frames = segment.geometry.video_shape(request.spatial_merge, request.temporal_merge)[0]
     basis = TemporalBasis(frames, _coefficients(segment, problem, request, clock), problem.arrays)
     estimate = _first_look(segment, problem, request, basis, clock)
-    theta = estimate.solver.theta
-    refined = None if request.denoiser else _refine(segment, problem, request, (basis, theta), clock)
+    refined = None if request.denoiser else _refine(segment, problem, request, estimate, clock)
     if refined is not None:
         return refined
     for _ in clock.run(PLAIN_ITERATIONS - clock.done, "solve"):
@@ -167,28 +166,32 @@ def _refine(
     segment: Segment,
     problem: Problem,
     request: Request,
-    first: tuple[TemporalBasis, Array],
+    first: InBand,
     clock: IterationClock,
 ) -> Estimate | None:
-    basis, theta = first
-    found = find_patterns(host(theta)) if clock.done < clock.iterations else None
+    """Patterns and curves from a first look; None where the scene is not made of a few."""
+    found = find_patterns(host(first.solver.theta)) if clock.done < clock.iterations else None
     if found is None:
         return None
+    basis = TemporalBasis(first.basis.frames, first.basis.count, problem.arrays)
     merges = (request.spatial_merge, request.temporal_merge)
     refinement = Refinement(segment, problem, basis, found, merges)
-    parameters = refinement.parameters
-    best, idle = np.inf, 0
+    best, kept, idle = np.inf, refinement.found, 0
     for _ in clock.run(clock.iterations - clock.done, "refine"):
         refinement.step()
         if not refinement.at_round_end:
             continue
         now = problem.prediction_error(refinement.predict())
-        idle = 0 if now < (1 - LEAST_GAIN) * best else idle + 1
-        best = min(best, now)
+        idle = idle + 1 if now >= (1 - LEAST_GAIN) * best else 0  # without held-out samples: NaN, go on
+        if not now >= best:
+            best, kept = now, refinement.found
         if idle == PATIENCE:
             clock.converged()
             break
-    return Refined(refinement, basis.count, parameters)
+    refinement.return_to(kept)
+    if problem.prediction_error(first.predict()) < best < np.inf:
+        return None
+    return Refined(refinement, basis.count)
 
 
 def solve_twist(segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> Estimate:
