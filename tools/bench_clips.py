@@ -2,8 +2,8 @@
 
 Usage: python tools/bench_clips.py CLIP [CLIP ...] [--budget 15] [--seed 1] [--pictures DIRECTORY]
 
-A clip is any video or animation that `acquire simulate` takes, or .npy (time, row, column). It plays once while
-the lines of Fig. 9 are recorded (64 stages × 3 steps, 263 lines, 980 sub-steps; a long one only from its
+A clip is any video or animation that `acquire simulate` takes, or .npy (time, row, column). It plays once
+while the lines of Fig. 9 are recorded (64 stages × 3 steps, 263 lines, 980 sub-steps; a long one from its
 beginning, a frame every 16 sub-steps), by a camera of 12 bits with shot noise and 25 e of read noise. Between
 two of its frames the light goes over from one to the other. Both solvers get the lines and so many seconds;
 each row says how far the 598 trusted frames of 64 × 64 voxels are from the truth. --pictures writes frames of
