@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+import re
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -29,7 +30,7 @@ def register(app: typer.Typer) -> None:
 def reconstruct(
     recording: PlaceArgument,
     out: Annotated[
-        Path | None, typer.Option(metavar="VIDEO", help="New video, a directory NAME.zarr.")
+        str | None, typer.Option(metavar="VIDEO", help="New video: a directory NAME.zarr, or a URL.")
     ] = None,
     first_line: Annotated[
         int | None, typer.Option(help="The trigger's number; else the recording's first.")
@@ -88,7 +89,7 @@ def reconstruct(
     from acquire.cli.reconstruct_request import Asked, prepare
     from acquire.reconstruct import Options
     from acquire.store import open_recording
-    from acquire.store.files import check_new_path
+    from acquire.store.delivery import check_new_place
 
     if out is None and not auto:
         raise UsageError("reconstruct without --out", possible="--out NAME.zarr")
@@ -113,28 +114,30 @@ def reconstruct(
         _print_plan(prepared.plan)
     if out is None:
         return
-    paths = [_beside(out, suffix) for suffix in prepared.requests]
-    for path in paths:
-        check_new_path(path)
+    places = [_beside(out, suffix) for suffix in prepared.requests]
+    for place in places:
+        check_new_place(place)
+    if preview and workers is None:
+        workers = 1  # processes take longer to start than a preview
     outcomes = []
-    for path, request in zip(paths, prepared.requests.values(), strict=True):
-        outcomes.append(_run(opened, request, path, prepared.options, workers, dask))
+    for place, request in zip(places, prepared.requests.values(), strict=True):
+        outcomes.append(_run(opened, request, place, prepared.options, workers, dask))
         if outcomes[-1].interrupted:
             break
-    _report(outcomes, json=json)
+    _report(outcomes, json=json, brief=preview)
     if any(outcome.interrupted for outcome in outcomes):
         raise typer.Exit(EXIT_INTERRUPTED)
 
 
-def _beside(out: Path, suffix: str) -> Path:
+def _beside(out: str, suffix: str) -> str:
     """NAME.zarr as NAME-1x820.zarr."""
-    return out.with_name(f"{out.stem}-{suffix}{out.suffix}") if suffix else out
+    return re.sub(r"(\.[^./]*)?$", rf"-{suffix}\1", out.rstrip("/"), count=1) if suffix else out
 
 
 def _run(
     recording: Recording,
     request: Request,
-    path: Path,
+    out: str,
     options: Options,
     workers: int | None,
     cluster: str | None,
@@ -142,27 +145,33 @@ def _run(
     from acquire.reconstruct import Watcher, combine, open_pool
 
     tasks = len(request.stretches)
-    with first_interrupt_asks() as interrupted, stage_progress(f"reconstructing {path.name}") as advance:
+    with (
+        first_interrupt_asks() as interrupted,
+        stage_progress(f"reconstructing {PurePosixPath(out).name}") as advance,
+    ):
         watcher = Watcher(
             tasks,
             lambda done, of: advance(round(PROGRESS_STEPS * done), PROGRESS_STEPS * of),
             interrupted.is_set,
         )
         with open_pool(tasks, workers, cluster, watcher) as pool:
-            return combine(recording, request, path, options, pool, watcher)
+            return combine(recording, request, out, options, pool, watcher)
 
 
-def _report(outcomes: list[Outcome], *, json: bool) -> None:
+def _report(outcomes: list[Outcome], *, json: bool, brief: bool) -> None:
+    """``brief``: of a preview, whose voxels cannot explain the lines, which is no news."""
     if json:
         facts = [{"path": str(each.path), "shape": each.shape, **each.provenance} for each in outcomes]
         print_json(facts[0] if len(facts) == 1 else facts)
         return
     for outcome in outcomes:
         print_facts(_readable(outcome))
-        if len(outcome.provenance["segments"]) > 1:
-            typer.echo()
-            _print_segments(outcome.provenance["segments"])
         segments = outcome.provenance["segments"]
+        if brief:
+            continue
+        if len(segments) > 1:
+            typer.echo()
+            _print_segments(segments)
         for text in dict.fromkeys(text for part in segments for text in part["warnings"]):
             print_warning(text)
 

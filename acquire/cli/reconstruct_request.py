@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING
 from acquire.cli.progress import stage_progress
 from acquire.config import check_plan, load_plan
 from acquire.errors import UsageError
-from acquire.recon.segments import Stream, Stretch, Voxels
+from acquire.recon.segments import Stretch, Voxels
 from acquire.reconstruct.learned import choose, recall
-from acquire.reconstruct.select import Selection, along_plan, by_lines, by_time, in_voxels
+from acquire.reconstruct.select import Selection, along_plan, by_lines, by_time, in_glimpses, in_voxels
 from acquire.store.files import check_new_path
 
 if TYPE_CHECKING:
@@ -28,6 +28,9 @@ PREVIEW_BANDWIDTH = 0.5
 """Of its frames' Nyquist frequency: to find out would take longer than the preview."""
 PREVIEW_MERGE = 4
 PREVIEW_LINES = 320
+"""More than these are not looked at one after the other, but in glimpses."""
+GLIMPSES = 12
+GLIMPSE_MERGE = 16
 NS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 ENDS = {None: None, "trusted": False, "whole": True}
 
@@ -88,14 +91,13 @@ def _requests(recording: Recording, asked: Asked) -> Prepared:
         raise UsageError("a plan, segments, --auto and --preview together", possible="one of them")
     selection, whole = _select(recording, asked), ENDS[asked.ends]
     if asked.preview:
-        coarse, voxels = _coarse(selection)
         options = replace(asked.options, iterations=PREVIEW_ITERATIONS, bandwidth=PREVIEW_BANDWIDTH)
-        return Prepared({"": in_voxels(coarse, voxels, whole_ends=whole, longest=1 << 62)}, options)
+        return Prepared({"": _preview(selection, whole=whole)}, options)
     plan = _plan(recording, selection, asked)
     if plan is not None:
         if asked.save_plan is not None:
             _write_plan(asked.save_plan, plan)
-        return Prepared({"": along_plan(selection, plan, _substep_s(recording))}, asked.options, plan)
+        return Prepared({"": along_plan(selection, plan)}, asked.options, plan)
     kinds = [parse_voxels(text) for text in asked.voxels]
     requests = [in_voxels(selection, kind, whole_ends=whole) for kind in kinds]
     names = [str(kind) if len(kinds) > 1 else "" for kind in kinds]
@@ -155,17 +157,14 @@ def _after_ns(recording: Recording, text: str | None) -> int | None:
     return (since.days * 86_400 + since.seconds) * NS["s"] + since.microseconds * NS["us"] - first_ns
 
 
-def _coarse(selection: Selection) -> tuple[Selection, Voxels]:
-    """The selection, no longer than a preview is, and voxels that make it short work."""
+def _preview(selection: Selection, *, whole: bool | None) -> Request:
+    """The whole of a selection in a second or two, however long it is: coarse, or glimpses of it."""
     stream = selection.stream
-    if selection.begin is not None or selection.end is not None:
-        begin, end = selection.extent(Voxels(1, 1), Voxels(1, 1), whole=False)
-        lines = stream.sub_segment(Stretch(begin, end, Voxels(1, 1)))
-        stream = Stream(stream.stages, stream.substeps, lines.first_line, lines.first_line + lines.lines)
-    stop = min(stream.end_line, stream.first_line + PREVIEW_LINES)
-    short = Stream(stream.stages, stream.substeps, stream.first_line, stop)
     side = min(2 * stream.substeps, stream.geometry(1).size)
-    return Selection(short), Voxels(side, PREVIEW_MERGE)
+    begin, end = selection.extent(Voxels(1, 1), Voxels(1, 1), whole=False)
+    if stream.sub_segment(Stretch(begin, end, Voxels(1, 1))).lines > PREVIEW_LINES:
+        return in_glimpses(selection, Voxels(side, GLIMPSE_MERGE), GLIMPSES)
+    return in_voxels(selection, Voxels(side, PREVIEW_MERGE), whole_ends=whole, longest=1 << 62)
 
 
 def _plan(recording: Recording, selection: Selection, asked: Asked) -> ReconstructionPlan | None:
@@ -190,7 +189,3 @@ def _write_plan(path: Path, plan: ReconstructionPlan) -> None:
         text += ["", "[[segments]]"]
         text += [f"{key} = {json.dumps(value)}" for key, value in part.model_dump(exclude_none=True).items()]
     path.write_text("\n".join(text) + "\n", encoding="utf-8")
-
-
-def _substep_s(recording: Recording) -> float:
-    return recording.line_period_ns / recording.geometry_for(1).substeps * 1e-9

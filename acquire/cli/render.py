@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Annotated
 
 import typer
@@ -21,7 +21,9 @@ def register(app: typer.Typer) -> None:
 
 
 def render(
-    video: Annotated[list[Path], typer.Argument(metavar="VIDEO...", help="Several stand side by side.")],
+    video: Annotated[
+        list[str], typer.Argument(metavar="VIDEO...", help="Paths or URLs; several stand side by side.")
+    ],
     out: Annotated[Path, typer.Option(metavar="FILE", help="New .mp4, .gif, .webp, or .png (a sheet).")],
     frames: Annotated[
         int | None, typer.Option(help=f"At most so many; else {MOVIE_FRAMES}, {SHEET_FRAMES} on a sheet.")
@@ -45,7 +47,7 @@ def render(
     look = Look(height or (192 if sheet else 384), peak, fps)
     _check(count, look.panel_px, fps, peak)
     check_new_path(out)
-    panels = [Panel(path.stem, open_video(path)) for path in video]
+    panels = [Panel(PurePosixPath(place).stem, open_video(place)) for place in video]
     part = out.with_name(f".{os.getpid()}.{out.name}")
     try:
         with stage_progress(f"rendering {out.name}") as advance:

@@ -61,7 +61,7 @@ class SubSegment:
     """What is kept, what is faded in and out, and the lines that it is reconstructed from.
 
     ``begin`` to ``end`` is kept; the neighbours fade over ``fade_in`` sub-steps before and after ``begin``,
-    and over ``fade_out`` about ``end``.
+    and over ``fade_out`` about ``end``. Its frames are taken from ``seen`` where that is less.
     """
 
     begin: int
@@ -71,6 +71,7 @@ class SubSegment:
     lines: int
     fade_in: int = 0
     fade_out: int = 0
+    seen: tuple[int, int] | None = None
 
     @property
     def shown(self) -> tuple[int, int]:
@@ -242,7 +243,7 @@ class Grid:
         frames = self.frames_of(segment)
         origin = substeps * segment.first_line
         have = origin + np.arange(len(values) + 1) * segment.voxels.temporal_merge
-        want = np.clip(self.edges(frames), have[0], have[-1])
+        want = np.clip(self.edges(frames), *(segment.seen or (have[0], have[-1])))
         begins = np.searchsorted(have, want[:-1], "right") - 1
         if self.voxels.temporal_merge == segment.voxels.temporal_merge and np.array_equal(
             have[begins], want[:-1]

@@ -13,7 +13,7 @@ Memory is bounded by what the pool works on; the recording is read and the video
 
 from acquire.reconstruct.combine import Outcome, Watcher, combine
 from acquire.reconstruct.pools import Pool, open_pool
-from acquire.reconstruct.select import Request, along_plan, by_lines, by_time, in_voxels
+from acquire.reconstruct.select import Request, along_plan, by_lines, by_time, in_glimpses, in_voxels
 from acquire.reconstruct.single import describe, save_reconstruction
 from acquire.reconstruct.work import Options
 
@@ -28,6 +28,7 @@ __all__ = [
     "by_time",
     "combine",
     "describe",
+    "in_glimpses",
     "in_voxels",
     "open_pool",
     "save_reconstruction",

@@ -14,6 +14,7 @@ import numpy as np
 from acquire import __version__
 from acquire.errors import AcquireError
 from acquire.recon.segments import Stitcher
+from acquire.reconstruct.times import Times
 from acquire.reconstruct.work import Task
 from acquire.store import VideoWriter
 from acquire.store.remote import is_url
@@ -22,8 +23,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from concurrent.futures import Future
     from pathlib import Path
-
-    from numpy.typing import NDArray
 
     from acquire.recon.segments import SubSegment
     from acquire.reconstruct.pools import Pool
@@ -41,7 +40,7 @@ QUALITY_KEYS = ("misfit", "prediction", "coverage")
 class Outcome:
     """What was written. ``interrupted``: less than what was asked for."""
 
-    path: Path
+    path: Path | str
     shape: tuple[int, int, int]
     interrupted: bool
     provenance: dict[str, Any]
@@ -71,26 +70,26 @@ class Watcher:
 
 
 def combine(
-    recording: Recording, request: Request, path: Path, options: Options, pool: Pool, watcher: Watcher
+    recording: Recording, request: Request, out: Path | str, options: Options, pool: Pool, watcher: Watcher
 ) -> Outcome:
     """Reconstruct the stretches of a request and write their video.
 
-    When the watcher says stop, what was solved so far is written, marked as interrupted; DataError and
-    whatever a sub-segment raises leave nothing.
+    ``out`` is a new path or URL. When the watcher says stop, what was solved so far is written, marked as
+    interrupted; DataError and whatever a sub-segment raises leave nothing.
     """
     began, grid = time.monotonic(), request.grid
-    segments = request.stream.arrange(request.stretches, request.fade)
+    segments = request.sub_segments()
     place = str(recording) if is_url(str(recording)) else str(recording.path.resolve())
     tasks = [Task(place, segment, grid, options) for segment in segments]
-    clock = _Clock.of(recording, request)
+    times, anchor = Times.of(recording), _anchor(recording, request)
     stitcher = Stitcher(grid)
     done: list[dict[str, Any]] = []
     with VideoWriter(
-        path,
+        out,
         (grid.side, grid.side),
         np.dtype(np.float32),
         float(grid.voxels.spatial_merge),
-        clock.substep_ns * grid.voxels.temporal_merge,
+        times.substep_ns * grid.voxels.temporal_merge,
         pixel_unit=None,
         quality=True,
     ) as writer:
@@ -98,7 +97,7 @@ def combine(
             video, error = stitcher.add(task.segment, (part.video, part.error), following)
             if len(video):
                 begins = grid.edges(slice(writer.frames, writer.frames + len(video)))[:-1]
-                writer.append(video, clock.time_ns(begins), error)
+                writer.append(video, times.utc_ns(begins, anchor), error)
             done.append(part.facts)  # not the part: memory must not grow with the stream
         if not done:
             raise KeyboardInterrupt  # there is nothing to keep
@@ -107,7 +106,7 @@ def combine(
         facts["seconds"] = round(time.monotonic() - began, 3)
         facts["trusted"] = _trusted_frames(request, writer.frames)
         writer.finish(facts)
-    return Outcome(path, (writer.frames, grid.side, grid.side), watcher.stopped, facts)
+    return Outcome(out, (writer.frames, grid.side, grid.side), watcher.stopped, facts)
 
 
 def _solved(
@@ -161,28 +160,12 @@ class _Budget:
         return replace(task, options=replace(task.options, budget_s=max(share, LEAST_BUDGET_S)))
 
 
-@dataclass(frozen=True, slots=True)
-class _Clock:
-    """UTC of a sub-step: that of the stream's first line, and from there on."""
-
-    first_substep: int
-    first_ns: int
-    substep_ns: float
-
-    @classmethod
-    def of(cls, recording: Recording, request: Request) -> _Clock:
-        stream = request.stream
-        row = stream.first_line - recording.first_line
-        read_out_ns = int(recording.arms["a"].read("time", row, row + 1)[0])
-        first = stream.substeps * stream.first_line + stream.geometry(1).readout_substep
-        return cls(first, read_out_ns, recording.line_period_ns / stream.substeps)
-
-    def time_ns(self, substeps: NDArray[np.int64]) -> NDArray[np.int64]:
-        """UTC at which sub-steps begin."""
-        offset: NDArray[np.int64] = np.rint((substeps - self.first_substep) * self.substep_ns).astype(
-            np.int64
-        )
-        return self.first_ns + offset
+def _anchor(recording: Recording, request: Request) -> tuple[int, int]:
+    """The sub-step at which the read-out of the stream's first line begins, and its UTC in ns."""
+    stream = request.stream
+    row = stream.first_line - recording.first_line
+    read_out_ns = int(recording.arms["a"].read("time", row, row + 1)[0])
+    return stream.substeps * stream.first_line + stream.geometry(1).readout_substep, read_out_ns
 
 
 def describe_parts(

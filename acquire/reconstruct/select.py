@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from acquire.errors import UsageError
 from acquire.plan_config import FADE_SUBSTEPS
-from acquire.recon.segments import Grid, Stream, Stretch, Voxels, split
+from acquire.recon.segments import Grid, Stream, Stretch, SubSegment, Voxels, split
+from acquire.reconstruct.times import Times, duration
 
 if TYPE_CHECKING:
     from acquire.plan_config import ReconstructionPlan
@@ -20,9 +21,13 @@ VOXELS_PER_SEGMENT = 16
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Sub-steps ``begin`` to ``end`` (None: as far as it goes) out of the lines of ``stream``."""
+    """Sub-steps ``begin`` to ``end`` (None: as far as it goes) out of the lines of ``stream``.
+
+    ``times`` says them to the user.
+    """
 
     stream: Stream
+    times: Times
     begin: int | None = None
     end: int | None = None
 
@@ -31,8 +36,18 @@ class Selection:
         low, high = self.stream.extent(first, last, whole=whole)
         begin, end = low if self.begin is None else self.begin, high if self.end is None else self.end
         if not low <= begin < end <= high:
-            raise UsageError(f"sub-steps {begin} to {end}, counted from line 0", possible=f"{low} to {high}")
+            raise UsageError(
+                f"{self.in_words(begin, end)} after the first line", possible=self.in_words(low, high)
+            )
         return begin, end
+
+    def length(self, substeps: int) -> str:
+        """So many sub-steps in words."""
+        return f"{duration(substeps * self.times.substep_ns)} ({substeps} sub-steps)"
+
+    def in_words(self, begin: int, end: int) -> str:
+        """Sub-steps as times and as what they are."""
+        return f"{self.times.words(begin)} to {self.times.words(end)} (sub-steps {begin} to {end})"
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +55,7 @@ class Request:
     """Stretches of a stream that follow one another, and the grid of their common video.
 
     ``trusted`` are the sub-steps that are sampled in full; ``names`` and ``reasons`` are the stretches'.
+    ``glimpses`` are what is looked at where that is less than all of each stretch.
     """
 
     stream: Stream
@@ -49,6 +65,11 @@ class Request:
     fade: int = FADE_SUBSTEPS
     names: tuple[str, ...] = ()
     reasons: tuple[str, ...] = ()
+    glimpses: tuple[SubSegment, ...] = ()
+
+    def sub_segments(self) -> tuple[SubSegment, ...]:
+        """What is solved, in order."""
+        return self.glimpses or self.stream.arrange(self.stretches, self.fade)
 
 
 def stream_of(recording: Recording) -> Stream:
@@ -66,13 +87,14 @@ def by_lines(recording: Recording, first_line: int | None = None, lines: int | N
     if not whole.first_line <= first < end <= whole.end_line:
         have = f"lines {whole.first_line} to {whole.end_line - 1}" if recording.lines else "no lines yet"
         raise UsageError(f"lines {first} to {end - 1} of {recording}", possible=have)
-    return Selection(Stream(whole.stages, whole.substeps, first, end))
+    return Selection(Stream(whole.stages, whole.substeps, first, end), Times.of(recording))
 
 
 def by_time(recording: Recording, begin_ns: int | None, end_ns: int | None) -> Selection:
     """The video from ``begin_ns`` to ``end_ns`` after the first line's read-out, from all lines it needs."""
-    stream = stream_of(recording)
-    return Selection(stream, _substep(recording, begin_ns), _substep(recording, end_ns))
+    times = Times.of(recording)
+    begin, end = (None if ns is None else times.substep(ns) for ns in (begin_ns, end_ns))
+    return Selection(stream_of(recording), times, begin, end)
 
 
 def in_voxels(
@@ -93,9 +115,34 @@ def in_voxels(
     return Request(stream, stretches, Grid.finest(stretches, size), _trusted(stream, begin, end))
 
 
-def along_plan(
-    selection: Selection, plan: ReconstructionPlan, substep_s: float, grid: Voxels | None = None
-) -> Request:
+def in_glimpses(selection: Selection, voxels: Voxels, count: int) -> Request:
+    """One frame for each of ``count`` equal stretches, from the fewest lines about its middle that show one.
+
+    How long that takes does not depend on how long the selection is. UsageError where the stretches are
+    shorter than a glimpse.
+    """
+    stream = selection.stream
+    begin, end = selection.extent(voxels, voxels, whole=False)
+    length = (end - begin) // count
+    needed = stream.sub_segment(Stretch(begin, begin + voxels.temporal_merge, voxels)).lines
+    if length < needed * stream.substeps:
+        raise UsageError(f"{count} glimpses of {selection.length(end - begin)}")
+    whole = Voxels(voxels.spatial_merge, length)
+    stretches = tuple(Stretch(begin + i * length, begin + (i + 1) * length, whole) for i in range(count))
+    glimpses = tuple(_glimpse(stream, stretch, voxels) for stretch in stretches)
+    grid = Grid.finest(stretches, stream.geometry(1).size)
+    return Request(stream, stretches, grid, (begin, stretches[-1].end), glimpses=glimpses)
+
+
+def _glimpse(stream: Stream, stretch: Stretch, voxels: Voxels) -> SubSegment:
+    middle = (stretch.begin + stretch.end - voxels.temporal_merge) // 2
+    seen = (middle, middle + voxels.temporal_merge)
+    return replace(
+        stream.sub_segment(Stretch(*seen, voxels)), begin=stretch.begin, end=stretch.end, seen=seen
+    )
+
+
+def along_plan(selection: Selection, plan: ReconstructionPlan, grid: Voxels | None = None) -> Request:
     """The sub-segments of a plan, one after the other from the selection's beginning.
 
     UsageError for a plan that is longer than what there is.
@@ -106,12 +153,13 @@ def along_plan(
     for each in voxels:
         geometry.check_merge(each.spatial_merge, each.temporal_merge)
     begin, end = selection.extent(voxels[0], voxels[-1], whole=plan.ends == "whole")
+    substep_s = selection.times.substep_ns * 1e-9
     stretches, edge = [], begin
     for part, each in zip(plan.segments, voxels, strict=True):
         length = part.length_substeps(geometry.substeps, substep_s)
         if edge + (length or 1) > end:
-            missing = f"{part.name or 'a segment'} to sub-step {edge + (length or 1) - begin}"
-            raise UsageError(f"plan with {missing}", possible=f"{end - begin} sub-steps in all")
+            wanted, most = (selection.length(to - begin) for to in (edge + (length or 1), end))
+            raise UsageError(f"plan with {part.name or 'a segment'} to {wanted}", possible=f"{most} in all")
         stop = end if length is None else edge + length
         stretches.append(Stretch(edge, stop, stream.evened(each, stop - edge)))
         edge = stop
@@ -131,13 +179,3 @@ def _trusted(stream: Stream, begin: int, end: int) -> tuple[int, int]:
     origin, trusted = stream.substeps * stream.first_line, stream.geometry().trusted
     low, high = max(begin, origin + trusted.start), min(end, origin + trusted.stop)
     return (low, high) if high > low else (begin, begin)
-
-
-def _substep(recording: Recording, after_ns: int | None) -> int | None:
-    """The sub-step that begins ``after_ns`` after the read-out of the recording's first line begins."""
-    if after_ns is None:
-        return None
-    geometry = recording.geometry_for(1)
-    substep_ns = recording.line_period_ns / geometry.substeps
-    first = geometry.substeps * recording.first_line + geometry.readout_substep
-    return first + round(after_ns / substep_ns)

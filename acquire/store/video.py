@@ -8,17 +8,15 @@
       quality    (t) float32, where it is known: relative error of prediction of each frame's lines
 
 `VideoWriter` takes the frames as they come, for videos longer than memory; `write_video` writes one at once.
+A place is a path, or a URL as recordings have.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import os
-import shutil
-from contextlib import contextmanager
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,11 +25,13 @@ from zarr.codecs import BloscCodec, Crc32cCodec
 
 from acquire.errors import DataError, UsageError
 from acquire.store.camera_stream import DAMAGE, child_array
-from acquire.store.files import DISK, check_new_path
+from acquire.store.delivery import delivery_to, told
 from acquire.store.layout import group_document, to_json
+from acquire.store.source import source_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Mapping
+    from pathlib import Path
     from types import TracebackType
 
     from numpy.typing import NDArray
@@ -76,7 +76,7 @@ class VideoFile:
 
 
 def write_video(
-    path: Path,
+    place: Path | str,
     video: NDArray[Any],
     time_ns: NDArray[np.int64],
     pixel_size: float,
@@ -94,7 +94,7 @@ def write_video(
     _check(video, time_ns, pixel_size, frame_interval_ns, provenance)
     rows, columns = video.shape[1:]
     with VideoWriter(
-        path, (rows, columns), video.dtype, pixel_size, frame_interval_ns, pixel_unit=pixel_unit
+        place, (rows, columns), video.dtype, pixel_size, frame_interval_ns, pixel_unit=pixel_unit
     ) as writer:
         writer.append(video, time_ns)
         writer.finish(provenance)
@@ -108,7 +108,7 @@ class VideoWriter:
 
     def __init__(
         self,
-        path: Path,
+        place: Path | str,
         shape: tuple[int, int],
         dtype: np.dtype[Any],
         pixel_size: float,
@@ -117,11 +117,11 @@ class VideoWriter:
         pixel_unit: str | None = "micrometer",
         quality: bool = False,
     ) -> None:
-        check_new_path(path)
-        self._path, self._partial = path, path.with_name(f".{path.name}.{os.getpid()}.partial")
-        self._ome = _ome(path.stem, (frame_interval_ns * 1e-9, pixel_size, pixel_size), pixel_unit)
-        with _told(path):
-            self._group = zarr.create_group(self._partial, zarr_format=3)
+        self._place, self._delivery = place, delivery_to(place)
+        name = PurePosixPath(str(place)).stem
+        self._ome = _ome(name, (frame_interval_ns * 1e-9, pixel_size, pixel_size), pixel_unit)
+        with told(place):
+            self._group = zarr.create_group(self._delivery.partial, zarr_format=3)
             self._image = _image(self._group, shape, dtype)
             self._columns = {"time": _column(self._group, "time", "int64", TIME_ATTRIBUTES)}
             if quality:
@@ -142,26 +142,23 @@ class VideoWriter:
     def finish(self, provenance: Mapping[str, Any]) -> None:
         """The video appears under its name. UsageError for one without frames."""
         if not self.frames:
-            raise UsageError(f"{self._path}: a video without a frame")
+            raise UsageError(f"{self._place}: a video without a frame")
         _check_provenance(provenance)
         self._flush(whole_chunks=False)
         attributes = {"format": FORMAT, "ome": self._ome, "provenance": dict(provenance)}
-        with _told(self._path):
+        with told(self._place):
             # Consolidated by hand: zarr-python warns of its own, and xarray warns where there is none.
-            names = ("0", *self._columns)
-            nodes = {n: json.loads((self._partial / n / "zarr.json").read_bytes()) for n in names}
-            (self._partial / "zarr.json").write_bytes(to_json(group_document(attributes, nodes)))
-            DISK.sync_tree(self._partial)
-            check_new_path(self._path)
-            self._partial.rename(self._path)
-            DISK.sync_directory(self._path.parent)
+            partial, names = self._delivery.partial, ("0", *self._columns)
+            nodes = {n: json.loads((partial / n / "zarr.json").read_bytes()) for n in names}
+            (partial / "zarr.json").write_bytes(to_json(group_document(attributes, nodes)))
+        self._delivery.deliver()
 
     def _flush(self, *, whole_chunks: bool) -> None:
         arrays = [np.concatenate(parts) for parts in zip(*self._chunk, strict=True)]
         chunk, waiting = self._image.chunks[0], len(arrays[0])
         count = waiting // chunk * chunk if whole_chunks else waiting
         first = self._image.shape[0]
-        with _told(self._path):
+        with told(self._place):
             for array, values in zip((self._image, *self._columns.values()), arrays, strict=True):
                 array.resize((first + count, *array.shape[1:]))
                 array[first:] = values[:count]
@@ -173,24 +170,24 @@ class VideoWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        shutil.rmtree(self._partial, ignore_errors=True)
+        self._delivery.clear()
 
 
-def open_video(path: Path | str) -> VideoFile:
-    """Open a video that `write_video` wrote. Raises DataError when ``path`` is not one, or is damaged."""
-    path = Path(path)
-    if not path.exists():
-        raise DataError(f"{path} does not exist", hint="the path of a video (a directory NAME.zarr)")
+def open_video(place: Path | str) -> VideoFile:
+    """Open a video that `write_video` wrote. Raises DataError when ``place`` is not one, or is damaged."""
+    source = source_of(place)
     try:
-        group = zarr.open_group(path, mode="r", zarr_format=3)
+        if not source.exists():
+            raise DataError(f"{source} does not exist", hint="the path of a video (a directory NAME.zarr)")
+        group = zarr.open_group(source.zarr_store(), mode="r", zarr_format=3)
         attributes = dict(group.attrs)
         if attributes.get("format") != FORMAT:
-            raise DataError(f"{path} is not a video of ours: format {attributes.get('format')!r}")
+            raise DataError(f"{source} is not a video of ours: format {attributes.get('format')!r}")
         time_ns = np.asarray(child_array(group, "time")[:], np.int64)
         quality = np.asarray(child_array(group, "quality")[:]) if "quality" in group else None
         return VideoFile(child_array(group, "0"), time_ns, attributes, quality)
     except DAMAGE as error:
-        raise DataError(f"{path} is not a video, or is damaged: {error}") from error
+        raise DataError(f"{source} is not a video, or is damaged: {error}") from error
 
 
 def _check(
@@ -249,12 +246,3 @@ def _column(group: zarr.Group, name: str, dtype: str, attributes: dict[str, Any]
         dimension_names=("t",),
         attributes=attributes,
     )
-
-
-@contextmanager
-def _told(path: Path) -> Iterator[None]:
-    """What the disk refuses, in words."""
-    try:
-        yield
-    except OSError as error:
-        raise DataError(f"{path} cannot be written: {error.strerror}", hint="another disk") from error

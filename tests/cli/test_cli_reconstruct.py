@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from acquire.config import load_rig
-from acquire.scene_config import LedConfig, LedSceneConfig, SineDrive
+from acquire.scene_config import ConstantDrive, LedConfig, LedSceneConfig, SineDrive
 from acquire.simulate import simulate
 from acquire.store import open_video
 
@@ -116,11 +116,41 @@ def test_a_preview_is_coarse(cli: Cli, recording: Path, tmp_path: Path) -> None:
     assert answer.json["shape"][1:] == [6, 6]
 
 
+def test_a_preview_shows_all_of_a_long_recording(cli: Cli, tmp_path: Path) -> None:
+    rig = load_rig("rig-demo", {"geometry.stages": 12, "geometry.substeps": 2})
+    led = LedConfig(
+        name="x", shape="square", row=0.5, column=0.5, size=0.5, drive=ConstantDrive(waveform="constant")
+    )
+    simulate(rig, LedSceneConfig(kind="leds", title="one LED", leds=(led,)), tmp_path / "long.zarr", 3000)
+    answer = cli("reconstruct", tmp_path / "long.zarr", "--out", tmp_path / "v.zarr", "--preview", "--json")
+    assert answer.code == 0, answer.err
+    facts = answer.json
+    assert facts["shape"] == [12, 6, 6]
+    assert 12 * facts["temporal_merge"] > 0.95 * 2 * 3000
+    assert sum(part["lines"] for part in facts["segments"]) < 600
+
+
+def test_a_video_is_written_to_a_url_and_rendered_from_it(cli: Cli, recording: Path, tmp_path: Path) -> None:
+    url = f"file://{tmp_path}/far/v.zarr"
+    words = ("reconstruct", recording, "--out", url, "--lines", 60, "--iterations", 2)
+    answer = cli(*words, "--voxels", "2x3", "--voxels", "1x66", "--json")
+    assert answer.code == 0, answer.err
+    places = [facts["path"] for facts in answer.json]
+    assert places == [f"file://{tmp_path}/far/v-2x3.zarr", f"file://{tmp_path}/far/v-1x66.zarr"]
+    assert open_video(places[0]).video.shape[1:] == (12, 12)
+    again = cli(*words, "--voxels", "2x3", "--voxels", "1x66")
+    assert again.code == 2
+    assert "exists already" in again.err
+    answer = cli("render", *places, "--out", tmp_path / "both.png", "--frames", 2)
+    assert answer.code == 0, answer.err
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (("--lines", 10_000), "possible: lines 0 to 299"),
         (("--from", "1h"), "52ms"),
+        (("--from", "1ms", "--to", "1s"), "1ms to 1s (sub-steps"),
         (("--voxels", "3"), "NMxTM"),
         (("--lines", 50, "--from", "1ms"), "--from and --to"),
         (("--segment", ":2x2", "--segment", "5:2x2"), "only the last segment"),

@@ -15,7 +15,17 @@ import pytest
 from acquire.errors import UsageError
 from acquire.plan_config import ReconstructionPlan
 from acquire.recon.segments import Voxels
-from acquire.reconstruct import Options, Watcher, along_plan, by_lines, by_time, combine, in_voxels, open_pool
+from acquire.reconstruct import (
+    Options,
+    Watcher,
+    along_plan,
+    by_lines,
+    by_time,
+    combine,
+    in_glimpses,
+    in_voxels,
+    open_pool,
+)
 from acquire.scene_config import LedSceneConfig
 from acquire.sim.scenes import build_scene
 from acquire.sim.voxels import truth
@@ -77,7 +87,7 @@ def test_a_plan_brings_different_voxels_to_one_grid(recording_path, tmp_path):
         }
     )
     selection = by_lines(open_recording(recording_path), 20, 250)
-    request = along_plan(selection, plan, 1e-5)
+    request = along_plan(selection, plan)
     outcome = run(recording_path, request, tmp_path / "v.zarr")
     fast, fine, rest = outcome.provenance["segments"]
     assert [part["name"] for part in (fast, fine, rest)] == ["fast", "fine", "rest"]
@@ -96,8 +106,31 @@ def test_times_ask_for_the_lines_they_need(recording_path):
     segment = request.stream.arrange(request.stretches)[0]
     read_out = recording.camera("a").time_ns
     assert read_out[segment.first_line] - read_out[0] <= 1_000_000
-    with pytest.raises(UsageError, match="possible: 23 to"):
+    with pytest.raises(UsageError, match=r"0us to 1000s .*\n?.*possible: 0us to .*ms \(sub-steps 23 to"):
         in_voxels(by_time(recording, 0, 10**12), Voxels(2, 1))
+
+
+def test_glimpses_show_the_whole_range_from_few_lines(recording_path, tmp_path):
+    selection = by_lines(open_recording(recording_path))
+    request = in_glimpses(selection, Voxels(4, 8), 4)
+    pieces = request.sub_segments()
+    assert [piece.lines for piece in pieces] == [pieces[0].lines] * 4
+    assert sum(piece.lines for piece in pieces) < request.stream.end_line / 1.5
+    outcome = run(recording_path, request, tmp_path / "v.zarr", Options(iterations=30))
+    written = open_video(tmp_path / "v.zarr")
+    assert outcome.shape == (4, 6, 6)
+    recording = open_recording(recording_path)
+    scene = build_scene(LedSceneConfig.model_validate(recording.attrs["scene"]), 24, 1e-5)
+    for frame, piece in zip(written.video[:], pieces, strict=True):
+        there = truth(scene, piece.seen[0], 8, 4, 8)[0]
+        assert np.sqrt(np.mean((frame - there) ** 2)) < 0.2 * there.max()
+    step_ns = np.diff(written.time_ns)
+    np.testing.assert_allclose(step_ns, written.interval_ns, atol=1)
+
+
+def test_glimpses_of_a_short_stretch_are_refused(recording_path):
+    with pytest.raises(UsageError, match=r"50 glimpses of .* sub-steps"):
+        in_glimpses(by_lines(open_recording(recording_path)), Voxels(4, 8), 50)
 
 
 def test_what_was_solved_before_a_stop_is_kept_and_marked(recording_path, request_of_three, tmp_path):

@@ -118,8 +118,7 @@ class Studio:
         """Reconstruct along a built-in plan from a line on, sub-segments side by side."""
         self.say(f"reconstructing {what}")
         plan = load_plan(plan_name)
-        substep_s = recording.line_period_ns / recording.geometry_for(1).substeps * 1e-9
-        request = along_plan(by_lines(recording, first_line), plan, substep_s)
+        request = along_plan(by_lines(recording, first_line), plan)
         began = time.perf_counter()
         watcher = Watcher(len(request.stretches))
         with open_pool(len(request.stretches), watch=watcher) as pool:

@@ -1,0 +1,117 @@
+"""A Zarr group that is made in private and appears at its place whole, on a disk or at a URL.
+
+::
+
+    path   .NAME.partial beside it ─▶ forced to the medium ─▶ renamed
+    URL    a temporary directory   ─▶ its arrays are put ─▶ its root metadata, as the last
+
+Who opens a group asks for its ``zarr.json`` first: as long as there is none, nothing is there. What an upload
+leaves that failed is therefore no group, and is replaced when it is tried again.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+from acquire.errors import DataError, UsageError
+from acquire.store.files import DISK, check_new_path
+from acquire.store.remote import RemoteSource, is_url
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+ROOT = "zarr.json"
+
+
+class Delivery(Protocol):
+    """What is made in ``partial``, until it is delivered or given up."""
+
+    partial: Path
+
+    def deliver(self) -> None:
+        """It appears at its place. UsageError where something is by now, DataError when that fails."""
+
+    def clear(self) -> None:
+        """Nothing of it stays here; what was delivered does."""
+
+
+def delivery_to(place: Path | str) -> Delivery:
+    """UsageError where nothing new can be created at a place; DataError for a store that does not answer."""
+    return _FarDelivery(str(place)) if is_url(place) else _LocalDelivery(Path(place))
+
+
+def check_new_place(place: Path | str) -> None:
+    """`check_new_path` of a path or a URL."""
+    if is_url(place):
+        _check_free(RemoteSource(str(place)))
+    else:
+        check_new_path(Path(place))
+
+
+class _LocalDelivery:
+    def __init__(self, path: Path) -> None:
+        check_new_path(path)
+        self._path = path
+        self.partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+
+    def deliver(self) -> None:
+        with told(self._path):
+            DISK.sync_tree(self.partial)
+            check_new_path(self._path)
+            self.partial.rename(self._path)
+            DISK.sync_directory(self._path.parent)
+
+    def clear(self) -> None:
+        shutil.rmtree(self.partial, ignore_errors=True)
+
+
+class _FarDelivery:
+    def __init__(self, url: str) -> None:
+        self._target = RemoteSource(url)
+        _check_free(self._target)
+        self._directory = tempfile.TemporaryDirectory(prefix="acquire-", ignore_cleanup_errors=True)
+        self.partial = Path(self._directory.name) / "group.zarr"
+
+    def deliver(self) -> None:
+        _check_free(self._target)
+        files = [file for file in self.partial.rglob("*") if file.is_file()]
+        files.sort(
+            key=lambda file: (file == self.partial / ROOT, file.name != ROOT)
+        )  # what it is comes first
+        with told(self._target):
+            for file in files:
+                key = file.relative_to(self.partial).as_posix()
+                if self._target.has_directories:
+                    self._target.make_directory_of(key)
+                self._target.put_file(key, file)
+
+    def clear(self) -> None:
+        self._directory.cleanup()
+
+
+def _check_free(target: RemoteSource) -> None:
+    """Where an upload has failed, there are arrays without a root; anything else is not ours to replace."""
+    with told(target):
+        there = target.sizes()
+    if ROOT in there:
+        raise UsageError(f"{target} exists already", hint="another name; nothing is ever overwritten")
+    arrays = {key.partition("/")[0] for key in there if key.endswith(f"/{ROOT}")}
+    foreign = sorted(key for key in there if key.partition("/")[0] not in arrays)
+    if foreign:
+        raise UsageError(f"{target} holds something else, such as {foreign[0]}", hint="another URL")
+
+
+@contextmanager
+def told(place: object) -> Iterator[None]:
+    """What a disk or a store refuses, in words."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(
+            f"{place} cannot be written: {error.strerror or error}", hint="another place"
+        ) from error
