@@ -3,7 +3,8 @@
 ::
 
     arm, start ─▶ kill a process at random ─▶ another takes its place ─▶ … ─▶ stop, or kill the daemon
-               ─▶ recover ─▶ every row is its line, or flagged and listed; nothing acknowledged is missing
+               ─▶ the daemon, or the next one, seals what is left ─▶ every row is its line, or flagged and
+                  listed; nothing acknowledged is missing
 
 ``python tools/kill_storm.py --kills 200`` prints what was killed and what was found. The cameras show a
 pattern without a zero in it, so that a row that was never written shows.
@@ -33,7 +34,6 @@ from acquire.errors import AcquireError
 from acquire.lines import ARMS, LineFlag
 from acquire.sim.pattern import Pattern
 from acquire.store import open_recording
-from acquire.store.recover import recover
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -136,6 +136,8 @@ class Storm:
                 self._end_daemon(daemon, acknowledged)
             else:
                 self._end_run(client, last)
+        self._serve()  # a daemon that was killed has left the last recovery to the next
+        _until(lambda: not _open_parts(path))
         self._examine(path, acknowledged)
 
     def _end_run(self, client: Client, last: str) -> None:
@@ -194,10 +196,8 @@ class Storm:
 
     def _examine(self, path: Path, acknowledged: Status) -> None:
         """The recording and those beside it that went on from it."""
-        paths = [path, *sorted(self._home.glob(f"{path.stem}-*.zarr"), key=lambda one: len(one.name))]
         end = None
-        for part in paths:
-            recover(part)
+        for part in (path, *(segment.path for segment in open_recording(path).segments)):
             self.outcome.faults += [f"{part.name}: {fault}" for fault in check_recording(part)]
             recording = open_recording(part)
             if end is not None and not recording.first_line <= end:
@@ -211,6 +211,13 @@ class Storm:
         seen = acknowledged.recording
         if seen is not None and end is not None and (seen.first_line or 0) + seen.committed_lines > end:
             self.outcome.faults.append(f"{path.name}: {seen.committed_lines} lines were acknowledged")
+
+
+def _open_parts(path: Path) -> list[str]:
+    """Of a recording and its segments, those that are not sealed, or not listed in the first."""
+    listed = [path.name, *open_recording(path).attrs.get("segments", [])]
+    parts = [path, *path.parent.glob(f"{path.stem}-*.zarr")]
+    return [part.name for part in parts if part.name not in listed or open_recording(part).state != "sealed"]
 
 
 def check_recording(path: Path) -> list[str]:

@@ -20,6 +20,8 @@ SocketOption = Annotated[
 ]
 DAMAGED = ("INCOMPLETE", "ABORTED", None)
 """Conditions of a recording that lost something."""
+RECOVERIES = 3
+"""Recordings that were not sealed, of which the status tells in words; --json has more."""
 
 
 def register(app: typer.Typer) -> None:
@@ -154,6 +156,7 @@ def _show(status: Status, json: bool) -> None:
             "run": status.run_id,
             "recording": _recording(status),
             "last": _last(status.last),
+            "not sealed": _recoveries(status),
             "sustains": _capacity(status),
             "possible": ", ".join(status.possible) or "wait until it is idle",
         }
@@ -185,6 +188,13 @@ def _last(last: LastRecording | None) -> str | None:
     if last is None:
         return None
     return f"{last.path}, {last.lines} lines, {last.condition or 'not sealed'} ({last.end_reason})"
+
+
+def _recoveries(status: Status) -> str | None:
+    """Recordings that their recorder did not seal, and what the daemon made of them."""
+    shown = [f"{one.path.name}: {one.state}, {one.text}" for one in status.recoveries[-RECOVERIES:]]
+    more = len(status.recoveries) - len(shown)
+    return "; ".join([*shown, *([f"and {more} before"] if more else [])]) or None
 
 
 def _show_arms(status: Status) -> None:

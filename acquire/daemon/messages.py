@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -146,6 +146,17 @@ class LastRecording(_Message):
     end_reason: str | None
 
 
+class RecoveryStatus(_Message):
+    """A recording that its recorder did not seal, and what the daemon made of it."""
+
+    path: Path
+    state: Literal["waiting", "recovered", "left", "failed"] = Field(
+        description="waiting for its turn or a lock; sealed; not to be touched by this daemon; could not be"
+    )
+    lines: int | None = Field(default=None, description="of each arm that a reader finds")
+    text: str = Field(default="", description="how it came to that")
+
+
 class CapacityStatus(_Message):
     """What this host sustains, as measured before the run was armed; line rates of both arms."""
 
@@ -174,6 +185,9 @@ class Status(_Message):
     fault: str | None
     capacity: CapacityStatus | None = None
     processes: dict[str, int] = Field(default={}, description="of the run: name → process number")
+    recoveries: list[RecoveryStatus] = Field(
+        default=[], description="the latest recordings that were not sealed"
+    )
 
 
 class ErrorMessage(_Message):

@@ -21,6 +21,7 @@ from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.notify import notify
 from acquire.daemon.plan import Run
 from acquire.daemon.proof import Proof
+from acquire.daemon.salvage import Salvage
 from acquire.daemon.service import Service
 from acquire.errors import EXIT_INTERRUPTED, StateError
 from acquire.rig import Rig
@@ -45,7 +46,9 @@ def serve(config: RigConfig) -> int:
     Raises StateError where another daemon has the socket, before any device is touched.
     """
     with contextlib.closing(Endpoint(config.control.socket.absolute())) as endpoint, Rig(config) as rig:
-        service = Service(config, lambda: Run(config, rig), Proof(config))
+        salvage = Salvage(config.recording.directory.absolute())
+        salvage.search()
+        service = Service(config, lambda: Run(config, rig), Proof(config), salvage)
         return asyncio.run(Daemon(service, endpoint).run())
 
 

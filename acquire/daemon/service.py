@@ -21,6 +21,7 @@ from acquire.daemon.events import StandingOrder, budget_lines, window_of
 from acquire.daemon.messages import ArmRequest, LastRecording, RecordingStatus, Status
 from acquire.daemon.plan import default_path
 from acquire.daemon.report import Rates, arm_statuses, delivered_lines
+from acquire.daemon.salvage import Salvage
 from acquire.daemon.states import Event, State, after, commands
 from acquire.errors import AcquireError, DeviceError
 from acquire.store import RunCondition
@@ -30,12 +31,14 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from acquire.config import RigConfig
-    from acquire.daemon.messages import CapacityStatus, StartRequest
+    from acquire.daemon.messages import CapacityStatus, RecoveryStatus, StartRequest
     from acquire.stream import Window
     from acquire.stream.messages import Note
 
 DRAIN_TIMEOUT_S = 30.0
 """From the last line's number to the sealed recording; more is a fault."""
+RECOVERY_S = 20.0
+"""How long the end of a run waits for recordings of it that are being recovered."""
 POLL_S = 0.05
 ARM = ArmRequest()
 
@@ -66,10 +69,17 @@ class Prove(Protocol):
 class Service:
     """One instrument, at most one run at a time. See the module for who may call what."""
 
-    def __init__(self, config: RigConfig, open_run: Callable[[], Run], prove: Prove | None = None) -> None:
+    def __init__(
+        self,
+        config: RigConfig,
+        open_run: Callable[[], Run],
+        prove: Prove | None = None,
+        salvage: Salvage | None = None,
+    ) -> None:
         self._config = config
         self._open_run = open_run
         self._prove = prove
+        self._salvage = salvage or Salvage(config.recording.directory.absolute())
         self._capacity: CapacityStatus | None = None
         self._hurried = threading.Event()
         self._born = time.monotonic()
@@ -105,6 +115,7 @@ class Service:
         them and that is not forced; the state is idle then.
         """
         with self._doing(Event.ARM):
+            self._recovered(self._salvage.look(capturing=True))  # what is under way would be measured, too
             if self._prove is not None:
                 self._capacity = self._prove(force=request.force)
             run = self._open_run()
@@ -146,6 +157,7 @@ class Service:
 
     def supervise(self) -> None:
         """Look at the capture path once and act on what is seen. Any failure of it becomes a fault."""
+        self._recovered(self._salvage.look(capturing=self._run is not None))
         if self._run is None:
             return
         try:
@@ -166,7 +178,11 @@ class Service:
         except (AcquireError, OSError) as error:
             log.error("while ending: %s", error)  # noqa: TRY400 - users get no traceback
         finally:
-            self._release()
+            try:
+                self._release()
+            finally:
+                self._recovered(self._salvage.wait(RECOVERY_S))
+                self._salvage.close()
 
     def _stop(self, reason: str) -> None:
         assert self._run is not None
@@ -174,6 +190,7 @@ class Service:
         self._go(Event.STOP, reason)
         while self._state is State.DRAINING:
             self._drain_on()
+        self._recovered(self._salvage.wait(RECOVERY_S))
 
     def _drain_on(self) -> None:
         self.supervise()
@@ -201,6 +218,7 @@ class Service:
     def _poll(self) -> CaptureStatus:
         assert self._run is not None
         self._seen = self._run.poll()
+        self._salvage.add(self._seen.orphans)
         self._rates.look(delivered_lines(self._seen))
         return self._seen
 
@@ -267,6 +285,7 @@ class Service:
             raise DeviceError(f"the devices could not be released in order: {error}") from error
         finally:
             self._seen, self._rates = run.poll(), Rates()
+            self._salvage.add(self._seen.orphans)
             for arm, account in self._seen.accounts.items():
                 if not account.balanced:
                     log.error("the ledger of arm %s does not balance: %s", arm, account)
@@ -277,8 +296,6 @@ class Service:
         if self._target is None:
             return
         (path, _), self._target = self._target, None
-        if self._seen.path not in (None, str(path)):
-            log.warning("%s was cut off; acquire recover %s seals it", path, path)
         path = Path(self._seen.path or path)
         self._last = LastRecording(
             path=path,
@@ -286,6 +303,16 @@ class Service:
             condition=None if self._seen.condition is None else str(self._seen.condition),
             end_reason=self._seen.end_reason,
         )
+
+    def _recovered(self, found: list[RecoveryStatus]) -> None:
+        """The latest recording may have been among what its recorder did not seal."""
+        for one in found:
+            if one.state == "recovered" and self._last is not None and self._last.path == one.path:
+                condition = str(RunCondition.INTERRUPTED)
+                update = {"lines": one.lines, "condition": condition, "end_reason": one.text}
+                self._last = self._last.model_copy(update=update)
+        if self._salvage.recoveries != self._status.recoveries:
+            self._publish()
 
     def _last_words(self) -> str:
         last = self._last
@@ -340,6 +367,7 @@ class Service:
             fault=self._fault,
             capacity=self._capacity,
             processes={} if self._run is None else self._seen.pids,
+            recoveries=self._salvage.recoveries,
         )
 
     def _recording(self) -> RecordingStatus | None:

@@ -7,7 +7,7 @@
     one arm            arm_writer                 camera_stream
     one array          array_writer → shard       chunks                    tables: table, table_reader
     what is written    spec (attributes), layout (metadata), codecs (bytes)
-    where              files (disk), pages        source → disk | remote (URLs)
+    where              files (disk), pages, host  source → disk | remote (URLs)
 """
 
 from acquire.store.camera_stream import CameraStream
@@ -16,7 +16,7 @@ from acquire.store.files import measure_disk
 from acquire.store.mirror import Mirrored, mirror
 from acquire.store.opening import format_of, open_recording
 from acquire.store.reader import Recording
-from acquire.store.recover import Recovery, recover
+from acquire.store.recover import Circumstances, Recovery, recover
 from acquire.store.resume import Continuation, next_segment
 from acquire.store.retention import Hold, Retention, hold
 from acquire.store.spec import FORMAT, RecordingSpec, RunCondition
@@ -28,6 +28,7 @@ from acquire.store.writer import RecordingWriter
 __all__ = [
     "FORMAT",
     "CameraStream",
+    "Circumstances",
     "Codec",
     "CodecChoice",
     "Continuation",

@@ -218,19 +218,19 @@ def tree_bytes(path: Path) -> int:
 
 
 @contextmanager
-def locked(path: Path, doing: str) -> Iterator[None]:
+def locked(path: Path, doing: str, *, surely: bool = False) -> Iterator[None]:
     """Hold the directory ``path`` for ourselves; StateError while another process does. Ends with us.
 
-    On a file system without locks it is taken for free.
+    On a file system without locks it is taken for free, unless it must be so ``surely``: StateError then.
     """
-    fd = lock(path, doing)
+    fd = lock(path, doing, surely=surely)
     try:
         yield
     finally:
         os.close(fd)
 
 
-def lock(path: Path, doing: str) -> int:
+def lock(path: Path, doing: str, *, surely: bool = False) -> int:
     """A descriptor that holds the directory ``path`` until it is closed; see `locked`."""
     fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
@@ -244,6 +244,11 @@ def lock(path: Path, doing: str) -> int:
         if error.errno not in NO_LOCKS:
             os.close(fd)
             raise
+        if surely:
+            os.close(fd)
+            raise StateError(
+                f"{doing} {path}: its file system has no locks that would tell whether somebody writes it"
+            ) from error
     return fd
 
 

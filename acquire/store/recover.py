@@ -7,21 +7,27 @@
 Nothing that was committed is cut off: lines of which a part is not on disk stay, flagged as missing and
 listed in gaps. Whole chunks that were written after the last commit are added. A second run finds nothing
 to do; one that is interrupted is simply run again, since the root is written last.
+
+Where the machine has run on since, what was committed is where it was written: then only what came after the
+last commit is looked at, and it takes a moment however long the recording is.
 """
 
 from __future__ import annotations
 
+import contextlib
 import copy
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from acquire.errors import StateError
 from acquire.lines import ARMS, LineFlag
 from acquire.store import layout
 from acquire.store.files import DISK, SCRATCH, Publisher, locked
 from acquire.store.mend import mend_index, rewrite_chunk
 from acquire.store.opening import open_recording
+from acquire.store.resume import list_segments
 from acquire.store.retention import delete_shard, release
 from acquire.store.scan import COLUMNS, ArmScan, Damage, covered, missing_rows, real_rows, runs, scan
 from acquire.store.spec import RunCondition
@@ -38,6 +44,26 @@ if TYPE_CHECKING:
     from acquire.store.reader import Recording
 
 REASON = "recovered: its writer ended without sealing it"
+
+
+@dataclass(frozen=True, slots=True)
+class Circumstances:
+    """What is known about the writer's end.
+
+    Attributes
+    ----------
+    reason : of the recording's end
+    committed_intact : the machine has run on since, and nothing else is to be feared for what was committed
+    alone : nobody else can be writing it, also where the file system has no locks that would tell
+    """
+
+    reason: str = REASON
+    committed_intact: bool = False
+    alone: bool = True
+
+
+UNKNOWN = Circumstances()
+"""An operator says that it is over; all of the recording is looked at."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,32 +89,48 @@ class Recovery:
         return asdict(self)
 
 
-def recover(path: Path, disk: Disk = DISK, progress: Callable[[int, int], None] | None = None) -> Recovery:
-    """Recover the recording at ``path``; idempotent.
+def recover(
+    path: Path,
+    disk: Disk = DISK,
+    progress: Callable[[int, int], None] | None = None,
+    known: Circumstances = UNKNOWN,
+) -> Recovery:
+    """Recover the recording at ``path``, and list it where it goes on in segments; idempotent.
 
-    Raises DataError where there is none or the disk refuses, StateError while somebody writes it.
+    ``progress`` is told chunks looked at, and how many there are; what it raises ends the recovery, which
+    can begin anew at any time. Raises DataError where there is no recording or the disk refuses, StateError
+    while somebody writes it.
     """
-    recording = open_recording(path)
-    with locked(path, "recovering"):
+    open_recording(path)
+    with locked(path, "recovering", surely=not known.alone):
         recording = open_recording(path)  # as it is now that nobody writes it
-        return _Recoverer(recording, path, disk).run(progress)
+        done = _Recoverer(recording, path, disk, known).run(progress)
+    with contextlib.suppress(StateError):  # who recovers the first recording meanwhile lists them all
+        list_segments(path, disk)
+    return done
 
 
 class _Recoverer:
     """One recovery, with the recording held."""
 
-    def __init__(self, recording: Recording, path: Path, disk: Disk) -> None:
+    def __init__(self, recording: Recording, path: Path, disk: Disk, known: Circumstances) -> None:
         self.recording = recording
         self.path = path
         self.disk = disk
+        self.reason = known.reason
         self.sealed = recording.state == "sealed"
         self.rows = recording.lines
         self.flags_changed = 0
+        self.shape = recording.arms[ARMS[0]].reader("lines").shape
+        trusted = known.committed_intact and not self.sealed
+        self.first_chunk = recording.lines // self.shape.chunk_rows if trusted else 0
+        """Those before it are known to be as they were written."""
+        self.chunks = [chunk for chunk in recording.kept_chunks() if chunk >= self.first_chunk]
 
     def run(self, progress: Callable[[int, int], None] | None) -> Recovery:
         recording = self.recording
         mended = sum(self._mend(arm) for arm in ARMS)
-        scans = scan(recording, recording.kept_chunks(), progress)
+        scans = scan(recording, self.chunks, progress)
         if not self.sealed:
             self.rows = self._grown(scans)
         damage = tuple(found for arm in scans.values() for found in arm.damages(recording.lines))
@@ -102,6 +144,7 @@ class _Recoverer:
     def _mend(self, arm: str) -> int:
         """Torn indices of an arm, mended."""
         stream = self.recording.arms[arm]
+        first_shard = self.first_chunk // self.shape.shard_chunks
         mended = 0
         for name in COLUMNS:
             reader = stream.reader(name)
@@ -110,13 +153,14 @@ class _Recoverer:
             mended += sum(
                 mend_index(self.disk, self.path, reader, shard, grow=not self.sealed)
                 for shard in sorted(shards)
+                if shard >= first_shard
             )
         return mended
 
     def _grown(self, scans: dict[str, ArmScan]) -> int:
         """Rows with those that are whole on disk in every array, though no commit lists them."""
         streams = [found.stream for found in scans.values()]
-        size = streams[0].reader("lines").shape.chunk_rows
+        size = self.shape.chunk_rows
         rows = self.recording.lines
         while rows % size == 0:
             chunk = rows // size
@@ -145,7 +189,7 @@ class _Recoverer:
     def _chunks(self, size: int) -> list[int]:
         """Chunks that hold rows now."""
         beyond = range(-(-self.recording.lines // size), -(-self.rows // size))
-        return [*self.recording.kept_chunks(), *beyond]
+        return [*self.chunks, *beyond]
 
     def _flag_chunk(self, found: ArmScan, chunk: int, lost: bool) -> NDArray[np.bool_]:
         """Which rows of a chunk are missing; all of one that is ``lost``, and so it stands on disk then."""
@@ -179,7 +223,7 @@ class _Recoverer:
 
     def _dropped_shards(self) -> list[int]:
         """Shards that retention had told of, and may have had no time to delete."""
-        size = self.recording.arms[ARMS[0]].reader("lines").shape.shard_rows
+        size = self.shape.shard_rows
         dropped = self.recording.dropped_rows()
         return [shard for rows in dropped for shard in range(rows.start // size, rows.stop // size)]
 
@@ -232,7 +276,7 @@ class _Recoverer:
             **attributes,
             "state": "sealed",
             "run_condition": str(RunCondition.INTERRUPTED),
-            "end_reason": REASON,
+            "end_reason": self.reason,
             "ledger": {"pulses": self.rows, **arms, "store": store},
         }
 

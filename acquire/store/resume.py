@@ -13,13 +13,15 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, replace
+from glob import escape
 from typing import TYPE_CHECKING, Any
 
-from acquire.errors import UsageError
+from acquire.errors import DataError, UsageError
 from acquire.lines import ARMS
 from acquire.store.files import DISK, SCRATCH, Publisher, locked
 from acquire.store.layout import to_json
-from acquire.store.opening import open_recording
+from acquire.store.opening import open_recording, read_root
+from acquire.store.source import LocalSource
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -39,6 +41,8 @@ class Continuation:
     number : of the segment; the first recording is 1
     end_line, end_ns : line after the last one before the outage, and when that was read out
     cause : why there was an outage
+    listed : in the first recording as soon as the segment has begun; if not, whoever recovers the first
+        recording does it
     """
 
     first: str
@@ -46,6 +50,7 @@ class Continuation:
     end_line: int
     end_ns: int | None
     cause: str
+    listed: bool = True
 
     def to_attrs(self, first_line: int, start_ns: int) -> dict[str, Any]:
         """For the segment's root, once its first line is known."""
@@ -84,11 +89,45 @@ def list_segment(segment: Path, follows: Continuation, disk: Disk = DISK) -> Non
     """Name a segment that has begun in the first recording. Raises OSError, DataError and StateError."""
     first = segment.with_name(follows.first)
     with locked(first, "listing a segment of"):
-        document = json.loads((first / "zarr.json").read_bytes())
-        listed = document["attributes"].get("segments", [])
-        document["attributes"]["segments"] = [*listed, segment.name]
+        _name(first, [segment.name], disk)
+
+
+def list_segments(path: Path, disk: Disk = DISK) -> None:
+    """Name in the first recording of the one at ``path`` every segment that lies beside it; idempotent.
+
+    Raises OSError, DataError, and StateError while somebody else writes the first recording.
+    """
+    segment = read_root(LocalSource(path))["attributes"].get("segment")
+    first = path if segment is None else path.with_name(str(segment["of"]))
+    if not first.is_dir():
+        return
+    with locked(first, "listing the segments of"):
+        _name(first, _segments_beside(first), disk)
+
+
+def _name(first: Path, segments: list[str], disk: Disk) -> None:
+    """List what is not listed yet; the recording is held."""
+    document = json.loads((first / "zarr.json").read_bytes())
+    listed = document["attributes"].get("segments", [])
+    if new := [name for name in segments if name not in listed]:
+        document["attributes"]["segments"] = [*listed, *new]
         publisher = Publisher(first / ARMS[0] / "lines" / SCRATCH, disk)
         publisher.replace(first / "zarr.json", to_json(document), durable=True)
+
+
+def _segments_beside(first: Path) -> list[str]:
+    """Names of recordings that say they are segments of this one, in order."""
+    run_id = read_root(LocalSource(first))["attributes"]["run_id"]
+    found = []
+    for path in first.parent.glob(f"{escape(first.stem)}-*{escape(first.suffix)}"):
+        try:
+            attributes = read_root(LocalSource(path))["attributes"]
+        except DataError:
+            continue  # no recording, or none that could say what it is
+        segment = attributes.get("segment")
+        if segment and (segment["of"], attributes.get("run_id")) == (first.name, run_id):
+            found.append((int(segment["number"]), path.name))
+    return [name for _, name in sorted(found)]
 
 
 def _check_alike(first: Recording, spec: RecordingSpec) -> None:

@@ -17,6 +17,7 @@ from acquire.geometry import Geometry
 from acquire.lines import ARMS
 from acquire.store.array_writer import ENCODED_AHEAD
 from acquire.store.codecs import CODECS, Codec
+from acquire.store.host import this_host
 from acquire.store.shard import MAX_CHUNK_BYTES, MAX_SHARD_CHUNKS
 
 if TYPE_CHECKING:
@@ -196,9 +197,14 @@ def root_attributes(spec: RecordingSpec, ending: Ending | None = None) -> dict[s
 
 def _segment(spec: RecordingSpec, continues: Continuation) -> dict[str, Any]:
     """What the recording continues, now that its first line is known."""
+    return continues.to_attrs(spec.first_line, readout_ns(spec, spec.first_line))
+
+
+def readout_ns(spec: RecordingSpec, line: int) -> int:
+    """UTC at which the read-out of a line begins."""
     readout = Geometry(spec.stages, spec.substeps, 1).readout_substep
-    tick = np.array([(spec.substeps * spec.first_line + readout) * spec.substep_ticks], np.uint64)
-    return continues.to_attrs(spec.first_line, int(spec.clock.time_ns(tick)[0]))
+    tick = np.array([(spec.substeps * line + readout) * spec.substep_ticks], np.uint64)
+    return int(spec.clock.time_ns(tick)[0])
 
 
 def _own_attributes(spec: RecordingSpec, ending: Ending | None) -> dict[str, Any]:
@@ -227,6 +233,7 @@ def _own_attributes(spec: RecordingSpec, ending: Ending | None) -> dict[str, Any
         "cameras": spec.cameras,
         "config": spec.config,
         "durability": asdict(spec.durability),
+        "host": this_host(),
         "versions": {
             "acquire": acquire.__version__,
             "python": platform.python_version(),

@@ -157,7 +157,7 @@ class RecordingWriter:
         try:
             with self._failing("creating the recording"):
                 self._publish_root(0, self._publish_parts(0, own=False))  # `prepare` did all that takes time
-                if self.spec.continues is not None:
+                if self.spec.continues is not None and self.spec.continues.listed:
                     list_segment(self.path, self.spec.continues, self._disk)
         except (DataError, StateError):
             self.close()

@@ -19,6 +19,7 @@ pipe · `messages` · `grabber` · `tagger` · `window` of lines around an event
 
 from acquire.stream.capture import Capture
 from acquire.stream.plan import CapturePlan, CaptureStatus
+from acquire.stream.succession import Orphan
 from acquire.stream.window import NOW, Window
 
-__all__ = ["NOW", "Capture", "CapturePlan", "CaptureStatus", "Window"]
+__all__ = ["NOW", "Capture", "CapturePlan", "CaptureStatus", "Orphan", "Window"]

@@ -297,6 +297,7 @@ class Capture:
             lines={arm: self._line_counts(arm, began=began is not None) for arm in ARMS},
             fault=supervisor.fault,
             pids={name: pid for name, pid in self.pids.items() if pid is not None},
+            orphans=supervisor.orphans,
         )
         if began is None:
             return status
@@ -415,6 +416,8 @@ class Capture:
         self._emptied = True
 
     def _end_memory(self) -> None:
+        if self._supervisor is not None:
+            self._supervisor.bury()
         with self._memory:
             self._final = self._look(self._supervisor) if self._supervisor else CaptureStatus()
             for counters in self._counters.values():

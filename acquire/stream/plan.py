@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from acquire.camera.base import CameraOpener
     from acquire.store import RunCondition
     from acquire.stream.ledger import ArmLedger
+    from acquire.stream.succession import Orphan
     from acquire.stream.watcher import WatchPlan
     from acquire.trigger.base import TriggerRun
 
@@ -140,6 +141,7 @@ class CaptureStatus:
     accounts : arm → what became of every pulse since arm
     fault : what failed first, or None
     pids : process numbers: of the recorder, and of each grabber
+    orphans : recordings that their recorder did not live to seal: to be recovered
     """
 
     recording: bool = False
@@ -157,3 +159,4 @@ class CaptureStatus:
     end_reason: str | None = None
     ledger: dict[str, Any] = field(default_factory=dict)
     accounts: dict[str, ArmLedger] = field(default_factory=dict)
+    orphans: tuple[Orphan, ...] = ()

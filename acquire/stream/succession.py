@@ -6,7 +6,7 @@
                         and what came between is a gap, `Cause.GRABBER_LOST`
     recorder killed  ─▶ another begins a recording beside the one that was cut off, from the first line on
                         that this one's last commit does not cover; what the ring does not hold any more
-                        is a gap, `Cause.RECORDER_LOST`
+                        is a gap, `Cause.RECORDER_LOST`; the one that was cut off is an `Orphan`
 
 A process that ended with a word of its own (an error of its camera, a full disk) has said why it cannot go
 on; nobody takes its place.
@@ -18,6 +18,8 @@ import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from acquire.store import Continuation
+from acquire.store.spec import readout_ns
 from acquire.stream.messages import Note
 from acquire.stream.window import Window
 
@@ -32,6 +34,14 @@ MOST = 5
 """Successors of one process in a run: what dies more often has a reason."""
 READY_S = 20.0
 """How long a successor may take until it is ready."""
+
+
+@dataclass(frozen=True, slots=True)
+class Orphan:
+    """A recording whose recorder did not live to seal it, and why."""
+
+    path: Path
+    why: str
 
 
 @dataclass(slots=True)
@@ -84,9 +94,15 @@ def continuation(begin: Begin, first_line: int, committed_lines: int, why: str) 
     """What has a recorder go on with a recording that was cut off after ``committed_lines`` lines."""
     at = first_line + committed_lines
     left = None if begin.lines is None else max(1, begin.lines - committed_lines)
-    text = f"goes on from {begin.path.name}: its recorder was {why}"
+    cause = f"its recorder was {why}"
+    text = f"goes on from {begin.path.name}: {cause}"
     window = Window(at, post_lines=left, exact=False, padded=True, kind="resumed", text=text)
-    return replace(begin, path=free_name(begin.path), lines=None, window=window)
+    spec, before = begin.spec, begin.spec.continues
+    first, number = (begin.path.name, 2) if before is None else (before.first, before.number + 1)
+    # Nobody may be kept waiting for the first recording: whoever recovers it lists its segments.
+    follows = Continuation(first, number, at, readout_ns(spec, at), cause, listed=False)
+    path = free_name(begin.path.with_name(first))
+    return replace(begin, path=path, spec=replace(spec, continues=follows), lines=None, window=window)
 
 
 def free_name(path: Path) -> Path:

@@ -14,7 +14,7 @@ from acquire.errors import AcquireError, DeviceError, TriggerError
 from acquire.lines import ARMS
 from acquire.stream.messages import Began, Checked, End, Failed, Interrupt, Note, Ready, Refused, Sealed
 from acquire.stream.stalls import Excess, Heartbeat
-from acquire.stream.succession import Succession, continuation, obituary
+from acquire.stream.succession import Orphan, Succession, continuation, obituary
 from acquire.stream.tagger import tag_rows
 from acquire.stream.witness import TRIGGER, TRIGGER_COUNTERS, WATCHER
 
@@ -70,6 +70,7 @@ class Supervisor:
         self._workers = workers
         self._succession = succession or Succession({})
         self._counters = counters
+        self._asked: Begin | None = None
         self._begin: Begin | None = None
         self._end_reason: str | None = None
         self._tags = tags
@@ -85,6 +86,8 @@ class Supervisor:
         self._trigger_lost = False
         self._events: deque[Note] = deque(maxlen=_MOST_EVENTS)
         self._dead: set[str] = set()
+        self._orphans: list[Orphan] = []
+        self._going_on = False
         self._last_words: dict[str, str] = {}
         self._news = threading.Condition()
         self._ending = threading.Event()
@@ -99,6 +102,11 @@ class Supervisor:
     def dead(self) -> frozenset[str]:
         """Processes that died, and whose place nobody took."""
         return frozenset(self._dead)
+
+    @property
+    def orphans(self) -> tuple[Orphan, ...]:
+        """Recordings that were not sealed; not while another recorder only begins, which has more to do."""
+        return () if self._going_on else tuple(self._orphans)
 
     @property
     def pulses(self) -> int:
@@ -118,12 +126,21 @@ class Supervisor:
                 f"the trigger has not returned from a wait of {_TAG_WAIT_S} s for {_JOIN_S:g} s"
             )
 
+    def bury(self) -> None:
+        """Every process has ended: a recording that is not sealed now will not be."""
+        self._going_on = False
+        if self.began is not None and self.sealed is None and self.path is not None:
+            why = self.fault or "its recorder did not end in time"
+            self._orphans.append(Orphan(self.path, why))
+
     def begin(self, message: Begin) -> None:
         """Have the recorder begin; returns when it has. Raises what it refuses with."""
         with self._news:
             self.began = self.sealed = self._refused = self._begin = self._end_reason = None
+            self._asked = message
             self._workers[RECORDER].post(message)
             self._news.wait_for(lambda: self.began or self._refused or self.fault, _ANSWER_S)
+            self._asked = None
             if self.began is not None:
                 self._begin, self.path = message, message.path
                 return
@@ -276,13 +293,22 @@ class Supervisor:
             self._cameras[arm].revive()
         self._loop.revive()
         if name == RECORDER and self._begin is not None and self.began is not None and self.sealed is None:
-            committed = self._counters[RECORDER]["committed"]
-            self._begin = continuation(self._begin, self.began.first_line, committed, death)
-            self.path = self._begin.path
-            successor.post(self._begin)
+            successor.post(self._go_on(self._begin, self.began.first_line, death))
+        elif name == RECORDER and self._asked is not None:
+            self._orphans.append(Orphan(self._asked.path, f"its recorder was {death}"))
+            self._note(name, Refused(DeviceError(f"start: the recorder was {death}", hint="start again")))
         newest = max(self._counters[arm]["next_line"] for arm in ARMS)
         self.happened(obituary(worker.name, death, max(newest, 0)))
         return True
+
+    def _go_on(self, begin: Begin, first_line: int, death: str) -> Begin:
+        """With the recording of a recorder that was killed, beside it."""
+        committed = self._counters[RECORDER]["committed"]
+        self._begin = following = continuation(begin, first_line, committed, death)
+        why = f"its recorder was {death}; it goes on in {following.path.name}"
+        self._orphans.append(Orphan(begin.path, why))
+        self._going_on, self.path = True, following.path
+        return following
 
     def _note(self, name: str, message: object) -> None:
         with self._news:
@@ -290,7 +316,7 @@ class Supervisor:
                 case Ready():
                     self._succession.ready(name)
                 case Began():
-                    self.began = message
+                    self.began, self._going_on = message, False
                     if self._end_reason is not None:
                         self._workers[RECORDER].post(End(self._end_reason))
                 case Refused(error) if self._begin is not None:

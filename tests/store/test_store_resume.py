@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 
 import numpy as np
 import pytest
 from store_helpers import Truth, fill, make_spec
 
 from acquire.errors import StateError, UsageError
-from acquire.store import RecordingWriter, RunCondition, next_segment, open_recording, recover, verify
+from acquire.store import (
+    Continuation,
+    RecordingWriter,
+    RunCondition,
+    next_segment,
+    open_recording,
+    recover,
+    verify,
+)
 from acquire.store.files import locked
 
 
@@ -108,3 +117,34 @@ def test_a_segment_that_cannot_be_listed_is_not_begun(killed):
         writer.begin(1500)
     assert not place.exists()
     assert "segments" not in open_recording(killed).attrs
+
+
+def go_on(path, number, first_line):
+    """Lines that a successor of the recorder wrote while the first recording was still open."""
+    follows = Continuation(path.name, number, first_line, None, "killed", listed=False)
+    place = path.with_name(f"run-{number}.zarr")
+    with RecordingWriter.create(place, make_spec(first_line=first_line, continues=follows)) as writer:
+        fill(writer, 40)
+        writer.seal(RunCondition.GOOD, "done", {})
+    return place
+
+
+def test_who_recovers_lists_what_went_on_meanwhile(killed):
+    places = [go_on(killed, number, 1080 + 40 * number) for number in (3, 2)]
+    (killed.parent / "run-x.zarr").mkdir()  # no recording, though it looks like a segment
+    assert "segments" not in open_recording(killed).attrs
+    recover(killed)
+    assert open_recording(killed).attrs["segments"] == ["run-2.zarr", "run-3.zarr"]
+    assert open_recording(killed).cut(1170, 20).first_line == 1170
+    late = go_on(killed, 4, 1500)
+    recover(late)
+    assert open_recording(killed).attrs["segments"] == ["run-2.zarr", "run-3.zarr", "run-4.zarr"]
+    before = (killed / "zarr.json").stat()
+    assert not recover(places[0]).changed
+    assert (killed / "zarr.json").stat().st_ino == before.st_ino
+
+
+def test_a_segment_alone_is_recovered_all_the_same(killed):
+    late = go_on(killed, 2, 1100)
+    shutil.rmtree(killed)
+    assert recover(late).lines == 40

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 from dataclasses import replace
 
@@ -12,7 +13,8 @@ from store_helpers import Truth, check_rows, fill, make_spec
 
 from acquire.errors import DataError, StateError
 from acquire.lines import ARMS, LineFlag
-from acquire.store import Gap, RecordingWriter, RunCondition, open_recording, recover, verify
+from acquire.store import Circumstances, Gap, RecordingWriter, RunCondition, open_recording, recover, verify
+from acquire.store.host import has_run_on, is_here
 from acquire.store.pages import PAGE
 
 SPEC = make_spec(codec="none")
@@ -199,3 +201,46 @@ def test_what_is_not_a_recording_cannot_be_verified_or_recovered(tmp_path):
     for attempt in (verify, recover):
         with pytest.raises(DataError, match="does not exist"):
             attempt(tmp_path / "no.zarr")
+
+
+def test_where_the_machine_ran_on_only_what_came_after_the_commit_is_looked_at(path):
+    """Lines that were on disk and not committed are found either way, damage of committed ones by looking."""
+    with RecordingWriter.create(path, SPEC) as writer:
+        fill(writer, 100)
+        writer.commit()
+        fill(writer, 50)
+    flip(path, "b", "lines", 2)
+    looked = []
+    known = Circumstances("its machine ran on", committed_intact=True)
+    quick = recover(path, progress=lambda *done: looked.append(done), known=known)
+    assert (quick.changed, quick.lines_before, quick.lines, quick.damage) == (True, 96, 144, ())
+    assert looked == []
+    recording = open_recording(path)
+    assert (recording.state, recording.attrs["end_reason"]) == ("sealed", "its machine ran on")
+    again = recover(path)
+    assert [(damage.first_line, damage.count) for damage in again.damage] == [(1032, 16)]
+
+
+def test_where_nothing_tells_whether_somebody_writes_it_is_left(path, monkeypatch):
+    def no_locks(fd, how):
+        raise OSError(errno.ENOLCK, "no locks")
+
+    with RecordingWriter.create(path, SPEC) as writer:
+        fill(writer, 100)
+        writer.commit()
+    monkeypatch.setattr("fcntl.flock", no_locks)
+    with pytest.raises(StateError, match="no locks that would tell whether somebody writes it"):
+        recover(path, known=Circumstances(alone=False))
+    assert open_recording(path).state == "recording"
+    assert recover(path).lines == 96
+
+
+def test_a_recording_says_which_machine_wrote_it(path):
+    attributes = open_recording(write(path)).attrs
+    assert is_here(attributes)
+    assert has_run_on(attributes) == bool(attributes["host"]["boot_id"])
+    elsewhere = {"host": {**attributes["host"], "name": "far"}}
+    assert not is_here(elsewhere)
+    assert not has_run_on(elsewhere)
+    assert not has_run_on({"host": {**attributes["host"], "boot_id": "before"}})
+    assert not is_here({})

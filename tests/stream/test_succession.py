@@ -6,6 +6,7 @@ import os
 import signal
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +14,13 @@ import pytest
 
 from acquire.config import RigConfig, builtin_directory, load_rig
 from acquire.daemon.plan import Run
+from acquire.errors import DeviceError
 from acquire.lines import ARMS, LineFlag
 from acquire.rig import Rig
 from acquire.sim.pattern import Pattern
 from acquire.store import open_recording
 from acquire.store.recover import recover
+from acquire.stream import Orphan
 
 WAIT_S = 60.0
 RIG = """
@@ -127,8 +130,12 @@ def test_a_recorder_that_is_killed_is_replaced_and_no_line_is_lost(run, tmp_path
     seen = run.poll()
     assert seen.fault is None
     assert seen.path == str(tmp_path / "r-2.zarr")
-    recover(tmp_path / "r.zarr")
+    (orphan,) = seen.orphans
+    assert orphan == Orphan(tmp_path / "r.zarr", "its recorder was killed by SIGKILL; it goes on in r-2.zarr")
+    recover(orphan.path)
     one, two = (open_recording(tmp_path / name) for name in ("r.zarr", "r-2.zarr"))
+    assert one.segments[0].path == two.path
+    assert two.attrs["segment"]["outage"]["lines"] == 0
     assert one.first_line == first
     assert one.first_line < two.first_line <= one.first_line + one.lines
     assert two.first_line + two.lines == first + lines
@@ -172,3 +179,19 @@ def test_what_is_killed_again_and_again_is_given_up(run, tmp_path, monkeypatch):
     assert run.poll().condition == "INTERRUPTED"
     check(tmp_path / "r.zarr")
     check_books(run)
+
+
+def test_a_recorder_that_is_killed_while_it_begins_refuses_at_once(run, tmp_path):
+    """Another takes its place, and the next start finds it; what was left is named."""
+    pid = run._capture.pids["recorder"]
+    os.kill(pid, signal.SIGSTOP)
+    with ThreadPoolExecutor(1) as user:
+        started = user.submit(run.start, tmp_path / "r.zarr", None)
+        until(lambda: run._capture._supervisor._asked is not None)
+        os.kill(pid, signal.SIGKILL)
+        with pytest.raises(DeviceError, match="start: the recorder was killed by SIGKILL"):
+            started.result(WAIT_S)
+    assert [orphan.path for orphan in run.poll().orphans] == [tmp_path / "r.zarr"]
+    run.start(tmp_path / "s.zarr", 1000)
+    until(lambda: run.poll().done)
+    assert check(tmp_path / "s.zarr") <= {"ring_full"}
