@@ -5,8 +5,8 @@
     whole recordings   writer                     reader, opening           verify  recover  mirror  video
       with             retention room resume                                scan    mend
     one arm            arm_writer                 camera_stream
-    one array          array_writer → shard       chunks                    tables: table, table_reader
-    what is written    spec (attributes), layout (metadata), codecs (bytes)
+    one array          array_writer → shard       stretch → chunks          tables: table, table_reader
+    what is written    terms, spec (attributes), layout (metadata), codecs (bytes)
     where              files (disk), pages, host  source → disk | remote (URLs)
 """
 
@@ -17,10 +17,11 @@ from acquire.store.mirror import Mirrored, mirror
 from acquire.store.opening import format_of, open_recording
 from acquire.store.reader import Recording
 from acquire.store.recover import Circumstances, Recovery, recover
-from acquire.store.resume import Continuation, next_segment
-from acquire.store.retention import Hold, Retention, hold
+from acquire.store.resume import next_segment
+from acquire.store.retention import Hold, hold
 from acquire.store.spec import FORMAT, RecordingSpec, RunCondition
 from acquire.store.table_reader import Event, Gap
+from acquire.store.terms import Continuation, Retention
 from acquire.store.verify import Verification, verify
 from acquire.store.video import VideoFile, VideoWriter, open_video, write_video
 from acquire.store.writer import RecordingWriter

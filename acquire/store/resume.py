@@ -12,9 +12,9 @@ and the outage is that many lines long; where it began anew, the outage is known
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from glob import escape
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from acquire.errors import DataError, UsageError
 from acquire.lines import ARMS
@@ -22,6 +22,7 @@ from acquire.store.files import DISK, SCRATCH, Publisher, locked
 from acquire.store.layout import to_json
 from acquire.store.opening import open_recording, read_root
 from acquire.store.source import LocalSource
+from acquire.store.terms import Continuation
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -29,40 +30,6 @@ if TYPE_CHECKING:
     from acquire.store.files import Disk
     from acquire.store.reader import Recording
     from acquire.store.spec import RecordingSpec
-
-
-@dataclass(frozen=True, slots=True)
-class Continuation:
-    """What a segment follows.
-
-    Attributes
-    ----------
-    first : name of the run's first recording, in the same directory
-    number : of the segment; the first recording is 1
-    end_line, end_ns : line after the last one before the outage, and when that was read out
-    cause : why there was an outage
-    listed : in the first recording as soon as the segment has begun; if not, whoever recovers the first
-        recording does it
-    """
-
-    first: str
-    number: int
-    end_line: int
-    end_ns: int | None
-    cause: str
-    listed: bool = True
-
-    def to_attrs(self, first_line: int, start_ns: int) -> dict[str, Any]:
-        """For the segment's root, once its first line is known."""
-        lost = first_line - self.end_line
-        outage = {
-            "after_line": self.end_line - 1,
-            "lines": lost if lost >= 0 else None,
-            "from_ns": self.end_ns,
-            "to_ns": start_ns,
-            "cause": self.cause,
-        }
-        return {"number": self.number, "of": self.first, "outage": outage}
 
 
 def next_segment(path: Path, spec: RecordingSpec, cause: str = "interrupted") -> tuple[Path, RecordingSpec]:

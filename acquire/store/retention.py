@@ -27,37 +27,13 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from acquire.store.files import Disk
+    from acquire.store.terms import Retention
 
 ALL_LINES = 2**62
 COPY = "0-copy.json"
 
 HOLDS = ".holds"
 """Directory of the files of `hold`, where no Zarr reader lists names."""
-
-
-@dataclass(frozen=True, slots=True)
-class Retention:
-    """What of an endless recording is kept; refuses with UsageError what cannot be.
-
-    Attributes
-    ----------
-    max_bytes : that the recording may take of the disk; None: as many as there are
-    max_age_lines : lines behind the newest; None: all
-    margin_lines : on either side of what is held, and behind the newest line whatever the limits: M + L_R
-    hold_events : kinds of events that hold lines
-    hold_lines : before and after such an event
-    """
-
-    max_bytes: int | None = None
-    max_age_lines: int | None = None
-    margin_lines: int = 4096
-    hold_events: tuple[str, ...] = ("mark",)
-    hold_lines: tuple[int, int] = (2**16, 2**16)
-
-    def __post_init__(self) -> None:
-        numbers = (self.max_bytes or 1, self.max_age_lines or 1, self.margin_lines + 1, *self.hold_lines)
-        if min(numbers) < 0 or 0 in (self.max_bytes, self.max_age_lines, self.margin_lines + 1):
-            raise UsageError(f"retention {self}", possible="numbers above 0")
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,8 +22,7 @@ from acquire.store.shard import MAX_CHUNK_BYTES, MAX_SHARD_CHUNKS
 
 if TYPE_CHECKING:
     from acquire.clock import ClockFit
-    from acquire.store.resume import Continuation
-    from acquire.store.retention import Retention
+    from acquire.store.terms import Continuation, Retention
 
 FORMAT = "acquire-recording/1"
 

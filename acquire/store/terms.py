@@ -1,0 +1,67 @@
+"""What is agreed before a recording begins: what of it is kept, and what it continues."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from acquire.errors import UsageError
+
+
+@dataclass(frozen=True, slots=True)
+class Retention:
+    """What of an endless recording is kept; refuses with UsageError what cannot be.
+
+    Attributes
+    ----------
+    max_bytes : that the recording may take of the disk; None: as many as there are
+    max_age_lines : lines behind the newest; None: all
+    margin_lines : on either side of what is held, and behind the newest line whatever the limits: M + L_R
+    hold_events : kinds of events that hold lines
+    hold_lines : before and after such an event
+    """
+
+    max_bytes: int | None = None
+    max_age_lines: int | None = None
+    margin_lines: int = 4096
+    hold_events: tuple[str, ...] = ("mark",)
+    hold_lines: tuple[int, int] = (2**16, 2**16)
+
+    def __post_init__(self) -> None:
+        numbers = (self.max_bytes or 1, self.max_age_lines or 1, self.margin_lines + 1, *self.hold_lines)
+        if min(numbers) < 0 or 0 in (self.max_bytes, self.max_age_lines, self.margin_lines + 1):
+            raise UsageError(f"retention {self}", possible="numbers above 0")
+
+
+@dataclass(frozen=True, slots=True)
+class Continuation:
+    """What a segment follows.
+
+    Attributes
+    ----------
+    first : name of the run's first recording, in the same directory
+    number : of the segment; the first recording is 1
+    end_line, end_ns : line after the last one before the outage, and when that was read out
+    cause : why there was an outage
+    listed : in the first recording as soon as the segment has begun; if not, whoever recovers the first
+        recording does it
+    """
+
+    first: str
+    number: int
+    end_line: int
+    end_ns: int | None
+    cause: str
+    listed: bool = True
+
+    def to_attrs(self, first_line: int, start_ns: int) -> dict[str, Any]:
+        """For the segment's root, once its first line is known."""
+        lost = first_line - self.end_line
+        outage = {
+            "after_line": self.end_line - 1,
+            "lines": lost if lost >= 0 else None,
+            "from_ns": self.end_ns,
+            "to_ns": start_ns,
+            "cause": self.cause,
+        }
+        return {"number": self.number, "of": self.first, "outage": outage}
