@@ -7,7 +7,7 @@ import json
 from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import FuncFormatter, LogFormatter, MaxNLocator
 
 from acquire.evaluate.figures import DPI, HIGHLIGHT, SOLVER_COLOURS, STYLE
 from acquire.evaluate.paper.drawing import canvas
@@ -87,6 +87,7 @@ def _curves(runs: Sequence[Run], voxels: Voxels) -> Figure:
             _curve(ax, run, name, colours[run.solver])
         ax.set(xscale="log", ylabel=label, xlabel="wall time (s)", yscale="log" if logarithmic else "linear")
         ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        ax.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.5)))
         if not logarithmic:
             ax.yaxis.set_major_locator(MaxNLocator(6))
     _front(axes[0], pareto(own))
