@@ -36,7 +36,7 @@ def main() -> None:
     asked = parser.parse_args()
     shape = (asked.frames, asked.side, asked.side)
     frames = np.random.default_rng(0).random(shape, np.float32)
-    tv = FrameTv(shape, asked.iterations, frames.dtype)
+    tv = FrameTv(asked.iterations)
     tv.prox(frames, 0.1)  # compiled now
     ours = best_ms(lambda: tv.prox(frames, 0.1))
 

@@ -25,6 +25,14 @@ def block_bounds(length: int, merge: int) -> tuple[NDArray[np.int64], NDArray[np
     return starts, np.minimum(merge, length - starts)
 
 
+def column_merging(geometry: Geometry, spatial_merge: int) -> NDArray[np.int64]:
+    """C_N (⌈n/N_m⌉, M): how many fine columns a block shares with a pixel."""
+    columns = np.arange(geometry.size)
+    shared = np.zeros((-(-geometry.size // spatial_merge), geometry.stages), np.int64)
+    np.add.at(shared, (columns // spatial_merge, columns // geometry.substeps), 1)
+    return shared
+
+
 def merge_video(video: NDArray[Any], spatial_merge: int, temporal_merge: int) -> NDArray[Any]:
     """Mean of a fine video (T, n, n) over the blocks of each voxel: (⌈T/T_m⌉, ⌈n/N_m⌉, ⌈n/N_m⌉)."""
     if video.ndim != 3:

@@ -16,16 +16,14 @@ step, one with B and one with Bᵀ. Over-relaxed by 1.7 (Eckstein and Bertsekas,
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numpy as np
-
+from acquire.arrays import dot, namespace
 from acquire.errors import NumericsError
 from acquire.recon.tv import FrameTv
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from acquire.arrays import Array
     from acquire.recon.basis import Basis
     from acquire.recon.denoisers import Denoiser
     from acquire.recon.problem import MaskedOperator
@@ -57,34 +55,42 @@ class Admm:
     def __init__(
         self,
         operator: MaskedOperator,
-        samples: NDArray[Any],
+        samples: Array,
         theta_shape: tuple[int, int, int],
         basis: Basis,
         parameters: AdmmParameters,
         *,
-        start: NDArray[Any] | None = None,
-        emphasis: NDArray[Any] | float = 1.0,
+        start: Array | None = None,
+        emphasis: Array | float = 1.0,
         denoiser: Denoiser | None = None,
     ) -> None:
         self._samples, self._parameters = samples, parameters
-        self._denoiser = denoiser or FrameTv(theta_shape, parameters.tv_iterations, samples.dtype)
-        self._strength = np.asarray(emphasis, samples.dtype) * (parameters.tv_weight / parameters.tv_penalty)
-        self._w = np.zeros_like(samples)
-        first = np.zeros(theta_shape, samples.dtype) if start is None else start.astype(samples.dtype)
-        self.rebase(operator, basis, first)
-        self._tv_multiplier = np.zeros_like(first)
-        self._sign = np.maximum(np.tensordot(self._grid.T, first, 1), 0)
-        self._sign_multiplier = np.zeros_like(self._sign)
+        self._denoiser = denoiser or FrameTv(parameters.tv_iterations)
+        self._xp, arrays = namespace(samples), basis.arrays
+        self._emphasis = arrays.asarray(emphasis)
+        self._strength = self._emphasis * (parameters.tv_weight / parameters.tv_penalty)
+        self._w = arrays.zeros(samples.shape)
+        self.rebase(operator, basis, arrays.zeros(theta_shape) if start is None else start)
+        self._tv_multiplier = arrays.zeros(theta_shape)
+        self._sign = self._xp.maximum(self._xp.tensordot(self._grid.T, self.theta, axes=1), 0)
+        self._sign_multiplier = arrays.zeros(self._sign.shape)
 
-    def rebase(self, operator: MaskedOperator, basis: Basis, theta: NDArray[Any]) -> None:
+    def rebase(self, operator: MaskedOperator, basis: Basis, theta: Array) -> None:
         """Go on in another basis of as many rows and cosines, not far from the last.
 
         Multipliers and w stay: those of the sign live on instants, w on the lines, and TV's follow slowly.
         """
-        self._operator, self.theta = operator, theta
+        self._operator, self.theta = operator, basis.arrays.asarray(theta)
         grid = min(basis.frames, self._parameters.grid_per_coefficient * basis.cosines)
-        self._grid = basis.matrix(grid)
+        self._grid = basis.arrays.asarray(basis.matrix(grid))
         self._lifted = operator.adjoint(self._w)  # BᵀW·w
+
+    def reweigh(self, parameters: AdmmParameters) -> None:
+        """Go on with other weights; multipliers, which are kept divided by ρ, stay what they are."""
+        old, self._parameters = self._parameters, parameters
+        self._tv_multiplier *= old.tv_penalty / parameters.tv_penalty
+        self._sign_multiplier *= old.sign_penalty / parameters.sign_penalty
+        self._strength = self._emphasis * (parameters.tv_weight / parameters.tv_penalty)
 
     def step(self) -> None:
         """One iteration.
@@ -97,36 +103,35 @@ class Admm:
         relaxed = relaxation * self._data_step() + (1 - relaxation) * self.theta
         self.theta = self._denoiser.prox(relaxed + self._tv_multiplier, self._strength)
         self._tv_multiplier += relaxed - self.theta
-        values = np.tensordot(self._grid.T, relaxed, 1) + self._sign_multiplier
-        np.maximum(values, 0, out=self._sign)
-        np.subtract(values, self._sign, out=self._sign_multiplier)
+        values = self._xp.tensordot(self._grid.T, relaxed, axes=1) + self._sign_multiplier
+        self._sign = self._xp.maximum(values, 0)
+        self._sign_multiplier = values - self._sign
 
-    def _data_step(self) -> NDArray[Any]:
+    def _data_step(self) -> Array:
         p = self._parameters
         rho = p.tv_penalty + p.sign_penalty
         centre = p.tv_penalty * (self.theta - self._tv_multiplier)
-        centre += p.sign_penalty * np.tensordot(self._grid, self._sign - self._sign_multiplier, 1)
+        centre += p.sign_penalty * self._xp.tensordot(self._grid, self._sign - self._sign_multiplier, axes=1)
         centre /= rho
         residual = self._samples - self._operator.forward(centre + self._lifted) - rho * self._w
-        if not np.isfinite(np.vdot(residual, residual)):
+        if not self._xp.isfinite(dot(residual, residual)):
             raise NumericsError(
                 "ADMM left the finite numbers", hint="check the segment's samples and weights"
             )
         self._descend(residual, rho)
-        theta: NDArray[Any] = centre + self._lifted
-        return theta
+        return centre + self._lifted
 
-    def _descend(self, residual: NDArray[Any], rho: float) -> None:
+    def _descend(self, residual: Array, rho: float) -> None:
         """Conjugate-gradient steps on (W·B·BᵀW + ρ)·w; ``residual`` is used up."""
-        direction, energy = residual.copy(), np.vdot(residual, residual)
+        direction, energy = self._xp.asarray(residual, copy=True), dot(residual, residual)
         for _ in range(self._parameters.gradient_steps):
             if energy == 0:
                 return
             lifted = self._operator.adjoint(direction)
             image = self._operator.forward(lifted) + rho * direction
-            length = energy / np.vdot(direction, image)
+            length = energy / dot(direction, image)
             self._w += length * direction
             self._lifted += length * lifted
             residual -= length * image
-            energy, before = np.vdot(residual, residual), energy
+            energy, before = dot(residual, residual), energy
             direction = residual + (energy / before) * direction

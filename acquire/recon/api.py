@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from acquire.arrays import Dtype, open_arrays
 from acquire.recon.clock import IterationClock
 from acquire.recon.judge import frame_error, judge
 from acquire.recon.problem import pose
@@ -42,6 +43,8 @@ def reconstruct(
     initial: NDArray[Any] | None = None,
     static_image: NDArray[Any] | None = None,
     denoiser: Denoiser | None = None,
+    dtype: Dtype = "float32",
+    device: str = "cpu",
     stop: Stop | None = None,
 ) -> Reconstruction:
     """Reconstruct the voxels X′ of a segment at N_m = ``spatial_merge``, T_m = ``temporal_merge`` (Eq. 5).
@@ -60,11 +63,13 @@ def reconstruct(
     initial : a video (⌈T/T_m⌉, ⌈n/N_m⌉, ⌈n/N_m⌉) in scene units to start from: a warm start (ADMM)
     static_image : (n, n), the scene at rest: only its light s(t) is solved for, in any units
     denoiser : in place of total variation (ADMM); see `acquire.recon.denoisers`
+    dtype : of the video and all that leads to it; sums that need it are float64 anyway
+    device : ``"cpu"`` or ``"gpu"``, where iterations are made; see `acquire.arrays`
     stop : asked after every iteration; once set, the best so far is returned
 
     Raises
     ------
-    UsageError : impossible merge, preset, solver, bandwidth, weight or array, or no usable sample
+    UsageError : impossible merge, preset, solver, bandwidth, weight, array, dtype or device; no usable sample
     NumericsError : a dark code, or iterates that are not finite
     """
     count = iterations if iterations is not None else preset_iterations(solver, preset)
@@ -81,10 +86,11 @@ def reconstruct(
         static_image,
         denoiser,
     )
+    arrays = open_arrays(device, dtype)
     request.check_shapes(segment.geometry.size, segment.geometry.video_shape(spatial_merge, temporal_merge))
     clock = IterationClock(count, budget_s, progress, stop)
     held_out = HOLD_OUT if solver != "twist" and static_image is None else 0.0
-    problem = pose(segment, spatial_merge, temporal_merge, hold_out=held_out)
+    problem = pose(segment, spatial_merge, temporal_merge, hold_out=held_out, arrays=arrays)
     estimate = _solve(segment, problem, request, clock)
     return _finish(segment, problem, request, estimate, clock)
 
@@ -100,13 +106,13 @@ def _finish(
 ) -> Reconstruction:
     T_m = request.temporal_merge
     predicted = estimate.predict()
-    video = estimate.video() * np.float32(problem.scale)
+    video = estimate.video() * problem.scale
     if request.solver != "twist":
         np.maximum(video, 0, out=video)
     quality = Quality(problem.misfit(predicted), problem.prediction_error(predicted), problem.coverage)
     trusted = segment.geometry.trusted_frames(T_m)
     return Reconstruction(
-        video=video.astype(np.float32, copy=False),
+        video=video,
         time_ns=segment.frame_time_ns(T_m),
         trusted=trusted,
         seconds=clock.seconds,
@@ -121,6 +127,7 @@ def _finish(
         parameters={
             "spatial_merge": request.spatial_merge,
             "temporal_merge": T_m,
+            "dtype": problem.arrays.dtype,
             **estimate.facts(),
         },
     )

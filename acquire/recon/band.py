@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.forward import DualArm, block_bounds
-from acquire.forward.kernels import blocks_to_pixels, pixels_to_blocks
+from acquire.forward import DualArm, GatheredArms, block_bounds, column_merging
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from acquire.arrays import Array
     from acquire.geometry import Geometry
     from acquire.recon.basis import Basis
 
@@ -34,10 +34,10 @@ def band_operator(
 ) -> BandOperator | InBasis:
     """B = Λ′·Dᵀ, by the dense factors where these take at most 1 GiB, else by way of the video."""
     side = geometry.video_shape(spatial_merge, temporal_merge)[1]
-    if 2 * geometry.lines * side * basis.count * basis.dtype.itemsize <= LARGEST_FACTORS_BYTES:
+    itemsize = np.dtype(basis.arrays.dtype).itemsize
+    if 2 * geometry.lines * side * basis.count * itemsize <= LARGEST_FACTORS_BYTES:
         return BandOperator(geometry, code, basis, spatial_merge, temporal_merge)
-    whole = DualArm(geometry, code, spatial_merge, temporal_merge, basis.dtype.type)
-    return InBasis(whole, basis)
+    return InBasis(geometry, code, basis, spatial_merge, temporal_merge)
 
 
 class BandOperator:
@@ -54,63 +54,73 @@ class BandOperator:
         side = geometry.video_shape(spatial_merge, temporal_merge)[1]
         self.theta_shape = (basis.count, side, side)
         self.lines_shape = geometry.lines_shape
-        self.dtype = basis.dtype
-        self._columns = (geometry.size, geometry.substeps, spatial_merge)
-        self._pixels = geometry.stages
+        self._xp, asarray = basis.arrays.xp, basis.arrays.asarray
+        self._merging = asarray(column_merging(geometry, spatial_merge))
         starts, lengths = block_bounds(geometry.size, spatial_merge)
         lit = self._lit_cosines(code, basis, temporal_merge)
         flipped = geometry.size - starts - lengths
         self._factors = [
-            _staircase(lit, order, lengths, geometry).reshape(geometry.lines, -1)
+            asarray(_staircase(lit, order, lengths, geometry).reshape(geometry.lines, -1))
             for order in (starts, flipped)
         ]
 
-    def forward(self, theta: NDArray[Any]) -> NDArray[Any]:
+    def forward(self, theta: Array) -> Array:
         """B·θ."""
-        views = theta.transpose(1, 0, 2), theta.transpose(2, 0, 1)  # (block along TDI, K, across)
-        return np.stack([self._arm(*pair) for pair in zip(self._factors, views, strict=True)])
+        views = (self._xp.permute_dims(theta, axes) for axes in ((1, 0, 2), (2, 0, 1)))  # (block, K, across)
+        return self._xp.stack([self._arm(*pair) for pair in zip(self._factors, views, strict=True)])
 
-    def adjoint(self, lines: NDArray[Any]) -> NDArray[Any]:
+    def adjoint(self, lines: Array) -> Array:
         """Bᵀ·y."""
         K, side, _ = self.theta_shape
         rows, columns = (
-            self._arm_adjoint(*pair).reshape(side, K, side) for pair in zip(self._factors, lines, strict=True)
+            self._xp.reshape(self._arm_adjoint(factor, lines[arm, ...]), (side, K, side))
+            for arm, factor in enumerate(self._factors)
         )
-        theta: NDArray[Any] = rows.transpose(1, 0, 2) + columns.transpose(1, 2, 0)
-        return theta
+        return self._xp.permute_dims(rows, (1, 0, 2)) + self._xp.permute_dims(columns, (1, 2, 0))
 
-    def _arm(self, factor: NDArray[Any], view: NDArray[Any]) -> NDArray[Any]:
+    def _arm(self, factor: Array, view: Array) -> Array:
         """Columns are merged into pixels on that side of the product where it is the smaller."""
-        blocks = np.ascontiguousarray(view).reshape(-1, self.theta_shape[1])
-        if self.theta_shape[1] > self._pixels:
-            pixels: NDArray[Any] = factor @ blocks_to_pixels(blocks, *self._columns)
-            return pixels
-        return blocks_to_pixels(factor @ blocks, *self._columns)
+        side, pixels = self._merging.shape
+        blocks = self._xp.reshape(view, (-1, side))
+        return factor @ (blocks @ self._merging) if side > pixels else (factor @ blocks) @ self._merging
 
-    def _arm_adjoint(self, factor: NDArray[Any], arm: NDArray[Any]) -> NDArray[Any]:
-        if self.theta_shape[1] > self._pixels:
-            return pixels_to_blocks(factor.T @ arm, *self._columns)
-        blocks: NDArray[Any] = factor.T @ pixels_to_blocks(arm, *self._columns)
-        return blocks
+    def _arm_adjoint(self, factor: Array, arm: Array) -> Array:
+        side, pixels = self._merging.shape
+        if side > pixels:
+            return (factor.T @ arm) @ self._merging.T
+        return factor.T @ (arm @ self._merging.T)
 
     @staticmethod
     def _lit_cosines(code: NDArray[np.uint8], basis: Basis, temporal_merge: int) -> NDArray[Any]:
         """E(t)·D_k(t // T_m): (T, K)."""
         frame = np.arange(len(code)) // temporal_merge
-        lit: NDArray[Any] = basis.matrix().T[frame] * code[:, None].astype(basis.dtype)
+        lit: NDArray[Any] = basis.matrix().T[frame] * code[:, None].astype(basis.arrays.dtype)
         return lit
 
 
 class InBasis:
     """Λ′·Dᵀ by synthesising the video and shearing it: for a full basis, K = T."""
 
-    def __init__(self, operator: DualArm, basis: Basis) -> None:
-        self._operator, self._basis = operator, basis
+    def __init__(
+        self,
+        geometry: Geometry,
+        code: NDArray[np.uint8],
+        basis: Basis,
+        spatial_merge: int = 1,
+        temporal_merge: int = 1,
+    ) -> None:
+        self._basis, case = basis, (geometry, code, spatial_merge, temporal_merge)
+        arrays = basis.arrays
+        self._operator: DualArm | GatheredArms
+        if arrays.compiled:
+            self._operator = DualArm(*case, np.dtype(arrays.dtype).type)
+        else:
+            self._operator = GatheredArms(*case, arrays)
 
-    def forward(self, theta: NDArray[Any]) -> NDArray[Any]:
+    def forward(self, theta: Array) -> Array:
         return self._operator.forward(self._basis.synthesize(theta))
 
-    def adjoint(self, lines: NDArray[Any]) -> NDArray[Any]:
+    def adjoint(self, lines: Array) -> Array:
         return self._basis.analyze(self._operator.adjoint(lines))
 
 

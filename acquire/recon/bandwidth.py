@@ -8,10 +8,12 @@ upper half gives itself away by peaks there; then all of the quarter is used.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from acquire.arrays import HOST, host
 from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import band_operator
 from acquire.recon.basis import TemporalBasis
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from acquire.arrays import Arrays
     from acquire.lines import Segment
 
 COARSE_SIDE = 24
@@ -34,7 +37,11 @@ LARGEST_SHARE = 0.25
 
 
 def estimate_coefficients(
-    segment: Segment, spatial_merge: int, temporal_merge: int, hurry: Callable[[], bool] = lambda: False
+    segment: Segment,
+    spatial_merge: int,
+    temporal_merge: int,
+    hurry: Callable[[], bool] = lambda: False,
+    arrays: Arrays = HOST,
 ) -> int:
     """How many of the first cosines of the frames' time axis hold the scene; sooner done where ``hurry()``.
 
@@ -45,19 +52,18 @@ def estimate_coefficients(
     if most <= FEWEST_COEFFICIENTS:
         return min(frames, FEWEST_COEFFICIENTS)
     merge = max(spatial_merge, -(-segment.geometry.size // COARSE_SIDE))
-    energy = np.square(_tentative(segment, (merge, temporal_merge), most, hurry), dtype=np.float64).sum(
-        (1, 2)
-    )
+    theta = _tentative(segment, (merge, temporal_merge), most, hurry, replace(arrays, dtype="float32"))
+    energy = np.square(theta, dtype=np.float64).sum((1, 2))
     return int(np.clip(MARGIN * _end_of_signal(energy), FEWEST_COEFFICIENTS, most))
 
 
 def _tentative(
-    segment: Segment, merges: tuple[int, int], count: int, hurry: Callable[[], bool]
+    segment: Segment, merges: tuple[int, int], count: int, hurry: Callable[[], bool], arrays: Arrays
 ) -> NDArray[Any]:
     merge, temporal_merge = merges
     frames, side, _ = segment.geometry.video_shape(merge, temporal_merge)
-    basis = TemporalBasis(frames, count)
-    problem = pose(segment, merge, temporal_merge, hold_out=0.0)
+    basis = TemporalBasis(frames, count, arrays)
+    problem = pose(segment, merge, temporal_merge, hold_out=0.0, arrays=arrays)
     operator = problem.masked(band_operator(segment.geometry, segment.code, basis, merge, temporal_merge))
     parameters = AdmmParameters(grid_per_coefficient=1)
     solver = Admm(operator, problem.used_samples, (count, side, side), basis, parameters)
@@ -65,7 +71,7 @@ def _tentative(
         if made >= FEWEST_ITERATIONS and hurry():
             break
         solver.step()
-    return solver.theta
+    return host(solver.theta)
 
 
 def _end_of_signal(energy: NDArray[np.float64]) -> int:

@@ -12,10 +12,13 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from scipy.fft import dct, idct
 
+from acquire.arrays import HOST
 from acquire.errors import UsageError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from acquire.arrays import Array, Arrays
 
 
 class Basis(Protocol):
@@ -33,24 +36,29 @@ class Basis(Protocol):
         ...
 
     @property
-    def dtype(self) -> np.dtype[Any]: ...
+    def arrays(self) -> Arrays:
+        """Where coefficients and videos live; D itself is the host's, in their dtype."""
+        ...
 
     def matrix(self, grid: int | None = None) -> NDArray[Any]: ...
 
-    def synthesize(self, theta: NDArray[Any]) -> NDArray[Any]: ...
+    def synthesize(self, theta: Array) -> Array: ...
 
-    def analyze(self, video: NDArray[Any]) -> NDArray[Any]: ...
+    def analyze(self, video: Array) -> Array: ...
 
 
 class TemporalBasis:
-    """D (K, T), orthonormal rows: θ = D·x analyses, x = Dᵀ·θ synthesises, along axis 0."""
+    """D (K, T), orthonormal rows: θ = D·x analyses, x = Dᵀ·θ synthesises, along axis 0.
 
-    def __init__(self, frames: int, count: int, dtype: type[np.floating[Any]] = np.float32) -> None:
+    By fast transforms on the host; elsewhere by the matrix, which a GPU does as soon.
+    """
+
+    def __init__(self, frames: int, count: int, arrays: Arrays = HOST) -> None:
         if not 1 <= count <= frames:
             raise UsageError(
                 f"{count} temporal coefficients", possible=f"1 to {frames} (frames of the segment)"
             )
-        self.frames, self.count, self.cosines, self.dtype = frames, count, count, np.dtype(dtype)
+        self.frames, self.count, self.cosines, self.arrays = frames, count, count, arrays
 
     def matrix(self, grid: int | None = None) -> NDArray[Any]:
         """D (K, grid) at ``grid`` ≥ K equidistant instants of the span (default: the frames)."""
@@ -60,26 +68,28 @@ class TemporalBasis:
         k = np.arange(self.count)[:, None]
         rows = np.sqrt(2 / points) * np.cos(np.pi * k * (np.arange(points) + 0.5) / points)
         rows[0] /= np.sqrt(2)
-        matrix: NDArray[Any] = rows.astype(self.dtype)
+        matrix: NDArray[Any] = rows.astype(self.arrays.dtype)
         return matrix
 
-    def synthesize(self, theta: NDArray[Any]) -> NDArray[Any]:
+    def synthesize(self, theta: Array) -> Array:
         """x = Dᵀ·θ: (K, …) → (T, …)."""
-        video: NDArray[Any] = idct(theta, n=self.frames, axis=0, norm="ortho", workers=2)
-        return video.astype(self.dtype, copy=False)
+        if not self.arrays.compiled:
+            return _product(self.arrays, self.matrix().T, theta)
+        return self.arrays.asarray(idct(theta, n=self.frames, axis=0, norm="ortho", workers=2))
 
-    def analyze(self, video: NDArray[Any]) -> NDArray[Any]:
+    def analyze(self, video: Array) -> Array:
         """θ = D·x: (T, …) → (K, …)."""
-        theta: NDArray[Any] = dct(video, axis=0, norm="ortho", workers=2)[: self.count]
-        return theta.astype(self.dtype, copy=False)
+        if not self.arrays.compiled:
+            return _product(self.arrays, self.matrix(), video)
+        return self.arrays.asarray(dct(video, axis=0, norm="ortho", workers=2)[: self.count])
 
 
 class LearnedBasis:
     """R orthonormal combinations of a basis' K rows: D = curvesᵀ·D_K, with ``curves`` (K, R)."""
 
     def __init__(self, within: TemporalBasis, curves: NDArray[Any]) -> None:
-        self._within, self.curves = within, curves.astype(within.dtype)
-        self.frames, self.count, self.dtype = within.frames, curves.shape[1], within.dtype
+        self._within, self.curves = within, curves.astype(within.arrays.dtype)
+        self.frames, self.count, self.arrays = within.frames, curves.shape[1], within.arrays
         self.cosines = within.count
 
     def matrix(self, grid: int | None = None) -> NDArray[Any]:
@@ -87,11 +97,15 @@ class LearnedBasis:
         matrix: NDArray[Any] = self.curves.T @ self._within.matrix(grid)
         return matrix
 
-    def synthesize(self, theta: NDArray[Any]) -> NDArray[Any]:
+    def synthesize(self, theta: Array) -> Array:
         """x = Dᵀ·θ: (R, …) → (T, …)."""
-        return self._within.synthesize(np.tensordot(self.curves, theta, 1))
+        return self._within.synthesize(_product(self.arrays, self.curves, theta))
 
-    def analyze(self, video: NDArray[Any]) -> NDArray[Any]:
+    def analyze(self, video: Array) -> Array:
         """θ = D·x: (T, …) → (R, …)."""
-        theta: NDArray[Any] = np.tensordot(self.curves.T, self._within.analyze(video), 1)
-        return theta
+        return _product(self.arrays, self.curves.T, self._within.analyze(video))
+
+
+def _product(arrays: Arrays, matrix: NDArray[Any], frames: Array) -> Array:
+    """``matrix`` of the host along the first axis."""
+    return arrays.xp.tensordot(arrays.asarray(matrix), frames, axes=1)

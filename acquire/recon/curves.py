@@ -54,9 +54,11 @@ def fit_curves(
     Patterns of like size make it well conditioned. Light to which the lines respond less than ``ridge``,
     relative to the mean eigenvalue, hardly moves: to be set as high as the patterns are wrong.
     """
+    problem = problem.on_host()
+    dtype = problem.arrays.dtype
     whole = CurveOperator(segment, patterns, cosines, temporal_merge)
     operator = problem.masked(whole)
-    residual = problem.used_samples - operator.forward(start.astype(np.float32))
+    residual = problem.used_samples - operator.forward(start.astype(dtype))
     small = segment.geometry.span <= LARGEST_SPAN and start.size <= LARGEST_UNKNOWNS
     precondition: Callable[[NDArray[Any]], NDArray[Any]]
     if small:
@@ -65,7 +67,8 @@ def fit_curves(
         precondition, damping = np.copy, 0.0
 
     def normal(x: NDArray[Any]) -> NDArray[np.float64]:
-        return operator.adjoint(operator.forward(x.astype(np.float32))).astype(np.float64) + damping * x
+        back: NDArray[Any] = operator.adjoint(operator.forward(x.astype(dtype)))
+        return back.astype(np.float64) + damping * x
 
     right = operator.adjoint(residual).astype(np.float64)
     return start + _conjugate_gradients(normal, right, precondition, STEPS if small else PLAIN_STEPS)
@@ -77,7 +80,7 @@ class CurveOperator:
     def __init__(
         self, segment: Segment, patterns: NDArray[Any], cosines: TemporalBasis, temporal_merge: int
     ) -> None:
-        self._geometry, self._code = segment.geometry, segment.code.astype(np.float32)
+        self._geometry, self._code = segment.geometry, segment.code.astype(patterns.dtype)
         self._frame = np.arange(segment.geometry.span) // temporal_merge
         self._begins = block_bounds(segment.geometry.span, temporal_merge)[0]
         self._width = segment.geometry.size + segment.geometry.substeps - 1

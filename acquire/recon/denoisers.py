@@ -13,20 +13,19 @@ of `admm`; any other denoiser makes it plug-and-play ADMM (Venkatakrishnan, Boum
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Protocol
 
-import numpy as np
-
+from acquire.arrays import namespace
 from acquire.errors import UsageError
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from acquire.arrays import Array
 
 
 class Denoiser(Protocol):
     """Cleans frames (K, row, column); ``weight`` says how strongly, in the units of TV's."""
 
-    def prox(self, frames: NDArray[Any], weight: float | NDArray[Any], /) -> NDArray[Any]: ...
+    def prox(self, frames: Array, weight: float | Array, /) -> Array: ...
 
 
 class HaarShrink:
@@ -41,27 +40,26 @@ class HaarShrink:
             raise UsageError(f"{levels} wavelet levels", possible="1 or more")
         self._levels = levels
 
-    def prox(self, frames: NDArray[Any], weight: float | NDArray[Any]) -> NDArray[Any]:
+    def prox(self, frames: Array, weight: float | Array) -> Array:
         """Details are shrunk by ``weight``."""
-        threshold = np.broadcast_to(np.asarray(weight, frames.dtype), len(frames)).reshape(-1, 1, 1)
-        smooth, details = frames, np.zeros_like(frames)
+        threshold = (namespace(frames).zeros_like(frames[:, 0, 0]) + weight)[:, None, None]
+        smooth, details = frames, namespace(frames).zeros_like(frames)
         for level in range(self._levels):
             step = 1 << level
             if step >= min(frames.shape[1:]):
                 break
             smooth, kept = _level(smooth, step, threshold)
             details += kept
-        cleaned: NDArray[Any] = smooth + details
-        return cleaned
+        return smooth + details
 
 
-def _level(smooth: NDArray[Any], step: int, threshold: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+def _level(smooth: Array, step: int, threshold: Array) -> tuple[Array, Array]:
     """The next smooth part and the kept details, which add up to ``smooth`` where nothing is shrunk."""
-    a, b = smooth, np.roll(smooth, -step, axis=2)
+    a, b = smooth, namespace(smooth).roll(smooth, -step, axis=2)
     parts = [(a + b) / 2, (a - b) / 2]
     bands = []
     for part in parts:
-        below = np.roll(part, -step, axis=1)
+        below = namespace(part).roll(part, -step, axis=1)
         bands += [(part + below) / 2, (part - below) / 2]
     kept = [
         _undo(_soft(band, threshold / 2), step, sign) for band, sign in zip(bands[1:], _SIGNS, strict=True)
@@ -73,13 +71,12 @@ _SIGNS = ((-1, 1), (1, -1), (-1, -1))
 """Of the second row and column, for the details down, across and diagonal."""
 
 
-def _undo(band: NDArray[Any], step: int, sign: tuple[int, int]) -> NDArray[Any]:
+def _undo(band: Array, step: int, sign: tuple[int, int]) -> Array:
     """Back to pixels: the mean over the shifts, which for Haar is the transposed filter."""
-    rows = (band + sign[0] * np.roll(band, step, axis=1)) / 2
-    back: NDArray[Any] = (rows + sign[1] * np.roll(rows, step, axis=2)) / 2
-    return back
+    rows = (band + sign[0] * namespace(band).roll(band, step, axis=1)) / 2
+    return (rows + sign[1] * namespace(rows).roll(rows, step, axis=2)) / 2
 
 
-def _soft(band: NDArray[Any], threshold: NDArray[Any]) -> NDArray[Any]:
-    shrunk: NDArray[Any] = np.sign(band) * np.maximum(np.abs(band) - threshold, 0)
-    return shrunk
+def _soft(band: Array, threshold: Array) -> Array:
+    xp = namespace(band)
+    return xp.sign(band) * xp.maximum(xp.abs(band) - threshold, 0)

@@ -16,11 +16,12 @@ N_m = 1 it is gone; voxels are averaged afterwards.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from acquire.arrays import host
 from acquire.forward import merge_video
 from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import band_operator
@@ -30,6 +31,7 @@ from acquire.recon.curves import fit_curves
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from acquire.arrays import Array
     from acquire.lines import Segment
     from acquire.recon.basis import TemporalBasis
     from acquire.recon.problem import MaskedOperator, Operator, Problem
@@ -38,24 +40,37 @@ LARGEST_RANK = 12
 TAIL = 16
 """Singular values from here on are taken as the floor of what the first reconstruction left over."""
 ABOVE_TAIL = 3.0
+GAP = 3.0
+"""Ratio of neighbouring singular values beyond which patterns end. A pattern too many is not harmless: it
+takes light from the others wherever the lines do not tell them apart, and the picture drifts away."""
 LARGEST_REST = 0.035
 """Share of the energy that the patterns may leave out; more, and the scene is not one of a few patterns."""
+LARGEST_REST_AT_GAP = 0.005
+"""The same for patterns that end at a gap, lest a bright still hides what moves before it."""
 FADING = 0.5
 """λ of a pattern is relative to (largest / its) singular value to this power: weak patterns are smoother."""
 
 PARAMETERS = AdmmParameters(tv_penalty=2e-3, sign_penalty=6e-4, grid_per_coefficient=1)
 ROUND = 5
 """ADMM iterations before the curves are fitted again."""
-FIRST_RIDGE, LAST_RIDGE, RIDGE_DECAY = 1e-2, 1e-4, 0.85
-"""The curves' fit is held back at first, when the patterns are still wrong (Levenberg's damping)."""
+RIDGE = 1e-2
+"""Levenberg's damping of the curves' fit: it slows them down, for the patterns to follow, but leaves the
+end where it is. With a tenth of it the two chase each other and part from the truth."""
+PENALTY_DECAY, LEAST_PENALTY = 0.8, 1 / 4
+WEIGHT_DECAY, LEAST_WEIGHT = 0.75, 1 / 16
+"""Of the penalties ρ and of λ, round by round: what holds the iterates together while patterns and curves
+are wrong flattens them when they are right."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patterns:
-    """Θ = curves·patterns: (K, R) orthonormal columns, and (R, row, column) that fall off in energy."""
+    """Θ = curves·patterns: (K, R) orthonormal columns, and (R, row, column) that fall off in energy.
+
+    Curves are the host's; patterns are where they were made.
+    """
 
     curves: NDArray[Any]
-    patterns: NDArray[Any]
+    patterns: Array
 
 
 def find_patterns(theta: NDArray[Any]) -> Patterns | None:
@@ -66,11 +81,22 @@ def find_patterns(theta: NDArray[Any]) -> Patterns | None:
     flat = theta.reshape(count, -1).astype(np.float64)
     energy, vectors = np.linalg.eigh(flat @ flat.T)
     energy, vectors = np.maximum(energy[::-1], 0), vectors[:, ::-1]
-    rank = int(np.count_nonzero(energy[:TAIL] > ABOVE_TAIL**2 * energy[TAIL - 1]))
-    if not 0 < rank <= LARGEST_RANK or energy[rank:].sum() > LARGEST_REST * energy.sum():
+    rank = _rank(energy)
+    if rank is None:
         return None
     curves = vectors[:, :rank].astype(theta.dtype)
     return Patterns(curves, (curves.T @ theta.reshape(count, -1)).reshape(rank, side, side))
+
+
+def _rank(energy: NDArray[np.float64]) -> int | None:
+    """How many squared singular values, falling, are a scene's: up to the last gap, or above the tail's."""
+    gaps = np.flatnonzero(energy[: TAIL - 1] > GAP**2 * energy[1:TAIL]) + 1
+    above = np.count_nonzero(energy[:TAIL] > ABOVE_TAIL**2 * energy[TAIL - 1])
+    candidates = [(int(gap), LARGEST_REST_AT_GAP) for gap in gaps[-1:]] + [(int(above), LARGEST_REST)]
+    for rank, rest in candidates:
+        if 0 < rank <= LARGEST_RANK and energy[rank:].sum() <= rest * energy.sum():
+            return rank
+    return None
 
 
 class Refinement:
@@ -87,13 +113,14 @@ class Refinement:
     ) -> None:
         self._segment, self._problem, self._cosines = segment, problem, cosines
         self._spatial_merge, self._temporal_merge = merges
-        self.parameters, self._steps, self._ridge = parameters, 0, FIRST_RIDGE
-        self._now = Patterns(found.curves, _hold(found.patterns, segment.geometry.size, merges[0]))
+        self.parameters, self._first, self._steps = parameters, parameters, 0
+        self.found = Patterns(found.curves, _hold(found.patterns, segment.geometry.size, merges[0]))
         self._admm = self._begin()
+        self.found = Patterns(found.curves, self._admm.theta)
 
     @property
     def rank(self) -> int:
-        return len(self._now.patterns)
+        return int(self.found.curves.shape[1])
 
     @property
     def at_round_end(self) -> bool:
@@ -102,31 +129,39 @@ class Refinement:
     def step(self) -> None:
         """One iteration. Raises NumericsError for iterates that are not finite."""
         self._admm.step()
-        self._now = Patterns(self._now.curves, self._admm.theta)
+        self.found = Patterns(self.found.curves, self._admm.theta)
         self._steps += 1
         if self.at_round_end:
             self._fit_curves()
-            self._admm.rebase(*self._operators(), self._now.patterns)
+            self._admm.rebase(*self._operators(), self.found.patterns)
+            self.found = Patterns(self.found.curves, self._admm.theta)
+            self._loosen()
+
+    def return_to(self, found: Patterns) -> None:
+        """Take ``found``, of an earlier round, as the estimate."""
+        self.found = found
+        self._operators()
 
     def predict(self) -> NDArray[Any]:
         """The lines of the estimate, as `Problem.samples`."""
-        return self._operator.forward(self._now.patterns) / np.float32(self._problem.norm)
+        return host(self._operator.forward(self.found.patterns)) / self._problem.norm
 
     def video(self) -> NDArray[Any]:
         """Dimensionless voxels (T/T_m, n/N_m, n/N_m)."""
-        merged = merge_video(self._now.patterns, self._spatial_merge, 1)
-        return LearnedBasis(self._cosines, self._now.curves).synthesize(merged)
+        merged = merge_video(host(self.found.patterns), self._spatial_merge, 1)
+        basis = LearnedBasis(self._cosines, self.found.curves)
+        return host(basis.synthesize(basis.arrays.asarray(merged)))
 
     def _operators(self) -> tuple[MaskedOperator, LearnedBasis]:
         """The patterns' operator and the basis of their curves, as these are now."""
-        basis = LearnedBasis(self._cosines, self._now.curves)
+        basis = LearnedBasis(self._cosines, self.found.curves)
         geometry, code = self._segment.geometry, self._segment.code
         self._operator: Operator = band_operator(geometry, code, basis, 1, self._temporal_merge)
         return self._problem.masked(self._operator), basis
 
     def _begin(self) -> Admm:
         operator, basis = self._operators()
-        size = np.sqrt(np.square(self._now.patterns, dtype=np.float64).sum((1, 2)))
+        size = np.sqrt(np.square(self.found.patterns, dtype=np.float64).sum((1, 2)))
         emphasis = (size.max() / np.maximum(size, 1e-6 * size.max() + 1e-30)) ** FADING
         n = self._segment.geometry.size
         return Admm(
@@ -135,29 +170,37 @@ class Refinement:
             (self.rank, n, n),
             basis,
             self.parameters,
-            start=self._now.patterns,
+            start=self.found.patterns,
             emphasis=emphasis,
         )
 
     def _fit_curves(self) -> None:
-        """New curves for the patterns, made orthonormal again with as little turning as possible."""
-        flat = self._now.patterns.reshape(self.rank, -1)
+        """New curves for the patterns, made orthonormal again with as little turning as possible.
+
+        A small problem in float64, solved on the host between two rounds.
+        """
+        shape, flat = self.found.patterns.shape, host(self.found.patterns).reshape(self.rank, -1)
         gram = (flat @ flat.T).astype(np.float64)
         root = np.linalg.cholesky(gram + 1e-6 * np.trace(gram) * np.eye(self.rank))
         # orthonormal patterns make the fit well conditioned; their sizes go to the curves meanwhile
-        unit = np.linalg.solve(root, flat).astype(np.float32).reshape(self._now.patterns.shape)
+        unit = np.linalg.solve(root, flat).astype(flat.dtype).reshape(shape)
         merge = self._temporal_merge
-        start = self._now.curves @ root
-        fitted = fit_curves(self._segment, self._problem, unit, self._cosines, merge, start, self._ridge)
-        self._ridge = max(LAST_RIDGE, RIDGE_DECAY * self._ridge)
+        start = self.found.curves @ root
+        fitted = fit_curves(self._segment, self._problem, unit, self._cosines, merge, start, RIDGE)
         left, middle, right = np.linalg.svd(np.linalg.solve(root.T, fitted.T).T, full_matrices=False)
         turned = (right.T * middle) @ right @ flat
-        self._now = Patterns((left @ right).astype(np.float32), _as(turned, self._now.patterns))
+        self.found = Patterns((left @ right).astype(flat.dtype), turned.reshape(shape))
 
-
-def _as(flat: NDArray[Any], patterns: NDArray[Any]) -> NDArray[Any]:
-    shaped: NDArray[Any] = flat.reshape(patterns.shape).astype(patterns.dtype)
-    return shaped
+    def _loosen(self) -> None:
+        now, first = self.parameters, self._first
+        penalty = max(PENALTY_DECAY * now.tv_penalty, LEAST_PENALTY * first.tv_penalty)
+        self.parameters = replace(
+            now,
+            tv_weight=max(WEIGHT_DECAY * now.tv_weight, LEAST_WEIGHT * first.tv_weight),
+            tv_penalty=penalty,
+            sign_penalty=first.sign_penalty * penalty / first.tv_penalty,
+        )
+        self._admm.reweigh(self.parameters)
 
 
 def _hold(patterns: NDArray[Any], n: int, merge: int) -> NDArray[Any]:

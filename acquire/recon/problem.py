@@ -7,11 +7,12 @@ masked: their weight is 0 and their value is never looked at.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from acquire.arrays import HOST, Arrays
 from acquire.errors import NumericsError, UsageError
 from acquire.forward import DualArm
 from acquire.recon.outliers import outliers
@@ -19,20 +20,21 @@ from acquire.recon.outliers import outliers
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from acquire.arrays import Array
     from acquire.lines import Segment
 
 
 class Operator(Protocol):
     """A linear map to lines (2, L_R, M) with its transpose."""
 
-    def forward(self, x: NDArray[Any], /) -> NDArray[Any]: ...
+    def forward(self, x: Array, /) -> Array: ...
 
-    def adjoint(self, y: NDArray[Any], /) -> NDArray[Any]: ...
+    def adjoint(self, y: Array, /) -> Array: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Problem:
-    """Find x with ``weight·(B·x/norm) ≈ weight·samples``.
+    """Find x with ``weight·(B·x/norm) ≈ weight·samples``. Held on the host, solved where ``arrays`` says.
 
     Attributes
     ----------
@@ -43,6 +45,7 @@ class Problem:
     scale : scene units per dimensionless voxel
     coverage : share of the samples that are usable
     masked_by : samples left out, by cause
+    arrays : library, device and dtype of the solvers' arrays
     """
 
     samples: NDArray[Any]
@@ -52,16 +55,20 @@ class Problem:
     scale: float
     coverage: float
     masked_by: dict[str, int] = field(default_factory=dict)
+    arrays: Arrays = HOST
 
     @property
-    def used_samples(self) -> NDArray[Any]:
+    def used_samples(self) -> Array:
         """``weight·samples``: what the solvers are given."""
-        used: NDArray[Any] = self.samples * self.weight
-        return used
+        return self.arrays.asarray(self.samples * self.weight)
 
     def masked(self, operator: Operator) -> MaskedOperator:
         """The solvers' operator: weighted, of norm at most 1."""
-        return MaskedOperator(operator, self.weight / self.samples.dtype.type(self.norm))
+        return MaskedOperator(operator, self.arrays.asarray(self.weight / self.norm))
+
+    def on_host(self) -> Problem:
+        """The same, for what is solved on the host."""
+        return replace(self, arrays=Arrays(dtype=self.arrays.dtype))
 
     def misfit(self, predicted: NDArray[Any]) -> float:
         """RMS of ``predicted − samples`` over the samples used, relative to their RMS."""
@@ -84,20 +91,25 @@ class MaskedOperator:
     """diag(weight)·B."""
 
     operator: Operator
-    weight: NDArray[Any]
+    weight: Array
 
-    def forward(self, x: NDArray[Any]) -> NDArray[Any]:
-        y: NDArray[Any] = self.operator.forward(x) * self.weight
-        return y
+    def forward(self, x: Array) -> Array:
+        return self.operator.forward(x) * self.weight
 
-    def adjoint(self, y: NDArray[Any]) -> NDArray[Any]:
+    def adjoint(self, y: Array) -> Array:
         return self.operator.adjoint(y * self.weight)
 
 
 def pose(
-    segment: Segment, spatial_merge: int, temporal_merge: int, *, hold_out: float, seed: int = 0
+    segment: Segment,
+    spatial_merge: int,
+    temporal_merge: int,
+    *,
+    hold_out: float,
+    seed: int = 0,
+    arrays: Arrays = HOST,
 ) -> Problem:
-    """The problem of a segment.
+    """The problem of a segment, to be solved in ``arrays``.
 
     ``hold_out`` is the share of usable samples kept from the solver, chosen by ``seed``.
 
@@ -121,14 +133,15 @@ def pose(
     if not (usable & ~held_out).any():
         held_out = np.zeros_like(usable)
     return Problem(
-        samples=(np.where(usable, samples, 0) / (scale * norm)).astype(np.float32),
-        weight=(usable & ~held_out).astype(np.float32),
+        samples=(np.where(usable, samples, 0) / (scale * norm)).astype(arrays.dtype),
+        weight=(usable & ~held_out).astype(arrays.dtype),
         held_out=held_out,
         norm=norm,
         scale=scale,
         coverage=float(usable.mean()),
         masked_by={"lost or saturated": int((~segment.mask).sum())}
         | {k: int(v.sum()) for k, v in bad.items()},
+        arrays=arrays,
     )
 
 

@@ -19,7 +19,7 @@ Solver = Literal["admm", "twist", "twist-band"]
 Preset = Literal["fast", "balanced", "best"]
 
 ITERATIONS: dict[str, dict[str, int]] = {
-    "admm": {"fast": 40, "balanced": 100, "best": 300},
+    "admm": {"fast": 40, "balanced": 150, "best": 300},
     "twist": {"fast": 60, "balanced": 200, "best": 400},
     "twist-band": {"fast": 60, "balanced": 200, "best": 400},
 }

@@ -39,9 +39,9 @@ class Reconstruction:
 
     Attributes
     ----------
-    video : (time, row, column) float32 in scene units, over the whole span; only the frames in ``trusted``
-        were sampled in full (Fig. 5). That interval is nominal: it follows from the geometry alone, whatever
-        lines were lost, samples masked, or the code does; ``quality`` says how well it went.
+    video : (time, row, column) in scene units and the dtype asked for, over the whole span; only the frames
+        in ``trusted`` were sampled in full (Fig. 5). That interval is nominal: it follows from the geometry
+        alone, whatever lines were lost, samples masked, or the code does; ``quality`` says how well it went.
     time_ns : the begin of each frame
     iterations : fewer than ``iterations_asked`` where the budget, ``stop`` or the data ended it (``ended``)
     frame_error : (time,) relative RMS residual of the samples that saw each frame; NaN where none did. It is
@@ -50,7 +50,7 @@ class Reconstruction:
     warnings : what a user should know before believing the video, in sentences
     """
 
-    video: NDArray[np.float32]
+    video: NDArray[np.floating[Any]]
     time_ns: NDArray[np.int64]
     trusted: slice
     seconds: float

@@ -6,8 +6,8 @@
     twist-band  the same algorithm with admm's band and sign
     (static image known)  one curve, least squares
 
-Held-out samples end the refinement: at full resolution the model has no error of its own to fit, so they
-are predicted better as long as the picture gets better.
+Held-out samples end the refinement, and the round that predicted them best is the result: at full resolution
+the model has no error of its own to fit, so they are predicted better as long as the picture gets better.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from acquire.forward import DualArm, merge_video
+from acquire.arrays import host
+from acquire.forward import merge_video
 from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import InBasis, band_operator
 from acquire.recon.bandwidth import estimate_coefficients
@@ -29,6 +30,7 @@ from acquire.recon.twist import Twist, TwistParameters
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from acquire.arrays import Array
     from acquire.lines import Segment
     from acquire.recon.basis import Basis
     from acquire.recon.clock import IterationClock
@@ -82,23 +84,23 @@ class InBand:
         parameters: AdmmParameters | TwistParameters,
     ) -> None:
         self.solver, self._parameters = solver, parameters
-        self._operator, self._basis, self._problem = operator, basis, problem
+        self.basis, self._operator, self._problem = basis, operator, problem
 
     def predict(self) -> NDArray[Any]:
-        return self._operator.forward(self.solver.theta) / np.float32(self._problem.norm)
+        return host(self._operator.forward(self.solver.theta)) / self._problem.norm
 
     def video(self) -> NDArray[Any]:
-        return self._basis.synthesize(self.solver.theta)
+        return host(self.basis.synthesize(self.solver.theta))
 
     def facts(self) -> dict[str, Any]:
-        return {"temporal_coefficients": self._basis.count} | asdict(self._parameters)
+        return {"temporal_coefficients": self.basis.count} | asdict(self._parameters)
 
 
 class Refined:
     """A refinement as an estimate."""
 
-    def __init__(self, refinement: Refinement, coefficients: int, parameters: AdmmParameters) -> None:
-        self._refinement, self._coefficients, self._parameters = refinement, coefficients, parameters
+    def __init__(self, refinement: Refinement, coefficients: int) -> None:
+        self._refinement, self._coefficients = refinement, coefficients
 
     def predict(self) -> NDArray[Any]:
         return self._refinement.predict()
@@ -108,16 +110,15 @@ class Refined:
 
     def facts(self) -> dict[str, Any]:
         found = {"temporal_coefficients": self._coefficients, "patterns": self._refinement.rank}
-        return found | asdict(self._parameters)
+        return found | asdict(self._refinement.parameters)
 
 
 def solve_admm(segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> Estimate:
     """The default: cosines first, then patterns and curves where the scene is of a few."""
     frames = segment.geometry.video_shape(request.spatial_merge, request.temporal_merge)[0]
-    basis = TemporalBasis(frames, _coefficients(segment, request, clock))
+    basis = TemporalBasis(frames, _coefficients(segment, problem, request, clock), problem.arrays)
     estimate = _first_look(segment, problem, request, basis, clock)
-    theta = estimate.solver.theta
-    refined = None if request.denoiser else _refine(segment, problem, request, (basis, theta), clock)
+    refined = None if request.denoiser else _refine(segment, problem, request, estimate, clock)
     if refined is not None:
         return refined
     for _ in clock.run(PLAIN_ITERATIONS - clock.done, "solve"):
@@ -133,7 +134,7 @@ def _first_look(
     frames, side, _ = segment.geometry.video_shape(N_m, T_m)
     operator = band_operator(segment.geometry, segment.code, basis, N_m, T_m)
 
-    def begin(start: NDArray[Any] | None, *, explained: bool = False) -> InBand:
+    def begin(start: Array | None, *, explained: bool = False) -> InBand:
         parameters = _weighted(_defaults(frames, explained=explained), request.tv_weight)
         solver = Admm(
             problem.masked(operator),
@@ -146,7 +147,9 @@ def _first_look(
         )
         return InBand(solver, operator, basis, problem, parameters)
 
-    start = None if request.initial is None else basis.analyze(request.initial / np.float32(problem.scale))
+    start = None
+    if request.initial is not None:
+        start = basis.analyze(problem.arrays.asarray(request.initial / problem.scale))
     estimate = begin(start)
     if 1 < frames <= FEW_FRAMES:
         for _ in clock.run(TRIAL, "first look", FIRST_LOOK_SHARE):
@@ -163,28 +166,32 @@ def _refine(
     segment: Segment,
     problem: Problem,
     request: Request,
-    first: tuple[TemporalBasis, NDArray[Any]],
+    first: InBand,
     clock: IterationClock,
 ) -> Estimate | None:
-    basis, theta = first
-    found = find_patterns(theta) if clock.done < clock.iterations else None
+    """Patterns and curves from a first look; None where the scene is not made of a few."""
+    found = find_patterns(host(first.solver.theta)) if clock.done < clock.iterations else None
     if found is None:
         return None
+    basis = TemporalBasis(first.basis.frames, first.basis.count, problem.arrays)
     merges = (request.spatial_merge, request.temporal_merge)
     refinement = Refinement(segment, problem, basis, found, merges)
-    parameters = refinement.parameters
-    best, idle = np.inf, 0
+    best, kept, idle = np.inf, refinement.found, 0
     for _ in clock.run(clock.iterations - clock.done, "refine"):
         refinement.step()
         if not refinement.at_round_end:
             continue
         now = problem.prediction_error(refinement.predict())
-        idle = 0 if now < (1 - LEAST_GAIN) * best else idle + 1
-        best = min(best, now)
+        idle = idle + 1 if now >= (1 - LEAST_GAIN) * best else 0  # without held-out samples: NaN, go on
+        if not now >= best:
+            best, kept = now, refinement.found
         if idle == PATIENCE:
             clock.converged()
             break
-    return Refined(refinement, basis.count, parameters)
+    refinement.return_to(kept)
+    if problem.prediction_error(first.predict()) < best < np.inf:
+        return None
+    return Refined(refinement, basis.count)
 
 
 def solve_twist(segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> Estimate:
@@ -192,12 +199,10 @@ def solve_twist(segment: Segment, problem: Problem, request: Request, clock: Ite
     N_m, T_m = request.spatial_merge, request.temporal_merge
     shape = segment.geometry.video_shape(N_m, T_m)
     banded = request.solver == "twist-band"
-    basis = TemporalBasis(shape[0], _coefficients(segment, request, clock) if banded else shape[0])
-    operator: Operator
-    if banded:
-        operator = band_operator(segment.geometry, segment.code, basis, N_m, T_m)
-    else:
-        operator = InBasis(DualArm(segment.geometry, segment.code, N_m, T_m), basis)
+    count = _coefficients(segment, problem, request, clock) if banded else shape[0]
+    basis = TemporalBasis(shape[0], count, problem.arrays)
+    make = band_operator if banded else InBasis
+    operator = make(segment.geometry, segment.code, basis, N_m, T_m)
     parameters = TwistParameters()
     if request.tv_weight is not None:
         parameters = replace(parameters, tv_weight=request.tv_weight)
@@ -223,20 +228,21 @@ class Lit:
         self, segment: Segment, problem: Problem, request: Request, image: NDArray[Any], clock: IterationClock
     ) -> None:
         frames = segment.geometry.video_shape(request.spatial_merge, request.temporal_merge)[0]
-        self._image, self._merge, self._problem = image.astype(np.float32), request.spatial_merge, problem
-        basis = TemporalBasis(frames, frames)
+        self._problem, arrays = problem, problem.on_host().arrays
+        self._image, self._merge = image.astype(arrays.dtype), request.spatial_merge
+        basis = TemporalBasis(frames, frames, arrays)
         patterns = self._image[None] / np.linalg.norm(self._image)
         self._operator = CurveOperator(segment, patterns, basis, request.temporal_merge)
         coefficients = np.zeros((frames, 1))
         for _ in clock.run(1, "light"):
             coefficients = fit_curves(segment, problem, patterns, basis, request.temporal_merge, coefficients)
-        self._coefficients = coefficients.astype(np.float32)
+        self._coefficients = arrays.asarray(coefficients)
         seen = np.add.reduceat(segment.code, np.arange(0, len(segment.code), request.temporal_merge)) > 0
         light = basis.synthesize(self._coefficients)[:, 0] / np.linalg.norm(self._image)
-        self._light = np.interp(np.arange(frames), np.flatnonzero(seen), light[seen]).astype(np.float32)
+        self._light = np.interp(np.arange(frames), np.flatnonzero(seen), light[seen]).astype(arrays.dtype)
 
     def predict(self) -> NDArray[Any]:
-        return self._operator.forward(self._coefficients) / np.float32(self._problem.norm)
+        return self._operator.forward(self._coefficients) / self._problem.norm
 
     def video(self) -> NDArray[Any]:
         video: NDArray[Any] = self._light[:, None, None] * merge_video(self._image[None], self._merge, 1)
@@ -246,10 +252,10 @@ class Lit:
         return {"patterns": 1}
 
 
-def _coefficients(segment: Segment, request: Request, clock: IterationClock) -> int:
+def _coefficients(segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> int:
     N_m, T_m = request.spatial_merge, request.temporal_merge
     if request.bandwidth is None:
-        return estimate_coefficients(segment, N_m, T_m, lambda: clock.spent(TENTATIVE_SHARE))
+        return estimate_coefficients(segment, N_m, T_m, lambda: clock.spent(TENTATIVE_SHARE), problem.arrays)
     frames = segment.geometry.video_shape(N_m, T_m)[0]
     return min(frames, max(1, round(request.bandwidth * frames)))
 

@@ -1,16 +1,22 @@
-"""Total variation of coefficient frames, with a prox that remembers its dual field between calls."""
+"""Total variation of coefficient frames, with a prox that remembers its dual field between calls.
+
+For numpy by the compiled loops of `kernels`, for other arrays by the same algorithm on all frames at once.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import math
+from typing import TYPE_CHECKING
 
 import numpy as np
+from array_api_compat import is_numpy_array
 
+from acquire.arrays import namespace
 from acquire.errors import UsageError
-from acquire.recon.kernels import tv_prox, tv_value
+from acquire.recon.kernels import SMALLEST_WEIGHT, tv_prox, tv_value
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from acquire.arrays import Array
 
 LARGEST_WEIGHT = 1e6
 """Weights are capped here: every frame is flat long before, and 1/λ stays representable."""
@@ -22,22 +28,68 @@ class FrameTv:
     ``prox`` is approximate: ``iterations`` of fast gradient projection from where the last call ended.
     """
 
-    def __init__(self, shape: tuple[int, int, int], iterations: int, dtype: np.dtype[Any]) -> None:
+    def __init__(self, iterations: int) -> None:
         if iterations < 1:
             raise UsageError(f"{iterations} iterations of the TV prox", possible="1 or more")
         self.iterations = iterations
-        self._dual = np.zeros((shape[0], 2, *shape[1:]), dtype)
+        self._dual: Array = None
 
-    def value(self, frames: NDArray[Any]) -> float:
+    def value(self, frames: Array) -> float:
         """Σ_k TV(frames[k])."""
-        values = np.empty(len(frames))
-        tv_value(frames, values)
-        return float(values.sum())
+        if is_numpy_array(frames):
+            values = np.empty(len(frames))
+            tv_value(frames, values)
+            return float(values.sum())
+        xp = namespace(frames)
+        return float(xp.sum(xp.sqrt(_ahead(frames, 1) ** 2 + _ahead(frames, 2) ** 2), dtype=xp.float64))
 
-    def prox(self, frames: NDArray[Any], weight: float | NDArray[Any]) -> NDArray[Any]:
-        """argmin_x ½‖x − frames‖² + Σ_k weight_k·TV(x_k); ``weight`` is one number or (K,)."""
+    def prox(self, frames: Array, weight: float | Array) -> Array:
+        """argmin_x ½‖x − frames‖² + Σ_k weight_k·TV(x_k); ``weight`` is one number or (K,).
+
+        Frames keep their shape from call to call.
+        """
+        xp = namespace(frames)
+        capped = (
+            min(weight, LARGEST_WEIGHT) if isinstance(weight, float) else xp.minimum(weight, LARGEST_WEIGHT)
+        )
+        weights = xp.zeros_like(frames[:, 0, 0]) + capped
+        if self._dual is None:
+            self._dual = xp.stack([xp.zeros_like(frames)] * 2, axis=1)
+        if not is_numpy_array(frames):
+            return self._prox_of_all(frames, weights)
         out = np.empty_like(frames)
-        weights = np.empty(len(frames), frames.dtype)
-        weights[:] = np.minimum(weight, LARGEST_WEIGHT)
         tv_prox(frames, weights, self._dual, self.iterations, out)
         return out
+
+    def _prox_of_all(self, frames: Array, weights: Array) -> Array:
+        """As `kernels.tv_prox`; p is the dual's part along the rows' axis, q that along the columns'."""
+        xp, scale = namespace(frames), weights[:, None, None]
+        used = xp.maximum(scale, SMALLEST_WEIGHT)
+        p, q = self._dual[:, 0, ...], self._dual[:, 1, ...]
+        p_ahead, q_ahead, momentum = p, q, 1.0
+        for _ in range(self.iterations):
+            x = frames + used * _divergence(p_ahead, q_ahead)
+            new_p, new_q = p_ahead + _ahead(x, 1) / (8 * used), q_ahead + _ahead(x, 2) / (8 * used)
+            length = xp.maximum(xp.sqrt(new_p**2 + new_q**2), 1)
+            new_p, new_q = new_p / length, new_q / length
+            following = (1 + math.sqrt(1 + 4 * momentum**2)) / 2
+            push, momentum = (momentum - 1) / following, following
+            p_ahead, q_ahead = new_p + push * (new_p - p), new_q + push * (new_q - q)
+            p, q = new_p, new_q
+        self._dual = xp.stack([p, q], axis=1)
+        return xp.where(scale < SMALLEST_WEIGHT, frames, frames + used * _divergence(p, q))
+
+
+def _ahead(x: Array, axis: int) -> Array:
+    """x_{i+1} − x_i along an axis, 0 at its end."""
+    xp = namespace(x)
+    last = x[:, -1:, :] if axis == 1 else x[:, :, -1:]
+    return xp.diff(x, axis=axis, append=last)
+
+
+def _divergence(p: Array, q: Array) -> Array:
+    """The negative transpose of `_ahead` along both axes, for p and q that are 0 at their ends."""
+    xp = namespace(p)
+    return xp.diff(p, axis=1, prepend=xp.zeros_like(p[:, :1, :])) + xp.diff(
+        q, axis=2, prepend=xp.zeros_like(q[:, :, :1])
+    )

@@ -19,17 +19,16 @@ gains can be told apart: θ in the band, and every shrunk iterate made non-negat
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numpy as np
-
+from acquire.arrays import dot, namespace
 from acquire.errors import NumericsError
 from acquire.recon.tv import FrameTv
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
+    from acquire.arrays import Array
     from acquire.recon.basis import Basis
     from acquire.recon.problem import MaskedOperator
 
@@ -60,20 +59,23 @@ class Twist:
     def __init__(
         self,
         operator: MaskedOperator,
-        samples: NDArray[Any],
+        samples: Array,
         theta_shape: tuple[int, int, int],
         parameters: TwistParameters,
         basis: Basis | None = None,
     ) -> None:
         self._operator, self._samples = operator, samples
-        self._grid = None if basis is None else basis.matrix(min(basis.frames, 2 * basis.cosines))
+        self._xp = xp = namespace(samples)
+        self._grid = None
+        if basis is not None:
+            self._grid = basis.arrays.asarray(basis.matrix(min(basis.frames, 2 * basis.cosines)))
         self._lambda = parameters.tv_weight
-        self._tv = FrameTv(theta_shape, parameters.tv_iterations, samples.dtype)
-        root = np.sqrt(parameters.smallest_eigenvalue)
+        self._tv = FrameTv(parameters.tv_iterations)
+        root = math.sqrt(parameters.smallest_eigenvalue)
         rho = (1 - root) / (1 + root)
         self._alpha = 1 + rho**2
         self._beta = 2 * self._alpha / (parameters.smallest_eigenvalue + 1)
-        self.theta = np.zeros(theta_shape, samples.dtype)
+        self.theta = xp.zeros(theta_shape, dtype=samples.dtype, device=samples.device)
         self._before = self.theta
         self._gap = self._samples
         self.objective = self._objective_of(self.theta, self._gap)
@@ -87,7 +89,7 @@ class Twist:
         """
         target = self.theta + self._operator.adjoint(self._gap)
         shrunk = self._non_negative(self._tv.prox(target, self._lambda))
-        alpha, beta = self.theta.dtype.type(self._alpha), self.theta.dtype.type(self._beta)
+        alpha, beta = self._alpha, self._beta
         if self._moved((1 - alpha) * self._before + (alpha - beta) * self.theta + beta * shrunk):
             return
         for _ in range(PROX_REPEATS):
@@ -96,7 +98,7 @@ class Twist:
             shrunk = self._tv.prox(target, self._lambda)  # goes on from where it stopped: more exact
         self._before = self.theta
 
-    def _moved(self, theta: NDArray[Any], *, whatever: bool = False) -> bool:
+    def _moved(self, theta: Array, *, whatever: bool = False) -> bool:
         """Go to ``theta`` unless the objective would rise, or ``whatever`` it does."""
         gap = self._samples - self._operator.forward(theta)
         objective = self._objective_of(theta, gap)
@@ -105,16 +107,15 @@ class Twist:
         self._before, self.theta, self._gap, self.objective = self.theta, theta, gap, objective
         return True
 
-    def _non_negative(self, theta: NDArray[Any]) -> NDArray[Any]:
+    def _non_negative(self, theta: Array) -> Array:
         """Dark where the video would be negative, as far as the band holds it."""
         if self._grid is None:
             return theta
-        values = np.maximum(np.tensordot(self._grid.T, theta, 1), 0)
-        clipped: NDArray[Any] = np.tensordot(self._grid, values, 1)
-        return clipped
+        values = self._xp.maximum(self._xp.tensordot(self._grid.T, theta, axes=1), 0)
+        return self._xp.tensordot(self._grid, values, axes=1)
 
-    def _objective_of(self, theta: NDArray[Any], gap: NDArray[Any]) -> float:
-        value = 0.5 * float(np.vdot(gap, gap)) + self._lambda * self._tv.value(theta)
-        if not np.isfinite(value):
+    def _objective_of(self, theta: Array, gap: Array) -> float:
+        value = 0.5 * float(dot(gap, gap)) + self._lambda * self._tv.value(theta)
+        if not math.isfinite(value):
             raise NumericsError("TwIST left the finite numbers", hint="check the segment's samples and λ")
         return value

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from acquire.arrays import open_arrays
 from acquire.errors import UsageError
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
@@ -14,9 +15,11 @@ from acquire.recon import band
 from acquire.recon.band import BandOperator, InBasis, band_operator
 from acquire.recon.basis import TemporalBasis
 
+DOUBLE = open_arrays(dtype="float64")
+
 
 def test_basis_is_orthonormal_and_both_ways_agree() -> None:
-    basis = TemporalBasis(50, 12, np.float64)
+    basis = TemporalBasis(50, 12, DOUBLE)
     D = basis.matrix()
     np.testing.assert_allclose(D @ D.T, np.eye(12), atol=1e-12)
     np.testing.assert_allclose(basis.matrix(24) @ basis.matrix(24).T, np.eye(12), atol=1e-12)
@@ -28,7 +31,7 @@ def test_basis_is_orthonormal_and_both_ways_agree() -> None:
 
 def test_the_coarse_grid_samples_the_same_function() -> None:
     """A video of twice the rate's worth of instants passes through the same band-limited signal."""
-    basis = TemporalBasis(60, 10, np.float64)
+    basis = TemporalBasis(60, 10, DOUBLE)
     theta = np.random.default_rng(1).standard_normal(10)
     coarse = basis.matrix(20).T @ theta * np.sqrt(20 / 60)
     fine = basis.synthesize(theta)
@@ -65,8 +68,8 @@ def test_band_operator_is_the_sensing_matrix_in_the_basis(case: tuple[Geometry, 
     rng = np.random.default_rng(seed)
     code = rng.integers(0, 2, g.span).astype(np.uint8)
     whole = DualArm(g, code, N_m, T_m, np.float64)
-    basis = TemporalBasis(whole.video_shape[0], K, np.float64)
-    band, composed = BandOperator(g, code, basis, N_m, T_m), InBasis(whole, basis)
+    basis = TemporalBasis(whole.video_shape[0], K, DOUBLE)
+    band, composed = BandOperator(g, code, basis, N_m, T_m), InBasis(g, code, basis, N_m, T_m)
     theta = rng.standard_normal(band.theta_shape)
     lines = rng.standard_normal(g.lines_shape)
     np.testing.assert_allclose(band.forward(theta), composed.forward(theta), atol=1e-11)

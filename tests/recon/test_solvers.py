@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from acquire.arrays import open_arrays
 from acquire.errors import NumericsError
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
@@ -14,6 +15,8 @@ from acquire.recon.basis import TemporalBasis
 from acquire.recon.problem import MaskedOperator
 from acquire.recon.tv import FrameTv
 from acquire.recon.twist import Twist, TwistParameters
+
+DOUBLE = open_arrays(dtype="float64")
 
 
 class Small:
@@ -25,10 +28,12 @@ class Small:
         code = rng.integers(0, 2, self.geometry.span).astype(np.uint8)
         whole = DualArm(self.geometry, code, 2, 3, np.float64)
         self.shape = whole.video_shape
-        self.basis = TemporalBasis(self.shape[0], self.shape[0], np.float64)
+        self.basis = TemporalBasis(self.shape[0], self.shape[0], DOUBLE)
         mask = np.ones(whole.lines_shape)
         mask[0, 2] = mask[1, 5, 1] = 0.0
-        self.operator = MaskedOperator(InBasis(whole, self.basis), mask / whole.norm_bound())
+        self.operator = MaskedOperator(
+            InBasis(self.geometry, code, self.basis, 2, 3), mask / whole.norm_bound()
+        )
         truth = self.basis.analyze(1 + rng.random(self.shape))
         self.samples = np.where(mask > 0, self.operator.forward(truth), 0.0)
         unit = np.eye(truth.size).reshape(-1, *self.shape)
@@ -36,7 +41,7 @@ class Small:
 
     def objective(self, theta: np.ndarray, weight: float) -> float:
         gap = self.samples - self.operator.forward(theta)
-        return 0.5 * float(np.vdot(gap, gap)) + weight * FrameTv(self.shape, 1, theta.dtype).value(theta)
+        return 0.5 * float(np.vdot(gap, gap)) + weight * FrameTv(1).value(theta)
 
 
 @pytest.fixture(scope="module")

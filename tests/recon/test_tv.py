@@ -11,7 +11,7 @@ from acquire.recon.tv import FrameTv
 
 
 def prox(frames: np.ndarray, weight: float, iterations: int = 3000) -> np.ndarray:
-    return FrameTv(frames.shape, iterations, frames.dtype).prox(frames, weight)
+    return FrameTv(iterations).prox(frames, weight)
 
 
 def test_two_pixels_move_towards_each_other_until_they_meet() -> None:
@@ -32,7 +32,7 @@ def test_equals_an_independent_implementation() -> None:
     frame = np.random.default_rng(0).random((20, 30))
     ours = prox(frame[None], 0.3, 5000)[0]
     theirs = denoise_tv_chambolle(frame, weight=0.3, eps=1e-14, max_num_iter=100_000)
-    tv = FrameTv((1, 20, 30), 1, frame.dtype)
+    tv = FrameTv(1)
 
     def objective(x: np.ndarray) -> float:
         return 0.5 * float(((x - frame) ** 2).sum()) + 0.3 * tv.value(x[None])
@@ -54,7 +54,7 @@ def test_frames_do_not_see_each_other_and_warm_starts_reach_the_same_point() -> 
     frames = np.random.default_rng(2).random((4, 12, 9))
     together = prox(frames, 0.1)
     np.testing.assert_allclose(prox(frames[2:3], 0.1), together[2:3], atol=1e-12)
-    warm = FrameTv(frames.shape, 20, frames.dtype)
+    warm = FrameTv(20)
     for _ in range(200):
         last = warm.prox(frames, 0.1)
     np.testing.assert_allclose(last, together, atol=1e-5)
@@ -63,7 +63,7 @@ def test_frames_do_not_see_each_other_and_warm_starts_reach_the_same_point() -> 
 def test_value_of_a_disc_edge_and_refusal() -> None:
     frame = np.zeros((2, 5, 5))
     frame[1, 2, 2] = 1.0  # three forward differences: right-below corner √2, left 1, above 1
-    tv = FrameTv(frame.shape, 1, frame.dtype)
+    tv = FrameTv(1)
     assert tv.value(frame) == pytest.approx(2 + np.sqrt(2))
     with pytest.raises(UsageError, match="0 iterations"):
-        FrameTv((1, 2, 2), 0, np.dtype(float))
+        FrameTv(0)

@@ -1,0 +1,110 @@
+"""Where the reconstruction's arrays live: a library of the array API standard, a device of it, a dtype.
+
+    numpy   the default; TV and the shear are compiled loops (numba)
+    others  the same solvers, TV and the shear in the standard's operations: vectorised over all frames
+
+The solvers ask `namespace` for the functions of whatever array they hold. Lines, weights and bases are made
+on the host; `Arrays.asarray` is the one way to the device, `host` the one way back, and neither is called
+inside an iteration. What an iteration does read are scalars: whether its residual is finite, or 0.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+
+import array_api_compat
+import array_api_compat.numpy
+import numpy as np
+
+from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+Array: TypeAlias = Any
+"""Of any library; the standard has no type for it yet."""
+Dtype = Literal["float32", "float64"]
+DTYPES: tuple[Dtype, ...] = ("float32", "float64")
+
+
+@dataclass(frozen=True, slots=True)
+class Arrays:
+    """Makes arrays of one library, device and dtype (float32 or float64)."""
+
+    xp: Any = array_api_compat.numpy
+    device: Any = None
+    dtype: Dtype = "float32"
+
+    def asarray(self, given: Array) -> Array:
+        """The numbers of a numpy array, or of an array that is there already."""
+        return self.xp.asarray(given, dtype=getattr(self.xp, self.dtype), device=self.device)
+
+    def zeros(self, shape: tuple[int, ...]) -> Array:
+        return self.xp.zeros(shape, dtype=getattr(self.xp, self.dtype), device=self.device)
+
+    def indices(self, given: NDArray[np.int64]) -> Array:
+        """Integers for ``take``."""
+        return self.xp.asarray(given, device=self.device)
+
+    @property
+    def compiled(self) -> bool:
+        """Whether there are compiled loops for these arrays."""
+        return bool(array_api_compat.is_numpy_namespace(self.xp))
+
+
+HOST = Arrays()
+"""numpy's, float32."""
+
+
+def namespace(array: Array) -> Any:
+    """The functions of an array's library, named as in the standard."""
+    return array_api_compat.array_namespace(array)
+
+
+def host(array: Array) -> NDArray[Any]:
+    """The same numbers for numpy: itself, or a copy from the device."""
+    if array_api_compat.is_cupy_array(array):
+        copied: NDArray[Any] = array.get()
+        return copied
+    return np.from_dlpack(array) if not array_api_compat.is_numpy_array(array) else array
+
+
+def dot(a: Array, b: Array) -> Array:
+    """Σ a·b over all elements, as an array of no dimension on their device."""
+    return namespace(a).reshape(a, (-1,)) @ namespace(b).reshape(b, (-1,))
+
+
+def _cupy() -> tuple[Any, Any]:
+    try:
+        import cupy
+        from array_api_compat import cupy as xp
+    except ImportError as error:
+        raise UsageError(
+            f"device 'gpu' without CuPy ({error})", possible="cpu", hint="pip install 'tdi-acquire[gpu]'"
+        ) from error
+    try:
+        return xp, cupy.cuda.Device()  # the one in use; asks the driver
+    except cupy.cuda.runtime.CUDARuntimeError as error:
+        raise UsageError(
+            f"device 'gpu': {error}", possible="cpu", hint="nvidia-smi shows what CUDA sees"
+        ) from error
+
+
+DEVICES: dict[str, Callable[[], tuple[Any, Any]]] = {
+    "cpu": lambda: (array_api_compat.numpy, None),
+    "gpu": _cupy,
+}
+"""By name: the library and its device, opened when asked for."""
+
+
+def open_arrays(device: str = "cpu", dtype: str = "float32") -> Arrays:
+    """Arrays on a device; UsageError where there is no such device or dtype."""
+    if dtype not in DTYPES:
+        raise UsageError(f"dtype {dtype!r}", possible=", ".join(DTYPES))
+    if device not in DEVICES:
+        raise UsageError(f"device {device!r}", possible=", ".join(DEVICES))
+    xp, where = DEVICES[device]()
+    return Arrays(xp, where, dtype)
