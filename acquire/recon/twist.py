@@ -6,11 +6,11 @@ with φ the isotropic 2-D TV of every frame of the video's DCT along time (Secti
 
     θ_{k+1} = (1 − α)·θ_{k−1} + (α − β)·θ_k + β·Ψ_λ(θ_k + BᵀW(y − W·B·θ_k))
 
-(Bioucas-Dias and Figueiredo, IEEE Trans. Image Process. 16, 2992 (2007), Eq. 18, 22–27). Where the objective
-would rise above the running mean of its past (Zhang and Hager, SIAM J. Optim. 14, 1043 (2004)), the plain step
-Ψ_λ(…) is taken instead, which needs the norm to be a true upper bound. A stricter watch, the reference's
-monotone variant, costs 1 dB and more at equal time: the few iterations of the prox make the objective ripple,
-and every plain step throws the speed away.
+(Bioucas-Dias and Figueiredo, IEEE Trans. Image Process. 16, 2992 (2007), Eq. 18, 22–27). Where the
+objective would rise above the running mean of its past (Zhang and Hager, SIAM J. Optim. 14, 1043 (2004)),
+the plain step Ψ_λ(…) is taken instead, which needs the norm to be a true upper bound. A stricter watch, the
+reference's monotone variant, costs 1 dB and more at equal time: the few iterations of the prox make the
+objective ripple, and every plain step throws the speed away.
 
 The paper's λ of 0.1 … 10 is for an operator that is not normalised and light of about 1: divided by
 norm² · scale (about 2000 for Fig. 9) it is 5e-5 … 5e-3 here.
