@@ -23,10 +23,10 @@ from scipy import sparse
 
 from acquire.codes import PrbsCode, mix_seed
 from acquire.config import GeometryConfig, load_scene
+from acquire.cores import limit_blas
 from acquire.device_config import CameraConfig
 from acquire.lines import ARMS
 from acquire.scene_config import SceneFile
-from acquire.sim.blas import limit_blas_threads
 from acquire.sim.lines import SeparableLines, StreamingArm
 from acquire.sim.pipeline import Bench, Converter
 from acquire.sim.scenes import build_scene
@@ -166,7 +166,7 @@ def main() -> None:
     parser.add_argument("--substeps", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=2.0)
     options = parser.parse_args()
-    told = limit_blas_threads(1)
+    told = limit_blas(1).get_original_num_threads()
     print(f"M = {options.stages}, S = {options.substeps}; libraries limited to one thread: {len(told)}")
     camera = CameraConfig(responsivity_dn=6.0)
     geometry = GeometryConfig(stages=options.stages, substeps=options.substeps)

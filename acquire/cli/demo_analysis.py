@@ -10,6 +10,7 @@ import numpy as np
 
 from acquire.cli.demo_plan import N_M, SEGMENT_LINES, T_M, segment_row
 from acquire.cli.progress import stage_progress
+from acquire.cores import idle_cores, limit_blas
 from acquire.evaluate.report import (
     ArmLedger,
     CaptureFacts,
@@ -99,7 +100,7 @@ def _cut(recording: Recording, row: int, journal: Journal) -> Segment:
 
 def _solve(method: Method, segment: Segment, journal: Journal) -> Reconstruction:
     name = f"Reconstruct: {method.label}"
-    with journal.stage(name) as note, stage_progress(name) as advance:
+    with journal.stage(name) as note, stage_progress(name) as advance, limit_blas(idle_cores()):
         result = reconstruct(
             segment,
             N_M,

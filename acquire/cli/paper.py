@@ -39,6 +39,7 @@ def paper(
     chosen = list(dict.fromkeys(figures or NAMES))
     if wrong := [name for name in chosen if name not in NAMES]:
         raise UsageError(f"figure {wrong[0]}", possible=", ".join(NAMES))
+    from acquire.cores import idle_cores, limit_blas
     from acquire.evaluate.paper import Studio, make
     from acquire.evaluate.paper.page import draw, summarise, write_page
     from acquire.reconstruct import Options
@@ -49,7 +50,7 @@ def paper(
     options = Options(preset, solver, None, budget)  # type: ignore[arg-type]  # checked there
     made: list[dict[str, Any]] = []
     pictures: dict[str, Path] = {}
-    with told() as say:
+    with told() as say, limit_blas(idle_cores()):
         for name in chosen:
             studio = Studio(out, options, seed, lambda text, name=name: say(f"{name}: {text}"))  # type: ignore[misc]
             figure = make(name, studio)

@@ -73,6 +73,8 @@ def reconstruct(
     solver: Annotated[str, typer.Option(help="admm; twist, the paper's; twist-band.")] = "admm",
     budget: Annotated[float | None, typer.Option(metavar="SECONDS", help="Stop iterating in time.")] = None,
     iterations: Annotated[int | None, typer.Option(help="Instead of the preset's.")] = None,
+    dtype: Annotated[str, typer.Option(help="float32 or float64: how exactly it is computed.")] = "float32",
+    device: Annotated[str, typer.Option(help="cpu, or gpu: CUDA by way of CuPy.")] = "cpu",
     preview: Annotated[bool, typer.Option("--preview", help="Coarse, in a second or two.")] = False,
     workers: Annotated[int | None, typer.Option(help="Processes at once; else one per core.")] = None,
     dask: Annotated[
@@ -86,6 +88,7 @@ def reconstruct(
 
     Example: [bold]acquire reconstruct run.zarr --out video.zarr --from 52ms --to 57.98ms --nm 3 --tm 1[/]
     """
+    from acquire.arrays import open_arrays
     from acquire.cli.reconstruct_request import Asked, prepare
     from acquire.reconstruct import Options
     from acquire.store import open_recording
@@ -93,6 +96,8 @@ def reconstruct(
 
     if out is None and not auto:
         raise UsageError("reconstruct without --out", possible="--out NAME.zarr")
+    if dask is None:
+        open_arrays(device, dtype)  # refused before anything is touched; a cluster's devices are not here
     opened = open_recording(recording)
     asked = Asked(
         first_line=first_line,
@@ -107,7 +112,7 @@ def reconstruct(
         ends=ends,
         preview=preview,
         preset=preset,
-        options=Options("balanced", solver, iterations, budget),  # type: ignore[arg-type]  # checked there
+        options=Options("balanced", solver, iterations, budget, None, dtype, device),  # type: ignore[arg-type]  # checked there
     )
     prepared = prepare(opened, asked)
     if prepared.plan is not None and not json:
@@ -145,6 +150,7 @@ def _run(
     from acquire.reconstruct import Watcher, combine, open_pool
 
     tasks = len(request.stretches)
+    at_once = workers or (None if options.device == "cpu" else 1)  # one process fills a GPU
     with (
         first_interrupt_asks() as interrupted,
         stage_progress(f"reconstructing {PurePosixPath(out).name}") as advance,
@@ -154,7 +160,7 @@ def _run(
             lambda done, of: advance(round(PROGRESS_STEPS * done), PROGRESS_STEPS * of),
             interrupted.is_set,
         )
-        with open_pool(tasks, workers, cluster, watcher) as pool:
+        with open_pool(tasks, at_once, cluster, watcher) as pool:
             return combine(recording, request, out, options, pool, watcher)
 
 

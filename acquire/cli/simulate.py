@@ -45,14 +45,14 @@ def simulate(
     Example: [bold]acquire simulate scene-digits --out digits.zarr[/]
     """
     from acquire.config import load_rig, load_scene, parse_settings
-    from acquire.sim.blas import limit_blas_threads
+    from acquire.cores import limit_blas
     from acquire.simulate import bench_of, study
     from acquire.simulate import simulate as run
     from acquire.store.files import check_new_path
 
     if out is None and not explain:
         raise UsageError("simulate without --out", possible="--out NAME.zarr, or --explain")
-    limit_blas_threads(1)  # the arms share the cores
+    limit_blas(1)  # the arms share the cores
     shown = load_scene(scene)
     rig = load_rig(config or shown.rig, parse_settings(settings or []))
     count = _line_count(rig, shown.lines, lines, duration)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shlex
 import sys
 from datetime import UTC, datetime
@@ -32,17 +33,20 @@ def tradeoff(
     voxels: Annotated[list[str] | None, typer.Option(metavar="NMxTM", help="Repeatable; else 3x1.")] = None,
     solver: Annotated[list[str] | None, typer.Option(help="Repeatable; else every solver.")] = None,
     preset: Annotated[list[str] | None, typer.Option(help="Repeatable; else fast and balanced.")] = None,
+    dtype: Annotated[list[str] | None, typer.Option(help="Repeatable; else float32 and float64.")] = None,
     first_line: Annotated[int | None, typer.Option(help="Of the segment.")] = None,
     lines: Annotated[int, typer.Option(help="How many lines, L_R.")] = LINES,
     budget: Annotated[float | None, typer.Option(metavar="SECONDS", help="No run longer than this.")] = None,
     learn: Annotated[bool, typer.Option(help="Keep it for --budget of acquire reconstruct.")] = True,
     json: JsonFlag = False,
 ) -> None:
-    """Draw accuracy against wall time for every solver, preset and kind of voxels, iteration by iteration.
+    """Draw accuracy against wall time for every solver, preset, dtype and kind of voxels, step by step.
 
     Example: [bold]acquire tradeoff scene-leds --voxels 3x1 --voxels 3x4[/]
     """
+    from acquire.arrays import DTYPES, open_arrays
     from acquire.cli.reconstruct_request import parse_voxels
+    from acquire.cores import idle_cores, limit_blas
     from acquire.evaluate.tradeoff import Judge, measure, table
     from acquire.evaluate.tradeoff_page import write_page
     from acquire.recon import ITERATIONS
@@ -56,14 +60,14 @@ def tradeoff(
     for each in solvers:
         for kind in presets:
             preset_iterations(each, kind)
+    dtypes = [open_arrays("cpu", each).dtype for each in dtype or DTYPES]
     check_new_path(out)
     recording, study = _opened(source, out, (first_line or FIRST_LINE) + lines)
     segment = recording.cut(_first(recording, first_line, lines), lines)
     judge, runs = Judge.of(recording, segment), []
-    for shape in kinds:
-        for each in solvers:
-            with stage_progress(f"{each} {shape}") as advance:
-                runs.append(measure(judge, each, shape, presets, budget, advance))  # type: ignore[arg-type]
+    for shape, each, exact in itertools.product(kinds, solvers, dtypes):
+        with stage_progress(f"{each} {shape} {exact}") as advance, limit_blas(idle_cores()):
+            runs.append(measure(judge, each, shape, presets, budget, advance, dtype=exact))  # type: ignore[arg-type]
     command = f"acquire {shlex.join(sys.argv[1:])}"
     page = write_page(runs, study, out, Path(source).stem, command, datetime.now(UTC))
     kept = remember(_lessons(runs)) if learn else None
@@ -120,7 +124,7 @@ def _lessons(runs: list[Run]) -> list[Learned]:
         for run in runs
         for point in run.points
         for preset in point.presets
-        if point.psnr_db is not None
+        if point.psnr_db is not None and run.dtype == "float32"  # what --budget chooses among
     ]
 
 
@@ -132,6 +136,7 @@ def _print(runs: list[Run]) -> None:
         (
             str(run.voxels),
             run.solver,
+            run.dtype,
             ", ".join(point.presets),
             str(point.iterations),
             text(point.seconds, 2),
@@ -143,5 +148,16 @@ def _print(runs: list[Run]) -> None:
         for run in runs
         for point in run.points
     ]
-    titles = ("voxels", "solver", "preset", "iterations", "seconds", "PSNR", "SSIM", "amplitude", "Hz off")
+    titles = (
+        "voxels",
+        "solver",
+        "dtype",
+        "preset",
+        "iterations",
+        "seconds",
+        "PSNR",
+        "SSIM",
+        "amplitude",
+        "Hz off",
+    )
     print_table(titles, rows)

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from acquire.arrays import Dtype
     from acquire.lines import Segment
     from acquire.recon import Preset, Reconstruction, Solver
     from acquire.recon.segments import Voxels
@@ -59,7 +60,7 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One solver on one kind of voxels, asked for more and more iterations."""
+    """One solver in one dtype on one kind of voxels, asked for more and more iterations."""
 
     solver: Solver
     voxels: Voxels
@@ -155,6 +156,8 @@ def measure(
     presets: Sequence[Preset] = ("fast", "balanced"),
     longest_s: float | None = None,
     progress: Callable[[int, int], object] | None = None,
+    *,
+    dtype: Dtype = "float32",
 ) -> Run:
     """Reconstruct with more and more iterations, up to the presets'; each answer is a whole one.
 
@@ -172,6 +175,7 @@ def measure(
             budget_s=longest_s,
             solver=solver,
             iterations=count,
+            dtype=dtype,
         )
         ended = result.ended != "done"
         reached = tuple(
@@ -183,7 +187,7 @@ def measure(
         if ended:
             break
     assert result is not None
-    return Run(solver, voxels, str(result.video.dtype), int(result.video.size), tuple(points))
+    return Run(solver, voxels, dtype, int(result.video.size), tuple(points))
 
 
 def _counts(limits: Iterable[int]) -> list[int]:

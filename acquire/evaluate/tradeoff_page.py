@@ -7,7 +7,7 @@ import json
 from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
-from matplotlib.ticker import FuncFormatter, MaxNLocator
+from matplotlib.ticker import FuncFormatter, LogFormatter, MaxNLocator
 
 from acquire.evaluate.figures import DPI, HIGHLIGHT, SOLVER_COLOURS, STYLE
 from acquire.evaluate.paper.drawing import canvas
@@ -74,7 +74,7 @@ def _kinds(runs: Sequence[Run]) -> list[Voxels]:
 
 
 def _curves(runs: Sequence[Run], voxels: Voxels) -> Figure:
-    """All metrics over time for one kind of voxels; a curve per solver, and the front."""
+    """All metrics over time for one kind of voxels; a curve per solver and dtype, and the front."""
     own = [run for run in runs if run.voxels == voxels]
     shown = [each for each in METRICS if any(getattr(run.end, each[0]) is not None for run in own)]
     figure = canvas(3.1 * -(-len(shown) // 2) + 0.4)
@@ -87,6 +87,7 @@ def _curves(runs: Sequence[Run], voxels: Voxels) -> Figure:
             _curve(ax, run, name, colours[run.solver])
         ax.set(xscale="log", ylabel=label, xlabel="wall time (s)", yscale="log" if logarithmic else "linear")
         ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        ax.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.5)))
         if not logarithmic:
             ax.yaxis.set_major_locator(MaxNLocator(6))
     _front(axes[0], pareto(own))
@@ -104,11 +105,14 @@ def _curve(ax: Axes, run: Run, name: str, colour: str) -> None:
     if not points:
         return
     times, values = ([each[i] for each in points] for i in (0, 1))
-    ax.plot(times, values, ".-", color=colour, lw=1.4, ms=4, label=run.solver)
+    single = run.dtype == "float32"
+    label = run.solver if single else f"{run.solver}, {run.dtype}"
+    ax.plot(times, values, ".-" if single else ".:", color=colour, lw=1.4, ms=4, label=label)
+    filled = colour if single else "white"
     for point in run.points:
         if point.presets and getattr(point, name) is not None:
             marker = MARKERS.get(point.presets[-1], "o")
-            ax.plot(point.seconds, getattr(point, name), marker, color=colour, ms=7)
+            ax.plot(point.seconds, getattr(point, name), marker, color=colour, ms=7, mfc=filled)
 
 
 def _front(ax: Axes, front: list[tuple[Run, Point]]) -> None:

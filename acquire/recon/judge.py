@@ -24,7 +24,12 @@ DENSITY = (0.1, 0.9)
 def frame_error(
     problem: Problem, predicted: NDArray[Any], geometry: Geometry, temporal_merge: int
 ) -> NDArray[np.float32]:
-    """Relative RMS residual of the samples that saw each frame (⌈T/T_m⌉,); NaN where none did."""
+    """Relative RMS residual of the samples that saw each frame (⌈T/T_m⌉,); NaN where none did.
+
+    It tells lines that are not explained from those that are, and no more. Lines cannot see all of a frame:
+    on simulated scenes the voxels' relative error was 1.5 to 13 times it, and the frames with the largest
+    residual were not always the worst.
+    """
     usable = (problem.weight > 0) | problem.held_out
     off = np.where(usable, predicted - problem.samples, 0).astype(np.float64)
     per_line = np.stack(

@@ -44,7 +44,8 @@ class Reconstruction:
         alone, whatever lines were lost, samples masked, or the code does; ``quality`` says how well it went.
     time_ns : the begin of each frame
     iterations : fewer than ``iterations_asked`` where the budget, ``stop`` or the data ended it (``ended``)
-    frame_error : (time,) relative RMS residual of the samples that saw each frame; NaN where none did
+    frame_error : (time,) relative RMS residual of the samples that saw each frame; NaN where none did. It is
+        no error of the frame, which may be many times larger; see `acquire.recon.judge.frame_error`
     masked : samples left out, by cause
     warnings : what a user should know before believing the video, in sentences
     """

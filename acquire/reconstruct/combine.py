@@ -188,6 +188,8 @@ def describe_parts(
         "temporal_merge": voxels.temporal_merge,
         "solver": options.solver,
         "preset": options.preset,
+        "dtype": options.dtype,
+        "device": options.device,
         "budget_s": options.budget_s,
         "iterations": sum(part["iterations"] for part in parts),
         "iterations_asked": sum(part["iterations_asked"] for part in parts),

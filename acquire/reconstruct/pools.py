@@ -6,13 +6,13 @@ All three take tasks by `submit` and give futures; the caller keeps at most ``wo
 from __future__ import annotations
 
 import multiprocessing
-import os
 import signal
 import threading
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Protocol
 
+from acquire.cores import idle_cores, limit_blas, usable_cores
 from acquire.errors import UsageError
 from acquire.reconstruct.work import Part, Task, solve
 
@@ -157,10 +157,11 @@ def open_pool(
         with _cluster(cluster) as pool:
             yield pool
         return
-    cores = len(os.sched_getaffinity(0))
+    cores = usable_cores()
     count = min(tasks, cores if workers is None else workers)
     if count <= 1:
-        yield Here(watch)
+        with limit_blas(idle_cores()):
+            yield Here(watch)
         return
     shared = _Shared()
     executor = ProcessPoolExecutor(
@@ -201,11 +202,9 @@ def _begin_worker(shared: _Shared, threads: int) -> None:
     global _worker  # noqa: PLW0603  # a process of a pool has no other place for what it is given at its start
     import numba
 
-    from acquire.sim.blas import limit_blas_threads
-
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     numba.set_num_threads(min(threads, numba.get_num_threads()))
-    limit_blas_threads(threads)
+    limit_blas(threads)
     _worker = shared
 
 

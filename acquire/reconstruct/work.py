@@ -13,6 +13,7 @@ from acquire.store import open_recording
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from acquire.arrays import Dtype
     from acquire.recon import Preset, Progress, Solver
     from acquire.recon.segments import Grid, SubSegment
 
@@ -26,6 +27,8 @@ class Options:
     iterations: int | None = None
     budget_s: float | None = None
     bandwidth: float | None = None
+    dtype: Dtype = "float32"
+    device: str = "cpu"
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +79,8 @@ def solve(task: Task, watch: Watch) -> Part:
         solver=options.solver,
         iterations=options.iterations,
         bandwidth=options.bandwidth,
+        dtype=options.dtype,
+        device=options.device,
         stop=watch,
     )
     watch.advance(1 - result.iterations / result.iterations_asked)

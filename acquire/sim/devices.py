@@ -18,9 +18,9 @@ import numpy as np
 from acquire import __version__
 from acquire.camera.base import CameraBlock, CameraIdentity
 from acquire.clock import NS_PER_S
+from acquire.cores import limit_blas
 from acquire.errors import CameraError
 from acquire.lines import ARMS
-from acquire.sim.blas import limit_blas_threads
 from acquire.sim.pipeline import Bench, Camera, Readout
 
 if TYPE_CHECKING:
@@ -224,5 +224,5 @@ class SimulatedCameraOpener:
 
     def __call__(self) -> SimulatedCamera:
         if multiprocessing.parent_process() is not None:
-            limit_blas_threads(1)
+            limit_blas(1)  # the cores are for the capture path
         return SimulatedCamera(self.wire, self.optics, self.config, self.block_lines, self.line_rate_hz)

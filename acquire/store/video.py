@@ -5,7 +5,7 @@
     NAME.zarr/   attributes: ome (axes t, y, x with units, scale), provenance
       0          (t, y, x)
       time       (t) int64, UTC of each frame
-      quality    (t) float32, where it is known: relative error of prediction of each frame's lines
+      quality    (t) float32, where it is known: relative residual of each frame's lines
 
 `VideoWriter` takes the frames as they come, for videos longer than memory; `write_video` writes one at once.
 A place is a path, or a URL as recordings have.
@@ -51,7 +51,8 @@ TIME_ATTRIBUTES: dict[str, Any] = {
 }
 
 QUALITY_ATTRIBUTES: dict[str, Any] = {
-    "long_name": "relative RMS error with which the lines that see the frame are predicted",
+    "long_name": "relative RMS residual of the lines that see the frame",
+    "comment": "how well the lines are explained; the error of the frame itself may be many times larger",
     "units": "1",
 }
 

@@ -158,6 +158,8 @@ def test_a_video_is_written_to_a_url_and_rendered_from_it(cli: Cli, recording: P
         (("--ends", "half"), "trusted, whole"),
         (("--lines", 5), "more than 12 lines"),
         (("--preset", "perfect"), "balanced"),
+        (("--dtype", "float16"), "float32, float64"),
+        (("--device", "tpu"), "cpu, gpu"),
     ],
 )
 def test_what_cannot_be_is_refused(cli: Cli, recording: Path, tmp_path: Path, words: Any, said: str) -> None:
@@ -175,15 +177,17 @@ def test_a_budget_takes_what_was_learned(
     answer = cli("tradeoff", recording, "--out", tmp_path / "t", *words)
     assert answer.code == 0, answer.err
     assert {row["preset"] for row in answer.json["rows"]} >= {"fast", "balanced"}
+    assert {row["dtype"] for row in answer.json["rows"]} == {"float32", "float64"}
     assert (tmp_path / "t" / "index.html").exists()
     lessons = json.loads((tmp_path / "cache" / "acquire" / "tradeoff.json").read_text())["learned"]
     for lesson in lessons:
         lesson["seconds"] = 1.0 if lesson["preset"] == "fast" else 50.0
     document = {"version": 1, "learned": lessons}
     (tmp_path / "cache" / "acquire" / "tradeoff.json").write_text(json.dumps(document))
-    words = ("--nm", 2, "--lines", 100, "--budget", 5, "--json")
+    words = ("--nm", 2, "--lines", 100, "--budget", 5, "--dtype", "float64", "--json")
     answer = cli("reconstruct", recording, "--out", tmp_path / "v.zarr", *words)
-    assert answer.json["preset"] == "fast"
+    assert (answer.json["preset"], answer.json["dtype"]) == ("fast", "float64")
+    assert answer.json["segments"][0]["parameters"]["dtype"] == "float64"
 
 
 def test_fig_9_from_scene_to_page(cli: Cli, tmp_path: Path) -> None:

@@ -69,12 +69,14 @@ def test_the_front_is_what_nothing_reaches_sooner():
 
 
 def test_page_and_table_say_the_same(judge, tmp_path):
-    run = measure(judge, "admm", VOXELS, ("fast",))
-    page = write_page([run], None, tmp_path, "one LED", "acquire tradeoff", datetime.now(UTC))
+    run, exact = (measure(judge, "admm", VOXELS, ("fast",), dtype=kind) for kind in ("float32", "float64"))
+    page = write_page([run, exact], None, tmp_path, "one LED", "acquire tradeoff", datetime.now(UTC))
     text = page.read_text()
     assert "data:image/png" in text
     assert f"{run.end.psnr_db:.2f}" in text
     with (tmp_path / "tradeoff.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [float(row["psnr_db"]) for row in rows] == [each.psnr_db for each in run.points]
+    both = [*run.points, *exact.points]
+    assert [float(row["psnr_db"]) for row in rows] == [each.psnr_db for each in both]
+    assert [row["dtype"] for row in rows] == ["float32"] * len(run.points) + ["float64"] * len(exact.points)
     assert json.loads((tmp_path / "tradeoff.json").read_text())["rows"][-1]["preset"] == "fast"

@@ -137,7 +137,7 @@ def test_a_budget_is_kept_and_progress_is_told() -> None:
     steps: list[Progress] = []
     result = reconstruct(segment(), 3, 1, budget_s=1e-6, progress=steps.append)
     assert result.iterations == len(steps) == 1
-    assert steps[0].iterations == result.iterations_asked == 100
+    assert steps[0].iterations == result.iterations_asked == 150
     assert result.ended == "budget"
 
 
@@ -192,3 +192,19 @@ def test_what_cannot_be_is_refused_with_what_can() -> None:
         reconstruct(replace(good, mask=np.zeros_like(good.mask)), 3, 1)
     with pytest.raises(NumericsError, match="dark"):
         reconstruct(replace(good, code=np.zeros_like(good.code)), 3, 1)
+
+
+def test_frame_error_is_a_residual_that_finds_lines_which_are_not_explained() -> None:
+    good = segment()
+    wrong = good.lines.copy()
+    wrong[:, 70:74] *= 1.3
+    seen = slice(GEOMETRY.substeps * 70, GEOMETRY.substeps * 74 + GEOMETRY.size)
+    clean, spoilt = (
+        reconstruct(replace(good, lines=lines), 3, 1, iterations=40) for lines in (good.lines, wrong)
+    )
+    assert seen.start <= int(np.argmax(spoilt.frame_error)) < seen.stop
+    assert spoilt.frame_error.max() > 2 * clean.frame_error[clean.trusted].max()
+    # not the error of the frames, which is larger: what `frame_error` says of itself
+    truth = merge_video(TRUTH, 3, 1)[clean.trusted]
+    error = np.linalg.norm(clean.video[clean.trusted] - truth) / np.linalg.norm(truth)
+    assert 1 < error / clean.frame_error[clean.trusted].mean() < 20

@@ -8,9 +8,8 @@ import numpy as np
 
 from acquire.evaluate.curves import region_mean
 from acquire.evaluate.figures import SOLVER_COLOURS, THEORY
-from acquire.evaluate.metrics import psnr, ssim
 from acquire.evaluate.paper.drawing import box, canvas, correlation, show, strips
-from acquire.evaluate.paper.studio import PaperFigure, Picture, Row, scene_of, true_voxels
+from acquire.evaluate.paper.studio import PaperFigure, Picture, Row
 from acquire.sim.digits import SEGMENTS, DigitScene
 
 if TYPE_CHECKING:
@@ -32,13 +31,8 @@ BOXES = {
 
 def figure(studio: Studio) -> PaperFigure:
     """Digits at their peaks, and the light of three segments over time."""
-    recording = studio.record("scene-digits", FIRST_LINE + LINES)
-    segment = recording.cut(FIRST_LINE, LINES)
-    result = studio.solve(segment, 3, 1, "Scene #2")
-    trusted, first = segment.geometry.trusted, segment.geometry.substeps * FIRST_LINE
-    video = result.video[trusted]
-    truth = true_voxels(recording, first, segment.geometry.span, 3, 1)[trusted]
-    scene = scene_of(recording)
+    shot = studio.shoot("scene-digits", FIRST_LINE, LINES, "Scene #2")
+    scene, video, truth, times = shot.scene, shot.video, shot.truth, shot.times_ms
     assert isinstance(scene, DigitScene)
     masks = _masks(scene)
     peaks = {side: _peaks(truth, masks, side) for side in ("left", "right")}
@@ -49,13 +43,11 @@ def figure(studio: Studio) -> PaperFigure:
         )
         for side, at in peaks.items()
     }
-    times = FIRST_LINE * 0.03 + np.arange(len(video)) * 0.01
     curves = {
         name: (region_mean(video, masks[key]), region_mean(truth, masks[key])) for name, key in BOXES.items()
     }
     picks = np.sort(np.concatenate([peaks["left"], peaks["right"]]))[:8]
     agreement = {name: correlation(*pair) for name, pair in curves.items()}
-    numbers = {"psnr_db": psnr(video, truth), "ssim": ssim(video, truth)}
     return PaperFigure(
         name="fig10",
         title="Scene #2: two seven-segment displays",
@@ -80,14 +72,10 @@ def figure(studio: Studio) -> PaperFigure:
                 Row(f"{name}: light over time", _statement(name), f"r = {r:.3f}")
                 for name, r in agreement.items()
             ),
-            Row(
-                "accuracy",
-                "–",
-                f"{numbers['psnr_db']:.1f} dB, SSIM {numbers['ssim']:.3f} in {result.seconds:.1f} s",
-            ),
+            shot.accuracy(),
         ),
         seconds=dict(studio.seconds),
-        numbers=numbers,
+        numbers=shot.numbers(),
         movie=video[::4],
         movie_ms=0.04,
     )

@@ -8,9 +8,8 @@ import numpy as np
 
 from acquire.evaluate.curves import CurveComparison, compare_curve, region_mean
 from acquire.evaluate.figures import SOLVER_COLOURS, THEORY
-from acquire.evaluate.metrics import psnr, ssim
 from acquire.evaluate.paper.drawing import canvas, strips
-from acquire.evaluate.paper.studio import PaperFigure, Picture, Row, scene_of, true_voxels
+from acquire.evaluate.paper.studio import PaperFigure, Picture, Row
 from acquire.sim.leds import LedScene
 
 if TYPE_CHECKING:
@@ -27,32 +26,25 @@ DETAIL_MS = 1.2
 
 def figure(studio: Studio) -> PaperFigure:
     """Lines from 52 ms to 59.89 ms, frames from 52 ms to 57.98 ms."""
-    recording = studio.record("scene-leds", FIRST_LINE + LINES)
-    segment = recording.cut(FIRST_LINE, LINES)
-    result = studio.solve(segment, 3, 1, "Scene #1")
-    trusted, first = segment.geometry.trusted, segment.geometry.substeps * FIRST_LINE
-    video = result.video[trusted]
-    truth = true_voxels(recording, first, segment.geometry.span, 3, 1)[trusted]
-    scene = scene_of(recording)
+    shot = studio.shoot("scene-leds", FIRST_LINE, LINES, "Scene #1")
+    scene, segment, video, truth = shot.scene, shot.segment, shot.video, shot.truth
     assert isinstance(scene, LedScene)
-    light = scene.intensity(first + trusted.start, len(video))
+    light = scene.intensity(shot.first_substep, len(video))
     masks = scene.masks.reshape(-1, 64, 3, 64, 3).mean(axis=(2, 4)) >= INNER
     measured = [region_mean(video, mask) for mask in masks]
     curves = [
         compare_curve(led.name, theory, found, segment.substep_ns * 1e-9)
         for led, theory, found in zip(scene.leds, light, measured, strict=True)
     ]
-    start_ms = FIRST_LINE * 0.03
-    times = start_ms + np.arange(len(video)) * 0.01
+    times = shot.times_ms
     picks = 250 + np.arange(6) * 17
-    numbers = {"psnr_db": psnr(video, truth), "ssim": ssim(video, truth)}
     return PaperFigure(
         name="fig9",
         title="Scene #1: four LEDs",
         text="263 lines of both cameras, 52 ms to 59.89 ms after the start; 598 frames of 64 × 64 voxels, "
         "10 µs apart, 52 ms to 57.98 ms.",
         pictures=(
-            Picture("lines", _lines(segment, start_ms), "(a) what the two cameras recorded."),
+            Picture("lines", _lines(segment, times[0]), "(a) what the two cameras recorded."),
             Picture(
                 "frames",
                 strips(
@@ -78,14 +70,10 @@ def figure(studio: Studio) -> PaperFigure:
                 "slight, from saturation",
                 f"{curves[2].measured.distortion:.1%} (true {curves[2].theory.distortion:.1%})",
             ),
-            Row(
-                "accuracy",
-                "–",
-                f"{numbers['psnr_db']:.1f} dB, SSIM {numbers['ssim']:.3f} in {result.seconds:.1f} s",
-            ),
+            shot.accuracy(),
         ),
         seconds=dict(studio.seconds),
-        numbers=numbers,
+        numbers=shot.numbers(),
         movie=video[100:400:2],
         movie_ms=0.02,
     )

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.config import RigConfig, load_plan, load_rig, load_scene
+from acquire.evaluate.metrics import psnr, ssim
 from acquire.recon import reconstruct
 from acquire.recon.segments import Voxels
 from acquire.reconstruct import Options, Watcher, along_plan, combine, in_voxels, open_pool
@@ -72,6 +73,35 @@ class PaperFigure:
     movie_ms: float = 1.0
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Shot:
+    """Frames of a scene that were sampled in full, beside the truth, T_m = 1.
+
+    ``video`` and ``truth`` (time, row, column); ``first_substep`` is that of their first frame.
+    """
+
+    scene: Scene
+    segment: Segment
+    video: NDArray[Any]
+    truth: NDArray[Any]
+    first_substep: int
+    seconds: float
+
+    @property
+    def times_ms(self) -> NDArray[np.floating[Any]]:
+        """When each frame begins, after the read-out of line 0."""
+        geometry = self.segment.geometry
+        first = self.first_substep - geometry.readout_substep
+        return (first + np.arange(len(self.video))) * (self.segment.substep_ns * 1e-6)
+
+    def numbers(self) -> dict[str, float]:
+        return {"psnr_db": psnr(self.video, self.truth), "ssim": ssim(self.video, self.truth)}
+
+    def accuracy(self) -> Row:
+        psnr_db, likeness = self.numbers().values()
+        return Row("accuracy", "–", f"{psnr_db:.1f} dB, SSIM {likeness:.3f} in {self.seconds:.1f} s")
+
+
 @dataclass(slots=True)
 class Studio:
     """Makes recordings in ``directory`` and reconstructs them; ``say`` is told what is being done."""
@@ -113,6 +143,23 @@ class Studio:
         )
         self.seconds[what] = result.seconds
         return result
+
+    def shoot(self, scene_name: str, first_line: int, lines: int, what: str) -> Shot:
+        """Record a scene, and reconstruct these lines at N_m = 3, T_m = 1."""
+        recording = self.record(scene_name, first_line + lines)
+        segment = recording.cut(first_line, lines)
+        result = self.solve(segment, 3, 1, what)
+        geometry = segment.geometry
+        first = geometry.substeps * first_line
+        truth = true_voxels(recording, first, geometry.span, 3, 1)[geometry.trusted]
+        return Shot(
+            scene_of(recording),
+            segment,
+            result.video[geometry.trusted],
+            truth,
+            first + geometry.trusted.start,
+            result.seconds,
+        )
 
     def stitch(self, recording: Recording, plan_name: str, first_line: int, what: str) -> Outcome:
         """Reconstruct along a built-in plan from a line on, sub-segments side by side."""

@@ -1,0 +1,59 @@
+"""How many cores are ours, and that BLAS keeps to them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_info
+
+from acquire import cores
+from acquire.cores import idle_cores, limit_blas, usable_cores
+
+
+def blas_threads() -> set[int]:
+    return {library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"}
+
+
+def test_blas_is_limited_for_a_while() -> None:
+    np.ones((2, 2)) @ np.ones((2, 2))
+    before = blas_threads()
+    with limit_blas(1):
+        assert blas_threads() == {1}
+    assert blas_threads() == before
+
+
+@pytest.mark.parametrize(
+    ("files", "limit"),
+    [
+        ({}, float("inf")),
+        ({"cpu.max": "max 100000\n"}, float("inf")),
+        ({"cpu.max": "150000 100000\n"}, 1.5),
+        ({"cpu/cpu.cfs_quota_us": "-1\n", "cpu/cpu.cfs_period_us": "100000\n"}, float("inf")),
+        ({"cpu/cpu.cfs_quota_us": "400000\n", "cpu/cpu.cfs_period_us": "100000\n"}, 4.0),
+    ],
+)
+def test_a_containers_quota_counts(tmp_path: Path, files: dict[str, str], limit: float) -> None:
+    (tmp_path / "cpu").mkdir()
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    assert cores._quota(tmp_path) == limit
+
+
+def test_cores_that_others_use_are_not_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1, 2, 3})
+    monkeypatch.setattr(os, "cpu_count", lambda: 6)
+    monkeypatch.setattr(cores, "_quota", lambda: float("inf"))
+    for running, idle in ((1, 4), (3, 4), (5, 2), (6, 1), (60, 1)):
+        monkeypatch.setattr(cores, "_running", lambda count=running: count)
+        assert idle_cores() == idle
+    monkeypatch.setattr(cores, "_quota", lambda: 2.5)
+    assert usable_cores() == 3
+    monkeypatch.setattr(cores, "_quota", lambda: 0.5)
+    assert usable_cores() == 1
+
+
+def test_this_thread_runs() -> None:
+    assert cores._running() >= 1
