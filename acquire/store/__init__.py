@@ -2,7 +2,7 @@
 
 ::
 
-    whole recordings   writer                     reader, opening           verify  recover  mirror  video
+    whole recordings   writer                     reader, opening, suspect  verify  recover  mirror  video
       with             retention room resume                                scan    mend
     one arm            arm_writer                 camera_stream
     one array          array_writer → shard       chunks                    tables: table, table_reader
@@ -20,6 +20,7 @@ from acquire.store.recover import Circumstances, Recovery, recover
 from acquire.store.resume import Continuation, next_segment
 from acquire.store.retention import Hold, Retention, hold
 from acquire.store.spec import FORMAT, RecordingSpec, RunCondition
+from acquire.store.suspect import Suspect, suspect_lines
 from acquire.store.table_reader import Event, Gap
 from acquire.store.verify import Verification, verify
 from acquire.store.video import VideoFile, VideoWriter, open_video, write_video
@@ -42,6 +43,7 @@ __all__ = [
     "Recovery",
     "Retention",
     "RunCondition",
+    "Suspect",
     "Verification",
     "VideoFile",
     "VideoWriter",
@@ -54,6 +56,7 @@ __all__ = [
     "open_recording",
     "open_video",
     "recover",
+    "suspect_lines",
     "verify",
     "write_video",
 ]

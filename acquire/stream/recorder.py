@@ -21,7 +21,7 @@ import select
 import time
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,6 +30,7 @@ from acquire.errors import AcquireError, DataError, StateError, UsageError
 from acquire.lines import ARMS
 from acquire.store import RecordingWriter, RunCondition
 from acquire.store.files import DISK, Disk
+from acquire.store.suspect import CODE_EVENTS, DOUBTFUL
 from acquire.stream.losses import Cause
 from acquire.stream.messages import (
     Began,
@@ -235,6 +236,8 @@ class Recorder:
     def _note(self, note: Note) -> None:
         self._notes.append(note)
         if self._session is not None:
+            if _is_verdict(note, before=self._session.first_line):
+                note = replace(note, line=self._session.first_line)
             self._session.note(note.kind, note.line, note.text)
 
     def _interrupt(self, reason: str, lost: dict[str, Cause]) -> None:
@@ -305,9 +308,15 @@ class Recorder:
             self._notes.append(Note(at, window.kind, window.text))
         if doubt := self._witness.doubt():
             self._notes.append(Note(first_line, "code_check", doubt))
-        for note in self._notes:
+        for note in [*self._standing_doubts(first_line), *self._notes]:
             session.note(note.kind, note.line, note.text)
         return session
+
+    def _standing_doubts(self, first_line: int) -> list[Note]:
+        """Arms whose code was in doubt before the line, and is at it."""
+        latest = {note.kind[-1]: note for note in self._notes if _is_verdict(note, before=first_line)}
+        doubts = [note for note in latest.values() if note.kind in DOUBTFUL.values()]
+        return [replace(note, line=first_line) for note in doubts]
 
     def _close(self, session: Session, error: Exception | None = None) -> None:
         self._session = None
@@ -375,6 +384,7 @@ class Recorder:
     def _look_after(self, session: Session) -> None:
         session.doubted = self._witness.doubted()
         session.trigger, session.cameras = self._witness.trigger(), self._witness.cameras()
+        session.verified = self._witness.verified()
         for name, arm in self._arms.items():
             self._listen_to(name, arm)  # what came while this was held up by the disk is no silence
             if name in session.lost and not arm.ring.fill:
@@ -405,3 +415,8 @@ class Recorder:
         for name, book in session.books.items():
             counters[f"rows_{name}"] = rows[name]
             counters[f"missing_{name}"] = book.missing.total()
+
+
+def _is_verdict(note: Note, *, before: int) -> bool:
+    """On the code of lines from before the line ``before`` on, and so of that line as well."""
+    return note.kind in CODE_EVENTS and note.line < before

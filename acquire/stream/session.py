@@ -15,6 +15,7 @@ import numpy as np
 from acquire.errors import AcquireError
 from acquire.lines import ARMS, LineBlock, LineFlag
 from acquire.store import RunCondition
+from acquire.store.suspect import DOUBTFUL
 from acquire.stream.losses import Cause
 from acquire.stream.messages import Sealed
 from acquire.stream.tagger import UNCONFIRMED
@@ -40,6 +41,9 @@ TAINTING_EVENTS = (
     "clock_lost",
 )
 """Events of the run so far that do so."""
+
+CODE_DOUBTS = frozenset(DOUBTFUL.values())
+"""Events of lines in the recording that do so, though they may have been written before the verdict."""
 
 MAX_MISMATCH_EVENTS = 100
 _BEST_FIRST = (
@@ -129,6 +133,7 @@ class Session:
     doubted : arms whose lines contradict the code at the moment: what comes is flagged
     trigger : what the trigger counted while this was recorded
     cameras : arm → what its camera counted since it was armed
+    verified : arm → the line up to which it is known to follow the light's code
     left_out : arm → lines that were taken, and that a disk which failed did not keep; below 0: which were
         not taken, and are there all the same
     """
@@ -147,6 +152,7 @@ class Session:
         self.trigger: dict[str, int] = {}
         self.cameras: dict[str, dict[str, int]] = {}
         self.left_out: dict[str, int] = {}
+        self.verified: dict[str, int] = {}
         self._writer = writer
         self._tagger = tagger
         self._blank = blank
@@ -224,6 +230,7 @@ class Session:
         if kind in TAINTING_EVENTS and line < self.end_line:
             self._doubts[kind] += 1
         if self.first_line <= line < self.end_line:
+            self._doubts[kind] += kind in CODE_DOUBTS
             self._note(kind, line, text)
 
     def mismatches(self, found: list[TagMismatch]) -> None:
@@ -330,6 +337,7 @@ class Session:
             "trigger": self.trigger,
             "cameras": self.cameras,
             "tainted_by": self._taints(),
+            **({"code_verified_to": self.verified} if self.verified else {}),
             **arms,
         }
 
