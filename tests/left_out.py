@@ -7,10 +7,12 @@ import os
 import subprocess
 import tempfile
 from collections import Counter
+from pathlib import Path
 from shutil import which
 from typing import Any
 
 import pytest
+from throttle import can_throttle
 
 from acquire.camera import aravis
 from acquire.errors import CameraError
@@ -44,6 +46,7 @@ MISSING = {
     "needs_compiler": not (compiler() and _HAVE_GENICAM) and "a C compiler and the genicam package",
     "needs_dask": importlib.util.find_spec("distributed") is None and "dask.distributed",
     "needs_mount": not _can_mount() and "the right to mount a small file system",
+    "needs_throttle": not can_throttle(Path(tempfile.gettempdir())) and "the right to slow a disk down",
     "needs_genicam": not _HAVE_GENICAM and "the genicam package",
 }
 _left_out: Counter[str] = Counter()
@@ -53,6 +56,7 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "needs_compiler: builds the simulated GenTL producer")
     config.addinivalue_line("markers", "needs_dask: spreads work over a Dask cluster")
     config.addinivalue_line("markers", "needs_mount: fills a small file system of its own")
+    config.addinivalue_line("markers", "needs_throttle: has the kernel slow a disk down for a process")
     config.addinivalue_line("markers", "needs_genicam: loads a GenTL producer")
     config.addinivalue_line("markers", "needs_aravis: loads Aravis' shared library")
     config.addinivalue_line("markers", "needs_gige_camera: runs Aravis' GigE Vision camera on loopback")

@@ -5,8 +5,11 @@
     pattern cameras, time-compressed ─▶ … armed, recorded, stopped, again and again …
     meanwhile: a camera goes and comes back · a camera drops blocks · the recorder is stopped for a while
 
-``python tools/soak.py --hours 8 --minutes 4`` simulates 8 hours of lines at 2 kHz. After every cycle memory,
-descriptors and threads of the owner are noted; every recording is read again to the line.
+``python -m tools.soak --hours 8 --minutes 4`` simulates 8 hours of lines at 2 kHz. At the end of every cycle
+the memory of each process is noted, and descriptors and threads of the owner, which alone outlives a
+cycle; and every other second, which ``--cycle 60`` makes worth while for those that begin anew with each cycle.
+Every recording is read again to the line by a process of its own: what malloc keeps of that is not the
+capture's.
 """
 
 from __future__ import annotations
@@ -22,10 +25,14 @@ import tempfile
 import threading
 import time
 from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from acquire.camera.base import CameraBlock
 from acquire.capacity.load import Load, capture_plan, recording_spec
@@ -42,11 +49,16 @@ from tools.kill_storm import check_recording
 
 if TYPE_CHECKING:
     from acquire.camera.base import Camera, CameraOpener
+    from acquire.stream import CaptureStatus
 
 CLOCK_HZ = 90_000_000
 SIMULATED_HZ = 2000.0
 FAULTS = ("gone", "drop", "pause")
 CYCLE_S = 4.0
+SAMPLE_S = 2.0
+LEAST_SAMPLES = 20
+MOST_GROWTH_MB = 2.0
+"""In the second half of what was noted of one process, if there is enough of it: less is called flat."""
 LONGEST_PAUSE_S = 0.3
 WAIT_S = 60.0
 
@@ -98,36 +110,72 @@ class Soak:
     faults: Counter[str] = field(default_factory=Counter)
     lost: Counter[str] = field(default_factory=Counter)
     wrong: list[str] = field(default_factory=list)
-    usage: list[tuple[float, int, int]] = field(default_factory=list)
+    usage: list[tuple[int, int]] = field(default_factory=list)
+    memory: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+    """Process → real time in seconds and MB of its own memory, without what it shares."""
+
+    def note_memory(self, pids: dict[str, int | None]) -> None:
+        """Of this process and the others."""
+        for name, pid in {"owner": os.getpid(), **pids}.items():
+            if pid is not None and (own := own_mb(pid)):
+                self.memory.setdefault(name, []).append((time.monotonic(), own))
+
+    def growth_mb(self, name: str) -> float | None:
+        """Of a process in the second half, by the median of slopes; None: too little was noted."""
+        noted = self.memory[name]
+        late = np.array(noted[len(noted) // 2 :])
+        if len(noted) < LEAST_SAMPLES:
+            return None
+        first, second = np.triu_indices(len(late), 1)
+        slopes = (late[second, 1] - late[first, 1]) / (late[second, 0] - late[first, 0])
+        return float(np.median(slopes) * (late[-1, 0] - late[0, 0]))
+
+    def judge(self) -> None:
+        """What grows is wrong."""
+        for name in self.memory:
+            growth = self.growth_mb(name)
+            if growth is not None and growth > MOST_GROWTH_MB:
+                self.wrong.append(f"{name}: grew by {growth:.1f} MB in the second half")
 
     def __str__(self) -> str:
-        memory, handles, threads = self.usage[min(1, len(self.usage) - 1)]
-        memory_end, handles_end, threads_end = self.usage[-1]
+        handles, threads = self.usage[min(1, len(self.usage) - 1)]
+        handles_end, threads_end = self.usage[-1]
         hours = self.lines / SIMULATED_HZ / 3600
         rows = [
             f"cycles   {self.cycles}, {self.lines} lines of each arm = {hours:.2f} hours",
             f"faults   {dict(self.faults)}; lines lost to them {dict(self.lost)}",
-            f"memory   {memory:.1f} MB after the first cycles, {memory_end:.1f} MB at the end",
+            *(f"memory   {self._memory(name)}" for name in self.memory),
             f"handles  {handles}, {handles_end}; threads {threads}, {threads_end}",
             f"wrong    {len(self.wrong)}",
         ]
         return "\n".join([*rows, *self.wrong])
 
+    def _memory(self, name: str) -> str:
+        own = [mb for _, mb in self.memory[name]]
+        growth = self.growth_mb(name)
+        told = "too short to tell" if growth is None else f"{growth:+.2f} MB in the second half"
+        return f"{name:9}{own[0]:.1f} MB first, {own[-1]:.1f} last, {max(own):.1f} most; {told}"
 
-def soak(home: Path, lines: int, line_rate_hz: float, seed: int) -> Soak:
+
+def soak(home: Path, lines: int, line_rate_hz: float, seed: int, cycle_s: float = CYCLE_S) -> Soak:
     """Simulate ``lines`` lines in cycles of arm, record, stop, each with faults of its own."""
     chance, found = random.Random(seed), Soak()
     load = Load(8, "uint16", line_rate_hz, substeps=2, stages=8, block_lines=512, ring_slots=1024)
-    while found.lines < lines:
-        _cycle(home, load, chance, found)
-        found.cycles += 1
-        gc.collect()
-        found.usage.append(_usage())
+    with ProcessPoolExecutor(1, get_context("spawn")) as reader:
+        while found.lines < lines:
+            path = home / "r.zarr"
+            seen = _cycle(path, load, chance, found, cycle_s)
+            _examine(seen, reader.submit(check_recording, path).result(), found)
+            shutil.rmtree(path)
+            found.cycles += 1
+            gc.collect()
+            found.usage.append(_usage())
+    found.judge()
     return found
 
 
-def _cycle(home: Path, load: Load, chance: random.Random, found: Soak) -> None:
-    wire, path = Wire(), home / "r.zarr"
+def _cycle(path: Path, load: Load, chance: random.Random, found: Soak, cycle_s: float) -> CaptureStatus:
+    wire = Wire()
     faults = Counters(tuple(f"{fault}_{arm}" for fault in ("gone", "drop") for arm in ARMS))
     model = TriggerModel(wire, CLOCK_HZ, load.speed)
     trigger = TriggerDriver(partial(TwinTransport, model), TriggerConfig(tag_every_lines=load.block_lines))
@@ -140,7 +188,8 @@ def _cycle(home: Path, load: Load, chance: random.Random, found: Soak) -> None:
     try:
         capture.arm()
         capture.start(path, recording_spec(load, capture.clock))
-        _throw(capture, faults, chance, found, time.monotonic() + CYCLE_S)
+        _throw(capture, faults, chance, found, time.monotonic() + cycle_s)
+        found.note_memory(capture.pids)
         capture.stop("end of the cycle")
         _until(lambda: capture.poll().done)
     finally:
@@ -148,12 +197,15 @@ def _cycle(home: Path, load: Load, chance: random.Random, found: Soak) -> None:
         trigger.close()
         wire.close()
         faults.close()
-    _examine(capture, path, found)
-    shutil.rmtree(path)
+    return capture.poll()
 
 
 def _throw(capture: Capture, faults: Counters, chance: random.Random, found: Soak, until_s: float) -> None:
-    while time.monotonic() < until_s:
+    note_s = time.monotonic() + SAMPLE_S
+    while (now_s := time.monotonic()) < until_s:
+        if now_s >= note_s:
+            note_s = now_s + SAMPLE_S
+            found.note_memory(capture.pids)
         time.sleep(chance.uniform(0.2, 1.0))
         fault = chance.choice(FAULTS)
         found.faults[fault] += 1
@@ -167,9 +219,8 @@ def _throw(capture: Capture, faults: Counters, chance: random.Random, found: Soa
             faults[f"{fault}_{chance.choice(ARMS)}"] = 1
 
 
-def _examine(capture: Capture, path: Path, found: Soak) -> None:
-    """The books to the line, and every row of the recording."""
-    seen = capture.poll()
+def _examine(seen: CaptureStatus, wrong: list[str], found: Soak) -> None:
+    """The books to the line; what is ``wrong`` with the rows of the recording."""
     for name, arm in seen.lines.items():
         told = arm["preroll"] + arm["lost"]["ring_full"] + arm["discarded"] + arm["recorded"] - arm["missing"]
         if arm["delivered"] != told:
@@ -177,15 +228,22 @@ def _examine(capture: Capture, path: Path, found: Soak) -> None:
         found.lost.update({cause: lines for cause, lines in arm["lost"].items() if lines})
     if seen.fault:
         found.wrong.append(f"cycle {found.cycles}: {seen.fault}")
-    found.wrong += [f"cycle {found.cycles}: {text}" for text in check_recording(path)]
+    found.wrong += [f"cycle {found.cycles}: {text}" for text in wrong]
     found.lines += seen.recorded_lines
 
 
-def _usage() -> tuple[float, int, int]:
-    """MB of memory, descriptors, threads of this process."""
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    handles = sum(1 for _ in Path("/proc/self/fd").iterdir())
-    return pages * os.sysconf("SC_PAGESIZE") / 1e6, handles, threading.active_count()
+def own_mb(pid: int) -> float:
+    """MB of memory of a process that it shares with no other and no file; 0 once it has ended."""
+    try:
+        _, resident, shared, *_ = Path(f"/proc/{pid}/statm").read_text().split()
+    except (FileNotFoundError, ProcessLookupError):
+        return 0.0
+    return (int(resident) - int(shared)) * os.sysconf("SC_PAGESIZE") / 1e6
+
+
+def _usage() -> tuple[int, int]:
+    """Descriptors and threads of this process."""
+    return sum(1 for _ in Path("/proc/self/fd").iterdir()), threading.active_count()
 
 
 def _until(condition: Any) -> None:
@@ -200,11 +258,12 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--hours", type=float, default=8.0, help="simulated")
     parser.add_argument("--minutes", type=float, default=4.0, help="real, of recording")
+    parser.add_argument("--cycle", type=float, default=CYCLE_S, help="seconds of a recording, real")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     lines = round(options.hours * 3600 * SIMULATED_HZ)
     with tempfile.TemporaryDirectory(prefix="acquire-soak-") as home:
-        found = soak(Path(home), lines, lines / (60 * options.minutes), options.seed)
+        found = soak(Path(home), lines, lines / (60 * options.minutes), options.seed, options.cycle)
     print(found)
     return 1 if found.wrong else 0
 

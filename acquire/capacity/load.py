@@ -25,7 +25,7 @@ from acquire.capacity.latency import Latencies, TimedOpener
 from acquire.codes import PrbsCode, mix_seed
 from acquire.config import GeometryConfig
 from acquire.device_config import CameraConfig, TriggerConfig
-from acquire.errors import DataError
+from acquire.errors import DataError, UsageError
 from acquire.lines import ARMS
 from acquire.recording_config import usual_chunk_lines
 from acquire.sim.clock import Wire
@@ -33,6 +33,7 @@ from acquire.sim.pattern import PatternCameraOpener
 from acquire.sim.trigger_model import TriggerModel
 from acquire.sim.twin_links import TwinTransport
 from acquire.store import RecordingSpec, RunCondition
+from acquire.store.codecs import CODECS
 from acquire.stream import Capture, CapturePlan
 from acquire.trigger.base import TriggerRun
 from acquire.trigger.driver import TriggerDriver
@@ -67,9 +68,12 @@ class Load:
     fsync: Literal["commit", "seal"] = "seal"
 
     @classmethod
-    def of(cls, config: RigConfig) -> Load:
-        """What a rig's cameras deliver, and how it is recorded."""
+    def of(cls, config: RigConfig, chosen: Codec | None = None) -> Load:
+        """What a rig's cameras deliver, and how it is recorded; ``chosen``: where its codec is ``auto``."""
         stream, recording = config.stream, config.recording
+        codec = chosen if recording.codec == "auto" else recording.codec
+        if codec is None:
+            raise UsageError("a load with codec 'auto'", possible=", ".join(CODECS), hint="choose it first")
         return cls(
             pixels=config.geometry.stages,
             dtype=config.cameras.a.dtype,
@@ -80,7 +84,7 @@ class Load:
             ring_slots=config.ring_slots,
             chunk_lines=config.chunk_lines,
             shard_chunks=recording.shard_chunks,
-            codec="none" if recording.codec == "auto" else recording.codec,
+            codec=codec,
             fsync=recording.fsync,
         )
 

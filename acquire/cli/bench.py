@@ -48,11 +48,14 @@ def bench(
     from acquire.capacity.parts import measure_parts
     from acquire.capacity.search import best, search_rate
     from acquire.config import load_rig, parse_settings
+    from acquire.daemon.storage import choose_for
 
     if not 0.1 <= seconds <= 600:
         raise UsageError(f"bench --seconds {seconds:g}", possible="0.1 to 600")
     rig = load_rig(config, parse_settings(settings or []))
-    load, directory = Load.of(rig), (out or rig.recording.directory).absolute()
+    directory = (out or rig.recording.directory).absolute()
+    chosen = choose_for(rig, directory=directory).codec if rig.recording.codec == "auto" else None
+    load = Load.of(rig, chosen)
     parts = measure_parts(load, directory)
     if not json:
         _show_parts(load, parts, directory)

@@ -181,7 +181,8 @@ def _capacity(status: Status) -> str | None:
     if found is None or found.warning is not None:
         return None if found is None else f"WARNING: {found.warning}"
     sustained, configured = quantity(found.sustained_hz or 0, "Hz"), quantity(found.line_rate_hz, "Hz")
-    return f"lines at {sustained} (the {found.limit} allows least); configured {configured}"
+    with_codec = "" if found.codec in (None, "none") else f" with {found.codec}"
+    return f"lines at {sustained}{with_codec} (the {found.limit} allows least); configured {configured}"
 
 
 def _last(last: LastRecording | None) -> str | None:

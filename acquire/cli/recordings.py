@@ -62,10 +62,10 @@ def info(recording: PlaceArgument, json: JsonFlag = False) -> None:
 
     Example: [bold]acquire info run.zarr[/]
     """
-    from acquire.store import open_recording
+    from acquire.store import open_recording, suspect_lines
 
     opened = open_recording(recording)
-    facts = opened.info()
+    facts = opened.info() | {"suspect": [found.to_dict() for found in suspect_lines(opened)]}
     if json:
         gaps = [
             {"arm": gap.arm, "first_line": gap.first_line, "count": gap.count, "cause": gap.cause}
@@ -273,6 +273,7 @@ def _readable(facts: dict[str, Any]) -> dict[str, Any]:
         "disk": _disk(facts["disk"]),
         "at risk": _at_risk(facts["durability"]),
         "lost lines": ", ".join(f"{arm} {count}" for arm, count in facts["lost_lines"].items()),
+        "in doubt": _suspect(facts["suspect"]),
         "simulated": "yes" if facts["simulated"] else "no",
         "written by": f"acquire {facts['versions']['acquire']}",
     }
@@ -291,6 +292,16 @@ def _stretches(stretches: list[list[Any]]) -> str | None:
     """Stretches of lines, at most some of them."""
     shown = [f"{first} to {first + count - 1}" for first, count, *_ in stretches[:LISTED]]
     more = [f"and {len(stretches) - LISTED} more"] if len(stretches) > LISTED else []
+    return ", ".join(shown + more) or None
+
+
+def _suspect(found: list[dict[str, Any]]) -> str | None:
+    """Lines that do not follow the light's code."""
+    shown = [
+        f"{one['arm']} {one['first_line']} to {one['first_line'] + one['count'] - 1} ({one['why']})"
+        for one in found[:LISTED]
+    ]
+    more = [f"and {len(found) - LISTED} more"] if len(found) > LISTED else []
     return ", ".join(shown + more) or None
 
 

@@ -162,6 +162,7 @@ class CapacityStatus(_Message):
 
     line_rate_hz: float = Field(description="configured")
     sustained_hz: float | None = Field(default=None, description="null: could not be measured")
+    codec: str | None = Field(default=None, description="that was measured, chosen where the rig says auto")
     limit: str | None = Field(default=None, description="what allows least")
     limits_hz: dict[str, float] = Field(default={}, description="ring, codec, recorder, processors")
     warning: str | None = None

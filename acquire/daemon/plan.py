@@ -16,6 +16,7 @@ from acquire.stream.messages import Note
 from acquire.trigger.base import TriggerRun
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from acquire.config import RigConfig
@@ -31,11 +32,17 @@ STALL_S = 3.0
 class Run:
     """One run of a rig: armed once, records at most once, closed once."""
 
-    def __init__(self, config: RigConfig, rig: Rig) -> None:
-        """Nothing is touched yet. Raises UsageError for a configuration that cannot work."""
+    def __init__(
+        self, config: RigConfig, rig: Rig, choose: Callable[[RigConfig], CodecChoice] = choose_for
+    ) -> None:
+        """Nothing is touched yet; ``choose`` finds the codec, where that is ``auto``.
+
+        Raises UsageError for a configuration that cannot work.
+        """
         self.run_id = new_run_id(config.name)
         self._config = config
         self._rig = rig
+        self._choose = choose
         self._choice: CodecChoice | None = None
         self._capture = Capture(capture_plan(config, rig, self.run_id), rig.trigger)
 
@@ -50,7 +57,7 @@ class Run:
     def arm(self) -> None:
         """Cameras and trigger run; on failure everything is undone and the first error raised."""
         if self._config.recording.codec == "auto":
-            self._choice = choose_for(self._config)
+            self._choice = self._choose(self._config)
         self._capture.arm()
 
     def start(self, path: Path, lines: int | None, window: Window = NOW, *, resume: bool = False) -> Path:

@@ -1,7 +1,8 @@
 """Before a run is armed: can ring, codec and disk of this host keep up with what is configured?
 
 Measured once for a directory, and again after some minutes, or with another configuration: a disk fills, and
-others come to use it.
+others come to use it. A codec that is ``auto`` is chosen first, and what is measured is what was chosen: the
+run records with it.
 """
 
 from __future__ import annotations
@@ -13,13 +14,13 @@ from typing import TYPE_CHECKING
 from acquire.capacity.load import Load
 from acquire.capacity.parts import measure_parts
 from acquire.daemon.messages import CapacityStatus
+from acquire.daemon.storage import choose_for
 from acquire.errors import DataError, UsageError
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from acquire.capacity.parts import Parts
     from acquire.config import RigConfig
+    from acquire.store import CodecChoice
 
 VALID_S = 600.0
 TIGHT = 0.7
@@ -32,46 +33,60 @@ class Proof:
     """What one rig's recordings need, and what the host has to offer."""
 
     def __init__(self, config: RigConfig) -> None:
-        self._load = Load.of(config)
+        self._config = config
         self._directory = config.recording.directory.absolute()
+        self._chosen: tuple[float, CodecChoice] | None = None
         self._measured: tuple[float, Parts] | None = None
+
+    def choose(self, config: RigConfig) -> CodecChoice:
+        """The codec for the rig, measured; for some minutes the same. Raises DataError."""
+        now_s = time.monotonic()
+        if self._chosen is None or now_s - self._chosen[0] > VALID_S:
+            self._chosen = now_s, choose_for(config)
+            self._measured = None
+        return self._chosen[1]
 
     def __call__(self, *, force: bool = False) -> CapacityStatus:
         """What is sustained. Raises UsageError where that is less than what is configured, unless forced."""
         try:
-            parts = self._parts(self._directory)
+            parts = self._parts()
         except (UsageError, DataError) as error:
             log.warning("capacity: nothing can be recorded to measure it: %s", error)
-            return CapacityStatus(line_rate_hz=self._load.line_rate_hz, warning=f"not measured: {error}")
-        short = parts.line_rate_hz < self._load.line_rate_hz
-        tight = parts.line_rate_hz * TIGHT < self._load.line_rate_hz
-        warning = f"{self._configured()}; {_sustained(parts)}" if tight else None
+            rate_hz = self._config.line_rate_hz * self._config.simulation.speed
+            return CapacityStatus(line_rate_hz=rate_hz, warning=f"not measured: {error}")
+        load = parts.load
+        short = parts.line_rate_hz < load.line_rate_hz
+        tight = parts.line_rate_hz * TIGHT < load.line_rate_hz
+        warning = f"{_configured(load)}; {_sustained(parts)}" if tight else None
         if short and not force:
             raise UsageError(
-                f"arm: {self._configured()} is more than this host sustains",
+                f"arm: {_configured(load)} is more than this host sustains",
                 possible=_sustained(parts),
                 hint="another codec or directory (acquire bench), or arm --force",
             )
         if warning:
             log.warning("capacity: %s", warning)
         return CapacityStatus(
-            line_rate_hz=self._load.line_rate_hz,
+            line_rate_hz=load.line_rate_hz,
+            codec=load.codec,
             sustained_hz=round(parts.line_rate_hz),
             limit=parts.limit,
             limits_hz={name: round(rate) for name, rate in parts.limits.items()},
             warning=warning,
         )
 
-    def _parts(self, directory: Path) -> Parts:
+    def _parts(self) -> Parts:
+        auto = self._config.recording.codec == "auto"
+        load = Load.of(self._config, self.choose(self._config).codec if auto else None)
         now_s = time.monotonic()
         if self._measured is None or now_s - self._measured[0] > VALID_S:
-            self._measured = now_s, measure_parts(self._load, directory)
+            self._measured = now_s, measure_parts(load, self._directory)
         return self._measured[1]
 
-    def _configured(self) -> str:
-        load = self._load
-        mb_s = load.bytes_per_s / 1e6
-        return f"2 x {load.pixels} px x {load.line_rate_hz:.6g} lines/s = {mb_s:.4g} MB/s, codec {load.codec}"
+
+def _configured(load: Load) -> str:
+    mb_s = load.bytes_per_s / 1e6
+    return f"2 x {load.pixels} px x {load.line_rate_hz:.6g} lines/s = {mb_s:.4g} MB/s, codec {load.codec}"
 
 
 def _sustained(parts: Parts) -> str:

@@ -48,7 +48,8 @@ def serve(config: RigConfig) -> int:
     with contextlib.closing(Endpoint(config.control.socket.absolute())) as endpoint, Rig(config) as rig:
         salvage = Salvage(config.recording.directory.absolute())
         salvage.search()
-        service = Service(config, lambda: Run(config, rig), Proof(config), salvage)
+        proof = Proof(config)
+        service = Service(config, lambda: Run(config, rig, proof.choose), proof, salvage)
         return asyncio.run(Daemon(service, endpoint).run())
 
 

@@ -7,11 +7,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from acquire.errors import DataError
 from acquire.geometry import Geometry
 from acquire.lines import ARMS
 from acquire.store import Retention, choose_codec, measure_disk
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from numpy.typing import NDArray
 
     from acquire.config import RigConfig
@@ -36,13 +39,21 @@ def storage_settings(config: RigConfig) -> dict[str, Any]:
     }
 
 
-def choose_for(config: RigConfig, lines: NDArray[Any] | None = None) -> CodecChoice:
+def choose_for(
+    config: RigConfig, lines: NDArray[Any] | None = None, directory: Path | None = None
+) -> CodecChoice:
     """The codec for both arms at full rate, measured here in about a second: on ``lines`` (line, pixel) like
-    those to come, or on shot noise at half the range.
+    those to come, or on shot noise at half the range; with the disk of ``directory``, or of the rig's.
+
+    Raises DataError where the disk cannot be written to.
     """
     sample = shot_noise(config) if lines is None else lines
     needed = len(ARMS) * config.line_rate_hz * sample[0].nbytes
-    return choose_codec(sample, needed, measure_disk(config.recording.directory))
+    directory = directory or config.recording.directory.absolute()
+    try:
+        return choose_codec(sample, needed, measure_disk(directory))
+    except OSError as error:
+        raise DataError(f"the disk of {directory} cannot be measured: {error.strerror}") from error
 
 
 def shot_noise(config: RigConfig) -> NDArray[Any]:

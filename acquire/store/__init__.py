@@ -2,7 +2,7 @@
 
 ::
 
-    whole recordings   writer                     reader, opening           verify  recover  mirror  video
+    whole recordings   writer                     reader, opening, suspect  verify  recover  mirror  video
       with             retention room resume                                scan    mend
     one arm            arm_writer                 camera_stream
     one array          array_writer → shard       stretch → chunks          tables: table, table_reader
@@ -20,6 +20,7 @@ from acquire.store.recover import Circumstances, Recovery, recover
 from acquire.store.resume import next_segment
 from acquire.store.retention import Hold, hold
 from acquire.store.spec import FORMAT, RecordingSpec, RunCondition
+from acquire.store.suspect import Suspect, suspect_lines
 from acquire.store.table_reader import Event, Gap
 from acquire.store.terms import Continuation, Retention
 from acquire.store.verify import Verification, verify
@@ -43,6 +44,7 @@ __all__ = [
     "Recovery",
     "Retention",
     "RunCondition",
+    "Suspect",
     "Verification",
     "VideoFile",
     "VideoWriter",
@@ -55,6 +57,7 @@ __all__ = [
     "open_recording",
     "open_video",
     "recover",
+    "suspect_lines",
     "verify",
     "write_video",
 ]

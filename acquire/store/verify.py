@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ from acquire.store.camera_stream import DAMAGE
 from acquire.store.opening import open_source
 from acquire.store.scan import Damage, missing_rows, scan
 from acquire.store.source import source_of
+from acquire.store.suspect import suspect_lines
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -173,6 +175,9 @@ def _metadata(recording: Recording) -> Iterator[str]:
 
 
 def _notes(recording: Recording) -> Iterator[str]:
+    """Never an error: where the events cannot be read, that is a contradiction, and told as one."""
+    with contextlib.suppress(DataError):
+        yield from map(str, suspect_lines(recording))
     for first, count in recording.dropped:
         yield f"lines {first} to {first + count - 1} were dropped by retention"
     if recording.state != "sealed":

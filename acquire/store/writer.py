@@ -283,6 +283,17 @@ class RecordingWriter:
             self._disk.sync_directory(self.path.parent)
         self.close()
 
+    def rescue(self) -> int:
+        """Rows that `seal` will end with: all that both arms have, or, after a disk error, what is on disk.
+
+        Raises DataError when the disk fails once more.
+        """
+        self._check_open()
+        if not self._failure:
+            return min(arm.next_line for arm in self._arms.values()) - self.spec.first_line
+        with self._failing("sealing"):
+            return self._rescue()
+
     def close(self) -> None:
         """Let go of all files; what was not committed is dropped. Idempotent."""
         self._closed = True

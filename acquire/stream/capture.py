@@ -230,6 +230,7 @@ class Capture:
             plan.tag_wait_s,
             plan.max_skew_lines,
             plan.realtime,
+            plan.disk,
         )
         return Worker(
             RECORDER, recorder.record, what, self._rings, self._tags, self._counters[RECORDER], self._others()
@@ -252,7 +253,8 @@ class Capture:
         """What the one before had released and not counted was stored: see `Session.take`."""
         counters = self._counters[RECORDER]
         for arm, ring in self._rings.items():
-            counters[f"stored_{arm}"] = ring.released_lines - counters[f"discarded_{arm}"]
+            others = counters[f"discarded_{arm}"] + counters[f"unsaved_{arm}"]
+            counters[f"stored_{arm}"] = ring.released_lines - others
         worker = self._new_recorder()
         worker.post(RunStarted(self.clock))
         return worker
@@ -321,7 +323,7 @@ class Capture:
         return counts
 
     def _lost(self, arm: str) -> dict[str, int]:
-        grabbed = self._counters[arm]
+        grabbed, unsaved = self._counters[arm], self._counters[RECORDER][f"unsaved_{arm}"]
         return {
             str(Cause.CAMERA): grabbed[Cause.CAMERA],
             str(Cause.RING_FULL): self._rings[arm].statistics().dropped_lines,
@@ -330,6 +332,7 @@ class Capture:
                 for cause in (*grabber.CAMERA_CAUSES[1:], Cause.GRABBER_LOST)
                 if grabbed[cause]
             },
+            **({str(Cause.WRITE_ERROR): unsaved} if unsaved else {}),
         }
 
     def _account(self, arm: str, supervisor: Supervisor) -> ArmLedger:

@@ -36,6 +36,8 @@ class Cause(StrEnum):
     """The arm's camera or grabber failed."""
     INTERRUPTED = "interrupted"
     """The recording was cut off before this arm delivered the line."""
+    WRITE_ERROR = "write_error"
+    """The disk failed before the line was on it; the recording ends before it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -114,11 +114,12 @@ class Interrupt:
 
 @dataclass(frozen=True, slots=True)
 class Sealed:
-    """The recording is over and closed."""
+    """The recording is over and closed; not ``on_disk``, where that failed: somebody must recover it."""
 
     condition: RunCondition
     end_reason: str
     ledger: dict[str, Any]
+    on_disk: bool = True
 
 
 @dataclass(frozen=True, slots=True)

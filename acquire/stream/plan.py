@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from acquire.errors import UsageError
 from acquire.geometry import Geometry
 from acquire.lines import ARMS
+from acquire.store.files import DISK, Disk
 from acquire.stream.ring import RingShape
 
 if TYPE_CHECKING:
@@ -53,6 +54,7 @@ class CapturePlan:
         ``openers["a"]`` opens; empty: a camera per arm
     ring_reserve : slots that hold no history: see `RingShape`
     watch : what is looked for in the lines while they pass; None: nothing
+    disk : that is written to; another than the local one behaves as a test wants
     """
 
     run: TriggerRun
@@ -71,6 +73,7 @@ class CapturePlan:
     realtime: bool = False
     ring_reserve: int = 2
     watch: WatchPlan | None = None
+    disk: Disk = DISK
 
     def __post_init__(self) -> None:
         if tuple(sorted(self.openers)) != ARMS:

@@ -7,10 +7,12 @@
 Lines are discarded while a recording is opened as well: its first line is chosen when it can take lines.
 Unless it begins with what was before (`window`): that is taken back from the rings at once, and waits there.
 A block waits in its ring until a tag of the trigger confirms its lines, but not longer than ``tag_wait_s``
-and not once the ring is half full; then its lines are written flagged. Creating and sealing a recording
-wait for the disk: a second thread does them, so that the rings are emptied meanwhile. What is counted is
-published in shared memory at every turn of the loop, so that nobody has to ask; only beginnings and ends
-are told.
+and not once the ring is half full; then its lines are written flagged. A recording that cannot be written as
+fast as lines come ends, sealed, while the rings still hold all of it (`stalls.Backlog`).
+
+Creating and sealing a recording wait for the disk: a second thread does them, so that the rings are emptied
+meanwhile. What is counted is published in shared memory at every turn of the loop, so that nobody has to
+ask; only beginnings and ends are told.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ import select
 import time
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +29,8 @@ import numpy as np
 from acquire.errors import AcquireError, DataError, StateError, UsageError
 from acquire.lines import ARMS
 from acquire.store import RecordingWriter, RunCondition
+from acquire.store.files import DISK, Disk
+from acquire.store.suspect import CODE_EVENTS, DOUBTFUL
 from acquire.stream.losses import Cause
 from acquire.stream.messages import (
     Began,
@@ -41,7 +45,7 @@ from acquire.stream.messages import (
 )
 from acquire.stream.process import OwnerGone, become_important
 from acquire.stream.session import Session
-from acquire.stream.stalls import Arm, find_stall
+from acquire.stream.stalls import Arm, Backlog, find_stall
 from acquire.stream.tagger import Tagger
 from acquire.stream.window import Span, hold, span
 from acquire.stream.witness import Witness
@@ -56,18 +60,21 @@ if TYPE_CHECKING:
 COUNTERS = (
     *("recorded", "committed", "draining", "rows_a", "rows_b", "missing_a", "missing_b"),
     *("discarded_a", "discarded_b", "stored_a", "stored_b", "turns", "awaited_a", "awaited_b"),
+    *("unsaved_a", "unsaved_b", "writing"),
 )
 """Of the latest recording: rows in both arms, rows that a reader finds, whether its last line is known; per
 arm the rows written and those of them that are missing. Since armed: per arm the lines taken from its ring
-that no recording holds, and those that one does; turns of the loop, which stand still when it hangs. The
-owner alone counts how often it has seen that an arm's next grabber is only starting: its silence means
-nothing then."""
+that no recording holds, those that one does, and those that a disk which failed did not keep; turns of the
+loop, which stand still when it hangs, and whether it was writing lines then. The owner alone counts how often
+it has seen that an arm's next grabber is only starting: its silence means nothing then."""
 
 _WAIT_S = 0.02
 _COMMIT_INTERVAL_S = 0.1
 _COMMIT_SHARE = 4
 """Commits take at most one part in so many of the time, however slow the disk."""
 _BLOCKS_PER_TURN = 8
+_LONGEST_DRAIN_S = 0.05
+"""Of one arm, while the other waits for its turn."""
 _NOTES = 1024
 """Events that are remembered for recordings which begin later and hold their lines."""
 
@@ -82,6 +89,7 @@ class RecorderPlan:
     tag_wait_s: float
     max_skew_lines: int
     realtime: bool = False
+    disk: Disk = DISK
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,7 +223,7 @@ class Recorder:
         except UsageError as error:
             self._mailbox.post(Refused(error))
             return
-        writer = self._disk.submit(RecordingWriter.prepare, begin.path, begin.spec)
+        writer = self._disk.submit(RecordingWriter.prepare, begin.path, begin.spec, self._plan.disk)
         self._opening = Opening(begin, span, writer)
 
     def _hold(self, begin: Begin) -> Span:
@@ -228,6 +236,8 @@ class Recorder:
     def _note(self, note: Note) -> None:
         self._notes.append(note)
         if self._session is not None:
+            if _is_verdict(note, before=self._session.first_line):
+                note = replace(note, line=self._session.first_line)
             self._session.note(note.kind, note.line, note.text)
 
     def _interrupt(self, reason: str, lost: dict[str, Cause]) -> None:
@@ -255,6 +265,10 @@ class Recorder:
         if self._closing is not None and self._closing[1].done():
             (session, sealed), self._closing = self._closing, None
             self._publish(session)
+            for name, lines in session.left_out.items():
+                self._counters.add(f"stored_{name}", -lines)
+                # Of a block that was taken in part, all lines are counted as discarded.
+                self._counters.add(f"unsaved_{name}" if lines > 0 else f"discarded_{name}", lines)
             self._mailbox.post(sealed.result())
 
     def _opened(self, opening: Opening) -> None:
@@ -272,6 +286,7 @@ class Recorder:
         self._session = self._new_session(writer, opening, first_line)
         for arm in self._arms.values():
             arm.revive(time.monotonic())
+            arm.backlog = Backlog()
         self._publish(self._session)
         self._mailbox.post(Began(first_line))
         if self._trouble is not None:
@@ -293,9 +308,15 @@ class Recorder:
             self._notes.append(Note(at, window.kind, window.text))
         if doubt := self._witness.doubt():
             self._notes.append(Note(first_line, "code_check", doubt))
-        for note in self._notes:
+        for note in [*self._standing_doubts(first_line), *self._notes]:
             session.note(note.kind, note.line, note.text)
         return session
+
+    def _standing_doubts(self, first_line: int) -> list[Note]:
+        """Arms whose code was in doubt before the line, and is at it."""
+        latest = {note.kind[-1]: note for note in self._notes if _is_verdict(note, before=first_line)}
+        doubts = [note for note in latest.values() if note.kind in DOUBTFUL.values()]
+        return [replace(note, line=first_line) for note in doubts]
 
     def _close(self, session: Session, error: Exception | None = None) -> None:
         self._session = None
@@ -314,18 +335,36 @@ class Recorder:
 
     def _drain(self, name: str, arm: Arm) -> bool:
         """Take what the arm has, some blocks at most; says whether there was any."""
-        arm.watch(time.monotonic(), self._counters[f"awaited_{name}"])
+        self._listen_to(name, arm)
         if self._opening is not None and self._opening.span is not None:
             return False  # it waits for the recording
+        until_s = time.monotonic() + _LONGEST_DRAIN_S
         for taken in range(_BLOCKS_PER_TURN):
             block = arm.ring.acquire()
             if block is None or not self._may_go(arm.ring, block):
                 return taken > 0
-            written = self._session.take(name, block) if self._session is not None else 0
+            written = 0 if self._session is None else self._take(name, arm, block, self._session)
             self._counters.add(f"discarded_{name}", len(block.flags) - written)
             self._counters.add(f"stored_{name}", written)
             arm.ring.release()
+            if time.monotonic() > until_s:
+                break
         return True
+
+    def _listen_to(self, name: str, arm: Arm) -> None:
+        arm.watch(time.monotonic(), self._counters[f"awaited_{name}"])
+
+    def _take(self, name: str, arm: Arm, block: RingBlock, session: Session) -> int:
+        """Write the block; end while all lines are still there, should the disk be too slow for them."""
+        self._counters["writing"] = 1
+        written = session.take(name, block)
+        self._counters["writing"] = 0
+        fill, slots = arm.ring.fill, arm.ring.shape.slots
+        if arm.backlog.grows(fill, slots, time.monotonic()) and not session.ending:
+            # Before the slot is released: nothing has been lost as long as the ring is not overtaken.
+            reason = f"too slow to write: {fill} of {slots} ring slots of arm {name} wait for disk or codec"
+            session.end(self._common_line(), reason, RunCondition.INTERRUPTED)
+        return written
 
     def _may_go(self, ring: Ring, block: RingBlock) -> bool:
         """Nothing is gained by letting the block wait any longer for its tag."""
@@ -345,7 +384,9 @@ class Recorder:
     def _look_after(self, session: Session) -> None:
         session.doubted = self._witness.doubted()
         session.trigger, session.cameras = self._witness.trigger(), self._witness.cameras()
+        session.verified = self._witness.verified()
         for name, arm in self._arms.items():
+            self._listen_to(name, arm)  # what came while this was held up by the disk is no silence
             if name in session.lost and not arm.ring.fill:
                 session.give_up(name)
         if session.done:
@@ -374,3 +415,8 @@ class Recorder:
         for name, book in session.books.items():
             counters[f"rows_{name}"] = rows[name]
             counters[f"missing_{name}"] = book.missing.total()
+
+
+def _is_verdict(note: Note, *, before: int) -> bool:
+    """On the code of lines from before the line ``before`` on, and so of that line as well."""
+    return note.kind in CODE_EVENTS and note.line < before

@@ -15,6 +15,7 @@ import numpy as np
 from acquire.errors import AcquireError
 from acquire.lines import ARMS, LineBlock, LineFlag
 from acquire.store import RunCondition
+from acquire.store.suspect import DOUBTFUL
 from acquire.stream.losses import Cause
 from acquire.stream.messages import Sealed
 from acquire.stream.tagger import UNCONFIRMED
@@ -41,6 +42,9 @@ TAINTING_EVENTS = (
 )
 """Events of the run so far that do so."""
 
+CODE_DOUBTS = frozenset(DOUBTFUL.values())
+"""Events of lines in the recording that do so, though they may have been written before the verdict."""
+
 MAX_MISMATCH_EVENTS = 100
 _BEST_FIRST = (
     RunCondition.GOOD,
@@ -62,6 +66,7 @@ class Writer(Protocol):
     def add_gap(self, arm: str, first_line: int, count: int, cause: str) -> None: ...
     def add_event(self, kind: str, tick: int, line: int, text: str = "") -> None: ...
     def commit(self) -> None: ...
+    def rescue(self) -> int: ...
     def seal(self, condition: RunCondition, end_reason: str, ledger: dict[str, Any]) -> None: ...
     def close(self) -> None: ...
 
@@ -77,6 +82,7 @@ class Book:
     doubted: int = 0
     incomplete: int = 0
     saturated: int = 0
+    left_out: int = 0
 
     def store(self, flags: NDArray[np.uint16]) -> None:
         self.next_line += len(flags)
@@ -93,6 +99,16 @@ class Book:
     def balances(self, lines: int) -> bool:
         return lines == self.stored + self.missing.total()
 
+    def end_at(self, line: int, missed: Counter[Cause]) -> int:
+        """Forget what the disk did not take from ``line`` on, ``missed`` of it; the lines that it cost."""
+        forgotten = self.next_line - line
+        self.next_line = line
+        self.missing -= missed
+        lost = forgotten - missed.total()
+        self.stored -= lost
+        self.left_out += lost
+        return lost
+
     def to_attrs(self, lines: int) -> dict[str, Any]:
         return {
             "stored": self.stored,
@@ -101,6 +117,7 @@ class Book:
             "doubted": self.doubted,
             "incomplete": self.incomplete,
             "saturated": self.saturated,
+            **({"left_out": self.left_out} if self.left_out else {}),
             "balanced": self.balances(lines),
         }
 
@@ -116,6 +133,9 @@ class Session:
     doubted : arms whose lines contradict the code at the moment: what comes is flagged
     trigger : what the trigger counted while this was recorded
     cameras : arm → what its camera counted since it was armed
+    verified : arm → the line up to which it is known to follow the light's code
+    left_out : arm → lines that were taken, and that a disk which failed did not keep; below 0: which were
+        not taken, and are there all the same
     """
 
     def __init__(
@@ -131,12 +151,16 @@ class Session:
         self.doubted: set[str] = set()
         self.trigger: dict[str, int] = {}
         self.cameras: dict[str, dict[str, int]] = {}
+        self.left_out: dict[str, int] = {}
+        self.verified: dict[str, int] = {}
         self._writer = writer
         self._tagger = tagger
         self._blank = blank
         self._floor = RunCondition.GOOD
         self._mismatches = 0
         self._doubts: Counter[str] = Counter()
+        self._gaps: list[tuple[str, range, Cause]] = []
+        """Those that are not committed yet."""
         self._told_to_end = False
         self._note("started", first_line, "")
 
@@ -206,6 +230,7 @@ class Session:
         if kind in TAINTING_EVENTS and line < self.end_line:
             self._doubts[kind] += 1
         if self.first_line <= line < self.end_line:
+            self._doubts[kind] += kind in CODE_DOUBTS
             self._note(kind, line, text)
 
     def mismatches(self, found: list[TagMismatch]) -> None:
@@ -217,6 +242,8 @@ class Session:
     def commit(self) -> None:
         """Make what is written visible to readers; a disk that is nearly full ends the recording."""
         self._writer.commit()
+        committed = self.first_line + self._writer.committed_lines
+        self._gaps = [gap for gap in self._gaps if gap[1].stop > committed]
         if (reason := self._writer.nearly_full) is not None and not self._told_to_end:
             self.end(max(book.next_line for book in self.books.values()), reason, RunCondition.INTERRUPTED)
 
@@ -229,10 +256,24 @@ class Session:
                 error = found
         reason = f"write error: {_words(error)}"
         try:
+            self._end_at(self._writer.rescue())
             return self._seal(RunCondition.ABORTED, reason)
         except (AcquireError, OSError) as second:
+            self._end_at(self._writer.committed_lines)
             self._writer.close()
-            return Sealed(RunCondition.ABORTED, f"{reason}; not sealed: {_words(second)}", self._ledger())
+            reason = f"{reason}; not sealed: {_words(second)}"
+            return Sealed(RunCondition.ABORTED, reason, self._ledger(), on_disk=False)
+
+    def _end_at(self, rows: int) -> None:
+        """Only so many rows were taken by the disk: no others are in the books."""
+        self.end_line = self.first_line + rows
+        for arm, book in self.books.items():
+            missed: Counter[Cause] = Counter()
+            for of, lines, cause in self._gaps:
+                if of == arm:
+                    missed[cause] += max(0, lines.stop - max(lines.start, self.end_line))
+            self.left_out[arm] = self.left_out.get(arm, 0) + book.end_at(self.end_line, +missed)
+        self._gaps = [(arm, lines, cause) for arm, lines, cause in self._gaps if lines.stop <= self.end_line]
 
     def _seal(self, condition: RunCondition, reason: str) -> Sealed:
         ledger = self._ledger()
@@ -245,6 +286,7 @@ class Session:
         if count <= 0:
             return
         self._writer.add_gap(arm, book.next_line, count, cause)
+        self._gaps.append((arm, range(book.next_line, book.next_line + count), cause))
         while count:
             pixels = self._blank[:count]
             flags = np.full(len(pixels), LineFlag.MISSING, np.uint16)
@@ -295,6 +337,7 @@ class Session:
             "trigger": self.trigger,
             "cameras": self.cameras,
             "tainted_by": self._taints(),
+            **({"code_verified_to": self.verified} if self.verified else {}),
             **arms,
         }
 

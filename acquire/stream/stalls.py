@@ -1,8 +1,8 @@
-"""Silence: when an arm counts as stalled, and when a process shows no life.
+"""Silence: when an arm counts as stalled, and when a process shows no life. And its opposite, too much.
 
-The recorder judges the arms of its recording: silent for too long, or too far behind the other. The
-supervisor judges by counters that must not stand still: the recorder always, the arms while nothing is
-recorded.
+The recorder judges the arms of its recording: silent for too long, or too far behind the other; and itself,
+by what waits in the rings. The supervisor judges by counters that must not stand still: the recorder always,
+the arms while nothing is recorded.
 """
 
 from __future__ import annotations
@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from acquire.stream.session import Session
     from acquire.stream.shared import Counters
 
+NEARLY_FULL = 0.9
+"""Of a ring: the recording is ended while the rest can still take what comes."""
+PATIENCE_S = 0.25
+"""A ring that is more than half full for less than this says nothing: processes are made to wait for less."""
 _LONGEST_LOOK_S = 0.5
 _EXCESS_S = 1.0
 
@@ -32,11 +36,35 @@ class Stall:
     condition: RunCondition
 
 
+class Backlog:
+    """Whether a ring fills up although it is being emptied: asked after every block that was taken from it.
+
+    A ring that leapt to full in a pause empties, and costs nothing more; so does one that begins full, with
+    what was before. One that is nearly full, and has not emptied since it was first seen more than half full,
+    will overflow.
+    """
+
+    def __init__(self) -> None:
+        self._caught_up = False
+        self._first: tuple[int, float] | None = None
+
+    def grows(self, fill: int, slots: int, now_s: float) -> bool:
+        """The next blocks would be lost; ``fill`` of ``slots`` wait."""
+        if 2 * fill < slots:
+            self._caught_up, self._first = True, None
+            return False
+        first_fill, since_s = self._first = self._first or (fill, now_s)
+        if not self._caught_up or now_s - since_s < PATIENCE_S:
+            return False
+        return fill >= max(first_fill, NEARLY_FULL * slots)
+
+
 class Arm:
-    """A ring as the recorder sees it: when it last showed life."""
+    """A ring as the recorder sees it: when it last showed life, and what waits in it."""
 
     def __init__(self, ring: Ring) -> None:
         self.ring = ring
+        self.backlog = Backlog()
         self.alive_s = time.monotonic()
         self._newest = ring.newest_line
         self._awaited = 0

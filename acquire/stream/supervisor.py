@@ -231,7 +231,8 @@ class Supervisor:
         limit_s = self._stall_timeout_s
         self._bear_with_successors()
         if self._loop.look(now_s) > limit_s:
-            self._fail(f"{self._workers[RECORDER].name}: no sign of life for {limit_s:g} s")
+            doing = ", while it writes to the disk" if self._counters[RECORDER]["writing"] else ""
+            self._fail(f"{self._workers[RECORDER].name}: no sign of life for {limit_s:g} s{doing}")
         self._watch_counts(now_s)
         if self.recording:
             for camera in self._cameras.values():
@@ -325,7 +326,7 @@ class Supervisor:
                 case Refused():
                     self._refused = message
                 case Sealed():
-                    self.sealed = message
+                    self._take_end(message)
                 case Note():
                     self.happened(message)
                 case Checked(first_line, _, text):
@@ -334,6 +335,11 @@ class Supervisor:
                     # Those of a defect begin with the process's name already.
                     self._last_words[name] = str(error).removeprefix(f"{self._workers[name].name}: ")
             self._news.notify_all()
+
+    def _take_end(self, sealed: Sealed) -> None:
+        self.sealed = sealed
+        if not sealed.on_disk and self.path is not None:
+            self._orphans.append(Orphan(self.path, sealed.end_reason))
 
     def _fail(self, text: str, name: str | None = None) -> None:
         """Keep the first fault, and have the recording sealed if the recorder lives."""

@@ -7,6 +7,7 @@ costs no line: what it did not see is not checked, which the counters tell.
 
     ring a ─▶ Intake ─┐  the same lines of both, twice a second     ┌▶ counters: verdicts
     ring b ─▶ Intake ─┴─▶ Judge (`lightcheck`) ─────────────────────┼▶ Checked, when a verdict changes
+                   │                                                ├▶ Note, from which line on it holds
                    └────▶ Threshold ────────────────────────────────┴▶ Note, at a crossing
 """
 
@@ -20,6 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from acquire.lines import ARMS
+from acquire.store.suspect import DOUBTFUL, VERIFIED
 from acquire.stream.lightcheck import Finding, Judge, Sight, Verdict, explain
 from acquire.stream.messages import Checked, Note, Ready
 from acquire.stream.observer import Observer
@@ -34,10 +36,12 @@ if TYPE_CHECKING:
     from acquire.stream.threshold import ThresholdPlan
 
 COUNTERS = tuple(
-    f"{name}_{arm}" for arm in ARMS for name in ("verdict", "shift", "checked_line", "checks", "lapped")
+    f"{name}_{arm}"
+    for arm in ARMS
+    for name in ("verdict", "shift", "checked_line", "verified_line", "checks", "lapped")
 )
-"""Per arm: position in `VERDICTS`, shift in sub-steps, the line after the last that was checked, how many
-checks there were; ring slots that came and went unseen."""
+"""Per arm: position in `VERDICTS`, shift in sub-steps, the line after the last that was checked, the first of
+the last check that was verified, how many checks there were; ring slots that came and went unseen."""
 VERDICTS = tuple(Verdict)
 OBSERVER = 0
 """The watcher's place among a ring's observers."""
@@ -87,6 +91,8 @@ class Watcher:
         self._threshold = None if plan.threshold is None else Threshold(plan.threshold)
         self._intakes: dict[str, Intake] = {}
         self._told = dict.fromkeys(ARMS, Finding(Verdict.UNKNOWN))
+        self._doubted: dict[str, bool | None] = dict.fromkeys(ARMS)
+        """As it was told last; None: not yet."""
         self._next_s = self._now_s = self._tell_s = 0.0
         self._untold = 0
         for observer in self._observers.values():
@@ -149,6 +155,7 @@ class Watcher:
         found = judge.look(first_line, {arm: intake.sight() for arm, intake in self._intakes.items()})
         self._intakes.clear()
         for arm, finding in found.items():
+            self._locate(arm, finding, first_line)
             self._counters[f"verdict_{arm}"] = VERDICTS.index(finding.verdict)
             self._counters[f"shift_{arm}"] = finding.shift
             self._counters[f"checked_line_{arm}"] = first_line + self._plan.lines
@@ -157,6 +164,24 @@ class Watcher:
             self._told = found
             doubtful = any(finding.verdict.doubtful for finding in found.values())
             self._mailbox.post(Checked(first_line, doubtful, explain(found, judge.substeps)))
+
+    def _locate(self, arm: str, finding: Finding, first_line: int) -> None:
+        """Tell from which line on an arm is in doubt, or no more.
+
+        A check whose lines slip half-way may say either, and nothing is known of the lines between checks:
+        doubt begins with the last check that saw none, and ends after the first.
+        """
+        if finding.verdict is Verdict.UNKNOWN:
+            return
+        before, doubtful = self._doubted[arm], finding.verdict.doubtful
+        if doubtful and not before:
+            self._mailbox.post(Note(self._counters[f"verified_line_{arm}"], DOUBTFUL[arm], str(finding)))
+        elif not doubtful and before is not False:
+            since = first_line + (self._plan.lines if before else 0)
+            self._mailbox.post(Note(since, VERIFIED[arm], str(finding)))
+        self._doubted[arm] = doubtful
+        if not doubtful:
+            self._counters[f"verified_line_{arm}"] = first_line
 
 
 class Intake:

@@ -63,6 +63,11 @@ class Witness:
             return set()
         return {arm for arm in ARMS if VERDICTS[watcher[f"verdict_{arm}"]].doubtful}
 
+    def verified(self) -> dict[str, int]:
+        """Arm → the line up to which the code is known to be followed; empty where nobody checks."""
+        watcher = self._watcher
+        return {} if watcher is None else {arm: watcher[f"verified_line_{arm}"] for arm in ARMS}
+
     def doubt(self) -> str:
         """What is wrong with them, in words; "" where nothing is."""
         watcher = self._watcher

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
 
+from acquire.capacity.load import Load
 from acquire.capacity.parts import Pace, Parts
 from acquire.config import load_rig
 from acquire.daemon import proof
 from acquire.daemon.messages import ArmRequest, CapacityStatus
+from acquire.daemon.plan import Run
 from acquire.daemon.proof import Proof
 from acquire.daemon.service import Service
 from acquire.daemon.states import State
 from acquire.errors import UsageError
+from acquire.rig import Rig
+from acquire.store import open_recording
 
 
 @pytest.fixture
@@ -85,3 +90,30 @@ def test_the_service_stays_idle_and_asks_no_device(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="too slow, True"):
         service.arm(ArmRequest(force=True))
     assert service.status().state is State.IDLE
+
+
+def test_the_codec_that_is_chosen_is_the_one_that_is_measured(tmp_path: Path) -> None:
+    """Both are measured here, with nothing in their place; the run records with the same choice."""
+    settings = {"recording.directory": str(tmp_path), "recording.codec": "auto", "code.seed": 7}
+    config = load_rig("rig-demo", settings)
+    prove = Proof(config)
+    found = prove(force=True)
+    choice = prove.choose(config)
+    assert found.codec == choice.codec != "none"  # photon noise packs well, and 8 MB/s are few
+    with Rig(config) as rig:
+        run = Run(config, rig, prove.choose)
+        try:
+            run.arm()
+            run.start(tmp_path / "r.zarr", 1000)
+        finally:
+            run.close()
+    attributes = open_recording(tmp_path / "r.zarr").attrs
+    assert attributes["codec_choice"] == json.loads(json.dumps(choice.to_attrs()))
+
+
+def test_a_load_without_a_chosen_codec_is_refused(tmp_path: Path) -> None:
+    config = load_rig("rig-demo", {"recording.codec": "auto", "recording.directory": str(tmp_path)})
+    with pytest.raises(UsageError, match="codec 'auto'"):
+        Load.of(config)
+    gone = load_rig("rig-demo", {"recording.codec": "auto", "recording.directory": str(tmp_path / "gone")})
+    assert "cannot be measured" in str(Proof(gone)(force=False).warning)

@@ -18,7 +18,7 @@ from acquire.daemon.states import State
 from acquire.lines import LineFlag
 from acquire.recon import reconstruct
 from acquire.rig import Rig
-from acquire.store import Recording, open_recording
+from acquire.store import Recording, Suspect, open_recording, suspect_lines, verify
 
 PATIENCE_S = 60.0
 SETTINGS = {"stream.ring_seconds": 4.0, "stream.reopen_s": 30.0, "recording.chunk_lines": 256}
@@ -173,6 +173,11 @@ def test_light_that_comes_late_is_told_flagged_and_taints(tmp_path: Path) -> Non
     assert [event.text for event in recording.events if event.kind == "code_check"] == [
         "arm a shifted, arm b shifted"
     ]
+    assert suspect_lines(recording) == tuple(
+        Suspect(arm, recording.first_line, 2000, "shifted by +2 sub-steps") for arm in "ab"
+    )
+    assert recording.attrs["ledger"]["code_verified_to"] == {"a": 0, "b": 0}
+    assert verify(recording.path).notes == tuple(map(str, suspect_lines(recording)))
 
 
 def test_light_that_follows_the_code_is_verified_and_every_pulse_has_its_place(tmp_path: Path) -> None:

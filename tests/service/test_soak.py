@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from tools.soak import soak
+from acquire.lines import ARMS
+from tools.soak import Soak, soak
 
 
 def test_every_line_has_a_fate_and_nothing_grows(tmp_path: Path) -> None:
@@ -12,6 +13,17 @@ def test_every_line_has_a_fate_and_nothing_grows(tmp_path: Path) -> None:
     assert found.wrong == []
     assert found.cycles >= 2
     assert found.faults.total() >= 4
-    (_, handles, threads), *_, (_, handles_end, threads_end) = found.usage
+    (handles, threads), *_, (handles_end, threads_end) = found.usage
     assert (handles_end, threads_end) == (handles, threads)
+    assert set(found.memory) == {"owner", "recorder", *ARMS}
+    assert "too short to tell" in str(found)
     assert not any(tmp_path.iterdir())
+
+
+def test_what_grows_is_wrong_and_what_wanders_is_not() -> None:
+    found = Soak()
+    found.memory["steady"] = [(second, 80.0 + second % 3) for second in range(40)]
+    found.memory["leaking"] = [(second, 80.0 + 0.2 * second) for second in range(40)]
+    found.memory["settling"] = [(second, 80.0 + min(second, 15)) for second in range(40)]
+    found.judge()
+    assert found.wrong == ["leaking: grew by 3.8 MB in the second half"]

@@ -15,8 +15,9 @@ from wired_devices import CODE, PIXELS, STAGES, SUBSTEP_TICKS, SUBSTEPS, make_sp
 from acquire.clock import ClockFit
 from acquire.errors import DataError
 from acquire.lines import ARMS
-from acquire.store import RunCondition, open_recording
-from acquire.stream.messages import Began, Begin, End, Refused, RunStarted, Sealed
+from acquire.store import RunCondition, Suspect, open_recording, suspect_lines
+from acquire.store.suspect import DOUBTFUL, VERIFIED
+from acquire.stream.messages import Began, Begin, End, Note, Refused, RunStarted, Sealed
 from acquire.stream.recorder import COUNTERS, Recorder, RecorderPlan
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.shared import Counters
@@ -164,3 +165,37 @@ def test_every_turn_is_a_sign_of_life(bed: Bed) -> None:
     for _ in range(3):
         bed.recorder.turn()
     assert bed.counters["turns"] == before + 3
+
+
+def record_with_verdicts(bed: Bed, path: Path, *before: Note) -> tuple[Suspect, ...]:
+    """100 lines from 4 blocks on; ``before``: what the watcher said before; then arm a slips."""
+    bed.lines(3)
+    bed.post.waiting += [*before, Begin(path, make_spec(), None)]
+    bed.lines()
+    bed.disk.finish()
+    bed.lines(3)
+    bed.post.waiting.append(Note(bed.line - 20, DOUBTFUL["a"], "inverted"))
+    bed.lines(3)
+    bed.post.waiting += [Note(bed.line - 10, VERIFIED["a"], "verified"), End("stopped")]
+    bed.recorder.turn()
+    bed.disk.finish()
+    bed.recorder.turn()
+    return suspect_lines(open_recording(path))
+
+
+def test_a_verdict_that_comes_late_says_where_it_begins(bed: Bed, tmp_path: Path) -> None:
+    """Of what was said before the recording, what still holds at its first line is in it."""
+    said = [
+        Note(0, DOUBTFUL["a"], "dark"),
+        Note(16, DOUBTFUL["b"], "dark"),
+        Note(32, VERIFIED["a"], "verified"),
+    ]
+    found = record_with_verdicts(bed, tmp_path / "r.zarr", *said)
+    recording = open_recording(tmp_path / "r.zarr")
+    first, end = recording.first_line, recording.first_line + recording.lines
+    slip = 7 * ROWS - 20
+    assert first < slip < bed.line - 10 < end
+    assert found == (
+        Suspect("a", slip, bed.line - 10 - slip, "inverted"),
+        Suspect("b", first, end - first, "dark"),
+    )

@@ -37,6 +37,7 @@ class MemoryWriter:
     closed: bool = False
     broken: tuple[str, ...] = ()
     committed_lines: int = 0
+    kept_lines: int = 0
     nearly_full: str | None = None
 
     def append(self, block: TaggedBlock) -> None:
@@ -58,6 +59,9 @@ class MemoryWriter:
     def seal(self, condition: RunCondition, end_reason: str, ledger: dict[str, Any]) -> None:
         self._refuse("seal")
         self.ending = condition, end_reason, ledger
+
+    def rescue(self) -> int:
+        return self.kept_lines
 
     def close(self) -> None:
         self.closed = True
@@ -268,7 +272,7 @@ def test_a_full_disk_aborts_and_seals_what_there_is() -> None:
     writer = MemoryWriter()
     session = make_session(writer, lines=50)
     feed(session, 20, 20)
-    writer.broken = ("append",)
+    writer.broken, writer.kept_lines = ("append",), 20
     with pytest.raises(DataError) as failure:
         session.take("a", ring_block("a", 20, 20))
     sealed = session.close(failure.value)
@@ -277,6 +281,24 @@ def test_a_full_disk_aborts_and_seals_what_there_is() -> None:
     assert sealed.ledger["a"] == sealed.ledger["b"] | {}
     assert sealed.ledger["a"]["stored"] == 20
     assert writer.ending[0] is RunCondition.ABORTED
+
+
+def test_what_a_disk_that_failed_did_not_keep_is_not_in_the_books() -> None:
+    """12 of the rows that were taken are kept; the others are left out, and so are their gaps."""
+    writer = MemoryWriter(kept_lines=12)
+    session = make_session(writer, lines=50)
+    feed(session, 5, 5)
+    for arm, lines in (("a", 5), ("b", 11)):  # lost before: lines 5 to 9, and 5 to 15
+        session.take(arm, ring_block(arm, 5 + lines, 10, losses=(Loss(5, lines, Cause.RING_FULL),)))
+    sealed = session.close(DataError("no space left"))
+    assert sealed.ledger["pulses"] == 12
+    assert sealed.ledger["a"]["stored"] == 5 + 2
+    assert sealed.ledger["a"]["missing"] == {"ring_full": 5}
+    assert sealed.ledger["b"]["stored"] == 5
+    assert sealed.ledger["b"]["missing"] == {"ring_full": 7}
+    assert session.left_out == {"a": 8, "b": 10}
+    assert sealed.ledger["a"]["balanced"]
+    assert sealed.ledger["b"]["balanced"]
 
 
 def test_a_disk_that_does_not_even_seal_leaves_the_recording_as_committed() -> None:

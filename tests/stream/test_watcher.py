@@ -88,7 +88,11 @@ def test_what_follows_the_code_is_told_once(beds: list[Bed]) -> None:
     assert bed.verdicts() == [Verdict.UNKNOWN, Verdict.UNKNOWN]
     bed.pass_by(40)
     assert bed.verdicts() == [Verdict.VERIFIED, Verdict.VERIFIED]
-    assert bed.post.said == [Checked(1000 + ROWS, False, "arm a verified, arm b verified")]
+    assert bed.post.said == [
+        Note(1000 + ROWS, "code_verified_a", "verified"),
+        Note(1000 + ROWS, "code_verified_b", "verified"),
+        Checked(1000 + ROWS, False, "arm a verified, arm b verified"),
+    ]
     assert bed.counters["checks_a"] == 3  # of 16 blocks each
     assert bed.counters["checked_line_b"] <= 1000 + bed.next
 
@@ -97,13 +101,31 @@ def test_a_slip_in_mid_stream_is_told(beds: list[Bed]) -> None:
     bed = Bed()
     beds.append(bed)
     bed.pass_by(18)
+    sure, slip = bed.counters["verified_line_b"], 1000 + bed.next
+    assert slip - 2 * CHECK < sure < slip
     bed.pass_by(40, slip_b=1)
     assert bed.verdicts() == [Verdict.VERIFIED, Verdict.SHIFTED]
+    doubts = [note for note in bed.post.said if isinstance(note, Note) and "doubtful" in note.kind]
+    assert doubts == [Note(sure, "code_doubtful_b", "shifted by +3 sub-steps")]
     last = bed.post.said[-1]
     assert isinstance(last, Checked)
     assert last.doubtful
     assert last.text == "arm a verified, arm b shifted by +3 sub-steps: arm b is 1 lines behind arm a"
     assert (bed.counters["shift_a"], bed.counters["shift_b"]) == (0, 3)
+
+
+def test_a_slip_that_is_undone_is_doubted_as_long_as_it_lasts(beds: list[Bed]) -> None:
+    bed = Bed()
+    beds.append(bed)
+    bed.pass_by(18)
+    first = 1000 + bed.next
+    bed.pass_by(18, slip_b=1)
+    end = 1000 + bed.next
+    bed.pass_by(26)
+    _, doubt, back = [note for note in bed.post.said if isinstance(note, Note) and note.kind.endswith("_b")]
+    assert (doubt.kind, back.kind) == ("code_doubtful_b", "code_verified_b")
+    assert first - 2 * CHECK < doubt.line < first
+    assert end <= back.line <= 1000 + bed.next
 
 
 def test_lost_lines_and_lapped_slots_only_delay_a_verdict(beds: list[Bed]) -> None:
@@ -150,6 +172,7 @@ def test_a_light_that_comes_late_is_told_from_the_first_check_on(beds: list[Bed]
     bed.turn()
     bed.pass_by(17)
     assert bed.post.said == [
+        *(Note(0, f"code_doubtful_{arm}", "shifted by +2 sub-steps") for arm in ARMS),
         Checked(1000 + ROWS, True, "arm a shifted by +2 sub-steps, arm b shifted by +2 sub-steps"),
     ]
     assert np.all([bed.counters[f"shift_{arm}"] == 2 for arm in ARMS])

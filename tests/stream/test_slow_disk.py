@@ -1,0 +1,183 @@
+"""Disks that are too slow, full, broken or read-only, under the real recorder process.
+
+Whatever the disk does: what is acknowledged can be read, the recording ends with a reason, and every line of
+it is there or listed. A slow disk ends it before a line is lost.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from slow_disks import FailingDisk, SlowDisk
+from throttle import Throttle
+
+from acquire.capacity.load import CLOCK_HZ, Load, capture_plan, recording_spec
+from acquire.device_config import TriggerConfig
+from acquire.lines import ARMS
+from acquire.sim.clock import Wire
+from acquire.sim.pattern import Pattern
+from acquire.sim.trigger_model import TriggerModel
+from acquire.sim.twin_links import TwinTransport
+from acquire.store import open_recording, verify
+from acquire.store.files import DISK, Disk
+from acquire.stream import Capture, CaptureStatus
+from acquire.stream.stalls import NEARLY_FULL, PATIENCE_S, Backlog
+from acquire.trigger.driver import TriggerDriver
+
+LOAD = Load(256, "uint16", 20_000.0, substeps=2, stages=8, block_lines=128, ring_slots=256, chunk_lines=256)
+"""20 MB/s from both arms, chunks of 128 KiB, a ring of 1.6 s."""
+WAIT_S = 60.0
+
+
+@contextlib.contextmanager
+def capturing(disk: Disk, load: Load = LOAD) -> Iterator[Capture]:
+    wire = Wire()
+    model = TriggerModel(wire, CLOCK_HZ, load.speed)
+    trigger = TriggerDriver(partial(TwinTransport, model), TriggerConfig(tag_every_lines=load.block_lines))
+    capture = Capture(replace(capture_plan(load, wire), realtime=False, disk=disk), trigger)
+    try:
+        capture.arm()
+        yield capture
+    finally:
+        capture.close()
+        trigger.close()
+        wire.close()
+
+
+def until_done(capture: Capture, path: Path) -> tuple[CaptureStatus, int]:
+    """The end, and the most lines that were acknowledged; each time, a reader finds them."""
+    deadline, acknowledged = time.monotonic() + WAIT_S, 0
+    while not (seen := capture.poll()).done:
+        if seen.committed_lines:
+            acknowledged = seen.committed_lines
+            assert open_recording(path).lines >= acknowledged
+        assert seen.fault is None
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    return seen, acknowledged
+
+
+def check_lines(path: Path) -> None:
+    """Every row is its line, and none is missing."""
+    recording = open_recording(path)
+    assert not recording.gaps
+    for arm in ARMS:
+        expected = Pattern(arm, LOAD.pixels, LOAD.dtype, 4095).lines(recording.first_line, recording.lines)
+        np.testing.assert_array_equal(recording.camera(arm).lines[:], expected)
+        assert not recording.camera(arm).flags[:].any() & 1
+
+
+def until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + WAIT_S
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def check_graceful_end(capture: Capture, path: Path) -> None:
+    seen, acknowledged = until_done(capture, path)
+    assert seen.condition == "INTERRUPTED"
+    assert "too slow to write: " in str(seen.end_reason)
+    assert "ring slots of arm" in str(seen.end_reason)
+    assert acknowledged > 0
+    recording = open_recording(path)
+    assert (recording.state, recording.attrs["end_reason"]) == ("sealed", seen.end_reason)
+    assert recording.lines >= acknowledged
+    assert verify(path).intact
+    check_lines(path)
+    for arm in ARMS:
+        book = recording.attrs["ledger"][arm]
+        assert book["balanced"]
+        assert (book["stored"], book["missing"]) == (recording.lines, {})
+    capture.close()
+    assert all(account.balanced for account in capture.poll().accounts.values())
+
+
+@pytest.mark.parametrize("share", [0.2, 0.6])
+def test_a_slow_disk_ends_the_recording_before_a_line_is_lost(tmp_path: Path, share: float) -> None:
+    path = tmp_path / "r.zarr"
+    with capturing(SlowDisk(share * LOAD.bytes_per_s)) as capture:
+        capture.start(path, recording_spec(LOAD, capture.clock))
+        check_graceful_end(capture, path)
+
+
+@pytest.mark.needs_throttle
+def test_a_disk_that_the_kernel_slows_down(tmp_path: Path) -> None:
+    """From some moment on it takes a fifth of what comes; direct writes feel that at once."""
+    path = tmp_path / "r.zarr"
+    with capturing(DISK) as capture:
+        capture.start(path, recording_spec(LOAD, capture.clock))
+        until(lambda: capture.poll().committed_lines > 0)
+        pid = capture.pids["recorder"]
+        assert pid is not None
+        with Throttle(tmp_path, LOAD.bytes_per_s / 5) as throttle:
+            throttle.take(pid)
+            check_graceful_end(capture, path)
+
+
+@pytest.mark.parametrize(
+    ("number", "wholly"), [(errno.ENOSPC, False), (errno.EIO, False), (errno.EROFS, True)]
+)
+def test_a_disk_that_fails_acknowledges_nothing_more(tmp_path: Path, number: int, wholly: bool) -> None:
+    """Sealed as aborted with what is there; on a disk that takes nothing any more, left as committed last."""
+    path = tmp_path / "r.zarr"
+    disk = FailingDisk(number, 4 * 2**20, tmp_path / "failed", wholly)
+    with capturing(disk) as capture:
+        capture.start(path, recording_spec(LOAD, capture.clock))
+        seen, acknowledged = until_done(capture, path)
+        assert seen.condition == "ABORTED"
+        assert os.strerror(number) in str(seen.end_reason)
+        assert ("not sealed" in str(seen.end_reason)) is wholly
+        assert acknowledged > 0
+        recording = open_recording(path)
+        assert recording.lines >= acknowledged
+        assert recording.state == ("recording" if wholly else "sealed")
+        assert verify(path).intact
+        check_lines(path)
+        capture.close()
+        assert [orphan.path for orphan in capture.poll().orphans] == ([path] if wholly else [])
+
+
+# ---- when a backlog is one
+
+
+@given(st.floats(0.02, 0.98), st.integers(16, 1000))
+def test_a_ring_that_fills_in_small_steps_is_told_before_it_is_full(share: float, slots: int) -> None:
+    """``share`` of what comes is taken, of a ring of a second: looks from 0.9 on come before it overflows."""
+    growth, step_s = 1 / share - 1, 1 / slots / share
+    assume(growth < (1 - NEARLY_FULL) * slots - 1)
+    backlog, fill, now_s = Backlog(), 0.0, 0.0
+    while not backlog.grows(int(fill), slots, now_s):
+        fill, now_s = fill + growth, now_s + step_s
+        assert fill <= slots
+
+
+@given(st.lists(st.integers(0, 100), min_size=1), st.floats(0, 1))
+def test_what_empties_is_none(pauses: list[int], step_s: float) -> None:
+    """After each pause the ring is fuller, even full; then it empties by one with every block."""
+    backlog, now_s = Backlog(), 0.0
+    assert not backlog.grows(0, 100, now_s)
+    for pause in pauses:
+        for fill in range(pause, 0, -1):
+            assert not backlog.grows(fill, 100, now_s)
+            now_s += step_s
+
+
+def test_a_ring_that_begins_full_is_given_time() -> None:
+    backlog = Backlog()
+    assert not any(backlog.grows(100, 100, now_s) for now_s in range(100))
+    assert not backlog.grows(49, 100, 100)
+    assert not backlog.grows(95, 100, 101)
+    assert not backlog.grows(95, 100, 101 + PATIENCE_S / 2)  # after a pause
+    assert backlog.grows(95, 100, 101 + PATIENCE_S)
