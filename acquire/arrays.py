@@ -10,7 +10,7 @@ inside an iteration. What an iteration does read are scalars: whether its residu
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import array_api_compat
@@ -48,6 +48,10 @@ class Arrays:
     def indices(self, given: NDArray[np.int64]) -> Array:
         """Integers for ``take``."""
         return self.xp.asarray(given, device=self.device)
+
+    def exact(self) -> Arrays:
+        """The same in float64."""
+        return replace(self, dtype="float64")
 
     @property
     def compiled(self) -> bool:
