@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from acquire.recon.problem import Operator, Problem
     from acquire.recon.request import Request
 
-FIRST_LOOK = 90
+FIRST_LOOK = 60
 """Iterations in the cosines before patterns are looked for."""
 FIRST_LOOK_SHARE = 0.9
 """Of a budget, the most that the first look may take."""

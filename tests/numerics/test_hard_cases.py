@@ -167,7 +167,7 @@ def test_a_wrong_orientation_is_said() -> None:
 
 
 def test_twist_survives_an_underestimated_norm() -> None:
-    """Monotone: where the step is too long nothing is taken, so the objective never rises."""
+    """Where the step is too long nothing is taken, so the objective never rises above its start."""
     problem = pose(segment(), 3, 1, hold_out=0.0)
     whole = DualArm(GEOMETRY, CODE, 3, 1)
     loud = MaskedOperator(whole, problem.weight / np.float32(0.7 * problem.norm))

@@ -137,7 +137,7 @@ def test_a_budget_is_kept_and_progress_is_told() -> None:
     steps: list[Progress] = []
     result = reconstruct(segment(), 3, 1, budget_s=1e-6, progress=steps.append)
     assert result.iterations == len(steps) == 1
-    assert steps[0].iterations == result.iterations_asked == 100
+    assert steps[0].iterations == result.iterations_asked == 150
     assert result.ended == "budget"
 
 
