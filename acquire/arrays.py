@@ -5,7 +5,8 @@
 
 The solvers ask `namespace` for the functions of whatever array they hold. Lines, weights and bases are made
 on the host; `Arrays.asarray` is the one way to the device, `host` the one way back, and neither is called
-inside an iteration. What an iteration does read are scalars: whether its residual is finite, or 0.
+inside an iteration (between rounds of them, for small matrices and the lines predicted). What an iteration
+does read are scalars: whether its residual is finite, or 0.
 """
 
 from __future__ import annotations
