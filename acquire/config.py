@@ -11,6 +11,7 @@ import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
+import numpy as np
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_validator
 
 from acquire.codes import TAPS, Code, ConstantCode, PrbsCode, mix_seed
@@ -20,7 +21,7 @@ from acquire.errors import ConfigError
 from acquire.event_config import CheckConfig, EventsConfig
 from acquire.geometry import Geometry
 from acquire.plan_config import ReconstructionPlan
-from acquire.recording_config import RecordingConfig
+from acquire.recording_config import USUAL_CHUNK_BYTES, RecordingConfig, usual_chunk_lines
 from acquire.scene_config import SceneConfig, SceneFile, VideoSceneConfig, anchored
 
 if TYPE_CHECKING:
@@ -191,6 +192,17 @@ class RigConfig(FrozenModel):
             return self.stream.ring_slots
         past = math.ceil(seconds * self.line_rate_hz / self.stream.block_lines) + 1
         return past + max(2, math.ceil(past / (RING_RESERVE_SHARE - 1)))
+
+    @property
+    def chunk_lines(self) -> int:
+        """Lines per chunk of a recording. A block of some MB is one chunk: it is written without a copy."""
+        if self.recording.chunk_lines is not None:
+            return self.recording.chunk_lines
+        line_bytes = self.geometry.stages * np.dtype(self.cameras.a.dtype).itemsize
+        block_lines = self.stream.block_lines
+        if USUAL_CHUNK_BYTES // 4 <= block_lines * line_bytes <= USUAL_CHUNK_BYTES:
+            return block_lines
+        return usual_chunk_lines(line_bytes, self.line_rate_hz)
 
     @property
     def ring_reserve(self) -> int:

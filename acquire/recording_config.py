@@ -9,6 +9,17 @@ from pydantic import Field
 
 from acquire.effect_config import FrozenModel
 
+USUAL_CHUNK_BYTES = 4 * 2**20
+"""A cut reads whole chunks, so small ones are quicker to cut; a disk writes smaller ones more slowly."""
+USUAL_CHUNK_S = 0.1
+"""What is held in memory until its chunk is whole, in seconds of lines."""
+
+
+def usual_chunk_lines(line_bytes: int, line_rate_hz: float) -> int:
+    """Lines per chunk that suit lines of so many bytes at such a rate: a power of two, at least 16."""
+    most = min(USUAL_CHUNK_BYTES / line_bytes, USUAL_CHUNK_S * line_rate_hz)
+    return 1 << max(4, int(most).bit_length() - 1)
+
 
 class RetentionConfig(FrozenModel):
     """What of an endless recording is kept; the oldest lines go first, in whole files."""
@@ -27,8 +38,13 @@ class RecordingConfig(FrozenModel):
     """How recordings are written."""
 
     directory: Path = Path()
-    chunk_lines: int = Field(default=4096, ge=16, le=2**20, description="lines per chunk, and per commit")
-    shard_chunks: int = Field(default=64, ge=1, le=255, description="chunks per file")
+    chunk_lines: int | None = Field(
+        default=None,
+        ge=16,
+        le=2**20,
+        description="lines per chunk; absent: at most 4 MiB and a tenth of a second",
+    )
+    shard_chunks: int = Field(default=128, ge=1, le=255, description="chunks per file")
     codec: Literal["none", "lz4", "zstd", "auto"] = Field(
         default="none", description="'auto': the smallest that holds the rate here, measured at arm"
     )

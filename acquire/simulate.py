@@ -228,7 +228,7 @@ def _spec(config: RigConfig, scene: SceneConfig) -> RecordingSpec:
         cameras=cameras,
         config=config.model_dump(mode="json"),
         extra=describe(scene),
-        chunk_lines=recording.chunk_lines,
+        chunk_lines=config.chunk_lines,
         shard_chunks=recording.shard_chunks,
         codec="lz4" if recording.codec == "auto" else recording.codec,  # nothing has to be kept up with
         fsync=recording.fsync,

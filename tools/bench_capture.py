@@ -24,7 +24,7 @@ from acquire.capacity.search import best, search_rate
 LOADS = {
     "4640 px x 100 kHz": Load(4640, "uint8", 100_000.0),
     "4640 px x 100 kHz, lz4": Load(4640, "uint8", 100_000.0, codec="lz4"),
-    "54 px x 600 kHz": Load(54, "uint8", 600_000.0, block_lines=8192, chunk_lines=65536),
+    "54 px x 600 kHz": Load(54, "uint8", 600_000.0, block_lines=8192),
 }
 BARE_BYTES = 2 * 10**9
 PIECE_BYTES = 4 * 2**20

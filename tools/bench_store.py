@@ -2,7 +2,7 @@
 
 ``python tools/bench_store.py --out DIR`` alternates a bare O_DIRECT write of the same bytes with every case,
 so that each ratio is within one run. Lines are 4640 pixels of 8 bit, both arms, with the noise of photons of
-a sensor whose white is 20 000 electrons; chunks of 1024 lines lie in page-aligned memory, as in the ring.
+a sensor whose white is 20 000 electrons; chunks like the daemon's, in page-aligned memory as in the ring.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ import numpy as np
 from acquire.clock import ClockFit
 from acquire.codes import ConstantCode
 from acquire.lines import ARMS, TaggedBlock
+from acquire.recording_config import usual_chunk_lines
 from acquire.store import RecordingSpec, RecordingWriter, RunCondition, open_recording
 from acquire.store.codecs import CODECS, measure_codec
 from acquire.store.files import DISK
@@ -30,8 +31,9 @@ from acquire.store.pages import PAGE, aligned_bytes, open_direct, page_up
 from acquire.store.retention import shard_files
 from acquire.store.shard import shard_key
 
-PIXELS, CHUNK_LINES, SHARD_CHUNKS, SUBSTEPS = 4640, 1024, 64, 3
+PIXELS, SHARD_CHUNKS, SUBSTEPS = 4640, 128, 3
 LINE_RATE_HZ = 100_000
+CHUNK_LINES = usual_chunk_lines(PIXELS, LINE_RATE_HZ)
 HOUR_LINES = 3600 * LINE_RATE_HZ
 SHARD_LINES = CHUNK_LINES * SHARD_CHUNKS
 MIDDLE = HOUR_LINES // 2 // SHARD_LINES * SHARD_LINES
@@ -66,12 +68,12 @@ def spec(codec: str = "none", fsync: str = "seal") -> RecordingSpec:
         shard_chunks=SHARD_CHUNKS,
         codec=codec,
         fsync=fsync,
-        commit_lines=10 * CHUNK_LINES,
+        commit_lines=LINE_RATE_HZ // 10,
         reserve_bytes=0,
     )
 
 
-def chunk_memory(count: int = 4) -> list[np.ndarray]:
+def chunk_memory(count: int = 8) -> list[np.ndarray]:
     """Chunks of lines like those of a camera, on pages."""
     generator = np.random.default_rng(0)
     chunks = []

@@ -27,6 +27,7 @@ from acquire.config import GeometryConfig
 from acquire.device_config import CameraConfig, TriggerConfig
 from acquire.errors import DataError
 from acquire.lines import ARMS
+from acquire.recording_config import usual_chunk_lines
 from acquire.sim.clock import Wire
 from acquire.sim.pattern import PatternCameraOpener
 from acquire.sim.trigger_model import TriggerModel
@@ -60,8 +61,8 @@ class Load:
     stages: int = 64
     block_lines: int = 1024
     ring_slots: int = 64
-    chunk_lines: int = 1024
-    shard_chunks: int = 64
+    chunk_lines: int | None = None
+    shard_chunks: int = 128
     codec: Codec = "none"
     fsync: Literal["commit", "seal"] = "seal"
 
@@ -77,7 +78,7 @@ class Load:
             stages=config.geometry.stages,
             block_lines=stream.block_lines,
             ring_slots=config.ring_slots,
-            chunk_lines=recording.chunk_lines,
+            chunk_lines=config.chunk_lines,
             shard_chunks=recording.shard_chunks,
             codec="none" if recording.codec == "auto" else recording.codec,
             fsync=recording.fsync,
@@ -268,7 +269,7 @@ def recording_spec(load: Load, clock: ClockFit) -> RecordingSpec:
         trigger={},
         cameras=dict.fromkeys(ARMS, camera),
         config={},
-        chunk_lines=load.chunk_lines,
+        chunk_lines=load.chunk_lines or usual_chunk_lines(load.line_bytes // len(ARMS), load.line_rate_hz),
         shard_chunks=load.shard_chunks,
         codec=load.codec,
         fsync=load.fsync,

@@ -25,12 +25,12 @@ SAMPLE_BYTES = 4 * 2**20
 def storage_settings(config: RigConfig) -> dict[str, Any]:
     """Fields of a RecordingSpec that ``[recording]`` decides, but for an ``auto`` codec."""
     recording = config.recording
-    chunks = ceil(recording.commit_s * config.line_rate_hz / recording.chunk_lines)
+    chunks = ceil(recording.commit_s * config.line_rate_hz / config.chunk_lines)
     return {
-        "chunk_lines": recording.chunk_lines,
+        "chunk_lines": config.chunk_lines,
         "shard_chunks": recording.shard_chunks,
         "fsync": recording.fsync,
-        "commit_lines": chunks * recording.chunk_lines,
+        "commit_lines": chunks * config.chunk_lines,
         "reserve_bytes": round(recording.reserve_gb * 1e9),
         "retention": recording.retention and _retention(recording.retention, config),
     }

@@ -46,15 +46,16 @@ class ArmWriter:
             )
             for column in layout.line_columns(spec.dtype)
         }
+        self._pixels = next(iter(self._arrays.values()))
 
     @property
     def next_line(self) -> int:
-        return self._first_line + min(array.rows for array in self._arrays.values())
+        return self._first_line + self._pixels.rows
 
     @property
     def written_rows(self) -> int:
-        """Rows that are on disk in every array, in whole chunks."""
-        return min(array.written_rows for array in self._arrays.values())
+        """Rows that are on disk in every array, in whole chunks: pixels, which may be packed, come last."""
+        return self._pixels.written_rows
 
     @property
     def whole_rows(self) -> int:
@@ -80,7 +81,7 @@ class ArmWriter:
 
     def append(self, block: TaggedBlock) -> None:
         self._check(block)
-        for column, array in self._arrays.items():
+        for column, array in reversed(self._arrays.items()):  # pixels last: what they have, all have
             array.append(getattr(block, column.source))
 
     def pad(self) -> None:

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import zarr
 
-from acquire.errors import DataError
-from acquire.store.chunks import AbsentChunkError, ChunkReader, DamagedChunkError
+from acquire.store.chunks import ChunkReader
 from acquire.store.layout import line_columns
+from acquire.store.stretch import Stretch
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -105,33 +105,13 @@ class CameraStream:
         """The chunks of the array ``name``."""
         return self._readers[name]
 
+    def stretch(self, name: str, start: int, stop: int) -> Stretch:
+        """Rows ``start .. stop - 1`` of one array, to be read."""
+        return Stretch(self._readers[name], start, stop, self.first_line)
+
     def read(self, name: str, start: int, stop: int) -> NDArray[Any]:
         """Rows ``start .. stop - 1`` of one array; DataError when they are not intact on disk."""
-        try:
-            return self._readers[name].read(start, stop)
-        except AbsentChunkError as error:
-            raise DataError(
-                f"{self}/{name}: line {self.first_line + self._first_absent(name, start, stop)} is recorded, "
-                "but not on disk",
-                hint="`acquire verify` says which lines are left; a file was lost or cut short",
-            ) from error
-        except (DamagedChunkError, OSError) as error:
-            raise DataError(
-                f"{self}/{name}: lines {self.first_line + start} to {self.first_line + stop - 1} cannot be "
-                f"read: {error}",
-                hint="`acquire verify` says which lines are intact",
-            ) from error
-
-    def _first_absent(self, name: str, start: int, stop: int) -> int:
-        """The first of these rows whose chunk is not in its file."""
-        reader = self._readers[name]
-        size = reader.shape.chunk_rows
-        for chunk in range(start // size, -(-stop // size)):
-            try:
-                reader.entry(chunk)
-            except AbsentChunkError:
-                return max(start, chunk * size)
-        return start
+        return self.stretch(name, start, stop).read()
 
 
 def child_array(group: zarr.Group, name: str) -> zarr.Array[Any]:

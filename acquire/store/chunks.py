@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -37,37 +36,42 @@ class ChunkReader:
         self.shape, self.rows = parse_line_array(document)
         self._source = source
 
-    def read(self, start: int, stop: int) -> NDArray[Any]:
-        """Rows ``start .. stop - 1``. Raises `AbsentChunkError`, `DamagedChunkError`, OSError."""
-        size = self.shape.chunk_rows
-        rows = np.empty((stop - start, *self.shape.row_shape), self.shape.dtype)
-        for chunk in range(start // size, -(-stop // size)):
-            low, high = max(start, chunk * size), min(stop, (chunk + 1) * size)
-            rows[low - start : high - start] = self.chunk(chunk)[low - chunk * size : high - chunk * size]
-        return rows
+    def __str__(self) -> str:
+        return f"{self._source}/{self.key}"
 
-    def expect_index(self, start: int, stop: int) -> None:
-        """Rows ``start .. stop - 1`` will be read soon: their indices are fetched meanwhile."""
-        size = self.shape.shard_rows
-        for shard in range(start // size, -(-stop // size)):
-            with suppress(OSError):  # reading it says what is wrong
-                self._source.expect(self.shard_file(shard), 0, index_bytes(self.shape.shard_chunks))
+    def expect_index(self, shard: int) -> None:
+        """The index of a shard will be read soon: it is fetched meanwhile. Raises OSError."""
+        self._source.expect(self.shard_file(shard), 0, index_bytes(self.shape.shard_chunks))
 
-    def expect(self, start: int, stop: int) -> None:
-        """The same of the chunks themselves: a disk does best when it knows all of them at once."""
-        size = self.shape.chunk_rows
-        for chunk in range(start // size, -(-stop // size)):
-            with suppress(AbsentChunkError, DamagedChunkError, OSError):
-                self._source.expect(self.file(chunk), *self.entry(chunk))
+    def expect(self, number: int, offset: int, size: int) -> None:
+        """The same of a chunk itself: a disk does best when it knows all that is wanted at once."""
+        self._source.expect(self.file(number), offset, size)
+
+    def places(self, numbers: range) -> dict[int, tuple[int, int]]:
+        """Offset and size of these chunks, as far as they are on disk and their indices intact.
+
+        Each index is read once. Raises OSError.
+        """
+        found, per_shard = {}, self.shape.shard_chunks
+        for shard in range(numbers.start // per_shard, -(-numbers.stop // per_shard)):
+            entries, intact = self.index(shard)
+            for number in numbers if intact else ():
+                if number // per_shard == shard and ABSENT not in entries[number % per_shard]:
+                    offset, size = entries[number % per_shard].tolist()
+                    found[number] = offset, size
+        return found
 
     @property
     def chunks(self) -> int:
         """Chunks that the rows are in."""
         return -(-self.rows // self.shape.chunk_rows)
 
-    def chunk(self, number: int) -> NDArray[Any]:
-        """All rows of one chunk, with what pads it. Raises as `read` does."""
-        payload = self.payload(number, *self.entry(number))
+    def chunk(self, number: int, place: tuple[int, int] | None = None) -> NDArray[Any]:
+        """All rows of one chunk, with what pads it; ``place`` is its offset and size, if known.
+
+        Raises `AbsentChunkError`, `DamagedChunkError`, OSError.
+        """
+        payload = self.payload(number, *(place or self.entry(number)))
         try:
             samples = decode(payload, self.shape.codec)
         except (ValueError, RuntimeError) as error:

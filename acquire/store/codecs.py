@@ -10,8 +10,8 @@ import time
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-import google_crc32c
 import numpy as np
+from awscrt import checksums
 from numcodecs import blosc
 
 from acquire.errors import UsageError
@@ -105,8 +105,7 @@ def stored_size(header: bytes, size: int, codec: Codec) -> int:
 
 def crc32c(data: Buffer) -> bytes:
     """Checksum as Zarr stores it: 4 bytes, little-endian."""
-    # The library refuses memoryviews, but takes arrays.
-    value: int = google_crc32c.value(np.frombuffer(memoryview(data), np.uint8))
+    value: int = checksums.crc32c(data)
     return value.to_bytes(CRC_BYTES, "little")
 
 

@@ -55,14 +55,22 @@ def _is_taken(path: Path) -> bool:
 def write_all(fd: int, parts: Sequence[Buffer], offset: int) -> None:
     """Write all of ``parts`` from ``offset`` on; a short write goes on until the disk says why."""
     views = [memoryview(part).cast("B") for part in parts]
-    while views := [view for view in views if len(view)]:
-        written = os.pwritev(fd, views, offset)
+    left = sum(map(len, views))
+    while (written := os.pwritev(fd, views, offset)) < left:
         if written == 0:
             raise OSError(errno.EIO, "the disk takes no more bytes")
         offset += written
-        for number, view in enumerate(views):
-            views[number] = view[written:]
-            written -= min(written, len(view))
+        left -= written
+        views = _without(views, written)
+
+
+def _without(views: Sequence[memoryview], count: int) -> list[memoryview]:
+    """``views`` after their first ``count`` bytes."""
+    rest = []
+    for view in views:
+        rest.append(view[count:])
+        count -= min(count, len(view))
+    return [view for view in rest if len(view)]
 
 
 class ShardFile:

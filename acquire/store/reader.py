@@ -6,6 +6,7 @@ A `Recording` is a snapshot: of one that is still growing it shows what was comm
 
 from __future__ import annotations
 
+import math
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
     from acquire.store.layout import Document
     from acquire.store.source import Source
+    from acquire.store.stretch import Stretch
     from acquire.store.table_reader import Event, Gap
 
 CUT_COLUMNS = ("lines", "flags", "code", "code_index", "time")
@@ -192,25 +194,35 @@ class Recording:
         geometry = self.geometry_for(lines)
         if (pixels := self.arms["a"].pixels) != geometry.stages:
             raise UsageError(f"cut of lines with {pixels} pixels", possible=f"M = {geometry.stages} pixels")
-        arms = self.arms.values()
-        expected = [stream.reader(name) for stream in arms for name in CUT_COLUMNS]
-        for reader in expected:
-            reader.expect_index(start, stop)
-        for reader in expected:
-            reader.expect(start, stop)
-        samples = np.stack([stream.read("lines", start, stop) for stream in arms])
-        flags = np.stack([stream.read("flags", start, stop) for stream in arms])
+        stretches = self._fetched(start, stop)
+        samples = np.empty((len(ARMS), lines, pixels), self.arms["a"].dtype)
+        for arm, of_arm in zip(stretches.values(), samples, strict=True):
+            arm["lines"].read(out=of_arm)
+        flags = np.stack([arm["flags"].read() for arm in stretches.values()])
         return Segment(
             lines=samples,
             mask=self._usable(samples, flags),
-            code=self._checked_code(first_line, geometry, flags),
+            code=self._checked_code(first_line, geometry, flags, stretches),
             geometry=geometry,
-            time_ns=self.arms["a"].read("time", start, stop),
+            time_ns=stretches["a"]["time"].read(),
             first_line=first_line,
             substep_ns=self.line_period_ns / geometry.substeps,
             black_level_dn=self._per_arm("black_level_dn"),
             responsivity_dn=self._per_arm("responsivity_dn"),
         )
+
+    def _fetched(self, start: int, stop: int) -> dict[str, dict[str, Stretch]]:
+        """Arm → array → its rows ``start .. stop - 1``, all on their way from the disk at once."""
+        found = {
+            arm: {name: stream.stretch(name, start, stop) for name in CUT_COLUMNS}
+            for arm, stream in self.arms.items()
+        }
+        stretches = [stretch for arm in found.values() for stretch in arm.values()]
+        for stretch in stretches:
+            stretch.expect_index()
+        for stretch in stretches:
+            stretch.expect()
+        return found
 
     def info(self) -> dict[str, Any]:
         """What one wants to know of a recording at a glance; everything is JSON."""
@@ -287,24 +299,27 @@ class Recording:
         return a if a == b else (a, b)
 
     def _usable(self, samples: NDArray[Any], flags: NDArray[np.uint16]) -> NDArray[np.bool_]:
-        white = np.array(self._camera_numbers("white_dn"))[:, None, None]
-        usable: NDArray[np.bool_] = (samples < white) & ((flags & UNUSABLE) == 0)[:, :, None]
+        usable = np.empty(samples.shape, np.bool_)
+        for arm, white in enumerate(self._camera_numbers("white_dn")):
+            np.less(samples[arm], math.ceil(white), out=usable[arm])  # whole numbers: many times faster
+        usable[(flags & UNUSABLE) != 0] = False
         return usable
 
     def _checked_code(
-        self, first_line: int, geometry: Geometry, flags: NDArray[np.uint16]
+        self,
+        first_line: int,
+        geometry: Geometry,
+        flags: NDArray[np.uint16],
+        stretches: dict[str, dict[str, Stretch]],
     ) -> NDArray[np.uint8]:
         """E of the segment from the attributes, compared with what stands beside each line of either arm."""
         S, lines = geometry.substeps, geometry.lines
         bits = code_from_attrs(self.attrs["code"]).bits(S * first_line, geometry.span)
         index = S * np.arange(first_line, first_line + lines, dtype=np.uint64)
         packed = np.packbits(bits[: S * lines].reshape(lines, S), axis=1, bitorder="little")[:, 0]
-        start = first_line - self.first_line
-        for stream, arm_flags in zip(self.arms.values(), flags, strict=True):
-            recorded = stream.read("code", start, start + lines)
-            recorded_index = stream.read("code_index", start, start + lines)
-            wrong = (recorded != packed) | (recorded_index != index)
-            self._refuse_code(stream, first_line, wrong & ((arm_flags & LineFlag.MISSING) == 0))
+        for (arm, columns), arm_flags in zip(stretches.items(), flags, strict=True):
+            wrong = (columns["code"].read() != packed) | (columns["code_index"].read() != index)
+            self._refuse_code(self.arms[arm], first_line, wrong & ((arm_flags & LineFlag.MISSING) == 0))
         return bits
 
     def _refuse_code(self, stream: CameraStream, first_line: int, wrong: NDArray[np.bool_]) -> None:

@@ -99,7 +99,11 @@ class ShardWriter:
         self._file = disk.create(path, direct=direct)
         self._in_pages = direct
         self._index = np.full((chunks, 2), ABSENT, np.uint64)
-        self._file.write([pack_index(self._index)], 0)
+        try:
+            self._file.write([pack_index(self._index)], 0)
+        except OSError:
+            self._file.close()  # a full disk still makes names
+            raise
         self._end = PAGE
         self.chunks = 0
         """Written."""

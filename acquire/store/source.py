@@ -49,22 +49,23 @@ class LocalSource:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._root = str(path)
 
     def __str__(self) -> str:
-        return str(self.path)
+        return self._root
 
     def read(self, key: str) -> bytes:
         return (self.path / key).read_bytes()
 
     def read_range(self, key: str, start: int, size: int) -> bytes:
-        fd = os.open(self.path / key, os.O_RDONLY | os.O_CLOEXEC)
+        fd = os.open(f"{self._root}/{key}", os.O_RDONLY | os.O_CLOEXEC)
         try:
             return os.pread(fd, size, start)
         finally:
             os.close(fd)
 
     def expect(self, key: str, start: int, size: int) -> None:
-        fd = os.open(self.path / key, os.O_RDONLY | os.O_CLOEXEC)
+        fd = os.open(f"{self._root}/{key}", os.O_RDONLY | os.O_CLOEXEC)
         try:
             os.posix_fadvise(fd, start, size, os.POSIX_FADV_WILLNEED)
         finally:

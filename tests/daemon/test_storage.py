@@ -45,3 +45,24 @@ def test_a_codec_is_chosen_for_the_rig(tmp_path):
     assert choice.codec in ("none", "lz4", "zstd")
     assert choice.needed_megabytes_per_s == pytest.approx(1.5 * 2 * 33333.3 * 64 * 2 / 1e6, rel=1e-3)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("stages", "substep_ticks", "block_lines", "chunk_lines"),
+    [
+        (192, 300, 1024, 8192),  # 100 kHz: a tenth of a second
+        (4096, 300, 1024, 512),  # 16 bit: 4 MiB
+        (4096, 300, 300, 300),  # a block of some MB is written as it lies in the ring
+        (54, 90_000, 256, 32),  # 333 Hz
+    ],
+)
+def test_chunks_suit_width_and_rate(stages, substep_ticks, block_lines, chunk_lines):
+    changes = {
+        "geometry.stages": stages,
+        "trigger.substep_ticks": substep_ticks,
+        "stream.block_lines": block_lines,
+    }
+    rig = load_rig("rig-demo", changes)
+    assert rig.chunk_lines == chunk_lines
+    assert storage_settings(rig)["commit_lines"] % chunk_lines == 0
+    assert load_rig("rig-demo", changes | {"recording.chunk_lines": 48}).chunk_lines == 48

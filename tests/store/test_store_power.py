@@ -337,7 +337,7 @@ class FailingFile(ShardFile):
 def test_a_disk_that_fails_at_any_step_acknowledges_nothing_false(tmp_path, number):
     spec = make_spec(fsync="commit", codec="none", shard_chunks=2)
     outcomes = set()
-    for allowed in range(0, 800, 31):
+    for allowed in range(0, 800, 23):
         path = tmp_path / f"{allowed}.zarr"
         outcome, acknowledged = attempt(path, spec, FailingDisk(allowed, number))
         outcomes.add(outcome)

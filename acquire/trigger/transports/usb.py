@@ -73,6 +73,7 @@ class UsbTransport:
             self._device = self._find(vendor, product, serial, backend)
             self._in, self._out = self._claim()
         except (usb.core.USBError, NotImplementedError, ValueError) as error:
+            # pyusb: no backend is a ValueError, a call that this host's libusb lacks NotImplementedError
             self._lock.release()
             hint = _HINTS.get(getattr(error, "errno", None) or 0, "check cable and power")
             if isinstance(error, usb.core.NoBackendError):

@@ -1,0 +1,75 @@
+"""Some rows of one array, read in steps, so that a disk can take the same step of many arrays at once.
+
+::
+
+    expect_index ─▶ indices are on their way ─▶ expect ─▶ chunks are on their way ─▶ read
+
+The first two are hints: `read` does all that is left to do.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.errors import DataError
+from acquire.store.chunks import AbsentChunkError, DamagedChunkError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.store.chunks import ChunkReader
+
+
+class Stretch:
+    """Rows ``start .. stop - 1`` of an array; row 0 is the trigger's line ``first_line``."""
+
+    def __init__(self, reader: ChunkReader, start: int, stop: int, first_line: int) -> None:
+        self._reader, self._start, self._stop, self._first_line = reader, start, stop, first_line
+        size = reader.shape.chunk_rows
+        self._chunks = range(start // size, -(-stop // size))
+        self._places: dict[int, tuple[int, int]] = {}
+
+    def expect_index(self) -> None:
+        """The indices of the files will be read soon."""
+        per_shard = self._reader.shape.shard_chunks
+        for shard in range(self._chunks.start // per_shard, -(-self._chunks.stop // per_shard)):
+            with suppress(OSError):  # reading it says what is wrong
+                self._reader.expect_index(shard)
+
+    def expect(self) -> None:
+        """The chunks will be read soon."""
+        with suppress(OSError):
+            self._places = self._reader.places(self._chunks)
+            for chunk, place in self._places.items():
+                self._reader.expect(chunk, *place)
+
+    def read(self, out: NDArray[Any] | None = None) -> NDArray[Any]:
+        """The rows, into ``out`` if given. Raises DataError when they are not intact on disk."""
+        shape = self._reader.shape
+        rows = np.empty((self._stop - self._start, *shape.row_shape), shape.dtype) if out is None else out
+        size = shape.chunk_rows
+        for chunk in self._chunks:
+            low, high = max(self._start, chunk * size), min(self._stop, (chunk + 1) * size)
+            rows[low - self._start : high - self._start] = self._chunk(chunk)[
+                low - chunk * size : high - chunk * size
+            ]
+        return rows
+
+    def _chunk(self, chunk: int) -> NDArray[Any]:
+        try:
+            return self._reader.chunk(chunk, self._places.get(chunk))
+        except AbsentChunkError as error:
+            absent = max(self._start, chunk * self._reader.shape.chunk_rows)
+            raise DataError(
+                f"{self._reader}: line {self._first_line + absent} is recorded, but not on disk",
+                hint="`acquire verify` says which lines are left; a file was lost or cut short",
+            ) from error
+        except (DamagedChunkError, OSError) as error:
+            first, last = self._first_line + self._start, self._first_line + self._stop - 1
+            raise DataError(
+                f"{self._reader}: lines {first} to {last} cannot be read: {error}",
+                hint="`acquire verify` says which lines are intact, `acquire recover` masks the others",
+            ) from error
