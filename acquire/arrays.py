@@ -5,12 +5,13 @@
 
 The solvers ask `namespace` for the functions of whatever array they hold. Lines, weights and bases are made
 on the host; `Arrays.asarray` is the one way to the device, `host` the one way back, and neither is called
-inside an iteration. What an iteration does read are scalars: whether its residual is finite, or 0.
+inside an iteration (between rounds of them, for small matrices and the lines predicted). What an iteration
+does read are scalars: whether its residual is finite, or 0.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import array_api_compat
@@ -48,6 +49,10 @@ class Arrays:
     def indices(self, given: NDArray[np.int64]) -> Array:
         """Integers for ``take``."""
         return self.xp.asarray(given, device=self.device)
+
+    def exact(self) -> Arrays:
+        """The same in float64."""
+        return replace(self, dtype="float64")
 
     @property
     def compiled(self) -> bool:

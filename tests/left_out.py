@@ -14,8 +14,9 @@ from typing import Any
 import pytest
 from throttle import can_throttle
 
+from acquire.arrays import open_arrays
 from acquire.camera import aravis
-from acquire.errors import CameraError
+from acquire.errors import CameraError, UsageError
 from acquire.sim.gentl.build import compiler
 
 FAKE_GIGE = "arv-fake-gv-camera-0.8"
@@ -26,6 +27,14 @@ def _have_aravis() -> bool:
     try:
         aravis.load()
     except CameraError:
+        return False
+    return True
+
+
+def _have_gpu() -> bool:
+    try:
+        open_arrays("gpu")
+    except UsageError:
         return False
     return True
 
@@ -45,6 +54,7 @@ MISSING = {
     "needs_gige_camera": not (_have_aravis() and which(FAKE_GIGE)) and f"Aravis and {FAKE_GIGE}",
     "needs_compiler": not (compiler() and _HAVE_GENICAM) and "a C compiler and the genicam package",
     "needs_dask": importlib.util.find_spec("distributed") is None and "dask.distributed",
+    "needs_gpu": not _have_gpu() and "CuPy and a GPU",
     "needs_mount": not _can_mount() and "the right to mount a small file system",
     "needs_throttle": not can_throttle(Path(tempfile.gettempdir())) and "the right to slow a disk down",
     "needs_genicam": not _HAVE_GENICAM and "the genicam package",
@@ -55,6 +65,7 @@ _left_out: Counter[str] = Counter()
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "needs_compiler: builds the simulated GenTL producer")
     config.addinivalue_line("markers", "needs_dask: spreads work over a Dask cluster")
+    config.addinivalue_line("markers", "needs_gpu: computes on CUDA")
     config.addinivalue_line("markers", "needs_mount: fills a small file system of its own")
     config.addinivalue_line("markers", "needs_throttle: has the kernel slow a disk down for a process")
     config.addinivalue_line("markers", "needs_genicam: loads a GenTL producer")

@@ -96,8 +96,7 @@ def reconstruct(
 
     if out is None and not auto:
         raise UsageError("reconstruct without --out", possible="--out NAME.zarr")
-    if dask is None:
-        open_arrays(device, dtype)  # refused before anything is touched; a cluster's devices are not here
+    open_arrays(device if dask is None else "cpu", dtype)  # a cluster's devices are not here
     opened = open_recording(recording)
     asked = Asked(
         first_line=first_line,

@@ -13,20 +13,21 @@ and its Cholesky factor is the preconditioner that makes a few steps enough wher
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import cho_factor, cho_solve
 
-from acquire.forward import block_bounds
-from acquire.forward.kernels import blocks_to_pixels
+from acquire.arrays import dot, host
+from acquire.forward import column_merging
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from numpy.typing import NDArray
 
+    from acquire.arrays import Array, Arrays
     from acquire.lines import Segment
     from acquire.recon.basis import TemporalBasis
     from acquire.recon.problem import Problem
@@ -43,7 +44,7 @@ LARGEST_UNKNOWNS = 4096
 def fit_curves(
     segment: Segment,
     problem: Problem,
-    patterns: NDArray[Any],
+    patterns: Array,
     cosines: TemporalBasis,
     temporal_merge: int,
     start: NDArray[Any],
@@ -52,135 +53,152 @@ def fit_curves(
     """Curves (K, R) that explain the samples best with ``patterns`` (R, n, n), near ``start``.
 
     Patterns of like size make it well conditioned. Light to which the lines respond less than ``ridge``,
-    relative to the mean eigenvalue, hardly moves: to be set as high as the patterns are wrong.
+    relative to the mean eigenvalue, hardly moves: to be set as high as the patterns are wrong. Patterns and
+    cosines are where the problem's arrays are, curves on the host.
     """
-    problem = problem.on_host()
-    dtype = problem.arrays.dtype
+    arrays, exact = problem.arrays, problem.arrays.exact()
     whole = CurveOperator(segment, patterns, cosines, temporal_merge)
     operator = problem.masked(whole)
-    residual = problem.used_samples - operator.forward(start.astype(dtype))
+    residual = problem.used_samples - operator.forward(arrays.asarray(start))
     small = segment.geometry.span <= LARGEST_SPAN and start.size <= LARGEST_UNKNOWNS
-    precondition: Callable[[NDArray[Any]], NDArray[Any]]
+    precondition: Callable[[Array], Array]
     if small:
-        precondition, damping = _preconditioner(whole.gram() / problem.norm**2, start.shape, ridge)
+        gram = whole.gram() / problem.norm**2
+        precondition, damping = _preconditioner(gram, start.shape, ridge, arrays)
     else:
-        precondition, damping = np.copy, 0.0
+        precondition, damping = _same, 0.0
 
-    def normal(x: NDArray[Any]) -> NDArray[np.float64]:
-        back: NDArray[Any] = operator.adjoint(operator.forward(x.astype(dtype)))
-        return back.astype(np.float64) + damping * x
+    def normal(x: Array) -> Array:
+        return exact.asarray(operator.adjoint(operator.forward(arrays.asarray(x)))) + damping * x
 
-    right = operator.adjoint(residual).astype(np.float64)
-    return start + _conjugate_gradients(normal, right, precondition, STEPS if small else PLAIN_STEPS)
+    right = exact.asarray(operator.adjoint(residual))
+    change = _conjugate_gradients(normal, right, precondition, STEPS if small else PLAIN_STEPS)
+    fitted: NDArray[np.float64] = start + host(change)
+    return fitted
 
 
 class CurveOperator:
     """Lines of patterns whose curves are the unknown: (K, R) → (2, L_R, M), and the transpose."""
 
     def __init__(
-        self, segment: Segment, patterns: NDArray[Any], cosines: TemporalBasis, temporal_merge: int
+        self, segment: Segment, patterns: Array, cosines: TemporalBasis, temporal_merge: int
     ) -> None:
-        self._geometry, self._code = segment.geometry, segment.code.astype(patterns.dtype)
-        self._frame = np.arange(segment.geometry.span) // temporal_merge
-        self._begins = block_bounds(segment.geometry.span, temporal_merge)[0]
+        self._geometry, self._merge, self._rank = segment.geometry, temporal_merge, patterns.shape[0]
+        self._arrays, self._xp = cosines.arrays, cosines.arrays.xp
         self._width = segment.geometry.size + segment.geometry.substeps - 1
-        self._rank = len(patterns)
-        views = (patterns, np.rot90(patterns, 1, axes=(1, 2)))
-        self._profiles = [_profiles(np.ascontiguousarray(view), segment) for view in views]
-        self._matrix = cosines.matrix()
+        substeps = np.arange(segment.geometry.span)
+        windows = np.asarray(self._firsts)[:, None] + np.arange(self._width)
+        self._frame = self._arrays.indices(substeps // temporal_merge)
+        self._windows = self._arrays.indices(windows.ravel())
+        self._code = self._arrays.asarray(segment.code)
+        views = (patterns, self._xp.flip(self._xp.permute_dims(patterns, (0, 2, 1)), axis=1))
+        merging = self._arrays.asarray(column_merging(segment.geometry, 1))
+        self._profiles = [_profiles(self._xp, view, merging, segment.geometry.substeps) for view in views]
+        self._matrix = self._arrays.asarray(cosines.matrix())
 
-    def forward(self, curves: NDArray[Any]) -> NDArray[Any]:
+    def forward(self, curves: Array) -> Array:
         """Lines of the curves (K, R)."""
-        lit = (self._matrix.T @ curves)[self._frame] * self._code[:, None]
-        windows = sliding_window_view(lit, self._width, axis=0)[:: self._geometry.substeps]
-        flat = windows[: self._geometry.lines].reshape(self._geometry.lines, -1)
-        return np.stack([flat @ profile for profile in self._profiles])
+        xp, lines = self._xp, self._geometry.lines
+        lit = xp.take(self._matrix.T @ curves, self._frame, axis=0) * self._code[:, None]
+        windows = xp.reshape(xp.take(lit, self._windows, axis=0), (lines, self._width, self._rank))
+        flat = xp.reshape(xp.permute_dims(windows, (0, 2, 1)), (lines, -1))
+        return xp.stack([flat @ profile for profile in self._profiles])
 
-    def adjoint(self, lines: NDArray[Any]) -> NDArray[Any]:
+    def adjoint(self, lines: Array) -> Array:
         """(2, L_R, M) → (K, R)."""
-        back = lines[0] @ self._profiles[0].T + lines[1] @ self._profiles[1].T
-        windows = back.reshape(self._geometry.lines, -1, self._width).transpose(0, 2, 1)
-        light = np.zeros((self._geometry.span, self._rank), lines.dtype)
-        for first, window in zip(self._firsts, windows, strict=True):
-            light[first : first + self._width] += window
+        xp, (a, b) = self._xp, self._profiles
+        back = lines[0, ...] @ a.T + lines[1, ...] @ b.T
+        windows = xp.permute_dims(xp.reshape(back, (-1, self._rank, self._width)), (0, 2, 1))
+        light = self._arrays.zeros((self._geometry.span, self._rank))
+        for line, first in enumerate(self._firsts):
+            light[first : first + self._width, :] += windows[line, ...]
         return self._to_cosines(light * self._code[:, None])
 
-    def gram(self) -> NDArray[np.float64]:
-        """The normal matrix of all samples, unknowns in the order of (R, K)."""
-        K, R = len(self._matrix), self._rank
-        gram = np.empty((R, K, R, K))
+    def gram(self) -> Array:
+        """The normal matrix of all samples in float64, unknowns in the order of (R, K)."""
+        K, R, exact = self._matrix.shape[0], self._rank, self._arrays.exact()
+        gram = exact.zeros((R, K, R, K))
         # float64: congruence keeps it positive definite only as far as rounding does
-        shaped = [profile.astype(np.float64).reshape(R, self._width, -1) for profile in self._profiles]
+        shaped = [self._xp.reshape(exact.asarray(each), (R, self._width, -1)) for each in self._profiles]
         for k in range(R):
             for other in range(k + 1):
-                Q = sum(profile[k] @ profile[other].T for profile in shaped)
-                gram[k, :, other] = self._pair(np.asarray(Q))
-                gram[other, :, k] = gram[k, :, other].T
-        return gram.reshape(R * K, R * K)
+                pair = self._pair(sum(each[k, ...] @ each[other, ...].T for each in shaped))
+                gram[k, :, other, :], gram[other, :, k, :] = pair, pair.T
+        return self._xp.reshape(gram, (R * K, R * K))
 
-    def _pair(self, Q: NDArray[Any]) -> NDArray[Any]:
+    def _pair(self, Q: Array) -> Array:
         """D·(E·Eᵀ ∘ Σ_i Q shifted by iS)·Dᵀ for one pair of patterns."""
-        total = np.zeros((self._geometry.span, self._geometry.span), Q.dtype)
+        total = self._arrays.exact().zeros((self._geometry.span, self._geometry.span))
         for first in self._firsts:
             total[first : first + self._width, first : first + self._width] += Q
         total *= self._code[:, None]
         total *= self._code
-        return self._to_cosines(np.ascontiguousarray(self._to_cosines(total).T)).T
+        return self._to_cosines(self._to_cosines(total).T).T
 
     @property
     def _firsts(self) -> range:
         return range(0, self._geometry.lines * self._geometry.substeps, self._geometry.substeps)
 
-    def _to_cosines(self, light: NDArray[Any]) -> NDArray[Any]:
+    def _to_cosines(self, light: Array) -> Array:
         """(T, …) → (K, …): sub-steps summed to frames, frames analysed."""
-        merged = light if len(self._begins) == len(light) else np.add.reduceat(light, self._begins, axis=0)
-        analysed: NDArray[Any] = self._matrix @ merged
-        return analysed
+        if self._merge > 1:
+            xp, missing = self._xp, -light.shape[0] % self._merge
+            dark = xp.zeros((missing, light.shape[1]), dtype=light.dtype, device=light.device)
+            frames = xp.reshape(xp.concat([light, dark]), (-1, self._merge, light.shape[1]))
+            light = xp.sum(frames, axis=1)
+        return self._matrix @ light
 
 
 def _preconditioner(
-    gram: NDArray[np.float64], shape: tuple[int, ...], ridge: float
-) -> tuple[Callable[[NDArray[Any]], NDArray[Any]], float]:
-    """Solver of (G + damping)·x = b for x, b of ``shape`` (K, R), and the damping."""
-    damping = max(ridge * float(np.trace(gram)) / len(gram), float(np.finfo(np.float32).tiny))
-    gram[np.diag_indices_from(gram)] += damping
-    factor = cho_factor(gram, lower=True, overwrite_a=True)
+    gram: Array, shape: tuple[int, ...], ridge: float, arrays: Arrays
+) -> tuple[Callable[[Array], Array], float]:
+    """Solver of (G + damping)·x = b for x, b of ``shape`` (K, R), and the damping.
 
-    def solve(right: NDArray[Any]) -> NDArray[Any]:
-        solved: NDArray[Any] = cho_solve(factor, right.T.ravel()).reshape(shape[::-1]).T
-        return solved
+    The standard has no triangular solver: elsewhere than on the host the inverse stands in.
+    """
+    xp, count = arrays.xp, gram.shape[0]
+    damping = max(ridge * float(xp.linalg.trace(gram)) / count, float(np.finfo(np.float32).tiny))
+    apply: Callable[[Array], Array]
+    if arrays.compiled:
+        gram[np.diag_indices_from(gram)] += damping
+        apply = partial(cho_solve, cho_factor(gram, lower=True, overwrite_a=True))
+    else:
+        apply = partial(xp.matmul, xp.linalg.inv(gram + damping * arrays.exact().asarray(np.eye(count))))
+
+    def solve(right: Array) -> Array:
+        return xp.reshape(apply(xp.reshape(right.T, (-1,))), shape[::-1]).T
 
     return solve, damping
 
 
+def _same(x: Array) -> Array:
+    return x
+
+
 def _conjugate_gradients(
-    normal: Callable[[NDArray[Any]], NDArray[Any]],
-    right: NDArray[Any],
-    precondition: Callable[[NDArray[Any]], NDArray[Any]],
-    steps: int,
-) -> NDArray[np.float64]:
-    x, residual = np.zeros(right.shape), right.copy()
-    scaled = precondition(residual)
-    direction, energy = scaled.copy(), float(np.vdot(residual, scaled))
+    normal: Callable[[Array], Array], right: Array, precondition: Callable[[Array], Array], steps: int
+) -> Array:
+    x, residual = 0 * right, right
+    direction = scaled = precondition(residual)
+    energy = float(dot(residual, scaled))
     for _ in range(steps):
         image = normal(direction)
-        curvature = float(np.vdot(direction, image))
+        curvature = float(dot(direction, image))
         if not energy > 0 or not curvature > 0:
             break
         x += (energy / curvature) * direction
-        residual -= (energy / curvature) * image
+        residual = residual - (energy / curvature) * image
         scaled = precondition(residual)
-        energy, before = float(np.vdot(residual, scaled)), energy
+        energy, before = float(dot(residual, scaled)), energy
         direction = scaled + (energy / before) * direction
     return x
 
 
-def _profiles(view: NDArray[Any], segment: Segment) -> NDArray[Any]:
+def _profiles(xp: Any, view: Array, merging: Array, S: int) -> Array:
     """P_k(s) = Σ_u Z_k(s − u), columns merged to pixels: (R·(n + S − 1), M)."""
     rank, n, _ = view.shape
-    S = segment.geometry.substeps
-    pixels = blocks_to_pixels(view.reshape(rank * n, n), n, S, 1).reshape(rank, n, -1)
-    summed = np.zeros((rank, n + S - 1, pixels.shape[2]), view.dtype)
-    for u in range(S):
-        summed[:, u : u + n] += pixels
-    return summed.reshape(-1, pixels.shape[2])
+    pixels = xp.reshape(xp.reshape(view, (rank * n, n)) @ merging, (rank, n, -1))
+    none = xp.zeros_like(pixels[:, : S - 1, :])
+    padded = xp.concat([none, pixels, none], axis=1)
+    summed = sum(padded[:, S - 1 - u : 2 * S - 2 - u + n, :] for u in range(S))
+    return xp.reshape(summed, (-1, pixels.shape[2]))

@@ -175,21 +175,21 @@ class Refinement:
         )
 
     def _fit_curves(self) -> None:
-        """New curves for the patterns, made orthonormal again with as little turning as possible.
-
-        A small problem in float64, solved on the host between two rounds.
-        """
-        shape, flat = self.found.patterns.shape, host(self.found.patterns).reshape(self.rank, -1)
-        gram = (flat @ flat.T).astype(np.float64)
+        """New curves for the patterns, made orthonormal again with as little turning as possible."""
+        patterns, arrays, exact = self.found.patterns, self._problem.arrays, self._problem.arrays.exact()
+        flat = exact.xp.reshape(exact.asarray(patterns), (self.rank, -1))
+        gram = host(flat @ flat.T)
         root = np.linalg.cholesky(gram + 1e-6 * np.trace(gram) * np.eye(self.rank))
         # orthonormal patterns make the fit well conditioned; their sizes go to the curves meanwhile
-        unit = np.linalg.solve(root, flat).astype(flat.dtype).reshape(shape)
+        unit = arrays.xp.reshape(arrays.asarray(exact.asarray(np.linalg.inv(root)) @ flat), patterns.shape)
         merge = self._temporal_merge
         start = self.found.curves @ root
         fitted = fit_curves(self._segment, self._problem, unit, self._cosines, merge, start, RIDGE)
         left, middle, right = np.linalg.svd(np.linalg.solve(root.T, fitted.T).T, full_matrices=False)
-        turned = (right.T * middle) @ right @ flat
-        self.found = Patterns((left @ right).astype(flat.dtype), turned.reshape(shape))
+        turned = exact.asarray((right.T * middle) @ right) @ flat
+        self.found = Patterns(
+            (left @ right).astype(arrays.dtype), arrays.xp.reshape(arrays.asarray(turned), patterns.shape)
+        )
 
     def _loosen(self) -> None:
         now, first = self.parameters, self._first

@@ -228,7 +228,8 @@ class Lit:
         self, segment: Segment, problem: Problem, request: Request, image: NDArray[Any], clock: IterationClock
     ) -> None:
         frames = segment.geometry.video_shape(request.spatial_merge, request.temporal_merge)[0]
-        self._problem, arrays = problem, problem.on_host().arrays
+        self._problem = problem = problem.on_host()
+        arrays = problem.arrays
         self._image, self._merge = image.astype(arrays.dtype), request.spatial_merge
         basis = TemporalBasis(frames, frames, arrays)
         patterns = self._image[None] / np.linalg.norm(self._image)
@@ -242,7 +243,7 @@ class Lit:
         self._light = np.interp(np.arange(frames), np.flatnonzero(seen), light[seen]).astype(arrays.dtype)
 
     def predict(self) -> NDArray[Any]:
-        return self._operator.forward(self._coefficients) / self._problem.norm
+        return host(self._operator.forward(self._coefficients)) / self._problem.norm
 
     def video(self) -> NDArray[Any]:
         video: NDArray[Any] = self._light[:, None, None] * merge_video(self._image[None], self._merge, 1)

@@ -36,11 +36,11 @@ ROUNDING = 1e-9
 """Relative; of float64 over ten iterations."""
 
 
-@pytest.fixture
-def strict(monkeypatch: pytest.MonkeyPatch) -> str:
-    """The name of that device, as `reconstruct` takes it."""
+@pytest.fixture(params=["strict", pytest.param("gpu", marks=pytest.mark.needs_gpu)])
+def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """That device, and a GPU where there is one, by the name that `reconstruct` takes."""
     monkeypatch.setitem(arrays.DEVICES, "strict", lambda: (array_api_strict, DEVICE))
-    return "strict"
+    return str(request.param)
 
 
 @pytest.fixture(scope="module")
@@ -129,21 +129,21 @@ def test_total_variation_is_that_of_the_compiled_loops(weight: float | np.ndarra
 
 @pytest.mark.parametrize("solver", ["admm", "twist", "twist-band"])
 @pytest.mark.parametrize("merges", [(3, 1), (1, 60)])
-def test_a_whole_reconstruction(strict: str, segment: Segment, solver: str, merges: tuple[int, int]) -> None:
+def test_a_whole_reconstruction(device: str, segment: Segment, solver: str, merges: tuple[int, int]) -> None:
     options = {"solver": solver, "iterations": 10, "bandwidth": 0.2, "dtype": "float64"}
     here = reconstruct(segment, *merges, **options)
-    there = reconstruct(segment, *merges, **options, device=strict)
+    there = reconstruct(segment, *merges, **options, device=device)
     assert difference(there, here) < ROUNDING
     assert there.quality.misfit == pytest.approx(here.quality.misfit, rel=1e-6)
 
 
-def test_every_stage_of_the_default(strict: str, segment: Segment) -> None:
+def test_every_stage_of_the_default(device: str, segment: Segment) -> None:
     """The bandwidth, the cosines, then patterns and curves.
 
     Over so many steps rounding grows to what a change of the samples by 1e-7 does: both are right as far.
     """
-    for device in ("cpu", strict):
-        result = reconstruct(segment, 3, 1, iterations=120, device=device)
+    for where in ("cpu", device):
+        result = reconstruct(segment, 3, 1, iterations=120, device=where)
         assert "patterns" in result.parameters
         assert result.video.dtype == np.float32
         assert error(result) < 0.2
@@ -166,7 +166,7 @@ def test_patterns_and_curves(segment: Segment) -> None:
     np.testing.assert_allclose(*videos, atol=1e-7)
 
 
-def test_a_warm_start_and_a_denoiser(strict: str, segment: Segment) -> None:
+def test_a_warm_start_and_a_denoiser(device: str, segment: Segment) -> None:
     first = reconstruct(segment, 3, 1, iterations=5, bandwidth=0.2)
     options = {
         "iterations": 5,
@@ -175,7 +175,7 @@ def test_a_warm_start_and_a_denoiser(strict: str, segment: Segment) -> None:
         "denoiser": HaarShrink(2),
         "dtype": "float64",
     }
-    here, there = (reconstruct(segment, 3, 1, **options, device=device) for device in ("cpu", strict))
+    here, there = (reconstruct(segment, 3, 1, **options, device=where) for where in ("cpu", device))
     assert difference(there, here) < ROUNDING
 
 
@@ -197,7 +197,7 @@ def test_every_solver_is_as_good_in_either_precision(segment: Segment, solver: s
         for kind in ("float32", "float64")
     )
     assert double.video.dtype == np.float64
-    assert error(single) == pytest.approx(error(double), rel=0.1)
+    assert error(single) == pytest.approx(error(double), rel=0.1, abs=0.05)
 
 
 def test_devices_that_are_not_there(monkeypatch: pytest.MonkeyPatch, segment: Segment) -> None:
