@@ -87,6 +87,41 @@ def test_noise_is_not_a_few_patterns() -> None:
     assert find_patterns(frames[:10]) is None
 
 
+def spectrum(*singular: float) -> np.ndarray:
+    """Coefficient frames (40, 12, 12) whose singular values begin with these and go on at 0.009."""
+    rng = np.random.default_rng(1)
+    left, right = (np.linalg.qr(rng.standard_normal((size, 40)))[0] for size in (40, 144))
+    values = np.full(40, 0.009)
+    values[: len(singular)] = singular
+    return ((left * values) @ right.T).reshape(40, 12, 12).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("singular", "rank"),
+    [
+        ((1, 0.27, 0.2, 0.12, 0.034, 0.026), 4),  # a gap: what follows stands out, but not as a scene
+        ((1, 0.5, 0.3, 0.2, 0.12, 0.08, 0.05), 7),  # no gap but the last
+        ((1, 0.1, 0.09, 0.08, 0.032, 0.031, 0.012), 6),  # the still does not hide what moves before it
+    ],
+)
+def test_patterns_end_at_a_gap_that_leaves_little_out(singular: tuple[float, ...], rank: int) -> None:
+    found = find_patterns(spectrum(*singular))
+    assert found is not None
+    assert len(found.patterns) == rank
+
+
+def test_more_iterations_do_not_spoil_the_picture() -> None:
+    wanted = TRUTH.reshape(-1, 12, 3, 12, 3).mean((2, 4))[GEOMETRY.trusted]
+    noise = np.random.default_rng(5).normal(0, 0.3, GEOMETRY.lines_shape)
+    noisy = replace(segment(), lines=segment().lines + noise)
+
+    def error(iterations: int) -> float:
+        result = reconstruct(noisy, 3, 1, iterations=iterations)
+        return float(np.mean((result.video[result.trusted] - wanted) ** 2))
+
+    assert error(400) <= 1.05 * error(120)
+
+
 def test_the_bandwidth_is_found_from_the_lines() -> None:
     slow = estimate_coefficients(segment(), 3, 1)
     assert slow == 32
