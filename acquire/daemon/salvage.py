@@ -86,7 +86,8 @@ class Salvage:
     def add(self, orphans: Iterable[Orphan]) -> None:
         """Recover what a run has left; what is known already is passed over."""
         for orphan in orphans:
-            if orphan.path not in self._found:
+            found = self._tasks.get(orphan.path)  # the search may have met it while it was being written
+            if orphan.path not in self._found or (found is not None and not found.ours):
                 log.warning("%s was not sealed: %s", orphan.path, orphan.why)
                 self._queue(Task(orphan.path, orphan.why, ours=True))
 
@@ -152,12 +153,19 @@ class Salvage:
         ]
         ended: list[RecoveryStatus] = []
         for task in sorted(able, key=lambda task: not task.ours):
-            hindrance = _hindrance(task.path)
+            hindrance = _hindrance(task.path) or self._spawn(task)
             if hindrance is None:
-                self._under_way, self._worker = task, Worker("salvage", salvage, task)
                 break
             ended += self._heed(task, hindrance)
         return ended
+
+    def _spawn(self, task: Task) -> RecoveryStatus | None:
+        try:
+            self._worker = Worker("salvage", salvage, task)
+        except DeviceError as error:
+            return RecoveryStatus(path=task.path, state="failed", text=str(error))
+        self._under_way = task
+        return None
 
     def _hear(self) -> list[RecoveryStatus]:
         worker, task = self._worker, self._under_way
@@ -246,9 +254,14 @@ def _salvage(mailbox: Mailbox, task: Task) -> RecoveryStatus:
         return RecoveryStatus(path=path, state="waiting", text=error.message)
     except (AcquireError, OSError) as error:
         return RecoveryStatus(path=path, state="failed", text=str(error))
-    added = done.lines - done.lines_before
-    text = f"{done.lines} lines, {added} of them not committed before; {reason}"
-    return RecoveryStatus(path=path, state="recovered", lines=done.lines, text=text)
+    sealed = read_root(LocalSource(path))["attributes"]
+    return RecoveryStatus(
+        path=path,
+        state="recovered",
+        lines=done.lines,
+        condition=sealed["run_condition"],
+        text=str(sealed["end_reason"]),
+    )
 
 
 def _ask(mailbox: Mailbox) -> None:
