@@ -42,6 +42,8 @@ AGAIN_S = 5.0
 MOST_TRIES = 6
 MOST_LISTED = 32
 """Recordings of which the status tells, the latest: more than one run can leave."""
+RECOVERED = "recovered: "
+"""How the end reason begins of a recording that was recovered."""
 _NICE = 10
 _END_S = 5.0
 _POLL_S = 0.02
@@ -176,7 +178,7 @@ class Salvage:
         if said is None and death is None:
             return []
         self._worker = self._under_way = None
-        _end(worker, time.monotonic() + _END_S)
+        _end(worker, _END_S)
         if not isinstance(said, RecoveryStatus):
             why = said.error if isinstance(said, Failed) else death
             said = RecoveryStatus(path=task.path, state="failed", text=f"the recovering process: {why}")
@@ -193,18 +195,19 @@ class Salvage:
             said = said.model_copy(update={"state": "left"})
             self._tell(said)
         level = logging.INFO if said.state == "recovered" else logging.WARNING
-        log.log(level, "%s %s: %s", said.path, said.state, said.text)
+        log.log(level, "%s %s: %s", said.path, said.state, said.text.removeprefix(RECOVERED))
         return [said]
 
     def _stand_back(self) -> None:
         worker, self._worker, self._under_way = self._worker, None, None
         if worker is not None:
-            _end(worker, time.monotonic() + _END_S)
+            _end(worker, 0.0)
 
 
-def _end(worker: Worker, deadline: float) -> None:
-    with contextlib.suppress(DeviceError):  # it took force: what it was at can begin anew
-        worker.end(deadline)
+def _end(worker: Worker, within_s: float) -> None:
+    """By force after a while, which costs nothing: what was cut off begins anew."""
+    with contextlib.suppress(DeviceError):
+        worker.end(time.monotonic() + within_s)
 
 
 def _hindrance(path: Path) -> RecoveryStatus | None:
@@ -247,7 +250,7 @@ def _salvage(mailbox: Mailbox, task: Task) -> RecoveryStatus:
         attributes = read_root(LocalSource(path))["attributes"]
         if not is_here(attributes):
             return RecoveryStatus(path=path, state="left", text=_ELSEWHERE)
-        reason = f"recovered: {task.why}" if task.why else Circumstances().reason
+        reason = f"{RECOVERED}{task.why}" if task.why else Circumstances().reason
         known = Circumstances(reason, committed_intact=has_run_on(attributes), alone=False)
         done = recover(path, progress=lambda *_: _ask(mailbox), known=known)
     except StateError as error:
@@ -265,7 +268,7 @@ def _salvage(mailbox: Mailbox, task: Task) -> RecoveryStatus:
 
 
 def _ask(mailbox: Mailbox) -> None:
-    """Ends the process, by an exception, once its owner wants that."""
+    """Ends the process, by an exception, once its owner has gone."""
     mailbox.take()
 
 
