@@ -5,11 +5,10 @@
     pattern cameras, time-compressed ─▶ … armed, recorded, stopped, again and again …
     meanwhile: a camera goes and comes back · a camera drops blocks · the recorder is stopped for a while
 
-``python -m tools.soak --hours 8 --minutes 4`` simulates 8 hours of lines at 2 kHz. At the end of every cycle
-the memory of each process is noted, and descriptors and threads of the owner, which alone outlives a
-cycle; and every other second, which ``--cycle 60`` makes worth while for those that begin anew with each cycle.
-Every recording is read again to the line by a process of its own: what malloc keeps of that is not the
-capture's.
+``python -m tools.soak --hours 8 --minutes 4`` simulates 8 hours of lines at 2 kHz. At the end of every cycle,
+and every other second of it, the memory of each process is noted; of the owner, which alone outlives a cycle,
+descriptors and threads as well. ``--cycle 60`` lets the others live longer. Every recording is read again to
+the line by a process of its own: what malloc keeps of that is not the capture's.
 """
 
 from __future__ import annotations

@@ -193,7 +193,10 @@ def _last(last: LastRecording | None) -> str | None:
 
 def _recoveries(status: Status) -> str | None:
     """Recordings that their recorder did not seal, and what the daemon made of them."""
-    shown = [f"{one.path.name}: {one.state}, {one.text}" for one in status.recoveries[-RECOVERIES:]]
+    shown = [
+        f"{one.path.name} {one.state}: {one.text.removeprefix('recovered: ')}"
+        for one in status.recoveries[-RECOVERIES:]
+    ]
     more = len(status.recoveries) - len(shown)
     return "; ".join([*shown, *([f"and {more} before"] if more else [])]) or None
 

@@ -6,5 +6,6 @@
                                      (messages)                   server      states      devices
 
 ``states`` is the table of what may follow what; ``service`` does the work on devices, in one thread;
+``proof`` measures what the host sustains, before; ``salvage`` seals what a killed process left open, after.
 ``control`` is the API; ``server`` is the process: socket, signals, supervision.
 """

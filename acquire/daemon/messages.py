@@ -154,7 +154,8 @@ class RecoveryStatus(_Message):
         description="waiting for its turn or a lock; sealed; not to be touched by this daemon; could not be"
     )
     lines: int | None = Field(default=None, description="of each arm that a reader finds")
-    text: str = Field(default="", description="how it came to that")
+    condition: str | None = Field(default=None, description="what the lines are worth, once it is recovered")
+    text: str = Field(default="", description="how it came to that; once it is recovered, its end reason")
 
 
 class CapacityStatus(_Message):

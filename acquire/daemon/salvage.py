@@ -42,6 +42,8 @@ AGAIN_S = 5.0
 MOST_TRIES = 6
 MOST_LISTED = 32
 """Recordings of which the status tells, the latest: more than one run can leave."""
+RECOVERED = "recovered: "
+"""How the end reason begins of a recording that was recovered."""
 _NICE = 10
 _END_S = 5.0
 _POLL_S = 0.02
@@ -86,7 +88,8 @@ class Salvage:
     def add(self, orphans: Iterable[Orphan]) -> None:
         """Recover what a run has left; what is known already is passed over."""
         for orphan in orphans:
-            if orphan.path not in self._found:
+            found = self._tasks.get(orphan.path)  # the search may have met it while it was being written
+            if orphan.path not in self._found or (found is not None and not found.ours):
                 log.warning("%s was not sealed: %s", orphan.path, orphan.why)
                 self._queue(Task(orphan.path, orphan.why, ours=True))
 
@@ -152,12 +155,19 @@ class Salvage:
         ]
         ended: list[RecoveryStatus] = []
         for task in sorted(able, key=lambda task: not task.ours):
-            hindrance = _hindrance(task.path)
+            hindrance = _hindrance(task.path) or self._spawn(task)
             if hindrance is None:
-                self._under_way, self._worker = task, Worker("salvage", salvage, task)
                 break
             ended += self._heed(task, hindrance)
         return ended
+
+    def _spawn(self, task: Task) -> RecoveryStatus | None:
+        try:
+            self._worker = Worker("salvage", salvage, task)
+        except DeviceError as error:
+            return RecoveryStatus(path=task.path, state="failed", text=str(error))
+        self._under_way = task
+        return None
 
     def _hear(self) -> list[RecoveryStatus]:
         worker, task = self._worker, self._under_way
@@ -168,7 +178,7 @@ class Salvage:
         if said is None and death is None:
             return []
         self._worker = self._under_way = None
-        _end(worker, time.monotonic() + _END_S)
+        _end(worker, _END_S)
         if not isinstance(said, RecoveryStatus):
             why = said.error if isinstance(said, Failed) else death
             said = RecoveryStatus(path=task.path, state="failed", text=f"the recovering process: {why}")
@@ -185,18 +195,19 @@ class Salvage:
             said = said.model_copy(update={"state": "left"})
             self._tell(said)
         level = logging.INFO if said.state == "recovered" else logging.WARNING
-        log.log(level, "%s %s: %s", said.path, said.state, said.text)
+        log.log(level, "%s %s: %s", said.path, said.state, said.text.removeprefix(RECOVERED))
         return [said]
 
     def _stand_back(self) -> None:
         worker, self._worker, self._under_way = self._worker, None, None
         if worker is not None:
-            _end(worker, time.monotonic() + _END_S)
+            _end(worker, 0.0)
 
 
-def _end(worker: Worker, deadline: float) -> None:
-    with contextlib.suppress(DeviceError):  # it took force: what it was at can begin anew
-        worker.end(deadline)
+def _end(worker: Worker, within_s: float) -> None:
+    """By force after a while, which costs nothing: what was cut off begins anew."""
+    with contextlib.suppress(DeviceError):
+        worker.end(time.monotonic() + within_s)
 
 
 def _hindrance(path: Path) -> RecoveryStatus | None:
@@ -239,20 +250,25 @@ def _salvage(mailbox: Mailbox, task: Task) -> RecoveryStatus:
         attributes = read_root(LocalSource(path))["attributes"]
         if not is_here(attributes):
             return RecoveryStatus(path=path, state="left", text=_ELSEWHERE)
-        reason = f"recovered: {task.why}" if task.why else Circumstances().reason
+        reason = f"{RECOVERED}{task.why}" if task.why else Circumstances().reason
         known = Circumstances(reason, committed_intact=has_run_on(attributes), alone=False)
         done = recover(path, progress=lambda *_: _ask(mailbox), known=known)
     except StateError as error:
         return RecoveryStatus(path=path, state="waiting", text=error.message)
     except (AcquireError, OSError) as error:
         return RecoveryStatus(path=path, state="failed", text=str(error))
-    added = done.lines - done.lines_before
-    text = f"{done.lines} lines, {added} of them not committed before; {reason}"
-    return RecoveryStatus(path=path, state="recovered", lines=done.lines, text=text)
+    sealed = read_root(LocalSource(path))["attributes"]
+    return RecoveryStatus(
+        path=path,
+        state="recovered",
+        lines=done.lines,
+        condition=sealed["run_condition"],
+        text=str(sealed["end_reason"]),
+    )
 
 
 def _ask(mailbox: Mailbox) -> None:
-    """Ends the process, by an exception, once its owner wants that."""
+    """Ends the process, by an exception, once its owner has gone."""
     mailbox.take()
 
 

@@ -307,9 +307,8 @@ class Service:
     def _recovered(self, found: list[RecoveryStatus]) -> None:
         """The latest recording may have been among what its recorder did not seal."""
         for one in found:
-            if one.state == "recovered" and self._last is not None and self._last.path == one.path:
-                condition = str(RunCondition.INTERRUPTED)
-                update = {"lines": one.lines, "condition": condition, "end_reason": one.text}
+            if one.condition is not None and self._last is not None and self._last.path == one.path:
+                update = {"lines": one.lines, "condition": one.condition, "end_reason": one.text}
                 self._last = self._last.model_copy(update=update)
         if self._salvage.recoveries != self._status.recoveries:
             self._publish()

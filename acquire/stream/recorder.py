@@ -320,6 +320,7 @@ class Recorder:
 
     def _close(self, session: Session, error: Exception | None = None) -> None:
         self._session = None
+        self._counters["writing"] = 0
         self._free_from = max(book.next_line for book in session.books.values())
         self._publish(session)
         self._closing = session, self._disk.submit(session.close, error)

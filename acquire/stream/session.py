@@ -230,7 +230,8 @@ class Session:
         if kind in TAINTING_EVENTS and line < self.end_line:
             self._doubts[kind] += 1
         if self.first_line <= line < self.end_line:
-            self._doubts[kind] += kind in CODE_DOUBTS
+            if kind in CODE_DOUBTS:
+                self._doubts[kind] += 1
             self._note(kind, line, text)
 
     def mismatches(self, found: list[TagMismatch]) -> None:

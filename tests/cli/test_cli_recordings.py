@@ -18,6 +18,7 @@ from acquire.clock import ClockFit
 from acquire.codes import PrbsCode
 from acquire.lines import ARMS, LineFlag, TaggedBlock
 from acquire.store import RecordingSpec, RecordingWriter, Retention, RunCondition, open_recording, write_video
+from acquire.store.suspect import DOUBTFUL, VERIFIED
 
 Cli = Callable[..., Any]
 M, S, FIRST, LINES = 4, 2, 100, 64
@@ -280,3 +281,29 @@ def test_recordings_at_urls(cli: Cli, recording: Path, tmp_path: Path) -> None:
     assert cli("cut", url, "--first-line", 110, "--lines", 20, "--out", out).code == 0
     with np.load(out) as saved:
         assert np.array_equal(saved["lines"], open_recording(recording).cut(110, 20).lines)
+
+
+def test_lines_that_do_not_follow_the_code_are_named(tmp_path: Path, cli: Cli) -> None:
+    """Each stretch of each arm, the last one to the end; what was doubted before its end is one stretch."""
+    path = tmp_path / "r.zarr"
+    with RecordingWriter.create(path, spec()) as writer:
+        for arm in ARMS:
+            writer.append(block(arm, range(0)))
+        for kind, line, text in (
+            (VERIFIED["a"], 100, "verified"),
+            (DOUBTFUL["a"], 110, "inverted"),
+            (DOUBTFUL["a"], 115, "dark"),
+            (VERIFIED["a"], 120, "verified"),
+            (DOUBTFUL["b"], 150, "shifted by +3 sub-steps"),
+            (DOUBTFUL["a"], 130, "dark"),
+            (VERIFIED["a"], 130, "verified"),
+        ):
+            writer.add_event(kind, 0, line, text)
+        writer.seal(RunCondition.TAINTED, "stopped", {})
+    stretches = [("a", 110, 10, "inverted"), ("b", 150, 14, "shifted by +3 sub-steps")]
+    told = cli("info", path, "--json").json["suspect"]
+    assert [tuple(one.values()) for one in told] == stretches
+    assert "a 110 to 119 (inverted), b 150 to 163 (shifted by +3 sub-steps)" in cli("info", path).out
+    verified = cli("verify", path)
+    assert verified.code == 0  # they are there, and as they were recorded
+    assert "b: lines 150 to 163 do not follow the light's code: shifted by +3 sub-steps" in verified.out
