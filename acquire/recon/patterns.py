@@ -181,6 +181,7 @@ class Refinement:
         self.found = Patterns((left @ right).astype(np.float32), _as(turned, self.found.patterns))
 
     def _loosen(self) -> None:
+        """Lower weights for the next round."""
         now, first = self.parameters, self._first
         penalty = max(PENALTY_DECAY * now.tv_penalty, LEAST_PENALTY * first.tv_penalty)
         self.parameters = replace(
