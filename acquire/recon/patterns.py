@@ -192,6 +192,7 @@ class Refinement:
         )
 
     def _loosen(self) -> None:
+        """Lower weights for the next round."""
         now, first = self.parameters, self._first
         penalty = max(PENALTY_DECAY * now.tv_penalty, LEAST_PENALTY * first.tv_penalty)
         self.parameters = replace(
