@@ -162,7 +162,8 @@ def _preview(selection: Selection, *, whole: bool | None) -> Request:
     stream = selection.stream
     side = min(2 * stream.substeps, stream.geometry(1).size)
     begin, end = selection.extent(Voxels(1, 1), Voxels(1, 1), whole=False)
-    if stream.sub_segment(Stretch(begin, end, Voxels(1, 1))).lines > PREVIEW_LINES:
+    lines = stream.sub_segment(Stretch(begin, end, Voxels(1, 1))).lines
+    if lines > PREVIEW_LINES and end - begin >= GLIMPSES * GLIMPSE_MERGE:
         return in_glimpses(selection, Voxels(side, GLIMPSE_MERGE), GLIMPSES)
     return in_voxels(selection, Voxels(side, PREVIEW_MERGE), whole_ends=whole, longest=1 << 62)
 

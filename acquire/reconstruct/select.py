@@ -119,14 +119,14 @@ def in_glimpses(selection: Selection, voxels: Voxels, count: int) -> Request:
     """One frame for each of ``count`` equal stretches, from the fewest lines about its middle that show one.
 
     How long that takes does not depend on how long the selection is. UsageError where the stretches are
-    shorter than a glimpse.
+    shorter than the voxels.
     """
     stream = selection.stream
     begin, end = selection.extent(voxels, voxels, whole=False)
     length = (end - begin) // count
-    needed = stream.sub_segment(Stretch(begin, begin + voxels.temporal_merge, voxels)).lines
-    if length < needed * stream.substeps:
-        raise UsageError(f"{count} glimpses of {selection.length(end - begin)}")
+    if length < voxels.temporal_merge:
+        most = (end - begin) // voxels.temporal_merge
+        raise UsageError(f"{count} glimpses of {selection.length(end - begin)}", possible=f"up to {most}")
     whole = Voxels(voxels.spatial_merge, length)
     stretches = tuple(Stretch(begin + i * length, begin + (i + 1) * length, whole) for i in range(count))
     glimpses = tuple(_glimpse(stream, stretch, voxels) for stretch in stretches)

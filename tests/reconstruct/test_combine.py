@@ -129,8 +129,10 @@ def test_glimpses_show_the_whole_range_from_few_lines(recording_path, tmp_path):
 
 
 def test_glimpses_of_a_short_stretch_are_refused(recording_path):
-    with pytest.raises(UsageError, match=r"50 glimpses of .* sub-steps"):
-        in_glimpses(by_lines(open_recording(recording_path)), Voxels(4, 8), 50)
+    selection = by_lines(open_recording(recording_path), 0, 100)
+    assert len(in_glimpses(selection, Voxels(4, 8), 22).sub_segments()) == 22  # which share lines
+    with pytest.raises(UsageError, match=r"23 glimpses of .*\(176 sub-steps\).*up to 22"):
+        in_glimpses(selection, Voxels(4, 8), 23)
 
 
 def test_what_was_solved_before_a_stop_is_kept_and_marked(recording_path, request_of_three, tmp_path):

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from s3_server import s3_server
 
 from acquire.errors import DataError, UsageError
 from acquire.store import open_video, write_video
@@ -18,13 +17,7 @@ VIDEO = np.arange(5 * 4 * 4, dtype=np.float32).reshape(5, 4, 4)
 TIME_NS = np.arange(5, dtype=np.int64) * 1000
 
 
-@pytest.fixture(scope="module", autouse=True)
-def bucket():
-    """Clients keep their event loops for the life of the process: they are made here, before the tests."""
-    with pytest.MonkeyPatch.context() as patch, s3_server(patch) as url:
-        RemoteSource(url).put("made", b"once")
-        assert RemoteSource(url).read("made") == b"once"
-        yield url
+pytestmark = pytest.mark.usefixtures("bucket")
 
 
 @pytest.fixture(params=["s3", "memory", "file"])

@@ -8,7 +8,6 @@ import uuid
 import numpy as np
 import pytest
 import zarr
-from s3_server import s3_server
 from store_helpers import Truth, check_rows, fill, make_spec
 
 from acquire.errors import DataError, UsageError
@@ -29,13 +28,7 @@ SPEC = make_spec()
 SHARD = 64
 
 
-@pytest.fixture(scope="module", autouse=True)
-def bucket():
-    """Clients keep their event loops for the life of the process: they are made here, before the tests."""
-    with pytest.MonkeyPatch.context() as patch, s3_server(patch) as url:
-        RemoteSource(url).put("made", b"once")
-        assert RemoteSource(url).read("made") == b"once"
-        yield url
+pytestmark = pytest.mark.usefixtures("bucket")
 
 
 @pytest.fixture(params=["s3", "memory"])
