@@ -73,30 +73,37 @@ class Patterns:
     patterns: Array
 
 
-def find_patterns(theta: NDArray[Any]) -> Patterns | None:
-    """The patterns of coefficient frames (K, n′, n′); None where a few do not hold the scene."""
+def find_patterns(theta: NDArray[Any], *, beyond_doubt: bool = False) -> Patterns | None:
+    """The patterns of coefficient frames (K, n′, n′); None where a few do not hold the scene.
+
+    ``beyond_doubt`` asks for a gap behind them, not only for a tail that they stand out of.
+    """
     count, side, _ = theta.shape
     if count <= TAIL:
         return None
     flat = theta.reshape(count, -1).astype(np.float64)
     energy, vectors = np.linalg.eigh(flat @ flat.T)
     energy, vectors = np.maximum(energy[::-1], 0), vectors[:, ::-1]
-    rank = _rank(energy)
+    rank = _rank_at_gap(energy) or (None if beyond_doubt else _rank_above_tail(energy))
     if rank is None:
         return None
     curves = vectors[:, :rank].astype(theta.dtype)
     return Patterns(curves, (curves.T @ theta.reshape(count, -1)).reshape(rank, side, side))
 
 
-def _rank(energy: NDArray[np.float64]) -> int | None:
-    """How many squared singular values, falling, are a scene's: up to the last gap, or above the tail's."""
+def _rank_at_gap(energy: NDArray[np.float64]) -> int | None:
+    """How many squared singular values, falling, come before the last gap; None if they leave much out."""
     gaps = np.flatnonzero(energy[: TAIL - 1] > GAP**2 * energy[1:TAIL]) + 1
+    return _if_enough(int(gaps[-1]), energy, LARGEST_REST_AT_GAP) if len(gaps) else None
+
+
+def _rank_above_tail(energy: NDArray[np.float64]) -> int | None:
     above = np.count_nonzero(energy[:TAIL] > ABOVE_TAIL**2 * energy[TAIL - 1])
-    candidates = [(int(gap), LARGEST_REST_AT_GAP) for gap in gaps[-1:]] + [(int(above), LARGEST_REST)]
-    for rank, rest in candidates:
-        if 0 < rank <= LARGEST_RANK and energy[rank:].sum() <= rest * energy.sum():
-            return rank
-    return None
+    return _if_enough(int(above), energy, LARGEST_REST)
+
+
+def _if_enough(rank: int, energy: NDArray[np.float64], rest: float) -> int | None:
+    return rank if 0 < rank <= LARGEST_RANK and energy[rank:].sum() <= rest * energy.sum() else None
 
 
 class Refinement:

@@ -37,8 +37,8 @@ if TYPE_CHECKING:
     from acquire.recon.problem import Operator, Problem
     from acquire.recon.request import Request
 
-FIRST_LOOK = 60
-"""Iterations in the cosines before patterns are looked for."""
+FIRST_LOOK, LONGER_LOOK = 60, 90
+"""Iterations in the cosines before patterns are looked for; longer where these are in doubt."""
 FIRST_LOOK_SHARE = 0.9
 """Of a budget, the most that the first look may take."""
 TENTATIVE_SHARE = 0.15
@@ -156,9 +156,12 @@ def _first_look(
             estimate.solver.step()
         if problem.prediction_error(estimate.predict()) < EXPLAINED:
             estimate = begin(estimate.solver.theta, explained=True)
-    most = min(FIRST_LOOK, -(-4 * request.iterations // 5))
-    for _ in clock.run(most - clock.done, "first look", FIRST_LOOK_SHARE):
-        estimate.solver.step()
+    for look in (FIRST_LOOK, LONGER_LOOK):
+        most = min(look, -(-4 * request.iterations // 5))
+        for _ in clock.run(most - clock.done, "first look", FIRST_LOOK_SHARE):
+            estimate.solver.step()
+        if find_patterns(estimate.solver.theta, beyond_doubt=True):
+            break
     return estimate
 
 
