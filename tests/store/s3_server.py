@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import boto3
-import fsspec
 import pytest
 from moto.server import ThreadedMotoServer
 
@@ -29,4 +28,3 @@ def s3_server(patch: pytest.MonkeyPatch) -> Iterator[str]:
         yield f"s3://{BUCKET}"
     finally:
         server.stop()
-        fsspec.get_filesystem_class("s3").clear_instance_cache()  # clients of a server that is gone
