@@ -36,45 +36,59 @@ RIDGE = 1e-5
 """Of the mean eigenvalue: what no line sees stays as it was."""
 STEPS = 6
 PLAIN_STEPS = 60
+REFRESH = 4
+"""Calls that share a preconditioner."""
 LARGEST_SPAN = 8192
 """Sub-steps; beyond, the normal matrix takes too much memory and plain steps are made."""
 LARGEST_UNKNOWNS = 4096
 
 
-def fit_curves(
-    segment: Segment,
-    problem: Problem,
-    patterns: Array,
-    cosines: TemporalBasis,
-    temporal_merge: int,
-    start: NDArray[Any],
-    ridge: float = RIDGE,
-) -> NDArray[np.float64]:
-    """Curves (K, R) that explain the samples best with ``patterns`` (R, n, n), near ``start``.
+class CurveFit:
+    """Fits the curves of patterns that change little from call to call.
 
-    Patterns of like size make it well conditioned. Light to which the lines respond less than ``ridge``,
-    relative to the mean eigenvalue, hardly moves: to be set as high as the patterns are wrong. Patterns and
-    cosines are where the problem's arrays are, curves on the host.
+    The normal matrix costs ten times the rest, and as a preconditioner an old one is as good as new: it is
+    made for every `REFRESH`-th call. Patterns and cosines are where the problem's arrays are, curves on the
+    host.
     """
-    arrays, exact = problem.arrays, problem.arrays.exact()
-    whole = CurveOperator(segment, patterns, cosines, temporal_merge)
-    operator = problem.masked(whole)
-    residual = problem.used_samples - operator.forward(arrays.asarray(start))
-    small = segment.geometry.span <= LARGEST_SPAN and start.size <= LARGEST_UNKNOWNS
-    precondition: Callable[[Array], Array]
-    if small:
-        gram = whole.gram() / problem.norm**2
-        precondition, damping = _preconditioner(gram, start.shape, ridge, arrays)
-    else:
-        precondition, damping = _same, 0.0
 
-    def normal(x: Array) -> Array:
-        return exact.asarray(operator.adjoint(operator.forward(arrays.asarray(x)))) + damping * x
+    def __init__(
+        self,
+        segment: Segment,
+        problem: Problem,
+        cosines: TemporalBasis,
+        temporal_merge: int,
+        ridge: float = RIDGE,
+    ) -> None:
+        """Light to which the lines respond less than ``ridge``, relative to the mean eigenvalue, hardly moves
+        in a call: to be set as high as the patterns are wrong.
+        """
+        self._segment, self._problem, self._cosines = segment, problem, cosines
+        self._merge, self._ridge, self._calls = temporal_merge, ridge, 0
+        self._precondition: Callable[[Array], Array] = _same
+        self._damping = 0.0
 
-    right = exact.asarray(operator.adjoint(residual))
-    change = _conjugate_gradients(normal, right, precondition, STEPS if small else PLAIN_STEPS)
-    fitted: NDArray[np.float64] = start + host(change)
-    return fitted
+    def __call__(self, patterns: Array, start: NDArray[Any]) -> NDArray[np.float64]:
+        """Curves (K, R) that explain the samples best with ``patterns`` (R, n, n), near ``start``.
+
+        Patterns of like size make it well conditioned.
+        """
+        arrays, exact = self._problem.arrays, self._problem.arrays.exact()
+        whole = CurveOperator(self._segment, patterns, self._cosines, self._merge)
+        operator = self._problem.masked(whole)
+        residual = self._problem.used_samples - operator.forward(arrays.asarray(start))
+        small = self._segment.geometry.span <= LARGEST_SPAN and start.size <= LARGEST_UNKNOWNS
+        if small and self._calls % REFRESH == 0:
+            gram = whole.gram() / self._problem.norm**2
+            self._precondition, self._damping = _preconditioner(gram, start.shape, self._ridge, arrays)
+        self._calls += 1
+
+        def normal(x: Array) -> Array:
+            return exact.asarray(operator.adjoint(operator.forward(arrays.asarray(x)))) + self._damping * x
+
+        right = exact.asarray(operator.adjoint(residual))
+        change = _conjugate_gradients(normal, right, self._precondition, STEPS if small else PLAIN_STEPS)
+        fitted: NDArray[np.float64] = start + host(change)
+        return fitted
 
 
 class CurveOperator:

@@ -26,7 +26,7 @@ from acquire.forward import merge_video
 from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import band_operator
 from acquire.recon.basis import LearnedBasis
-from acquire.recon.curves import fit_curves
+from acquire.recon.curves import CurveFit
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -122,6 +122,7 @@ class Refinement:
         self._spatial_merge, self._temporal_merge = merges
         self.parameters, self._first, self._steps = parameters, parameters, 0
         self.found = Patterns(found.curves, _hold(found.patterns, segment.geometry.size, merges[0]))
+        self._fit = CurveFit(segment, problem, cosines, merges[1], RIDGE)
         self._admm = self._begin()
         self.found = Patterns(found.curves, self._admm.theta)
 
@@ -189,9 +190,7 @@ class Refinement:
         root = np.linalg.cholesky(gram + 1e-6 * np.trace(gram) * np.eye(self.rank))
         # orthonormal patterns make the fit well conditioned; their sizes go to the curves meanwhile
         unit = arrays.xp.reshape(arrays.asarray(exact.asarray(np.linalg.inv(root)) @ flat), patterns.shape)
-        merge = self._temporal_merge
-        start = self.found.curves @ root
-        fitted = fit_curves(self._segment, self._problem, unit, self._cosines, merge, start, RIDGE)
+        fitted = self._fit(unit, self.found.curves @ root)
         left, middle, right = np.linalg.svd(np.linalg.solve(root.T, fitted.T).T, full_matrices=False)
         turned = exact.asarray((right.T * middle) @ right) @ flat
         self.found = Patterns(

@@ -23,7 +23,7 @@ from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import InBasis, band_operator
 from acquire.recon.bandwidth import estimate_coefficients
 from acquire.recon.basis import TemporalBasis
-from acquire.recon.curves import CurveOperator, fit_curves
+from acquire.recon.curves import CurveFit, CurveOperator
 from acquire.recon.patterns import Refinement, find_patterns
 from acquire.recon.twist import Twist, TwistParameters
 
@@ -239,7 +239,7 @@ class Lit:
         self._operator = CurveOperator(segment, patterns, basis, request.temporal_merge)
         coefficients = np.zeros((frames, 1))
         for _ in clock.run(1, "light"):
-            coefficients = fit_curves(segment, problem, patterns, basis, request.temporal_merge, coefficients)
+            coefficients = CurveFit(segment, problem, basis, request.temporal_merge)(patterns, coefficients)
         self._coefficients = arrays.asarray(coefficients)
         seen = np.add.reduceat(segment.code, np.arange(0, len(segment.code), request.temporal_merge)) > 0
         light = basis.synthesize(self._coefficients)[:, 0] / np.linalg.norm(self._image)

@@ -16,7 +16,7 @@ from acquire.lines import Segment
 from acquire.recon import HaarShrink, Progress, reconstruct
 from acquire.recon.bandwidth import estimate_coefficients
 from acquire.recon.basis import TemporalBasis
-from acquire.recon.curves import CurveOperator, fit_curves
+from acquire.recon.curves import CurveFit, CurveOperator
 from acquire.recon.patterns import find_patterns
 from acquire.recon.problem import pose
 
@@ -69,7 +69,7 @@ def test_curves_of_known_patterns_are_exact_even_where_samples_are_lost() -> Non
     held = segment(np.tensordot(cosines.synthesize(wanted) * problem.scale, IMAGES, 1))
     problem = replace(problem, samples=np.where(holed.mask, held.lines / (problem.scale * problem.norm), 0))
     problem = replace(problem, samples=problem.samples.astype(np.float32))
-    found = fit_curves(holed, problem, IMAGES, cosines, 1, np.zeros(wanted.shape))
+    found = CurveFit(holed, problem, cosines, 1)(IMAGES, np.zeros(wanted.shape))
     seen = cosines.synthesize(found.astype(np.float32))[GEOMETRY.trusted]
     np.testing.assert_allclose(seen, cosines.synthesize(wanted)[GEOMETRY.trusted], atol=0.02 / problem.scale)
 
