@@ -160,7 +160,7 @@ def _first_look(
         most = min(look, -(-4 * request.iterations // 5))
         for _ in clock.run(most - clock.done, "first look", FIRST_LOOK_SHARE):
             estimate.solver.step()
-        if find_patterns(estimate.solver.theta, beyond_doubt=True):
+        if find_patterns(host(estimate.solver.theta), beyond_doubt=True):
             break
     return estimate
 
