@@ -314,9 +314,10 @@ class RecordingWriter:
         return min(arm.whole_rows for arm in self._arms.values())
 
     def _rescue(self) -> int:
-        """After a failure: the rows that are whole."""
+        """After a failure: the rows that are whole. A full disk has room again for tags and indices."""
+        self._disk.remove(self._reserve)
         for arm in self._arms.values():
-            arm.publish_chunks()
+            arm.rescue()
         return self._whole_rows()
 
     def _pad(self) -> int:
