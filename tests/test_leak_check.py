@@ -45,7 +45,7 @@ def test_end():
 
 
 def test_each_kind_of_leftover_fails_its_test_and_no_other(tmp_path: Path) -> None:
-    for name in ("conftest.py", "left_out.py"):
+    for name in ("conftest.py", "left_out.py", "throttle.py"):
         shutil.copy(Path(__file__).parent / name, tmp_path)
     (tmp_path / "pytest.ini").write_text("[pytest]\nleak_grace_s = 0.3\n")
     (tmp_path / "test_leaky.py").write_text(LEAKY)
