@@ -93,11 +93,11 @@ class ArmWriter:
         for array in self._arrays.values():
             array.settle()
 
-    def rescue(self) -> None:
-        """Put what is written, and what waits, into the indices, as far as the disk lets it."""
+    def publish_chunks(self) -> None:
+        """Put what is written into the indices, as far as the disk lets it."""
         for array in self._arrays.values():
             with contextlib.suppress(OSError):
-                array.rescue()
+                array.publish()
 
     def sync(self) -> None:
         for array in self._arrays.values():

@@ -2,16 +2,12 @@
 
 ::
 
-    append ─▶ buffer ─full─▶ encode (in a thread of the pool) ─in order─▶ shard ─▶ disk
-
-The buffer has room for one chunk, or for a few where chunks are small: what is done with one of them costs
-less than coming to it, after MB of pixels went through the caches.
+    append ─▶ buffer of one chunk ─full─▶ encode (in a thread of the pool) ─in order─▶ shard ─▶ disk
 """
 
 from __future__ import annotations
 
 from collections import deque
-from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,12 +28,10 @@ if TYPE_CHECKING:
 
 ENCODED_AHEAD = 2
 """Chunks of an array that are encoded while others are filled and written."""
-GATHERED = 4
-"""Small chunks that are encoded and written one after the other, once all of them are full."""
 
 
 class ArrayWriter:
-    """Appends rows to one array; whole chunks go to disk, small ones a few at a time, the rest waits.
+    """Appends rows to one array; whole chunks go to disk at once, the rest waits in one buffer.
 
     Buffers are allocated once. Rows that make a whole chunk by themselves are written without a copy, unless
     a ``pool`` encodes: then up to ``ahead`` chunks are encoded while others are filled and written, always in
@@ -67,8 +61,7 @@ class ArrayWriter:
         self._disk = disk
         self._pool = pool
         self._once = once
-        gathered = GATHERED if pool is None and shape.chunk_bytes < DIRECT_BYTES else 1
-        self._free = deque(_buffer(shape, gathered) for _ in range(1 + ahead if pool else 1))
+        self._free: deque[NDArray[Any]] = deque(_buffer(shape) for _ in range(1 + ahead if pool else 1))
         self._buffer = self._free.popleft()
         self._filled = 0
         self._encoding: deque[tuple[Future[NDArray[np.uint8]], NDArray[Any]]] = deque()
@@ -103,16 +96,13 @@ class ArrayWriter:
 
     def pad(self) -> None:
         """Write the rows that wait as one more chunk, filled up with ``padding``."""
-        if missing := -self._filled % self.shape.chunk_rows:
-            self._buffer[self._filled : self._filled + missing] = self._padding
-            self._filled += missing
-        self._flush()
+        if self._filled:
+            self._buffer[self._filled :] = self._padding
+            self._flush()
         self.settle()
 
     def settle(self) -> None:
-        """Write the chunks that are full or being encoded, and publish all of them."""
-        if self._pool is None:
-            self._flush()
+        """Wait for the chunks that are being encoded, write them, and publish all of them."""
         while self._encoding:
             self._write_oldest()
         self.publish()
@@ -122,13 +112,6 @@ class ArrayWriter:
         if self._shard is not None:
             self._shard.publish()
             self._published = self._chunks
-
-    def rescue(self) -> None:
-        """After a failure: publish what is written, and of what waits as much as the disk now takes."""
-        if self._pool is None:
-            with suppress(OSError):
-                self._flush()
-        self.publish()
 
     def sync(self) -> None:
         """Force what was written since the last call to the medium."""
@@ -143,40 +126,25 @@ class ArrayWriter:
 
     def _take(self, rows: NDArray[Any]) -> int:
         size = self.shape.chunk_rows
-        alone = self._pool is None and len(self._buffer) == size
-        if alone and self._filled == 0 and len(rows) >= size and rows.flags.c_contiguous:
+        if self._pool is None and self._filled == 0 and len(rows) >= size and rows.flags.c_contiguous:
             self._write(self._encode(rows[:size]))
             return size
-        count = min(len(self._buffer) - self._filled, len(rows))
+        count = min(size - self._filled, len(rows))
         self._buffer[self._filled : self._filled + count] = rows[:count]
         self._filled += count
-        if self._filled == len(self._buffer):
+        if self._filled == size:
             self._flush()
         return count
 
     def _flush(self) -> None:
-        """Encode and write the whole chunks of the buffer."""
-        if self._pool is None:
-            self._flush_here()
-            return
-        if not self._filled:
-            return
         self._filled = 0
+        if self._pool is None:
+            self._write(self._encode(self._buffer))
+            return
         self._encoding.append((self._pool.submit(encode, self._buffer, self.shape.codec), self._buffer))
         if not self._free:
             self._write_oldest()
         self._buffer = self._free.popleft()
-
-    def _flush_here(self) -> None:
-        """The same in this thread. What could not be written stays, and can be tried again."""
-        size, done = self.shape.chunk_rows, 0
-        try:
-            while self._filled - done >= size:
-                self._write(self._encode(self._buffer[done : done + size]))
-                done += size
-        finally:
-            self._filled -= done
-            self._buffer[: self._filled] = self._buffer[done : done + self._filled]
 
     def _encode(self, rows: NDArray[Any]) -> NDArray[np.uint8]:
         if self._once is None:
@@ -219,7 +187,7 @@ class ArrayWriter:
             directory = directory.parent
 
 
-def _buffer(shape: ArrayShape, chunks: int) -> NDArray[Any]:
-    """Chunks in page-aligned memory."""
-    size = chunks * shape.chunk_bytes
-    return aligned_bytes(size)[:size].view(shape.dtype).reshape(-1, *shape.row_shape)
+def _buffer(shape: ArrayShape) -> NDArray[Any]:
+    """A chunk in page-aligned memory."""
+    samples = aligned_bytes(shape.chunk_bytes)[: shape.chunk_bytes]
+    return samples.view(shape.dtype).reshape(shape.chunk_shape)

@@ -15,7 +15,7 @@ from acquire.codes import code_from_attrs
 from acquire.errors import UsageError
 from acquire.geometry import Geometry
 from acquire.lines import ARMS
-from acquire.store.array_writer import ENCODED_AHEAD, GATHERED
+from acquire.store.array_writer import ENCODED_AHEAD
 from acquire.store.codecs import CODECS, Codec
 from acquire.store.host import this_host
 from acquire.store.shard import MAX_CHUNK_BYTES, MAX_SHARD_CHUNKS
@@ -55,7 +55,7 @@ class Durability:
     ----------
     fsync : when bytes are forced to the medium
     kill_lines : when the writer's process is killed and the recording recovered: the chunk that fills, and
-        those that are being packed or gathered
+        those that are being packed
     power_lines : when the machine loses power; None: as many as the system had not written back
     """
 
@@ -125,7 +125,7 @@ class RecordingSpec:
     @property
     def durability(self) -> Durability:
         """What this recording can lose."""
-        held = self.chunk_lines * max(GATHERED, 1 if self.codec == "none" else 1 + ENCODED_AHEAD)
+        held = self.chunk_lines * (1 if self.codec == "none" else 1 + ENCODED_AHEAD)
         committed = self.commit_lines + held if self.fsync == "commit" else None
         return Durability(self.fsync, held, committed)
 

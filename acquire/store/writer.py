@@ -314,10 +314,9 @@ class RecordingWriter:
         return min(arm.whole_rows for arm in self._arms.values())
 
     def _rescue(self) -> int:
-        """After a failure: the rows that are whole. A full disk has room again for tags and indices."""
-        self._disk.remove(self._reserve)
+        """After a failure: the rows that are whole."""
         for arm in self._arms.values():
-            arm.rescue()
+            arm.publish_chunks()
         return self._whole_rows()
 
     def _pad(self) -> int:
