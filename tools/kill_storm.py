@@ -171,7 +171,7 @@ class Storm:
             if now.processes.get(name) in (None, before.processes[name]):
                 return False
             if name == "recorder":
-                return now.recording is not None and _path(now) != _path(before) and _committed(now) > 0
+                return now.recording is not None and _place(now) != _place(before) and _committed(now) > 0
             lost = now.arms[name].lost.get("grabber_lost", 0)
             return lost > before.arms[name].lost.get("grabber_lost", 0)
 
@@ -265,8 +265,9 @@ def _committed(status: Status) -> int:
     return 0 if status.recording is None else status.recording.committed_lines
 
 
-def _path(status: Status) -> Path | None:
-    return None if status.recording is None else status.recording.path
+def _place(status: Status) -> tuple[Path, int | None] | None:
+    """A recorder that was killed before it had made anything leaves its name to the next."""
+    return None if status.recording is None else (status.recording.path, status.recording.first_line)
 
 
 def _until(condition: Callable[[], bool]) -> None:

@@ -306,8 +306,9 @@ class Supervisor:
         """With the recording of a recorder that was killed, beside it."""
         committed = self._counters[RECORDER]["committed"]
         self._begin = following = continuation(begin, first_line, committed, death)
-        why = f"its recorder was {death}; it goes on in {following.path.name}"
-        self._orphans.append(Orphan(begin.path, why))
+        if following.path != begin.path:  # else it was killed before it had made anything
+            why = f"its recorder was {death}; it goes on in {following.path.name}"
+            self._orphans.append(Orphan(begin.path, why))
         self._going_on, self.path = True, following.path
         return following
 
