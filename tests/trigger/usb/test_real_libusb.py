@@ -38,4 +38,6 @@ def test_the_driver_runs_over_libusb_and_hears_of_an_unplugged_cable() -> None:
     assert who == {"backend": "usb.backend.libusb1", "device": "0000000000001234"}
     assert done["tagged"] == list(range(0, done["lines"], 16))
     assert (done["pulses"], done["tags_missing"], done["tag_lost"]) == (done["lines"], 0, 0)
-    assert "usb 1209:0001 42 was unplugged" in end["error"]
+    # The transfer under way may fail before the bus has noticed that nobody is there.
+    said = ("usb 1209:0001 42 was unplugged", "usb 1209:0001 42 failed: [Errno 5]")
+    assert any(text in end["error"] for text in said), end["error"]
