@@ -84,9 +84,10 @@ class Extend:
 
 @dataclass(frozen=True, slots=True)
 class Began:
-    """The recording exists."""
+    """The recording exists; ``end_line``: where it ends by itself, if it does."""
 
     first_line: int
+    end_line: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

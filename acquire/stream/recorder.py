@@ -44,7 +44,7 @@ from acquire.stream.messages import (
     RunStarted,
 )
 from acquire.stream.process import OwnerGone, become_important
-from acquire.stream.session import Session
+from acquire.stream.session import OPEN_END, Session
 from acquire.stream.stalls import Arm, Backlog, find_stall
 from acquire.stream.tagger import Tagger
 from acquire.stream.window import Span, hold, span
@@ -288,7 +288,8 @@ class Recorder:
             arm.revive(time.monotonic())
             arm.backlog = Backlog()
         self._publish(self._session)
-        self._mailbox.post(Began(first_line))
+        end_line = self._session.end_line
+        self._mailbox.post(Began(first_line, None if end_line == OPEN_END else end_line))
         if self._trouble is not None:
             self._interrupt(*self._trouble)
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
-    from acquire.stream.messages import Begin
+    from acquire.stream.messages import Began, Begin
     from acquire.stream.process import Worker
 
 MOST = 5
@@ -90,10 +90,10 @@ class Succession:
             self._lines[name].ready_by_s = None
 
 
-def continuation(begin: Begin, first_line: int, committed_lines: int, why: str) -> Begin:
+def continuation(begin: Begin, began: Began, committed_lines: int, why: str) -> Begin:
     """What has a recorder go on with a recording that was cut off after ``committed_lines`` lines."""
-    at = first_line + committed_lines
-    left = None if begin.lines is None else max(1, begin.lines - committed_lines)
+    at = began.first_line + committed_lines
+    left = None if began.end_line is None else max(1, began.end_line - at)
     cause = f"its recorder was {why}"
     text = f"goes on from {begin.path.name}: {cause}"
     window = Window(at, post_lines=left, exact=False, padded=True, kind="resumed", text=text)
@@ -103,6 +103,12 @@ def continuation(begin: Begin, first_line: int, committed_lines: int, why: str) 
     follows = Continuation(first, number, at, readout_ns(spec, at), cause, listed=False)
     path = free_name(begin.path.with_name(first))
     return replace(begin, path=path, spec=replace(spec, continues=follows), lines=None, window=window)
+
+
+def once_more(following: Begin) -> Begin:
+    """A continuation for another recorder, since the one it was for was killed before it had begun."""
+    assert following.spec.continues is not None
+    return replace(following, path=free_name(following.path.with_name(following.spec.continues.first)))
 
 
 def free_name(path: Path) -> Path:

@@ -14,7 +14,7 @@ from acquire.errors import AcquireError, DeviceError, TriggerError
 from acquire.lines import ARMS
 from acquire.stream.messages import Began, Checked, End, Failed, Interrupt, Note, Ready, Refused, Sealed
 from acquire.stream.stalls import Excess, Heartbeat
-from acquire.stream.succession import Orphan, Succession, continuation, obituary
+from acquire.stream.succession import Orphan, Succession, continuation, obituary, once_more
 from acquire.stream.tagger import tag_rows
 from acquire.stream.witness import TRIGGER, TRIGGER_COUNTERS, WATCHER
 
@@ -294,7 +294,7 @@ class Supervisor:
             self._cameras[arm].revive()
         self._loop.revive()
         if name == RECORDER and self._begin is not None and self.began is not None and self.sealed is None:
-            successor.post(self._go_on(self._begin, self.began.first_line, death))
+            successor.post(self._go_on(self._begin, self.began, death))
         elif name == RECORDER and self._asked is not None:
             self._orphans.append(Orphan(self._asked.path, f"its recorder was {death}"))
             self._note(name, Refused(DeviceError(f"start: the recorder was {death}", hint="start again")))
@@ -302,10 +302,13 @@ class Supervisor:
         self.happened(obituary(worker.name, death, max(newest, 0)))
         return True
 
-    def _go_on(self, begin: Begin, first_line: int, death: str) -> Begin:
+    def _go_on(self, begin: Begin, began: Began, death: str) -> Begin:
         """With the recording of a recorder that was killed, beside it."""
-        committed = self._counters[RECORDER]["committed"]
-        self._begin = following = continuation(begin, first_line, committed, death)
+        if self._going_on:  # and the counters may be neither's
+            following = once_more(begin)
+        else:
+            following = continuation(begin, began, self._counters[RECORDER]["committed"], death)
+        self._begin = following
         if following.path != begin.path:  # else it was killed before it had made anything
             why = f"its recorder was {death}; it goes on in {following.path.name}"
             self._orphans.append(Orphan(begin.path, why))

@@ -62,10 +62,6 @@ NOW = Window()
 """From the next line on."""
 
 
-NOW = Window()
-"""From the next line on."""
-
-
 @dataclass(frozen=True, slots=True)
 class Held:
     """What the rings hold for a window at line ``at``: everything ``from_line`` on; lines ``taken`` back."""

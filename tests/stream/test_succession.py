@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import signal
 import time
@@ -142,6 +143,35 @@ def test_a_recorder_that_is_killed_is_replaced_and_no_line_is_lost(run, tmp_path
     assert check(tmp_path / "r.zarr") == check(tmp_path / "r-2.zarr") == set()
     assert seen.condition in {"GOOD", "TAINTED"}  # lines may come before a tag has confirmed them
     assert any(event.kind == "resumed" and "SIGKILL" in event.text for event in two.events)
+
+
+@pytest.mark.parametrize("begun", [True, False], ids=["once it has begun", "before it begins"])
+def test_a_successor_that_is_killed_as_well_is_replaced_and_the_budget_stays(run, tmp_path, begun):
+    lines = 40_000
+    run.start(tmp_path / "r.zarr", lines)
+    until(lambda: run.poll().committed_lines > 2000)
+    first = run.poll().first_line
+    killed = kill(run, "recorder")
+    until(lambda: run._capture.pids["recorder"] not in (None, killed))
+    if begun:
+        until(lambda: run.poll().first_line != first and run.poll().committed_lines > 0)
+    kill(run, "recorder")
+    until(lambda: run.poll().done)
+    seen = run.poll()
+    assert seen.fault is None
+    assert len({orphan.path for orphan in seen.orphans} - {Path(seen.path)}) == (2 if begun else 1)
+    recover(tmp_path / "r.zarr")
+    parts = [open_recording(tmp_path / "r.zarr")]
+    parts += parts[0].segments
+    for orphan in seen.orphans[1:]:
+        recover(orphan.path)
+    parts = [part.refreshed() for part in parts]
+    assert [part.attrs["segment"]["number"] for part in parts[1:]] == list(range(2, len(parts) + 1))
+    for one, two in itertools.pairwise(parts):
+        assert one.first_line < two.first_line <= one.first_line + one.lines
+    assert parts[-1].first_line + parts[-1].lines == first + lines
+    for part in parts:
+        assert check(part.path) == set()
 
 
 def test_what_the_ring_could_not_hold_meanwhile_is_a_gap(config, tmp_path):
