@@ -12,7 +12,7 @@ import array_api_strict
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
+from recon_cases import cases
 
 from acquire import arrays
 from acquire.arrays import Arrays, dot, host, open_arrays
@@ -75,14 +75,6 @@ def error(result: Reconstruction) -> float:
 
 def difference(a: Reconstruction, b: Reconstruction) -> float:
     return float(np.linalg.norm(a.video - b.video) / np.linalg.norm(b.video))
-
-
-@st.composite
-def cases(draw: st.DrawFn) -> tuple[Geometry, int, int, int, int]:
-    g = Geometry(draw(st.integers(1, 5)), draw(st.integers(1, 3)), draw(st.integers(1, 6)))
-    N_m, T_m = draw(st.integers(1, g.size)), draw(st.integers(1, g.span + 1))
-    frames = g.video_shape(N_m, T_m)[0]
-    return g, N_m, T_m, draw(st.integers(1, frames)), draw(st.integers(0, 2**32 - 1))
 
 
 @settings(max_examples=60, deadline=None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from hypothesis import strategies as st
+from recon_cases import cases
 
 from acquire.arrays import open_arrays
 from acquire.errors import UsageError
@@ -51,14 +51,6 @@ def test_long_segments_do_without_the_dense_factors(monkeypatch: pytest.MonkeyPa
     assert isinstance(band_operator(g, code, basis), BandOperator)
     monkeypatch.setattr(band, "LARGEST_FACTORS_BYTES", 100)
     assert isinstance(band_operator(g, code, basis), InBasis)
-
-
-@st.composite
-def cases(draw: st.DrawFn) -> tuple[Geometry, int, int, int, int]:
-    g = Geometry(draw(st.integers(1, 5)), draw(st.integers(1, 3)), draw(st.integers(1, 6)))
-    N_m, T_m = draw(st.integers(1, g.size)), draw(st.integers(1, g.span + 1))
-    frames = g.video_shape(N_m, T_m)[0]
-    return g, N_m, T_m, draw(st.integers(1, frames)), draw(st.integers(0, 2**32 - 1))
 
 
 @settings(max_examples=60, deadline=None)

@@ -1,0 +1,16 @@
+"""What the operators are tried on: geometries small enough for their dense matrix, and codes by seed."""
+
+from __future__ import annotations
+
+from hypothesis import strategies as st
+
+from acquire.geometry import Geometry
+
+
+@st.composite
+def cases(draw: st.DrawFn) -> tuple[Geometry, int, int, int, int]:
+    """Geometry, N_m, T_m, frequencies kept, seed."""
+    g = Geometry(draw(st.integers(1, 5)), draw(st.integers(1, 3)), draw(st.integers(1, 6)))
+    N_m, T_m = draw(st.integers(1, g.size)), draw(st.integers(1, g.span + 1))
+    frames = g.video_shape(N_m, T_m)[0]
+    return g, N_m, T_m, draw(st.integers(1, frames)), draw(st.integers(0, 2**32 - 1))
