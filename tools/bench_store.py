@@ -137,8 +137,9 @@ def written(directory: Path, chunks: list[np.ndarray], count: int, codec: str, f
 
         def work() -> None:
             for pair in blocks:
-                for one in pair:
-                    writer.append(one)
+                for one in pair:  # as the recorder does: while one arm's lines are written, the other's turn
+                    writer.give_back(one.arm)
+                    writer.lend(one)
             writer.commit()
 
         pace = paced(work, count * chunks[0].nbytes)

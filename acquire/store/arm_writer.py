@@ -79,10 +79,15 @@ class ArmWriter:
         """Row 0 is line ``first_line``; before the first `append`."""
         self._first_line = first_line
 
-    def append(self, block: TaggedBlock) -> None:
+    def append(self, block: TaggedBlock, behind: ThreadPoolExecutor | None) -> None:
+        """With ``behind``, a thread that writes, the block is lent until `give_back`."""
         self._check(block)
         for column, array in reversed(self._arrays.items()):  # pixels last: what they have, all have
-            array.append(getattr(block, column.source))
+            array.append(getattr(block, column.source), behind)
+
+    def give_back(self) -> None:
+        """Wait until what the last `append` was given may be reused."""
+        self._pixels.give_back()
 
     def pad(self) -> None:
         for array in self._arrays.values():
@@ -96,6 +101,8 @@ class ArmWriter:
     def publish_chunks(self) -> None:
         """Put what is written into the indices, as far as the disk lets it."""
         for array in self._arrays.values():
+            with contextlib.suppress(OSError):
+                array.finish()  # once it has failed, there is nothing left to wait for
             with contextlib.suppress(OSError):
                 array.publish()
 

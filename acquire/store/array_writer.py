@@ -3,6 +3,7 @@
 ::
 
     append ─▶ buffer of one chunk ─full─▶ encode (in a thread of the pool) ─in order─▶ shard ─▶ disk
+       └───── whole chunks, lent ─────────────────────────────────────────────────────▲ (behind)
 """
 
 from __future__ import annotations
@@ -15,16 +16,17 @@ import numpy as np
 from acquire.store.codecs import EncodeOnce, encode
 from acquire.store.files import DISK
 from acquire.store.pages import aligned_bytes
-from acquire.store.shard import DIRECT_BYTES, Pages, ShardWriter, shard_key
+from acquire.store.shard import DIRECT_BYTES, Pages, ShardWriter, shard_key, small_piece
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from concurrent.futures import Future, ThreadPoolExecutor
     from pathlib import Path
 
     from numpy.typing import NDArray
 
     from acquire.store.files import Disk
-    from acquire.store.shard import ArrayShape
+    from acquire.store.shard import ArrayShape, Piece
 
 ENCODED_AHEAD = 2
 """Chunks of an array that are encoded while others are filled and written."""
@@ -33,10 +35,10 @@ ENCODED_AHEAD = 2
 class ArrayWriter:
     """Appends rows to one array; whole chunks go to disk at once, the rest waits in one buffer.
 
-    Buffers are allocated once. Rows that make a whole chunk by themselves are written without a copy, unless
-    a ``pool`` encodes: then up to ``ahead`` chunks are encoded while others are filled and written, always in
-    order. ``once`` is shared by arrays of equal rows. ``durable`` forces each file to the medium before it is
-    left for the next. What fills up the last chunk is ``padding``.
+    Buffers are allocated once. Rows that make whole chunks by themselves are written without a copy, in one
+    piece, unless a ``pool`` encodes: then up to ``ahead`` chunks are encoded while others are filled and
+    written, always in order. ``once`` is shared by arrays of equal rows. ``durable`` forces each file to the
+    medium before it is left for the next. What fills up the last chunk is ``padding``.
     """
 
     def __init__(
@@ -60,11 +62,14 @@ class ArrayWriter:
         self._padding = padding
         self._disk = disk
         self._pool = pool
+        self._is_large = shape.chunk_bytes >= DIRECT_BYTES
+        self._behind: ThreadPoolExecutor | None = None
         self._once = once
         self._free: deque[NDArray[Any]] = deque(_buffer(shape) for _ in range(1 + ahead if pool else 1))
         self._buffer = self._free.popleft()
         self._filled = 0
         self._encoding: deque[tuple[Future[NDArray[np.uint8]], NDArray[Any]]] = deque()
+        self._writing: tuple[Future[None], Piece] | None = None
         self._chunks = 0
         self._published = 0
         self._shard: ShardWriter | None = None
@@ -86,13 +91,29 @@ class ArrayWriter:
         """Chunks go past the page cache."""
         return self._shard is not None and self._shard.direct
 
-    def append(self, rows: NDArray[Any]) -> None:
-        """Append rows of this array's dtype and row shape, any number of them."""
+    def append(self, rows: NDArray[Any], behind: ThreadPoolExecutor | None = None) -> None:
+        """Append rows of this array's dtype and row shape, any number of them.
+
+        With ``behind``, a thread, they are lent until `give_back`: large chunks may be on their way to disk.
+        """
+        self._behind = behind if self._is_large else None
         start = 0
         while start < len(rows):
             taken = self._take(rows[start:])
             start += taken
             self.rows += taken
+
+    def give_back(self) -> None:
+        """Wait until the rows of the last `append` may be reused; what is packed is a copy of them."""
+        if self._pool is None:
+            self.finish()
+
+    def finish(self) -> None:
+        """Wait for the piece that is on its way to the disk; raises what the disk says."""
+        if self._writing is not None:
+            (written, piece), self._writing = self._writing, None
+            written.result()
+            self._count(piece)
 
     def pad(self) -> None:
         """Write the rows that wait as one more chunk, filled up with ``padding``."""
@@ -109,6 +130,7 @@ class ArrayWriter:
 
     def publish(self) -> None:
         """Put what is written into the index of its shard."""
+        self.finish()
         if self._shard is not None:
             self._shard.publish()
             self._published = self._chunks
@@ -120,15 +142,16 @@ class ArrayWriter:
             self._unsynced = False
 
     def close(self) -> None:
-        """Let go of the file; rows that wait are dropped. Idempotent."""
+        """Let go of the file; rows that wait are dropped. Idempotent; no piece is on its way any more."""
         if self._shard is not None:
             self._shard.close()
 
     def _take(self, rows: NDArray[Any]) -> int:
         size = self.shape.chunk_rows
-        if self._pool is None and self._filled == 0 and len(rows) >= size and rows.flags.c_contiguous:
-            self._write(self._encode(rows[:size]))
-            return size
+        if self._pool is None and self._filled == 0:
+            self.finish()  # it may be the buffer
+            if len(rows) >= size and rows.flags.c_contiguous:
+                return self._write_whole(rows)
         count = min(size - self._filled, len(rows))
         self._buffer[self._filled : self._filled + count] = rows[:count]
         self._filled += count
@@ -136,33 +159,51 @@ class ArrayWriter:
             self._flush()
         return count
 
+    def _write_whole(self, rows: NDArray[Any]) -> int:
+        """Write the whole chunks at the beginning of ``rows`` that the file has room for; so many rows."""
+        size = self.shape.chunk_rows
+        count = min(len(rows) // size, self._with_room().room)
+        self._write([self._encode(rows[k * size : (k + 1) * size], self._chunks + k) for k in range(count)])
+        return count * size
+
     def _flush(self) -> None:
         self._filled = 0
         if self._pool is None:
-            self._write(self._encode(self._buffer))
+            self._write([self._encode(self._buffer, self._chunks)])
             return
         self._encoding.append((self._pool.submit(encode, self._buffer, self.shape.codec), self._buffer))
         if not self._free:
             self._write_oldest()
         self._buffer = self._free.popleft()
 
-    def _encode(self, rows: NDArray[Any]) -> NDArray[np.uint8]:
+    def _encode(self, rows: NDArray[Any], chunk: int) -> NDArray[np.uint8]:
         if self._once is None:
             return encode(rows, self.shape.codec)
-        return self._once(self._chunks, rows, self.shape.codec)
+        return self._once(chunk, rows, self.shape.codec)
 
     def _write_oldest(self) -> None:
         payload, buffer = self._encoding.popleft()
         self._free.append(buffer)
-        self._write(payload.result())
+        self._write([payload.result()])
 
-    def _write(self, payload: NDArray[np.uint8]) -> None:
-        shard = self._shard
-        if shard is None or shard.full:
-            shard = self._next_shard()
+    def _write(self, payloads: Sequence[NDArray[np.uint8]]) -> None:
+        self.finish()  # its last pages are those that the next piece needs
+        shard = self._with_room()
+        piece = self._pages.piece(payloads) if self._is_large else small_piece(payloads)
         self._unsynced = True
-        self.bytes_written += shard.append(payload, self._pages)
-        self._chunks += 1
+        if self._behind is not None:
+            self._writing = self._behind.submit(shard.append, piece), piece
+        else:
+            shard.append(piece)
+            self._count(piece)
+
+    def _count(self, piece: Piece) -> None:
+        self._chunks += len(piece.sizes)
+        self.bytes_written += sum(piece.sizes)
+
+    def _with_room(self) -> ShardWriter:
+        shard = self._shard
+        return shard if shard is not None and shard.room else self._next_shard()
 
     def _next_shard(self) -> ShardWriter:
         self.publish()
@@ -174,8 +215,7 @@ class ArrayWriter:
         path = self.directory / key
         self.directory.stat()  # one that was taken away is a failure, and not made again
         self._disk.make_directory(path.parent, parents=True)
-        direct = self.shape.chunk_bytes >= DIRECT_BYTES
-        self._shard = ShardWriter(self._disk, path, self.shape.shard_chunks, direct=direct)
+        self._shard = ShardWriter(self._disk, path, self.shape.shard_chunks, direct=self._is_large)
         if self._durable:
             self._sync_directories(path.parent)
         return self._shard

@@ -55,7 +55,7 @@ def keep_freed_memory() -> bool:
 
 def is_aligned(array: NDArray[Any]) -> bool:
     """The array's memory begins with a page."""
-    return int(array.ctypes.data) % PAGE == 0
+    return int(array.__array_interface__["data"][0]) % PAGE == 0
 
 
 def open_direct(path: Path) -> int:

@@ -14,7 +14,9 @@ chunk.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +25,7 @@ from acquire.store.codecs import CRC_BYTES, crc32c
 from acquire.store.pages import PAGE, aligned_bytes, is_aligned, page_up
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -58,7 +61,7 @@ class ArrayShape:
     @property
     def chunk_bytes(self) -> int:
         """Bytes of a chunk's samples."""
-        return int(np.prod(self.chunk_shape)) * self.dtype.itemsize
+        return math.prod(self.chunk_shape) * self.dtype.itemsize
 
     @property
     def shard_rows(self) -> int:
@@ -92,8 +95,19 @@ def unpack_index(data: Buffer, chunks: int) -> tuple[NDArray[np.uint64], bool]:
     return np.frombuffer(entries, "<u8").reshape(chunks, 2), crc32c(entries) == checksum
 
 
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """Chunks that follow each other in a shard: their bytes and checksums as they will lie in the file.
+
+    ``parts`` are whole pages; ``sizes`` are the bytes of each chunk, with its checksum.
+    """
+
+    parts: list[Buffer]
+    sizes: list[int]
+
+
 class ShardWriter:
-    """One shard being written, chunk after chunk. Raises OSError as the disk gives it."""
+    """One shard being written, piece after piece. Raises OSError as the disk gives it."""
 
     def __init__(self, disk: Disk, path: Path, chunks: int, *, direct: bool) -> None:
         self._file = disk.create(path, direct=direct)
@@ -111,28 +125,24 @@ class ShardWriter:
         """Of these, in the index: all that exists for a reader."""
 
     @property
-    def full(self) -> bool:
-        return self.chunks == len(self._index)
+    def room(self) -> int:
+        """Chunks that it can still take."""
+        return len(self._index) - self.chunks
 
     @property
     def direct(self) -> bool:
         """Chunks go past the page cache."""
         return self._file.direct
 
-    def append(self, payload: NDArray[np.uint8], pages: Pages) -> int:
-        """Write one encoded chunk, to be published; returns its size on disk.
-
-        Page-aligned memory is written from where it is, but for its last page.
-        """
-        size = len(payload) + CRC_BYTES
-        if self._in_pages:
-            self._file.write_pages(pages.arrange(payload, crc32c(payload.data)), self._end)
-        else:
-            self._file.write([payload.data, crc32c(payload.data)], self._end)
-        self._index[self.chunks] = self._end, size
-        self.chunks += 1
-        self._end += page_up(size)
-        return size
+    def append(self, piece: Piece) -> None:
+        """Write chunks, to be published; all at once, since a disk takes large writes sooner than many."""
+        write = self._file.write_pages if self._in_pages else self._file.write
+        write(piece.parts, self._end)
+        ends = list(accumulate(map(page_up, piece.sizes), initial=self._end))
+        new = slice(self.chunks, self.chunks + len(piece.sizes))
+        self._index[new, 0], self._index[new, 1] = ends[:-1], piece.sizes
+        self.chunks += len(piece.sizes)
+        self._end = ends[-1]
 
     def publish(self) -> None:
         """Put the chunks that are written into the index; several at once cost as much as one."""
@@ -155,14 +165,38 @@ class Pages:
     def __init__(self) -> None:
         self._memory = aligned_bytes(2 * PAGE)
 
-    def arrange(self, payload: NDArray[np.uint8], checksum: bytes) -> list[Buffer]:
-        """Payload and checksum as parts that are whole pages, filled up with 0; valid until the next call."""
-        whole = len(payload) // PAGE * PAGE if is_aligned(payload) else 0
-        rest = len(payload) - whole
-        size = page_up(rest + CRC_BYTES)
+    def piece(self, payloads: Sequence[NDArray[np.uint8]]) -> Piece:
+        """Encoded chunks with their checksums, each filled up with 0; valid until the next call.
+
+        Page-aligned memory stays where it is, but for its last page.
+        """
+        wholes = [len(payload) // PAGE * PAGE if is_aligned(payload) else 0 for payload in payloads]
+        rests = [payload[whole:] for payload, whole in zip(payloads, wholes, strict=True)]
+        free = self._at_least(sum(page_up(len(rest) + CRC_BYTES) for rest in rests))
+        parts: list[Buffer] = []
+        for payload, whole, rest in zip(payloads, wholes, rests, strict=True):
+            size = page_up(len(rest) + CRC_BYTES)
+            last, free = free[:size], free[size:]
+            _fill(last, rest, crc32c(payload.data))
+            parts += [payload[:whole].data, last.data]
+        return Piece(parts, [len(payload) + CRC_BYTES for payload in payloads])
+
+    def _at_least(self, size: int) -> NDArray[np.uint8]:
         if size > len(self._memory):
             self._memory = aligned_bytes(size + size // 4)
-        self._memory[:rest] = payload[whole:]
-        self._memory[rest : rest + CRC_BYTES] = np.frombuffer(checksum, np.uint8)
-        self._memory[rest + CRC_BYTES : size] = 0
-        return [payload[:whole].data, self._memory[:size].data]
+        return self._memory
+
+
+def small_piece(payloads: Sequence[NDArray[np.uint8]]) -> Piece:
+    """Small encoded chunks with their checksums, each filled up with 0: a copy is all that they cost."""
+    chunks = [payload.tobytes() + crc32c(payload.data) for payload in payloads]
+    whole = b"".join(chunk.ljust(page_up(len(chunk)), b"\0") for chunk in chunks)
+    return Piece([whole], [len(chunk) for chunk in chunks])
+
+
+def _fill(pages: NDArray[np.uint8], rest: NDArray[np.uint8], checksum: bytes) -> None:
+    """The last pages of a chunk."""
+    size = len(rest)
+    pages[:size] = rest
+    pages[size : size + CRC_BYTES] = np.frombuffer(checksum, np.uint8)
+    pages[size + CRC_BYTES :] = 0

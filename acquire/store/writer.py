@@ -92,6 +92,7 @@ class RecordingWriter:
         if threads:
             keep_freed_memory()
         self._pool = ThreadPoolExecutor(threads, "encoder") if threads else None
+        self._behind = ThreadPoolExecutor(1, "disk")
         once = {name: EncodeOnce() for name in layout.SAME_IN_BOTH_ARMS}
         self._arms = {arm: ArmWriter(path / arm, spec, disk, self._pool, once) for arm in ARMS}
         self._gaps = gap_table(path)
@@ -202,12 +203,27 @@ class RecordingWriter:
 
         Raises DataError unless the block begins with the next line of its arm, and when the disk fails.
         """
+        self._append(block, None)
+
+    def lend(self, block: TaggedBlock) -> None:
+        """`append` that goes on while the lines are on their way to the disk: it can be the other arm's turn.
+
+        The block's arrays stay as they are until `give_back`, which may be told that the disk failed.
+        """
+        self._append(block, self._behind)
+
+    def _append(self, block: TaggedBlock, behind: ThreadPoolExecutor | None) -> None:
         self._check_alive()
         with self._failing(f"writing lines of arm {block.arm}"):
-            self._arms[block.arm].append(block)
+            self._arms[block.arm].append(block, behind)
         written = min(arm.written_rows for arm in self._arms.values())
         if written - self._committed >= self.spec.commit_lines:
             self.commit()
+
+    def give_back(self, arm: str) -> None:
+        """Wait until the arrays that the arm has lent may be reused. DataError: the disk failed."""
+        with self._failing(f"writing lines of arm {arm}"):
+            self._arms[arm].give_back()
 
     def add_gap(self, arm: str, first_line: int, count: int, cause: str) -> None:
         """List ``count`` lines of ``arm`` as lost because of ``cause``, a short name.
@@ -297,8 +313,9 @@ class RecordingWriter:
     def close(self) -> None:
         """Let go of all files; what was not committed is dropped. Idempotent."""
         self._closed = True
-        if self._pool is not None:
-            self._pool.shutdown(cancel_futures=True)
+        for threads in (self._pool, self._behind):
+            if threads is not None:
+                threads.shutdown(cancel_futures=True)
         with self._failing("closing files"):
             for arm in self._arms.values():
                 arm.close()

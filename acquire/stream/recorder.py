@@ -21,6 +21,7 @@ import select
 import time
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -45,12 +46,14 @@ from acquire.stream.messages import (
 )
 from acquire.stream.process import OwnerGone, become_important
 from acquire.stream.session import OPEN_END, Session
-from acquire.stream.stalls import Arm, Backlog, find_stall
+from acquire.stream.stalls import Arm, Backlog, Lent, find_stall
 from acquire.stream.tagger import Tagger
 from acquire.stream.window import Span, hold, span
 from acquire.stream.witness import Witness
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from acquire.stream.messages import Sealed
     from acquire.stream.process import Mailbox
     from acquire.stream.ring import Ring, RingBlock
@@ -73,8 +76,10 @@ _COMMIT_INTERVAL_S = 0.1
 _COMMIT_SHARE = 4
 """Commits take at most one part in so many of the time, however slow the disk."""
 _BLOCKS_PER_TURN = 8
+_CALM_BLOCKS = 2
+"""Waiting in a ring. With more, the disk is kept busy while blocks are made ready: two processors for one."""
 _LONGEST_DRAIN_S = 0.05
-"""Of one arm, while the other waits for its turn."""
+"""While messages and commits wait."""
 _NOTES = 1024
 """Events that are remembered for recordings which begin later and hold their lines."""
 
@@ -168,8 +173,7 @@ class Recorder:
             self._listen()
             self._look_at_disk()
             self._read_tags()
-            moved = [self._drain(name, arm) for name, arm in self._arms.items()]
-            self._busy = any(moved)
+            self._busy = self._drain()
             if self._session is not None:
                 self._look_after(self._session)
         except (AcquireError, OSError) as error:
@@ -320,6 +324,11 @@ class Recorder:
         return [replace(note, line=first_line) for note in doubts]
 
     def _close(self, session: Session, error: Exception | None = None) -> None:
+        for name, arm in self._arms.items():
+            try:
+                self._release(name, arm)
+            except (AcquireError, OSError) as another:
+                error = error or another
         self._session = None
         self._counters["writing"] = 0
         self._free_from = max(book.next_line for book in session.books.values())
@@ -335,38 +344,70 @@ class Recorder:
             if self._session is not None:
                 self._session.mismatches(found)
 
-    def _drain(self, name: str, arm: Arm) -> bool:
-        """Take what the arm has, some blocks at most; says whether there was any."""
+    def _drain(self) -> bool:
+        """Take what the rings have, some blocks at most; says whether there was any.
+
+        The arms take turns: in a hurry, one's block is made ready while the disk writes the other's.
+        """
+        until_s = time.monotonic() + _LONGEST_DRAIN_S
+        for taken in range(_BLOCKS_PER_TURN):
+            moved = [self._move(name, arm) for name, arm in self._arms.items()]
+            if not any(moved):
+                return taken > 0
+            if time.monotonic() > until_s:
+                break
+        return True
+
+    def _move(self, name: str, arm: Arm) -> bool:
+        """Let go of the arm's last block and take the next, if there is one that may go."""
+        self._release(name, arm)
         self._listen_to(name, arm)
         if self._opening is not None and self._opening.span is not None:
             return False  # it waits for the recording
-        until_s = time.monotonic() + _LONGEST_DRAIN_S
-        for taken in range(_BLOCKS_PER_TURN):
-            block = arm.ring.acquire()
-            if block is None or not self._may_go(arm.ring, block):
-                return taken > 0
-            written = 0 if self._session is None else self._take(name, arm, block, self._session)
-            self._counters.add(f"discarded_{name}", len(block.flags) - written)
-            self._counters.add(f"stored_{name}", written)
-            arm.ring.release()
-            if time.monotonic() > until_s:
-                break
+        block = arm.ring.acquire()
+        if block is None or not self._may_go(arm.ring, block):
+            return False
+        arm.lent = Lent(len(block.flags))
+        if self._session is None:
+            self._release(name, arm)
+        else:
+            self._take(name, arm, block, self._session)
         return True
 
     def _listen_to(self, name: str, arm: Arm) -> None:
         arm.watch(time.monotonic(), self._counters[f"awaited_{name}"])
 
-    def _take(self, name: str, arm: Arm, block: RingBlock, session: Session) -> int:
+    def _take(self, name: str, arm: Arm, block: RingBlock, session: Session) -> None:
         """Write the block; end while all lines are still there, should the disk be too slow for them."""
-        self._counters["writing"] = 1
-        written = session.take(name, block)
-        self._counters["writing"] = 0
+        assert arm.lent is not None
+        with self._counting():
+            arm.lent.written = session.take(name, block, hurry=arm.ring.fill > _CALM_BLOCKS)
         fill, slots = arm.ring.fill, arm.ring.shape.slots
         if arm.backlog.grows(fill, slots, time.monotonic()) and not session.ending:
             # Before the slot is released: nothing has been lost as long as the ring is not overtaken.
             reason = f"too slow to write: {fill} of {slots} ring slots of arm {name} wait for disk or codec"
             session.end(self._common_line(), reason, RunCondition.INTERRUPTED)
-        return written
+
+    def _release(self, name: str, arm: Arm) -> None:
+        """Give the arm's last block back to its ring, once it is written."""
+        lent, arm.lent = arm.lent, None
+        if lent is None:
+            return
+        try:
+            if self._session is not None:
+                with self._counting():
+                    self._session.give_back(name)
+        finally:
+            self._counters.add(f"discarded_{name}", lent.lines - lent.written)
+            self._counters.add(f"stored_{name}", lent.written)
+            arm.ring.release()
+
+    @contextmanager
+    def _counting(self) -> Iterator[None]:
+        """Lines are being written: it may take its time."""
+        self._counters["writing"] = 1
+        yield
+        self._counters["writing"] = 0
 
     def _may_go(self, ring: Ring, block: RingBlock) -> bool:
         """Nothing is gained by letting the block wait any longer for its tag."""

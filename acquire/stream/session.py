@@ -63,6 +63,8 @@ class Writer(Protocol):
     @property
     def nearly_full(self) -> str | None: ...
     def append(self, block: TaggedBlock) -> None: ...
+    def lend(self, block: TaggedBlock) -> None: ...
+    def give_back(self, arm: str) -> None: ...
     def add_gap(self, arm: str, first_line: int, count: int, cause: str) -> None: ...
     def add_event(self, kind: str, tick: int, line: int, text: str = "") -> None: ...
     def commit(self) -> None: ...
@@ -189,8 +191,11 @@ class Session:
         """The arm has all its rows."""
         return self.books[arm].next_line >= self.end_line
 
-    def take(self, arm: str, block: RingBlock) -> int:
-        """Write what was lost before the block, and what of the block is in range: so many lines."""
+    def take(self, arm: str, block: RingBlock, *, hurry: bool = False) -> int:
+        """Write what was lost before the block, and what of the block is in range: so many lines.
+
+        In a ``hurry`` it may still be on its way to the disk afterwards: it is lent until `give_back`.
+        """
         book = self.books[arm]
         if block.end_line <= book.next_line:
             return 0
@@ -202,8 +207,12 @@ class Session:
         if part.stop <= part.start:
             return 0
         taken = LineBlock(arm, book.next_line, block.pixels[part], block.flags[part])
-        self._append(taken)
+        self._append(taken, hurry=hurry)
         return len(taken)
+
+    def give_back(self, arm: str) -> None:
+        """Wait until the block that the arm's `take` was given may be reused."""
+        self._writer.give_back(arm)
 
     def give_up(self, arm: str) -> None:
         """Fill the remaining rows of a lost arm."""
@@ -295,13 +304,13 @@ class Session:
             book.miss(len(pixels), cause)
             count -= len(pixels)
 
-    def _append(self, block: LineBlock) -> None:
+    def _append(self, block: LineBlock, *, hurry: bool) -> None:
         tagged = self._tagger.tag(block)
         book = self.books[block.arm]
         if block.arm in self.doubted:
             tagged = replace(tagged, flags=tagged.flags | np.uint16(LineFlag.CODE_UNVERIFIED))
             book.doubted += len(tagged)
-        self._writer.append(tagged)
+        (self._writer.lend if hurry else self._writer.append)(tagged)
         book.store(tagged.flags)
 
     def _condition(self) -> RunCondition:

@@ -59,12 +59,21 @@ class Backlog:
         return fill >= max(first_fill, NEARLY_FULL * slots)
 
 
+@dataclass(slots=True)
+class Lent:
+    """A block that may still be on its way to the disk: its lines, and how many of them are recorded."""
+
+    lines: int
+    written: int = 0
+
+
 class Arm:
-    """A ring as the recorder sees it: when it last showed life, and what waits in it."""
+    """A ring as the recorder sees it: when it last showed life, what waits in it, what is being written."""
 
     def __init__(self, ring: Ring) -> None:
         self.ring = ring
         self.backlog = Backlog()
+        self.lent: Lent | None = None
         self.alive_s = time.monotonic()
         self._newest = ring.newest_line
         self._awaited = 0

@@ -81,7 +81,7 @@ def test_kill_leaves_everything_that_was_acknowledged(tmp_path, seed):
 def test_reader_of_a_growing_recording_never_sees_a_line_that_is_not_there(tmp_path):
     path = tmp_path / "r.zarr"
     steps, seen = 0, 0
-    with writer_process(path, 24 * 6 * 50) as process:
+    with writer_process(path, 24 * 6 * 200) as process:
         deadline = time.monotonic() + WAIT_S
         while not (path / "zarr.json").exists():
             assert time.monotonic() < deadline
@@ -92,9 +92,9 @@ def test_reader_of_a_growing_recording_never_sees_a_line_that_is_not_there(tmp_p
             if rows > seen:
                 check_growth(recording, path, seen)
                 steps, seen = steps + 1, rows
-        assert words(process.stdout.read())[-1] == ("sealed", 24 * 6 * 50)
+        assert words(process.stdout.read())[-1] == ("sealed", 24 * 6 * 200)
     assert steps >= 3
-    check_rows(zarr.open_group(path, mode="r"), SPEC, 24 * 6 * 50)
+    check_rows(zarr.open_group(path, mode="r"), SPEC, 24 * 6 * 200)
 
 
 def check_growth(recording, path, seen):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import subprocess
+import time
 
 import numpy as np
 import pytest
@@ -143,6 +145,71 @@ def test_memory_in_pages_is_written_from_where_it_is(path):
                 memory[:] = 0  # it may be used again at once
         writer.seal(RunCondition.GOOD, "done", {})
     check_rows(zarr.open_group(path, mode="r"), spec, 192)
+
+
+class LateDisk(Disk):
+    """Looks at the memory that it is given late; after ``allowed`` pieces it is full."""
+
+    def __init__(self, allowed=10**6):
+        self.left = allowed
+
+    def create(self, path, *, direct):
+        file = ShardFile(path, direct=direct)
+        write_pages = file.write_pages
+
+        def late(parts, offset):
+            self.left -= 1
+            time.sleep(0.005)
+            if self.left < 0:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            write_pages(parts, offset)
+
+        file.write_pages = late
+        return file
+
+
+def lend_blocks(writer, truth, sizes):
+    """Blocks of both arms in turn, each arm's in the same memory, which is filled anew once it is back."""
+    memory = {arm: aligned_bytes(max(sizes) * truth.spec.pixels * 2) for arm in ARMS}
+    for size in sizes:
+        for arm in ARMS:
+            writer.give_back(arm)
+            block = truth.block(arm, writer.next_line(arm), size)
+            pixels = memory[arm][: block.pixels.nbytes].view(block.pixels.dtype).reshape(block.pixels.shape)
+            pixels[:] = block.pixels
+            object.__setattr__(block, "pixels", pixels)
+            writer.lend(block)
+
+
+@pytest.mark.parametrize("codec", ["none", "lz4"])
+def test_memory_that_is_lent_is_written_as_it_was(path, codec):
+    """Whole chunks, several at once, over the end of a file, and such as are put together from blocks."""
+    spec = make_spec(pixels=1024, chunk_lines=64, shard_chunks=4, codec=codec)
+    sizes = [64, 128, 320, 150, 10, 90, 64, 200]
+    with RecordingWriter.create(path, spec, LateDisk()) as writer:
+        lend_blocks(writer, Truth(spec), sizes)
+        writer.commit()
+        assert writer.committed_lines == sum(sizes) // 64 * 64
+        writer.seal(RunCondition.GOOD, "done", {})
+    check_rows(zarr.open_group(path, mode="r"), spec, sum(sizes))
+    assert verify(path).intact
+
+
+@pytest.mark.parametrize("allowed", range(1, 8))
+def test_a_disk_that_fails_while_memory_is_lent(path, allowed):
+    with RecordingWriter.create(path, BIG, LateDisk(allowed)) as writer:
+        with pytest.raises(DataError, match=r"writing lines of arm [ab]: No space left on device"):
+            lend_blocks(writer, Truth(BIG), [128] * 5)
+        with pytest.raises(DataError, match="no more lines"):
+            writer.lend(Truth(BIG).block("a", writer.next_line("a"), 64))
+        for arm in ARMS:
+            with contextlib.suppress(DataError):  # the other may have failed as well
+                writer.give_back(arm)
+        writer.seal(RunCondition.ABORTED, "disk full", {})
+    recording = open_recording(path)
+    assert recording.lines == allowed // 2 * 128
+    assert verify(path).intact
+    check_rows(zarr.open_group(path, mode="r"), BIG, recording.lines)
 
 
 @pytest.mark.parametrize("codec", ["lz4", "zstd"])

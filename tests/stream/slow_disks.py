@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Sequence
@@ -34,13 +35,17 @@ class SlowFile(ShardFile):
 
 @dataclass(frozen=True)
 class FailingDisk(Disk):
-    """Refuses with ``number`` once a file of lines would pass so many bytes; ``wholly``: all after it."""
+    """Refuses with ``number`` once a file of lines would pass so many bytes; ``wholly``: all after it.
+
+    ``bytes_per_s``: of lines, that it takes before.
+    """
 
     number: int
     after_bytes: int
     marker: Path
     """Exists once it has failed: the writer's process knows of it by nothing else."""
     wholly: bool = False
+    bytes_per_s: float = math.inf
 
     def create(self, path: Path, *, direct: bool) -> ShardFile:
         self._refuse()
@@ -69,6 +74,8 @@ class FailingFile(ShardFile):
         self._disk = disk
 
     def write_pages(self, parts: Sequence[Any], offset: int) -> None:
-        if offset + sum(memoryview(part).nbytes for part in parts) > self._disk.after_bytes:
+        size = sum(memoryview(part).nbytes for part in parts)
+        time.sleep(size / self._disk.bytes_per_s)
+        if offset + size > self._disk.after_bytes:
             self._disk.fail()
         super().write_pages(parts, offset)

@@ -47,6 +47,12 @@ class MemoryWriter:
         pixels = block.pixels.copy()  # the ring takes its memory back
         taken.append(TaggedBlock(block.arm, block.first_line, pixels, *rest_of(block)))
 
+    def lend(self, block: TaggedBlock) -> None:
+        self.append(block)
+
+    def give_back(self, arm: str) -> None:
+        self._refuse("give_back")
+
     def add_gap(self, arm: str, first_line: int, count: int, cause: str) -> None:
         self.gaps.append((arm, first_line, count, str(cause)))
 

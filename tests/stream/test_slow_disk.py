@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import math
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -104,11 +105,16 @@ def check_graceful_end(capture: Capture, path: Path) -> None:
     assert all(account.balanced for account in capture.poll().accounts.values())
 
 
-@pytest.mark.parametrize("share", [0.2, 0.6])
-def test_a_slow_disk_ends_the_recording_before_a_line_is_lost(tmp_path: Path, share: float) -> None:
+@pytest.mark.parametrize(("share", "block_lines"), [(0.2, 128), (0.6, 128), (0.6, 512)])
+def test_a_slow_disk_ends_the_recording_before_a_line_is_lost(
+    tmp_path: Path, share: float, block_lines: int
+) -> None:
     path = tmp_path / "r.zarr"
-    with capturing(SlowDisk(share * LOAD.bytes_per_s)) as capture:
-        capture.start(path, recording_spec(LOAD, capture.clock))
+    load = replace(
+        LOAD, block_lines=block_lines, ring_slots=LOAD.ring_slots * LOAD.block_lines // block_lines
+    )
+    with capturing(SlowDisk(share * LOAD.bytes_per_s), load) as capture:
+        capture.start(path, recording_spec(load, capture.clock))
         check_graceful_end(capture, path)
 
 
@@ -127,12 +133,20 @@ def test_a_disk_that_the_kernel_slows_down(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "wholly"), [(errno.ENOSPC, False), (errno.EIO, False), (errno.EROFS, True)]
+    ("number", "wholly", "share"),
+    [
+        (errno.ENOSPC, False, math.inf),
+        (errno.EIO, False, math.inf),
+        (errno.EIO, False, 0.8),  # in a hurry by then
+        (errno.EROFS, True, math.inf),
+    ],
 )
-def test_a_disk_that_fails_acknowledges_nothing_more(tmp_path: Path, number: int, wholly: bool) -> None:
+def test_a_disk_that_fails_acknowledges_nothing_more(
+    tmp_path: Path, number: int, wholly: bool, share: float
+) -> None:
     """Sealed as aborted with what is there; on a disk that takes nothing any more, left as committed last."""
     path = tmp_path / "r.zarr"
-    disk = FailingDisk(number, 4 * 2**20, tmp_path / "failed", wholly)
+    disk = FailingDisk(number, 4 * 2**20, tmp_path / "failed", wholly, share * LOAD.bytes_per_s)
     with capturing(disk) as capture:
         capture.start(path, recording_spec(LOAD, capture.clock))
         seen, acknowledged = until_done(capture, path)
