@@ -21,7 +21,7 @@ from acquire.errors import ConfigError
 from acquire.event_config import CheckConfig, EventsConfig
 from acquire.geometry import Geometry
 from acquire.plan_config import ReconstructionPlan
-from acquire.recording_config import USUAL_CHUNK_BYTES, RecordingConfig, usual_chunk_lines
+from acquire.recording_config import USUAL_CHUNK_BYTES, RecordingConfig, usual_chunk_lines, usual_tag_chunks
 from acquire.scene_config import SceneConfig, SceneFile, VideoSceneConfig, anchored
 
 if TYPE_CHECKING:
@@ -203,6 +203,14 @@ class RigConfig(FrozenModel):
         if USUAL_CHUNK_BYTES // 4 <= block_lines * line_bytes <= USUAL_CHUNK_BYTES:
             return block_lines
         return usual_chunk_lines(line_bytes, self.line_rate_hz)
+
+    @property
+    def tag_chunks(self) -> int:
+        """Chunks of a recording's lines whose tags share one chunk."""
+        recording = self.recording
+        return usual_tag_chunks(
+            self.chunk_lines, recording.shard_chunks, self.line_rate_hz, recording.commit_s
+        )
 
     @property
     def ring_reserve(self) -> int:

@@ -9,16 +9,26 @@ from pydantic import Field
 
 from acquire.effect_config import FrozenModel
 
-USUAL_CHUNK_BYTES = 4 * 2**20
-"""A cut reads whole chunks, so small ones are quicker to cut; a disk writes smaller ones more slowly."""
+USUAL_CHUNK_BYTES = 2 * 2**20
+"""A cut reads whole chunks: small ones are quicker to cut, but there are more of them to be written."""
 USUAL_CHUNK_S = 0.1
 """What is held in memory until its chunk is whole, in seconds of lines."""
+USUAL_TAG_LINES = 4096
 
 
 def usual_chunk_lines(line_bytes: int, line_rate_hz: float) -> int:
     """Lines per chunk that suit lines of so many bytes at such a rate: a power of two, at least 16."""
     most = min(USUAL_CHUNK_BYTES / line_bytes, USUAL_CHUNK_S * line_rate_hz)
     return 1 << max(4, int(most).bit_length() - 1)
+
+
+def usual_tag_chunks(chunk_lines: int, shard_chunks: int, line_rate_hz: float, commit_s: float) -> int:
+    """Chunks of lines whose tags share one chunk: few bytes cost as much to write as many.
+
+    Lines become readable with the chunk of their tags, so it must not take long to be whole.
+    """
+    most = min(USUAL_TAG_LINES, min(USUAL_CHUNK_S, commit_s) * line_rate_hz) / chunk_lines
+    return max(n for n in range(1, shard_chunks + 1) if shard_chunks % n == 0 and n <= max(1, most))
 
 
 class RetentionConfig(FrozenModel):
@@ -42,9 +52,9 @@ class RecordingConfig(FrozenModel):
         default=None,
         ge=16,
         le=2**20,
-        description="lines per chunk; absent: at most 4 MiB and a tenth of a second",
+        description="lines per chunk; absent: at most 2 MiB and a tenth of a second",
     )
-    shard_chunks: int = Field(default=128, ge=1, le=255, description="chunks per file")
+    shard_chunks: int = Field(default=240, ge=1, le=255, description="chunks per file")
     codec: Literal["none", "lz4", "zstd", "auto"] = Field(
         default="none", description="'auto': the smallest that holds the rate here, measured at arm"
     )

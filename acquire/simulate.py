@@ -230,6 +230,7 @@ def _spec(config: RigConfig, scene: SceneConfig) -> RecordingSpec:
         extra=describe(scene),
         chunk_lines=config.chunk_lines,
         shard_chunks=recording.shard_chunks,
+        tag_chunks=config.tag_chunks,
         codec="lz4" if recording.codec == "auto" else recording.codec,  # nothing has to be kept up with
         fsync=recording.fsync,
         layout=scene.optics.layout,

@@ -2,7 +2,7 @@
 
 ``python tools/bench_store.py --out DIR`` alternates a bare O_DIRECT write of the same bytes with every case,
 so that each ratio is within one run. Lines are 4640 pixels of 8 bit, both arms, with the noise of photons of
-a sensor whose white is 20 000 electrons; chunks like the daemon's, in page-aligned memory as in the ring.
+a sensor whose white is 20 000 electrons; blocks like those of a ring, in page-aligned memory.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 from acquire.clock import ClockFit
 from acquire.codes import ConstantCode
 from acquire.lines import ARMS, TaggedBlock
-from acquire.recording_config import usual_chunk_lines
+from acquire.recording_config import usual_chunk_lines, usual_tag_chunks
 from acquire.store import RecordingSpec, RecordingWriter, RunCondition, open_recording
 from acquire.store.codecs import CODECS, measure_codec
 from acquire.store.files import DISK
@@ -31,9 +31,11 @@ from acquire.store.pages import PAGE, aligned_bytes, open_direct, page_up
 from acquire.store.retention import shard_files
 from acquire.store.shard import shard_key
 
-PIXELS, SHARD_CHUNKS, SUBSTEPS = 4640, 128, 3
+PIXELS, SHARD_CHUNKS, SUBSTEPS = 4640, 240, 3
 LINE_RATE_HZ = 100_000
 CHUNK_LINES = usual_chunk_lines(PIXELS, LINE_RATE_HZ)
+COMMIT_S = 0.1
+BLOCK_LINES = 1024
 HOUR_LINES = 3600 * LINE_RATE_HZ
 SHARD_LINES = CHUNK_LINES * SHARD_CHUNKS
 MIDDLE = HOUR_LINES // 2 // SHARD_LINES * SHARD_LINES
@@ -66,30 +68,31 @@ def spec(codec: str = "none", fsync: str = "seal") -> RecordingSpec:
         config={},
         chunk_lines=CHUNK_LINES,
         shard_chunks=SHARD_CHUNKS,
+        tag_chunks=usual_tag_chunks(CHUNK_LINES, SHARD_CHUNKS, LINE_RATE_HZ, COMMIT_S),
         codec=codec,
         fsync=fsync,
-        commit_lines=LINE_RATE_HZ // 10,
+        commit_lines=round(COMMIT_S * LINE_RATE_HZ),
         reserve_bytes=0,
     )
 
 
-def chunk_memory(count: int = 8) -> list[np.ndarray]:
-    """Chunks of lines like those of a camera, on pages."""
+def block_memory(count: int = 8) -> list[np.ndarray]:
+    """Blocks of lines like those of a camera, on pages."""
     generator = np.random.default_rng(0)
-    chunks = []
+    blocks = []
     for _ in range(count):
-        memory = aligned_bytes(CHUNK_LINES * PIXELS)[: CHUNK_LINES * PIXELS]
-        chunk = memory.reshape(CHUNK_LINES, PIXELS)
-        along, across = np.arange(CHUNK_LINES)[:, None], np.arange(PIXELS)
-        light = 100 * (1.2 + np.sin(across / 300)) * generator.uniform(0.8, 1, (CHUNK_LINES, 1)) + along % 7
+        memory = aligned_bytes(BLOCK_LINES * PIXELS)[: BLOCK_LINES * PIXELS]
+        lines = memory.reshape(BLOCK_LINES, PIXELS)
+        along, across = np.arange(BLOCK_LINES)[:, None], np.arange(PIXELS)
+        light = 100 * (1.2 + np.sin(across / 300)) * generator.uniform(0.8, 1, (BLOCK_LINES, 1)) + along % 7
         noise = generator.normal(0, 1, light.shape) * np.sqrt(light * 255 / WHITE_ELECTRONS)
-        chunk[:] = np.clip(np.rint(light + noise), 0, 255)
-        chunks.append(chunk)
-    return chunks
+        lines[:] = np.clip(np.rint(light + noise), 0, 255)
+        blocks.append(lines)
+    return blocks
 
 
 def block(arm: str, number: int, pixels: np.ndarray) -> TaggedBlock:
-    line = np.arange(number * CHUNK_LINES, (number + 1) * CHUNK_LINES, dtype=np.uint64)
+    line = np.arange(number * BLOCK_LINES, (number + 1) * BLOCK_LINES, dtype=np.uint64)
     return TaggedBlock(
         arm=arm,
         first_line=int(line[0]),
@@ -109,15 +112,15 @@ def paced(work: Callable[[], None], size: int) -> Pace:
     return Pace(size / seconds / 1e6, (time.process_time() - used) / (size / 1e9))
 
 
-def bare(directory: Path, chunks: list[np.ndarray], count: int) -> Pace:
+def bare(directory: Path, memory: list[np.ndarray], count: int) -> Pace:
     """One file, direct I/O, the same memory, pieces of the same size."""
     path = directory / ".bare"
     path.touch()
-    fd, size = open_direct(path), page_up(chunks[0].nbytes) // PAGE * PAGE
+    fd, size = open_direct(path), memory[0].nbytes // PAGE * PAGE
 
     def work() -> None:
         for number in range(count):
-            os.pwrite(fd, chunks[number % len(chunks)].data.cast("B")[:size], number * size)
+            os.pwrite(fd, memory[number % len(memory)].data.cast("B")[:size], number * size)
 
     try:
         return paced(work, count * size)
@@ -126,11 +129,11 @@ def bare(directory: Path, chunks: list[np.ndarray], count: int) -> Pace:
         path.unlink()
 
 
-def written(directory: Path, chunks: list[np.ndarray], count: int, codec: str, fsync: str) -> Pace:
-    """A recording of both arms, ``count`` chunks in all, until its last line is committed."""
+def written(directory: Path, memory: list[np.ndarray], count: int, codec: str, fsync: str) -> Pace:
+    """A recording of both arms, ``count`` blocks in all, until its last line is committed."""
     path = directory / ".bench-store.zarr"
     blocks = [
-        [block(arm, number, chunks[number % len(chunks)]) for arm in ARMS]
+        [block(arm, number, memory[number % len(memory)]) for arm in ARMS]
         for number in range(count // len(ARMS))
     ]
     with RecordingWriter.create(path, spec(codec, fsync)) as writer:
@@ -142,19 +145,19 @@ def written(directory: Path, chunks: list[np.ndarray], count: int, codec: str, f
                     writer.lend(one)
             writer.commit()
 
-        pace = paced(work, count * chunks[0].nbytes)
+        pace = paced(work, count * memory[0].nbytes)
         writer.seal(RunCondition.GOOD, "done", {})
     DISK.remove_tree(path)
     return pace
 
 
 def write_cases(directory: Path, gigabytes: float) -> None:
-    chunks = chunk_memory()
-    count = max(2, int(gigabytes * 1e9 / chunks[0].nbytes) // 2 * 2)
+    memory = block_memory()
+    count = max(2, int(gigabytes * 1e9 / memory[0].nbytes) // 2 * 2)
     cases = [("none", "seal"), ("none", "commit"), ("lz4", "seal"), ("zstd", "seal")]
     for codec, fsync in cases:
-        disk = bare(directory, chunks, count)
-        ours = written(directory, chunks, count, codec, fsync)
+        disk = bare(directory, memory, count)
+        ours = written(directory, memory, count, codec, fsync)
         print(
             f"writer, codec {codec}, fsync at {fsync}: {ours.mb_s:.0f} MB/s, {ours.cpu_s_per_gb:.3f} s "
             f"per GB; {ours.mb_s / disk.mb_s:.2f} of the bare write ({disk.mb_s:.0f} MB/s, "
@@ -163,7 +166,7 @@ def write_cases(directory: Path, gigabytes: float) -> None:
 
 
 def codec_cases() -> None:
-    (chunk,) = chunk_memory(1)
+    chunk = block_memory(1)[0][:CHUNK_LINES]
     for codec in CODECS:
         speed = measure_codec(chunk, codec, seconds=0.5)
         print(f"codec {codec} with crc32c, one thread: {speed.megabytes_per_s:.0f} MB/s, x {speed.ratio:.2f}")
@@ -172,15 +175,12 @@ def codec_cases() -> None:
 def hour(directory: Path) -> Path:
     """A recording of an hour: one shard in its middle has lines, the others are names of files."""
     path = directory / ".bench-hour.zarr"
-    chunk = chunk_memory(1)[0]
-    small = replace(
-        spec(), first_line=HOUR_LINES // 2 // (CHUNK_LINES * SHARD_CHUNKS) * CHUNK_LINES * SHARD_CHUNKS
-    )
-    first = small.first_line // CHUNK_LINES
+    lines = block_memory(1)[0]
+    small = replace(spec(), first_line=MIDDLE)
     with RecordingWriter.create(path, small) as writer:
-        for number in range(first, first + SHARD_CHUNKS):
+        for first in range(MIDDLE, MIDDLE + SHARD_LINES, BLOCK_LINES):
             for arm in ARMS:
-                writer.append(block(arm, number, chunk))
+                writer.append(block(arm, first // BLOCK_LINES, lines))
         writer.seal(RunCondition.GOOD, "done", {})
     _stretch(path, small.first_line)
     return path

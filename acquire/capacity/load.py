@@ -27,7 +27,7 @@ from acquire.config import GeometryConfig
 from acquire.device_config import CameraConfig, TriggerConfig
 from acquire.errors import DataError, UsageError
 from acquire.lines import ARMS
-from acquire.recording_config import usual_chunk_lines
+from acquire.recording_config import usual_chunk_lines, usual_tag_chunks
 from acquire.sim.clock import Wire
 from acquire.sim.pattern import PatternCameraOpener
 from acquire.sim.trigger_model import TriggerModel
@@ -63,7 +63,8 @@ class Load:
     block_lines: int = 1024
     ring_slots: int = 64
     chunk_lines: int | None = None
-    shard_chunks: int = 128
+    shard_chunks: int = 240
+    commit_s: float = 1.0
     codec: Codec = "none"
     fsync: Literal["commit", "seal"] = "seal"
 
@@ -84,6 +85,7 @@ class Load:
             ring_slots=config.ring_slots,
             chunk_lines=config.chunk_lines,
             shard_chunks=recording.shard_chunks,
+            commit_s=recording.commit_s,
             codec=codec,
             fsync=recording.fsync,
         )
@@ -260,6 +262,8 @@ def trigger_run(load: Load) -> TriggerRun:
 def recording_spec(load: Load, clock: ClockFit) -> RecordingSpec:
     """What a recording of the load would be told."""
     camera = {"white_dn": 255, "black_level_dn": 0.0, "responsivity_dn": 1.0}
+    rate_hz = load.line_rate_hz
+    chunk_lines = load.chunk_lines or usual_chunk_lines(load.line_bytes // len(ARMS), rate_hz)
     return RecordingSpec(
         run_id="load",
         stages=load.stages,
@@ -273,8 +277,9 @@ def recording_spec(load: Load, clock: ClockFit) -> RecordingSpec:
         trigger={},
         cameras=dict.fromkeys(ARMS, camera),
         config={},
-        chunk_lines=load.chunk_lines or usual_chunk_lines(load.line_bytes // len(ARMS), load.line_rate_hz),
+        chunk_lines=chunk_lines,
         shard_chunks=load.shard_chunks,
+        tag_chunks=usual_tag_chunks(chunk_lines, load.shard_chunks, rate_hz, load.commit_s),
         codec=load.codec,
         fsync=load.fsync,
     )

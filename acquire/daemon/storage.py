@@ -28,12 +28,13 @@ SAMPLE_BYTES = 4 * 2**20
 def storage_settings(config: RigConfig) -> dict[str, Any]:
     """Fields of a RecordingSpec that ``[recording]`` decides, but for an ``auto`` codec."""
     recording = config.recording
-    chunks = ceil(recording.commit_s * config.line_rate_hz / config.chunk_lines)
+    whole = config.chunk_lines * config.tag_chunks
     return {
         "chunk_lines": config.chunk_lines,
         "shard_chunks": recording.shard_chunks,
         "fsync": recording.fsync,
-        "commit_lines": chunks * config.chunk_lines,
+        "tag_chunks": config.tag_chunks,
+        "commit_lines": ceil(recording.commit_s * config.line_rate_hz / whole) * whole,
         "reserve_bytes": round(recording.reserve_gb * 1e9),
         "retention": recording.retention and _retention(recording.retention, config),
     }

@@ -54,8 +54,8 @@ class ArmWriter:
 
     @property
     def written_rows(self) -> int:
-        """Rows that are on disk in every array, in whole chunks: pixels, which may be packed, come last."""
-        return self._pixels.written_rows
+        """Rows that are on disk in every array, in whole chunks."""
+        return min(array.written_rows for array in self._arrays.values())
 
     @property
     def whole_rows(self) -> int:

@@ -130,14 +130,18 @@ SAME_IN_BOTH_ARMS = ("code_index", "code", "tick", "time")
 
 
 def column_shape(column: Column, spec: RecordingSpec) -> ArrayShape:
-    """How ``column`` is cut into pieces. Tags are predictable: packed even where pixels are not."""
+    """How ``column`` is cut into pieces; a file of any of them has the same rows.
+
+    Tags are few bytes, and predictable: they come in longer chunks, packed even where pixels are not.
+    """
     pixels = column.name == "lines"
     codec: Codec = spec.codec if pixels or spec.codec != "none" else "lz4"
+    joined = 1 if pixels else spec.tag_chunks
     return ArrayShape(
         dtype=np.dtype(column.dtype).newbyteorder("<"),
         row_shape=(spec.pixels,) if pixels else (),
-        chunk_rows=spec.chunk_lines,
-        shard_chunks=spec.shard_chunks,
+        chunk_rows=spec.chunk_lines * joined,
+        shard_chunks=spec.shard_chunks // joined,
         codec=codec,
     )
 

@@ -139,11 +139,13 @@ class Recording:
         last = int(self.arms[ARMS[0]].read("time", self.lines - 1, self.lines)[0])
         return last + round(self.line_period_ns)
 
-    def kept_chunks(self) -> list[int]:
-        """Chunks that hold rows and have not been deleted; retention deletes whole ones."""
-        reader = self.arms[ARMS[0]].reader("lines")
-        size, dropped = reader.shape.chunk_rows, self.dropped_rows()
-        return [c for c in range(reader.chunks) if not any(c * size in rows for rows in dropped)]
+    def kept_rows(self) -> list[range]:
+        """Rows that have not been deleted; retention deletes whole files."""
+        kept, start = [], 0
+        for dropped in sorted(self.dropped_rows(), key=lambda rows: rows.start):
+            kept.append(range(start, dropped.start))
+            start = dropped.stop
+        return [rows for rows in [*kept, range(start, self.lines)] if rows]
 
     def lost_rows(self, arm: str, lines: int | None = None) -> list[range]:
         """Rows of one arm that are listed in gaps; of the first ``lines`` rows, or of all that there are."""

@@ -29,7 +29,18 @@ from acquire.store.mend import mend_index, rewrite_chunk
 from acquire.store.opening import open_recording
 from acquire.store.resume import list_segments
 from acquire.store.retention import delete_shard, release
-from acquire.store.scan import COLUMNS, ArmScan, Damage, covered, missing_rows, real_rows, runs, scan
+from acquire.store.scan import (
+    COLUMNS,
+    ArmScan,
+    Damage,
+    chunks_of,
+    covered,
+    grown_rows,
+    missing_rows,
+    runs,
+    scan,
+    tag_rows,
+)
 from acquire.store.spec import RunCondition
 from acquire.store.table import event_table, gap_table
 from acquire.store.writer import RESERVE
@@ -122,17 +133,19 @@ class _Recoverer:
         self.rows = recording.lines
         self.flags_changed = 0
         self.shape = recording.arms[ARMS[0]].reader("lines").shape
+        self.tag_rows = tag_rows(recording)
         trusted = known.committed_intact and not self.sealed
-        self.first_chunk = recording.lines // self.shape.chunk_rows if trusted else 0
+        self.first_row = recording.lines // self.tag_rows * self.tag_rows if trusted else 0
         """Those before it are known to be as they were written."""
-        self.chunks = [chunk for chunk in recording.kept_chunks() if chunk >= self.first_chunk]
+        kept = [range(max(rows.start, self.first_row), rows.stop) for rows in recording.kept_rows()]
+        self.kept = [rows for rows in kept if rows]
 
     def run(self, progress: Callable[[int, int], None] | None) -> Recovery:
         recording = self.recording
         mended = sum(self._mend(arm) for arm in ARMS)
-        scans = scan(recording, self.chunks, progress)
+        scans = scan(recording, self.kept, progress)
         if not self.sealed:
-            self.rows = self._grown(scans)
+            self.rows = self._grown()
         damage = tuple(found for arm in scans.values() for found in arm.damages(recording.lines))
         new_gaps = {arm: self._flag(found) for arm, found in scans.items()}
         changed = bool(not self.sealed or mended or self.flags_changed or any(new_gaps.values()))
@@ -144,7 +157,7 @@ class _Recoverer:
     def _mend(self, arm: str) -> int:
         """Torn indices of an arm, mended."""
         stream = self.recording.arms[arm]
-        first_shard = self.first_chunk // self.shape.shard_chunks
+        first_shard = self.first_row // self.shape.shard_rows
         mended = 0
         for name in COLUMNS:
             reader = stream.reader(name)
@@ -157,49 +170,37 @@ class _Recoverer:
             )
         return mended
 
-    def _grown(self, scans: dict[str, ArmScan]) -> int:
+    def _grown(self) -> int:
         """Rows with those that are whole on disk in every array, though no commit lists them."""
-        streams = [found.stream for found in scans.values()]
-        size = self.shape.chunk_rows
-        rows = self.recording.lines
-        while rows % size == 0:
-            chunk = rows // size
-            beyond = scan(self.recording, [chunk])
-            if any(found.damaged_chunks for found in beyond.values()):
-                break
-            rows += min(real_rows(stream, chunk) for stream in streams)
-            if rows == chunk * size:
-                break
+        rows, grown = self.recording.lines, self.tag_rows
+        while rows % self.tag_rows == 0 and grown:
+            beyond = range(rows, rows + self.tag_rows)
+            grown = min(grown_rows(found, beyond) for found in scan(self.recording, [beyond]).values())
+            rows += grown
         return rows
 
     def _flag(self, found: ArmScan) -> list[tuple[int, int, str]]:
         """Flag what is lost of one arm; gaps to be listed: first line, count, cause."""
-        size = found.stream.reader("flags").shape.chunk_rows
+        size = self.tag_rows
         listed = sorted(self.recording.lost_rows(found.stream.arm, self.rows), key=lambda rows: rows.start)
-        gaps: list[tuple[int, int, str]] = []
-        for chunk in self._chunks(size):
+        gaps: dict[str, list[tuple[int, int, str]]] = {"damaged": [], "unlisted": []}
+        for chunk in chunks_of(size, [*self.kept, range(self.recording.lines, self.rows)]):
             here = range(chunk * size, min(self.rows, (chunk + 1) * size))
-            lost = chunk in found.damaged_chunks
+            lost = found.lost(range(here.start, here.start + size))
             missing = self._flag_chunk(found, chunk, lost)[: len(here)] & ~covered(listed, here)
-            cause = "damaged" if lost else "unlisted"
-            for first, count in runs(missing, self.recording.first_line + here.start):
-                gaps = _joined(gaps, first, count, cause)
-        return gaps
+            lost = lost[: len(here)]
+            for cause, rows in (("damaged", missing & lost), ("unlisted", missing & ~lost)):
+                for first, count in runs(rows, self.recording.first_line + here.start):
+                    gaps[cause] = _joined(gaps[cause], first, count, cause)
+        return sorted(gap for of_cause in gaps.values() for gap in of_cause)
 
-    def _chunks(self, size: int) -> list[int]:
-        """Chunks that hold rows now."""
-        beyond = range(-(-self.recording.lines // size), -(-self.rows // size))
-        return [*self.chunks, *beyond]
-
-    def _flag_chunk(self, found: ArmScan, chunk: int, lost: bool) -> NDArray[np.bool_]:
-        """Which rows of a chunk are missing; all of one that is ``lost``, and so it stands on disk then."""
+    def _flag_chunk(self, found: ArmScan, chunk: int, lost: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which rows of a chunk are missing; those that are ``lost`` are, and so it stands on disk then."""
         reader = found.stream.reader("flags")
-        if chunk in found.troubles["flags"]:
-            flags = np.zeros(reader.shape.chunk_rows, reader.shape.dtype)
-        else:
-            flags = reader.chunk(chunk).copy()
-        if lost and (chunk in found.troubles["flags"] or not missing_rows(flags).all()):
-            flags |= np.uint16(LineFlag.MISSING)
+        damaged = chunk in found.troubles["flags"]
+        flags = np.zeros(len(lost), reader.shape.dtype) if damaged else reader.chunk(chunk).copy()
+        if damaged or (lost & ~missing_rows(flags)).any():
+            flags[lost] |= np.uint16(LineFlag.MISSING)
             rewrite_chunk(self.disk, self.path, reader, chunk, flags)
             self.flags_changed += 1
         return missing_rows(flags)

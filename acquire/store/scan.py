@@ -12,7 +12,7 @@ from acquire.lines import LineFlag
 from acquire.store.layout import NO_LINE, line_columns
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -42,48 +42,80 @@ class Damage:
 
 @dataclass(frozen=True, slots=True)
 class ArmScan:
-    """One arm: array → chunk → what is wrong with it; chunks that are not listed are intact."""
+    """One arm: array → chunk of it → what is wrong with it; chunks that are not listed are intact."""
 
     stream: CameraStream
     troubles: dict[str, dict[int, str]]
 
-    @property
-    def damaged_chunks(self) -> set[int]:
-        """Chunks in which an array is not intact."""
-        return {chunk for troubles in self.troubles.values() for chunk in troubles}
+    def chunks(self, array: str, rows: Iterable[range]) -> Iterator[int]:
+        """Chunks of an array that hold any of ``rows``."""
+        return chunks_of(self.stream.reader(array).shape.chunk_rows, rows)
+
+    def look(self, array: str, chunk: int) -> None:
+        """Note what is wrong with a chunk, if anything is."""
+        trouble = self.stream.reader(array).trouble(chunk)
+        if trouble is not None:
+            self.troubles[array][chunk] = trouble
+
+    def lost(self, rows: range) -> NDArray[np.bool_]:
+        """Which of ``rows`` lie in a chunk, of any array, that is not intact."""
+        lost = np.zeros(len(rows), bool)
+        for array, troubles in self.troubles.items():
+            size = self.stream.reader(array).shape.chunk_rows
+            for chunk in self.chunks(array, [rows]):
+                if chunk in troubles:
+                    lost[max(0, chunk * size - rows.start) : (chunk + 1) * size - rows.start] = True
+        return lost
 
     def damages(self, rows: int) -> Iterator[Damage]:
         """Neighbouring chunks with the same trouble as one; only the first ``rows`` rows count."""
-        size = self.stream.reader("lines").shape.chunk_rows
         for array, troubles in self.troubles.items():
+            size = self.stream.reader(array).shape.chunk_rows
             for chunks, what in _stretches(troubles):
                 start, stop = chunks.start * size, min(rows, chunks.stop * size)
                 if start < stop:
                     yield Damage(self.stream.arm, array, self.stream.first_line + start, stop - start, what)
 
 
+def chunks_of(size: int, rows: Iterable[range]) -> Iterator[int]:
+    """Chunks of ``size`` rows that hold any of ``rows``, which are in order."""
+    unseen = 0
+    for part in filter(None, rows):
+        stop = -(-part.stop // size)
+        yield from range(max(unseen, part.start // size), stop)
+        unseen = stop
+
+
 def scan(
-    recording: Recording, chunks: Iterable[int], progress: Callable[[int, int], None] | None = None
+    recording: Recording, rows: Sequence[range], progress: Callable[[int, int], None] | None = None
 ) -> dict[str, ArmScan]:
-    """Look at these chunks of every array of both arms."""
-    wanted = list(chunks)
-    found = {}
-    for number, (arm, stream) in enumerate(recording.arms.items()):
-        troubles: dict[str, dict[int, str]] = {name: {} for name in COLUMNS}
-        for done, chunk in enumerate(wanted):
-            for name in COLUMNS:
-                trouble = stream.reader(name).trouble(chunk)
-                if trouble is not None:
-                    troubles[name][chunk] = trouble
+    """Look at the chunks that hold these rows, of every array of both arms."""
+    found = {arm: ArmScan(stream, {name: {} for name in COLUMNS}) for arm, stream in recording.arms.items()}
+    arrays = [(arm, name) for arm in found for name in COLUMNS]
+    total = sum(1 for arm, name in arrays for _ in found[arm].chunks(name, rows))
+    done = 0
+    for arm, name in arrays:
+        for chunk in found[arm].chunks(name, rows):
+            found[arm].look(name, chunk)
+            done += 1
             if progress is not None:
-                progress(number * len(wanted) + done + 1, len(wanted) * len(recording.arms))
-        found[arm] = ArmScan(stream, troubles)
+                progress(done, total)
     return found
 
 
-def real_rows(stream: CameraStream, chunk: int) -> int:
-    """Rows of an intact chunk that are lines; the others fill it up."""
-    return int(np.count_nonzero(stream.reader("code_index").chunk(chunk) != NO_LINE))
+def tag_rows(recording: Recording) -> int:
+    """Rows of a chunk of tags: the longest chunk that there is."""
+    return next(iter(recording.arms.values())).reader("flags").shape.chunk_rows
+
+
+def grown_rows(found: ArmScan, rows: range) -> int:
+    """How many of ``rows``, one chunk of tags, are lines from its beginning on, whole in every array."""
+    lost = found.lost(rows)
+    whole = int(lost.argmax()) if lost.any() else len(rows)
+    if not whole:
+        return 0
+    tags = found.stream.reader("code_index").chunk(rows.start // len(rows))
+    return min(whole, int(np.count_nonzero(tags != NO_LINE)))  # the others fill it up
 
 
 def missing_rows(flags: NDArray[np.uint16]) -> NDArray[np.bool_]:

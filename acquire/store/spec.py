@@ -79,6 +79,7 @@ class RecordingSpec:
     cameras : per arm the settings as read back, with ``white_dn``, ``black_level_dn``, ``responsivity_dn``
     extra : further attributes (``scene``, ``effects``, ``simulated`` ...)
     chunk_lines, shard_chunks : lines per chunk; chunks per file
+    tag_chunks : chunks of pixels whose tags (code, times, flags) share one chunk; a part of ``shard_chunks``
     codec : of the pixels
     encoders : threads that pack chunks, where there is a codec
     fsync : force bytes to the medium at every ``"commit"``, or only at the ``"seal"``
@@ -104,6 +105,7 @@ class RecordingSpec:
     extra: dict[str, Any] = field(default_factory=dict)
     chunk_lines: int = 4096
     shard_chunks: int = 64
+    tag_chunks: int = 1
     codec: Codec = "none"
     encoders: int = 2
     fsync: Literal["commit", "seal"] = "seal"
@@ -125,7 +127,7 @@ class RecordingSpec:
     @property
     def durability(self) -> Durability:
         """What this recording can lose."""
-        held = self.chunk_lines * (1 if self.codec == "none" else 1 + ENCODED_AHEAD)
+        held = self.chunk_lines * max(self.tag_chunks, 1 if self.codec == "none" else 1 + ENCODED_AHEAD)
         committed = self.commit_lines + held if self.fsync == "commit" else None
         return Durability(self.fsync, held, committed)
 
@@ -150,6 +152,7 @@ class RecordingSpec:
             "first_line": (0, 2**63 - 1),
             "substep_ticks": (1, 2**32),
             "shard_chunks": (1, MAX_SHARD_CHUNKS),
+            "tag_chunks": (1, self.shard_chunks),
             "encoders": (1, 64),
             "commit_lines": (1, 2**40),
             "reserve_bytes": (0, 2**60),
@@ -160,6 +163,10 @@ class RecordingSpec:
                 raise UsageError(
                     f"recording with {name} = {getattr(self, name)}", possible=f"{low} to {high}"
                 )
+        if self.shard_chunks % self.tag_chunks:
+            raise UsageError(
+                f"recording with tag_chunks = {self.tag_chunks}", possible=f"a divisor of {self.shard_chunks}"
+            )
 
     def _check_attributes(self) -> None:
         code_from_attrs(self.code)

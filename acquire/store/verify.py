@@ -13,7 +13,7 @@ from acquire.errors import DataError
 from acquire.lines import ARMS
 from acquire.store.camera_stream import DAMAGE
 from acquire.store.opening import open_source
-from acquire.store.scan import Damage, missing_rows, scan
+from acquire.store.scan import Damage, chunks_of, missing_rows, scan
 from acquire.store.source import source_of
 from acquire.store.suspect import suspect_lines
 
@@ -70,7 +70,7 @@ def verify(place: Path | str, progress: Callable[[int, int], None] | None = None
     """
     source = source_of(place)
     recording = open_source(source)
-    scans = scan(recording, recording.kept_chunks(), progress)
+    scans = scan(recording, recording.kept_rows(), progress)
     gone = open_source(source).dropped  # what retention may have deleted meanwhile is no damage
     damage = tuple(
         found
@@ -127,7 +127,7 @@ def _read_tags(recording: Recording, found: ArmScan) -> tuple[int | None, int]:
     """Lines flagged as missing, None where flags are damaged; lines with an impossible code index."""
     flagged, misnumbered = 0, 0
     size = found.stream.reader("flags").shape.chunk_rows
-    for chunk in recording.kept_chunks():
+    for chunk in chunks_of(size, recording.kept_rows()):
         if chunk in found.troubles["flags"] or chunk in found.troubles["code_index"]:
             return None, misnumbered
         rows = min(size, recording.lines - chunk * size)

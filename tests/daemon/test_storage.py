@@ -48,21 +48,25 @@ def test_a_codec_is_chosen_for_the_rig(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("stages", "substep_ticks", "block_lines", "chunk_lines"),
+    ("stages", "substep_ticks", "block_lines", "chunk_lines", "tag_chunks"),
     [
-        (192, 300, 1024, 8192),  # 100 kHz: a tenth of a second
-        (4096, 300, 1024, 512),  # 16 bit: 4 MiB
-        (4096, 300, 300, 300),  # a block of some MB is written as it lies in the ring
-        (54, 90_000, 256, 32),  # 333 Hz
+        (96, 300, 1024, 8192, 1),  # 100 kHz: a tenth of a second
+        (4096, 300, 1024, 256, 16),  # 16 bit: 2 MiB; tags of 4096 lines
+        (4096, 300, 200, 200, 20),  # a block of such a size is written as it lies in the ring
+        (4096, 3000, 1024, 256, 3),  # 10 kHz: tags of a tenth of a second at most
+        (54, 90_000, 256, 32, 1),  # 333 Hz
     ],
 )
-def test_chunks_suit_width_and_rate(stages, substep_ticks, block_lines, chunk_lines):
+def test_chunks_suit_width_and_rate(stages, substep_ticks, block_lines, chunk_lines, tag_chunks):
     changes = {
         "geometry.stages": stages,
         "trigger.substep_ticks": substep_ticks,
         "stream.block_lines": block_lines,
     }
     rig = load_rig("rig-demo", changes)
-    assert rig.chunk_lines == chunk_lines
-    assert storage_settings(rig)["commit_lines"] % chunk_lines == 0
+    assert (rig.chunk_lines, rig.tag_chunks) == (chunk_lines, tag_chunks)
+    assert storage_settings(rig)["commit_lines"] % (chunk_lines * tag_chunks) == 0
+    assert load_rig("rig-demo", changes | {"recording.shard_chunks": 7}).tag_chunks in (1, 7)
+    hurried = load_rig("rig-demo", changes | {"recording.commit_s": 0.002})
+    assert hurried.tag_chunks * chunk_lines <= max(chunk_lines, 0.002 * rig.line_rate_hz)
     assert load_rig("rig-demo", changes | {"recording.chunk_lines": 48}).chunk_lines == 48

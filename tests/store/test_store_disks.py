@@ -224,8 +224,9 @@ def test_encoders_keep_the_order_of_chunks(path, codec):
     check_rows(zarr.open_group(path, mode="r"), spec, 500)
 
 
-def test_no_more_is_lost_at_a_kill_than_is_stated(path):
-    spec = make_spec(codec="none", chunk_lines=16, commit_lines=32)
+@pytest.mark.parametrize("tag_chunks", [1, 4])
+def test_no_more_is_lost_at_a_kill_than_is_stated(path, tag_chunks):
+    spec = make_spec(codec="none", chunk_lines=16, commit_lines=32, tag_chunks=tag_chunks)
     lost = spec.durability.kill_lines
     with RecordingWriter.create(path, spec) as writer:
         for lines in range(7, 200, 7):

@@ -197,13 +197,18 @@ def keeper(step: int):
 
 
 @pytest.mark.parametrize(
-    ("codec", "first", "stride"),
-    [("none", 0, 4), ("none", 1, 4), ("none", 2, 4), ("none", 3, 4), ("lz4", 0, 13)],
+    ("codec", "tag_chunks", "first", "stride"),
+    [
+        *(("none", 1, 0, 4), ("none", 1, 1, 4), ("none", 1, 2, 4), ("none", 1, 3, 4), ("lz4", 1, 0, 13)),
+        *(("none", 2, 0, 7), ("none", 2, 3, 7), ("lz4", 2, 0, 17)),
+    ],
 )
-def test_power_cut_at_every_step_loses_nothing_that_was_acknowledged(tmp_path, codec, first, stride):
-    spec = make_spec(fsync="commit", codec=codec, shard_chunks=2)
+def test_power_cut_at_every_step_loses_nothing_that_was_acknowledged(
+    tmp_path, codec, tag_chunks, first, stride
+):
+    spec = make_spec(fsync="commit", codec=codec, shard_chunks=2, tag_chunks=tag_chunks)
     disk = TracedDisk()
-    acknowledged = record(tmp_path / "r.zarr", disk, spec)
+    acknowledged = record(tmp_path / "r.zarr", disk, spec, steps=tag_chunks)
     steps = disk.trace.steps
     created = acknowledged[1][0]
     for cut in range(created + first, len(steps) + 1, stride):
@@ -245,11 +250,12 @@ def check_arms(path: Path, spec, rows: int) -> None:
             np.testing.assert_array_equal(stream.read(name, 0, rows), values)
 
 
-def test_power_cut_without_forcing_leaves_no_line_that_is_not_told(tmp_path):
+@pytest.mark.parametrize("tag_chunks", [1, 2])
+def test_power_cut_without_forcing_leaves_no_line_that_is_not_told(tmp_path, tag_chunks):
     """With ``fsync="seal"`` lines may be lost, but each is flagged and listed, and none is invented."""
-    spec = make_spec(fsync="seal", codec="none", shard_chunks=2)
+    spec = make_spec(fsync="seal", codec="none", shard_chunks=2, tag_chunks=tag_chunks)
     disk = TracedDisk()
-    (_, (steps_created, _), *_) = record(tmp_path / "r.zarr", disk, spec)
+    (_, (steps_created, _), *_) = record(tmp_path / "r.zarr", disk, spec, steps=tag_chunks)
     steps = disk.trace.steps
     opened = lost = 0
     for cut in range(steps_created, len(steps) + 1, 5):
@@ -333,9 +339,9 @@ class FailingFile(ShardFile):
         super().sync()
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EIO, errno.EROFS])
-def test_a_disk_that_fails_at_any_step_acknowledges_nothing_false(tmp_path, number):
-    spec = make_spec(fsync="commit", codec="none", shard_chunks=2)
+@pytest.mark.parametrize(("number", "tag_chunks"), [(errno.ENOSPC, 1), (errno.EIO, 2), (errno.EROFS, 1)])
+def test_a_disk_that_fails_at_any_step_acknowledges_nothing_false(tmp_path, number, tag_chunks):
+    spec = make_spec(fsync="commit", codec="none", shard_chunks=2, tag_chunks=tag_chunks)
     outcomes = set()
     for allowed in range(0, 800, 23):
         path = tmp_path / f"{allowed}.zarr"

@@ -66,12 +66,14 @@ def test_sealed_recording_holds_every_line(path, codec, dtype, fsync):
     blocks=st.lists(st.tuples(st.sampled_from(ARMS), st.integers(1, 60), st.booleans()), max_size=16),
     chunk_lines=st.integers(1, 40),
     shard_chunks=st.integers(1, 3),
+    tag_chunks=st.integers(1, 3),
 )
 def test_whatever_the_order_of_blocks_both_arms_show_the_same_lines(
-    tmp_path_factory, blocks, chunk_lines, shard_chunks
+    tmp_path_factory, blocks, chunk_lines, shard_chunks, tag_chunks
 ):
     path = tmp_path_factory.mktemp("p") / "r.zarr"
-    spec = make_spec(chunk_lines=chunk_lines, shard_chunks=shard_chunks)
+    spec = make_spec(chunk_lines=chunk_lines, shard_chunks=shard_chunks * tag_chunks, tag_chunks=tag_chunks)
+    whole = chunk_lines * tag_chunks
     truth, given_lines = Truth(spec), dict.fromkeys(ARMS, 0)
     with RecordingWriter.create(path, spec) as writer:
         for arm, count, commit in blocks:
@@ -80,7 +82,7 @@ def test_whatever_the_order_of_blocks_both_arms_show_the_same_lines(
             if commit:
                 writer.commit()
                 both = min(given_lines.values())
-                assert writer.committed_lines == both // chunk_lines * chunk_lines
+                assert writer.committed_lines == both // whole * whole
                 check_rows(zarr.open_group(path, mode="r"), spec, writer.committed_lines)
         seal(writer)
     rows = min(given_lines.values())
@@ -337,6 +339,8 @@ def test_a_disk_that_refuses_the_beginning_leaves_nothing_behind(path):
         {"codec": "gzip"},
         {"fsync": "never"},
         {"shard_chunks": 256},
+        {"tag_chunks": 3},  # no part of the 4 chunks of a file
+        {"tag_chunks": 0},
         {"chunk_lines": 0},
         {"chunk_lines": 2**29},
         {"chunk_lines": 2**26 // 16 + 1},  # a little more than a chunk may take of the memory

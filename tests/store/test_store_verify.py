@@ -26,10 +26,10 @@ def path(tmp_path):
     return tmp_path / "r.zarr"
 
 
-def write(path, lines=150, lost=range(0)):
+def write(path, lines=150, lost=range(0), spec=SPEC):
     """A sealed recording of which arm b lacks some lines."""
-    truth = Truth(SPEC)
-    with RecordingWriter.create(path, SPEC) as writer:
+    truth = Truth(spec)
+    with RecordingWriter.create(path, spec) as writer:
         for arm in ARMS:
             block = truth.block(arm, SPEC.first_line, lines)
             gone = np.isin(np.arange(lines), lost) & (arm == "b")
@@ -82,6 +82,47 @@ def test_a_flipped_bit_is_found_and_its_lines_are_flagged(path, array):
     assert verify(path).contradictions == ()
     again = recover(path)
     assert (again.changed, again.lines) == (False, 150)
+
+
+@pytest.mark.parametrize(
+    ("array", "chunk", "rows"),
+    [("lines", 5, range(80, 96)), ("lines", 9, range(144, 150)), ("tick", 2, range(64, 96))],
+)
+def test_damage_costs_the_lines_of_its_chunk_only(path, array, chunk, rows):
+    """Chunks of tags are longer here than those of pixels, and have fewer to a file."""
+    write(path, spec=replace(SPEC, shard_chunks=8, tag_chunks=2))
+    offset, _ = open_recording(path).arms["b"].reader(array).entry(chunk)
+    file = path / "b" / array / "c" / str(rows.start // 128)
+    with (file / "0" if array == "lines" else file).open("r+b") as opened:
+        opened.seek(offset + 5)
+        byte = opened.read(1)[0]
+        opened.seek(offset + 5)
+        opened.write(bytes([byte ^ 16]))
+    (damage,) = verify(path).damage
+    assert (damage.array, damage.first_line, damage.count) == (array, 1000 + rows.start, len(rows))
+    assert recover(path).changed
+    assert open_recording(path).gaps == (Gap("b", 1000 + rows.start, len(rows), "damaged"),)
+    flags = zarr.open_group(path, mode="r")["b/flags"][:]
+    assert np.flatnonzero(flags & LineFlag.MISSING).tolist() == list(rows)
+    assert verify(path).contradictions == ()
+    assert not recover(path).changed
+
+
+def test_of_a_chunk_of_tags_the_lines_are_added_that_have_pixels(path):
+    """A writer that was killed between the two; whole chunks of tags are what a commit can list."""
+    writer = RecordingWriter.create(path, replace(SPEC, shard_chunks=8, tag_chunks=4))
+    fill(writer, 150, block_lines=8)
+    assert writer.committed_lines == 0
+    writer.commit()
+    assert writer.committed_lines == 128
+    fill(writer, 42, block_lines=42)
+    writer.close()
+    with (path / open_recording(path).arms["b"].reader("lines").file(10)).open("r+b") as opened:
+        opened.truncate(PAGE + 2 * PAGE + 100)  # the third chunk of its file
+    recovered = recover(path)
+    assert (recovered.lines_before, recovered.lines) == (128, 160)
+    check_rows(zarr.open_group(path, mode="r"), SPEC, 160)
+    assert verify(path).intact
 
 
 def test_a_lost_file_is_found(path):

@@ -17,7 +17,7 @@ from acquire.store import RecordingWriter, RunCondition
 
 BLOCK_LINES = 24
 PIXELS = 512
-SPEC = make_spec(pixels=PIXELS, chunk_lines=64, shard_chunks=4, codec="none")
+SPEC = make_spec(pixels=PIXELS, chunk_lines=64, shard_chunks=4, tag_chunks=2, codec="none")
 """Chunks of 64 KiB: some kills fall into the middle of one."""
 
 
