@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from acquire.store.files import Disk
     from acquire.store.shard import ArrayShape, Piece
 
-ENCODED_AHEAD = 2
+ENCODED_AHEAD = 4
 """Chunks of an array that are encoded while others are filled and written."""
 
 
