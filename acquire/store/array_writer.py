@@ -3,12 +3,13 @@
 ::
 
     append ─▶ buffer of one chunk ─full─▶ encode (in a thread of the pool) ─in order─▶ shard ─▶ disk
-       └───── whole chunks, lent ─────────────────────────────────────────────────────▲ (behind)
+       └───── whole chunks ───────────▲─────────────────────────────────────────────▲
 """
 
 from __future__ import annotations
 
 from collections import deque
+from concurrent.futures import wait
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -36,9 +37,10 @@ class ArrayWriter:
     """Appends rows to one array; whole chunks go to disk at once, the rest waits in one buffer.
 
     Buffers are allocated once. Rows that make whole chunks by themselves are written without a copy, in one
-    piece, unless a ``pool`` encodes: then up to ``ahead`` chunks are encoded while others are filled and
-    written, always in order. ``once`` is shared by arrays of equal rows. ``durable`` forces each file to the
-    medium before it is left for the next. What fills up the last chunk is ``padding``.
+    piece; with a ``pool`` they are encoded there while others are written, always in order: as they are if
+    they are lent, else copied into up to ``ahead`` buffers. ``once`` is shared by arrays of equal rows.
+    ``durable`` forces each file to the medium before it is left for the next. What fills up the last chunk is
+    ``padding``.
     """
 
     def __init__(
@@ -68,7 +70,8 @@ class ArrayWriter:
         self._free: deque[NDArray[Any]] = deque(_buffer(shape) for _ in range(1 + ahead if pool else 1))
         self._buffer = self._free.popleft()
         self._filled = 0
-        self._encoding: deque[tuple[Future[NDArray[np.uint8]], NDArray[Any]]] = deque()
+        self._encoding: deque[tuple[Future[NDArray[np.uint8]], NDArray[Any] | None]] = deque()
+        """In order; the buffer that a chunk is in, or None: it is lent."""
         self._writing: tuple[Future[None], Piece] | None = None
         self._chunks = 0
         self._published = 0
@@ -94,7 +97,8 @@ class ArrayWriter:
     def append(self, rows: NDArray[Any], behind: ThreadPoolExecutor | None = None) -> None:
         """Append rows of this array's dtype and row shape, any number of them.
 
-        With ``behind``, a thread, they are lent until `give_back`: large chunks may be on their way to disk.
+        With ``behind``, a thread, they are lent until `give_back`: large chunks may be on their way to disk,
+        or being encoded.
         """
         self._behind = behind if self._is_large else None
         start = 0
@@ -104,9 +108,10 @@ class ArrayWriter:
             self.rows += taken
 
     def give_back(self) -> None:
-        """Wait until the rows of the last `append` may be reused; what is packed is a copy of them."""
+        """Wait until the rows of the last `append` may be reused: for the disk, or for what encodes them."""
         if self._pool is None:
             self.finish()
+        wait([payload for payload, buffer in self._encoding if buffer is None])
 
     def finish(self) -> None:
         """Wait for the piece that is on its way to the disk; raises what the disk says."""
@@ -124,8 +129,7 @@ class ArrayWriter:
 
     def settle(self) -> None:
         """Wait for the chunks that are being encoded, write them, and publish all of them."""
-        while self._encoding:
-            self._write_oldest()
+        self._write_encoded()
         self.publish()
 
     def publish(self) -> None:
@@ -150,8 +154,11 @@ class ArrayWriter:
         size = self.shape.chunk_rows
         if self._pool is None and self._filled == 0:
             self.finish()  # it may be the buffer
-            if len(rows) >= size and rows.flags.c_contiguous:
+        if self._filled == 0 and len(rows) >= size and rows.flags.c_contiguous:
+            if self._pool is None:
                 return self._write_whole(rows)
+            if self._behind is not None:
+                return self._encode_whole(rows, self._pool)
         count = min(size - self._filled, len(rows))
         self._buffer[self._filled : self._filled + count] = rows[:count]
         self._filled += count
@@ -166,14 +173,24 @@ class ArrayWriter:
         self._write([self._encode(rows[k * size : (k + 1) * size], self._chunks + k) for k in range(count)])
         return count * size
 
+    def _encode_whole(self, rows: NDArray[Any], pool: ThreadPoolExecutor) -> int:
+        """Have the whole chunks at the beginning of ``rows`` encoded where they are; so many rows."""
+        self._write_encoded()
+        size = self.shape.chunk_rows
+        whole = len(rows) // size
+        for k in range(whole):
+            chunk = rows[k * size : (k + 1) * size]
+            self._encoding.append((pool.submit(encode, chunk, self.shape.codec), None))
+        return whole * size
+
     def _flush(self) -> None:
         self._filled = 0
         if self._pool is None:
             self._write([self._encode(self._buffer, self._chunks)])
             return
         self._encoding.append((self._pool.submit(encode, self._buffer, self.shape.codec), self._buffer))
-        if not self._free:
-            self._write_oldest()
+        while not self._free:
+            self._write([self._encoded()])
         self._buffer = self._free.popleft()
 
     def _encode(self, rows: NDArray[Any], chunk: int) -> NDArray[np.uint8]:
@@ -181,10 +198,19 @@ class ArrayWriter:
             return encode(rows, self.shape.codec)
         return self._once(chunk, rows, self.shape.codec)
 
-    def _write_oldest(self) -> None:
+    def _write_encoded(self) -> None:
+        """Wait for all that is being encoded, and write it in as few pieces as can be."""
+        while self._encoding:
+            self.finish()
+            count = min(self._with_room().room, len(self._encoding))
+            self._write([self._encoded() for _ in range(count)])
+
+    def _encoded(self) -> NDArray[np.uint8]:
+        """The oldest chunk that is being encoded."""
         payload, buffer = self._encoding.popleft()
-        self._free.append(buffer)
-        self._write([payload.result()])
+        if buffer is not None:
+            self._free.append(buffer)
+        return payload.result()
 
     def _write(self, payloads: Sequence[NDArray[np.uint8]]) -> None:
         self.finish()  # its last pages are those that the next piece needs

@@ -208,7 +208,8 @@ class RecordingWriter:
     def lend(self, block: TaggedBlock) -> None:
         """`append` that goes on while the lines are on their way to the disk: it can be the other arm's turn.
 
-        The block's arrays stay as they are until `give_back`, which may be told that the disk failed.
+        The block's arrays stay as they are until `give_back`, which may be told that the disk failed; until
+        then ``kill -9`` loses its lines as well.
         """
         self._append(block, self._behind)
 
@@ -219,6 +220,11 @@ class RecordingWriter:
         written = min(arm.written_rows for arm in self._arms.values())
         if written - self._committed >= self.spec.commit_lines:
             self.commit()
+
+    @property
+    def packs(self) -> bool:
+        """Lines are packed, by threads beside the caller: what is lent to them need not be copied."""
+        return self._pool is not None
 
     def give_back(self, arm: str) -> None:
         """Wait until the arrays that the arm has lent may be reused. DataError: the disk failed."""

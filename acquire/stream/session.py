@@ -62,6 +62,8 @@ class Writer(Protocol):
     def committed_lines(self) -> int: ...
     @property
     def nearly_full(self) -> str | None: ...
+    @property
+    def packs(self) -> bool: ...
     def append(self, block: TaggedBlock) -> None: ...
     def lend(self, block: TaggedBlock) -> None: ...
     def give_back(self, arm: str) -> None: ...
@@ -194,7 +196,8 @@ class Session:
     def take(self, arm: str, block: RingBlock, *, hurry: bool = False) -> int:
         """Write what was lost before the block, and what of the block is in range: so many lines.
 
-        In a ``hurry`` it may still be on its way to the disk afterwards: it is lent until `give_back`.
+        In a ``hurry`` it may still be on its way to the disk afterwards, and where it is packed to that: it
+        is lent until `give_back`.
         """
         book = self.books[arm]
         if block.end_line <= book.next_line:
@@ -310,7 +313,7 @@ class Session:
         if block.arm in self.doubted:
             tagged = replace(tagged, flags=tagged.flags | np.uint16(LineFlag.CODE_UNVERIFIED))
             book.doubted += len(tagged)
-        (self._writer.lend if hurry else self._writer.append)(tagged)
+        (self._writer.lend if hurry or self._writer.packs else self._writer.append)(tagged)
         book.store(tagged.flags)
 
     def _condition(self) -> RunCondition:

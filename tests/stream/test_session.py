@@ -39,6 +39,7 @@ class MemoryWriter:
     committed_lines: int = 0
     kept_lines: int = 0
     nearly_full: str | None = None
+    packs: bool = False
 
     def append(self, block: TaggedBlock) -> None:
         self._refuse("append")
