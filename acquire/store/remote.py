@@ -25,6 +25,10 @@ RETRY = {"max_retries": 4, "retry_timeout": timedelta(seconds=30)}
 """For how long a store that does not answer is asked again."""
 
 
+PROOF = ".acquire"
+"""A part beside the recordings, put to see whether one can be."""
+
+
 def is_url(place: Path | str) -> bool:
     """Whether a place is meant as a URL."""
     return isinstance(place, str) and "://" in place
@@ -90,6 +94,16 @@ class RemoteSource:
         with _as_os_errors():
             self._fs.put_file(str(file), self._path(key))
 
+    def prove(self) -> None:
+        """Find out whether parts can be put here, by a small one that stays: `PROOF`.
+
+        Raises PermissionError and FileNotFoundError (no such bucket) where the store says no, and OSError
+        where it cannot be asked.
+        """
+        if self.has_directories:
+            self.make_directory_of(PROOF)
+        self.put(PROOF, b"acquire copies recordings to this place\n")
+
     def make_directory_of(self, key: str) -> None:
         """What a file system needs before a part can be put; an object store needs nothing."""
         with _as_os_errors():
@@ -145,14 +159,21 @@ def _as_os_errors() -> Iterator[None]:
     """obstore has an exception tree of its own."""
     try:
         yield
-    except _store_errors() as error:
-        raise OSError(str(error).partition("\n")[0][:300]) from error
+    except tuple(_store_errors()) as error:
+        kinds = (kind for known, kind in _store_errors().items() if isinstance(error, known))
+        raise next(kinds)(str(error).partition("\n")[0][:300]) from error
 
 
 @cache
-def _store_errors() -> tuple[type[Exception], ...]:
+def _store_errors() -> dict[type[Exception], type[OSError]]:
+    """What obstore raises, the particular first → what that is here."""
     if not _has_obstore():
-        return ()
-    from obstore.exceptions import BaseError
+        return {}
+    from obstore.exceptions import BaseError, NotFoundError, PermissionDeniedError, UnauthenticatedError
 
-    return (BaseError,)
+    return {
+        NotFoundError: FileNotFoundError,
+        PermissionDeniedError: PermissionError,
+        UnauthenticatedError: PermissionError,
+        BaseError: OSError,
+    }

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 ALL_LINES = 2**62
 COPY = "0-copy.json"
+_NOT_COPIED = "not copied yet"
 
 HOLDS = ".holds"
 """Directory of the files of `hold`, where no Zarr reader lists names."""
@@ -87,7 +88,7 @@ def hold(path: Path, first_line: int, count: int, why: str = "", disk: Disk = DI
 
 def keep_from(path: Path, line: int, disk: Disk = DISK) -> None:
     """Hold every line from ``line`` on, those to come included; a later call replaces an earlier one."""
-    text = json.dumps({"first_line": line, "count": ALL_LINES, "why": "not copied yet"}).encode()
+    text = json.dumps({"first_line": line, "count": ALL_LINES, "why": _NOT_COPIED}).encode()
     try:
         disk.make_directory(_holds(path), parents=True)
         Publisher(_holds(path) / ".copy", disk).replace(_holds(path) / COPY, text, durable=True)
@@ -150,7 +151,7 @@ class Keeper:
         ``missing_bytes`` more than the limits ask for, where the disk is nearly full.
         """
         self._measure(rows)
-        self.marked = holds_of(self.path)
+        self.marked = self._marks()
         held = [hold.lines for hold in (*self.holds, *self.marked)]
         newest = self.first_line + rows
         partly = max(self.sizes.values(), default=0)
@@ -172,7 +173,7 @@ class Keeper:
 
         Returns the latter: they count as kept again.
         """
-        held = [hold.lines for hold in holds_of(self.path)]
+        held = [hold.lines for hold in self._marks()]
         saved = [shard for shard in shards if self._held(shard, held)]
         for shard in shards:
             if shard in saved:
@@ -189,6 +190,13 @@ class Keeper:
         ]
         holds = [[hold.first_line, hold.count, hold.why] for hold in (*self.holds, *self.marked)]
         return {"dropped": stretches, "holds": holds}
+
+    def _marks(self) -> list[Hold]:
+        """By `hold`, and by a copy that is to come and has not begun."""
+        marks = holds_of(self.path)
+        if self.policy.copied and not (_holds(self.path) / COPY).exists():
+            marks.append(Hold(self.first_line, ALL_LINES, _NOT_COPIED))
+        return marks
 
     def _measure(self, rows: int) -> None:
         known = max([-1, *self.sizes, *(rows.stop - 1 for rows in self.gone)])
