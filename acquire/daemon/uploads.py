@@ -24,7 +24,7 @@ from acquire.daemon.messages import UploadStatus
 from acquire.errors import ConfigError, DataError, DeviceError, UsageError
 from acquire.store.files import Publisher
 from acquire.store.opening import read_root
-from acquire.store.remote import RemoteSource
+from acquire.store.remote import check_url
 from acquire.store.source import LocalSource
 from acquire.stream.messages import Failed
 from acquire.stream.process import Worker
@@ -51,7 +51,7 @@ def check_upload(config: RigConfig) -> None:
     if url is None:
         return
     try:
-        RemoteSource(url)
+        check_url(url)
     except UsageError as error:
         raise ConfigError(
             f"recording.upload_to = {error.message}", possible=error.possible, hint=error.hint

@@ -117,22 +117,38 @@ class RemoteSource:
         return f"{self._root}/{key}"
 
 
-def _file_system(url: str) -> tuple[Any, str]:
+def check_url(url: str) -> None:
+    """Raise UsageError for a URL that cannot be one, or whose packages are not installed; asks nobody."""
     if importlib.util.find_spec("fsspec") is None:
         raise UsageError(f"{url}: fsspec is not installed", hint="pip install 'tdi-acquire[remote]'")
     import fsspec
 
     protocol = url.partition("://")[0]
     _register(protocol)
-    try:
+    with _told(url):
+        fsspec.get_filesystem_class(protocol)
+
+
+def _file_system(url: str) -> tuple[Any, str]:
+    check_url(url)
+    import fsspec
+
+    with _told(url):
         system, root = fsspec.core.url_to_fs(url, **_options(url))
+    return system, root
+
+
+@contextmanager
+def _told(url: str) -> Iterator[None]:
+    """What fsspec says of a URL, in words."""
+    try:
+        yield
     except (ValueError, ImportError) as error:
         raise UsageError(
             f"{url}: {error}",
             possible=f"{', '.join(OBJECT_STORES)}, file, memory and what else fsspec has a package for",
             hint="pip install 'tdi-acquire[remote]'",
         ) from error
-    return system, root
 
 
 def _options(url: str) -> dict[str, Any]:

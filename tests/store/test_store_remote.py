@@ -10,7 +10,7 @@ import pytest
 import zarr
 from store_helpers import Truth, check_rows, fill, make_spec
 
-from acquire.errors import DataError, UsageError
+from acquire.errors import DataError, StateError, UsageError
 from acquire.store import (
     RecordingWriter,
     Retention,
@@ -21,7 +21,7 @@ from acquire.store import (
     recover,
     verify,
 )
-from acquire.store.mirror import Mirror
+from acquire.store.mirror import Mirror, only_copy
 from acquire.store.remote import RemoteSource
 
 SPEC = make_spec()
@@ -135,6 +135,69 @@ def test_the_spool_is_bounded_and_no_line_is_lost(path):
     copying.step()
     assert open_recording(place).dropped == ()
     check_rows(zarr.open_group(RemoteSource(place).zarr_store(), mode="r"), spec, 14 * SHARD)
+
+
+def test_nothing_goes_before_its_copy_has_begun(path):
+    """The rig copies its recordings: the writer waits for whoever will do it."""
+    policy = {"max_age_lines": SHARD, "margin_lines": 1}
+    spec = make_spec(retention=Retention(**policy, copied=True))
+    with RecordingWriter.create(path, spec) as writer:
+        for _ in range(3):
+            fill(writer, 2 * SHARD, block_lines=32)
+            writer.commit()
+        assert open_recording(path).dropped == ()
+        copying = Mirror(path, f"memory://{uuid.uuid4()}/run.zarr")
+        assert copying.step(most_shards=2).waiting_lines == 4 * SHARD
+        for _ in range(2):
+            fill(writer, 32, block_lines=32)
+            writer.commit()
+        assert open_recording(path).dropped == ((spec.first_line, SHARD),)  # the margin is kept
+
+
+def test_a_copy_in_small_steps_is_one_recording_at_any_time(path):
+    place = f"memory://{uuid.uuid4()}/run.zarr"
+    with RecordingWriter.create(path, SPEC) as writer:
+        fill(writer, 200)
+        writer.commit()
+        copying = Mirror(path, place)
+        assert [copying.step(most_shards=1).lines for _ in range(2)] == [SHARD, 2 * SHARD]
+        check_rows(zarr.open_group(RemoteSource(place).zarr_store(), mode="r"), SPEC, 2 * SHARD)
+        fill(writer, 130)
+        writer.seal(RunCondition.GOOD, "done", {})
+    seen = [copying.step(most_shards=2) for _ in range(2)]
+    assert [(done.lines, done.waiting_lines, done.sealed) for done in seen] == [
+        (4 * SHARD, 330 - 4 * SHARD, False),
+        (330, 0, True),
+    ]
+    assert verify(place).intact
+
+
+def test_what_recovery_mended_after_it_was_copied_is_copied_again(path, place):
+    with RecordingWriter.create(path, SPEC) as writer:
+        fill(writer, 230)
+        writer.commit()
+        copying = Mirror(path, place)
+        assert copying.step().lines == 3 * SHARD
+    file = path / "b" / "lines" / "c" / "1" / "0"
+    data = bytearray(file.read_bytes())
+    data[4096 + 20] ^= 1
+    file.write_bytes(data)
+    assert [found.first_line for found in recover(path).damage] == [1064]
+    assert copying.step().sealed
+    there = open_recording(place)
+    assert there.gaps == open_recording(path).gaps
+    assert there.source.read("b/flags/c/1") == (path / "b" / "flags" / "c" / "1").read_bytes()
+    assert verify(place).contradictions == ()
+
+
+def test_one_process_copies_a_recording(path, tmp_path):
+    place = f"file://{tmp_path}/far.zarr"
+    write(path)
+    with only_copy(path), pytest.raises(StateError, match="another process"):
+        mirror(path, place)
+    assert mirror(path, place).sealed
+    with pytest.raises(DataError, match="does not exist"):
+        mirror(tmp_path / "none.zarr", place)
 
 
 def test_another_recording_is_not_written_over(path, tmp_path):
