@@ -218,7 +218,7 @@ class Uploads:
 
     def _heed(self, said: UploadStatus) -> None:
         before = self._found.get(said.path)
-        if said.error and (before is None or said.error != before.error):
+        if said.error and (before is None or (said.state, said.error) != (before.state, before.error)):
             log.warning("upload of %s %s: %s", said.path, said.state, said.error)
         elif said.state == "copied":
             log.info("upload of %s: %d lines are in %s", said.path, said.lines, said.url)

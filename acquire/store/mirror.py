@@ -134,6 +134,8 @@ class Mirror:
         self._disk = disk
         self._pause = pause
         self._run_id = str(open_recording(path).attrs["run_id"])
+        if (there := self.target.path) is not None and there.exists() and there.samefile(path):
+            raise UsageError(f"{url} is the recording itself, not a place for its copy", hint="another URL")
         self._bytes = 0
         self._shards = 0
         self._directories: set[str] = set()

@@ -7,22 +7,25 @@ none of them is ever written anywhere.
 from __future__ import annotations
 
 import importlib.util
+import re
 from contextlib import contextmanager
 from datetime import timedelta
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from acquire.errors import UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
     from zarr.abc.store import Store
 
 OBJECT_STORES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss")
 RETRY = {"max_retries": 4, "retry_timeout": timedelta(seconds=30)}
 """For how long a store that does not answer is asked again."""
+_ATTEMPTS = re.compile(r" in [\d.]+\w+, after \d+ retries, max_retries: \d+, retry_timeout: \w+ ?")
+"""What obstore tells of that is another text each time."""
 
 
 PROOF = ".acquire"
@@ -110,6 +113,11 @@ class RemoteSource:
             self._fs.makedirs(self._path(key).rpartition("/")[0], exist_ok=True)
 
     @property
+    def path(self) -> Path | None:
+        """Where it is on a disk of this machine, if it is."""
+        return Path(self._root) if self.url.partition("://")[0] in ("file", "local") else None
+
+    @property
     def has_directories(self) -> bool:
         return self.url.partition("://")[0] not in OBJECT_STORES
 
@@ -177,7 +185,8 @@ def _as_os_errors() -> Iterator[None]:
         yield
     except tuple(_store_errors()) as error:
         kinds = (kind for known, kind in _store_errors().items() if isinstance(error, known))
-        raise next(kinds)(str(error).partition("\n")[0][:300]) from error
+        text = _ATTEMPTS.sub("", str(error).partition("\n")[0])
+        raise next(kinds)(text[:300]) from error
 
 
 @cache

@@ -208,6 +208,15 @@ def test_another_recording_is_not_written_over(path, tmp_path):
         mirror(other, place)
 
 
+def test_a_recording_is_not_copied_onto_itself(path, tmp_path):
+    before = (write(path) / "zarr.json").read_bytes()
+    (tmp_path / "link").symlink_to(tmp_path)
+    for place in (f"file://{path}", f"file://{tmp_path}/link/run.zarr"):
+        with pytest.raises(UsageError, match="the recording itself"):
+            mirror(path, place)
+    assert (path / "zarr.json").read_bytes() == before
+
+
 def test_a_writer_that_is_gone_is_told(path, tmp_path):
     with RecordingWriter.create(path, SPEC) as writer:
         fill(writer, 100)
