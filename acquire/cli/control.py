@@ -208,9 +208,9 @@ def _uploads(status: Status) -> str | None:
     """Recordings on their way to the remote store, those that are not there yet last."""
     found = sorted(status.uploads, key=lambda one: one.state != "copied")
     shown = [f"WARNING: {status.upload_warning}"] if status.upload_warning else []
-    shown += [_upload(one) for one in found[-UPLOADS:]]
-    more = len(found) - UPLOADS
-    return "; ".join([*shown, *([f"and {more} more"] if more > 0 else [])]) or None
+    if status.uploads_left > UPLOADS:
+        shown.append(f"{status.uploads_left} recordings are not copied yet")
+    return "; ".join([*shown, *map(_upload, found[-UPLOADS:])]) or None
 
 
 def _upload(one: UploadStatus) -> str:

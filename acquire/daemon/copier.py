@@ -97,10 +97,12 @@ def url_of(target: str, path: Path) -> str:
     return f"{target}/{path.name}"
 
 
-def copy_recordings(mailbox: Mailbox, target: str) -> None:
-    """Life of the process, until its owner ends it."""
+def copy_recordings(mailbox: Mailbox, target: str, copies: tuple[Copy, ...]) -> None:
+    """Life of the process, until its owner ends it; it begins with ``copies``."""
     os.nice(_NICE)
     copier = Copier(mailbox, target)
+    for copy in copies:
+        copier.add(copy.path, ours=copy.ours)
     while True:
         copier.turn()
 
@@ -130,17 +132,17 @@ class Copier:
         """Take what the owner says. Raises OwnerGone."""
         while (message := self._mailbox.take()) is not None:
             if isinstance(message, Copy):
-                self._add(message.path, ours=message.ours)
+                self.add(message.path, ours=message.ours)
             elif isinstance(message, Reach):
                 self._mailbox.post(self._reach(message.number))
 
-    def _add(self, path: Path, *, ours: bool) -> None:
+    def add(self, path: Path, *, ours: bool) -> None:
+        """Copy a recording, too; one that waits is tried at once."""
         if (job := self._jobs.get(path)) is not None:
             job.ours, job.not_before_s = job.ours or ours, 0.0
             return
         said = UploadStatus(path=path, url=url_of(self._target, path), state="waiting")
         self._jobs[path] = Job(path, ours, said)
-        self._mailbox.post(said)
 
     def _reach(self, number: int) -> Reached:
         try:
@@ -203,7 +205,8 @@ class Copier:
         """The first recording of a run lists its segments, this one by now."""
         segment = read_root(LocalSource(path))["attributes"].get("segment")
         if segment is not None and (first := path.with_name(str(segment["of"]))).exists():
-            self._add(first, ours=False)
+            self.add(first, ours=False)
+            self._mailbox.post(self._jobs[first].said)
 
     def _end(self, job: Job, **facts: Any) -> None:
         del self._jobs[job.path]

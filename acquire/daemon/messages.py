@@ -213,6 +213,7 @@ class Status(_Message):
         default=[],
         description="recordings that are not copied to where the rig wants them, and the latest that are",
     )
+    uploads_left: int = Field(default=0, description="recordings that are not copied, listed or not")
     upload_warning: str | None = Field(default=None, description="why copies may have to wait")
 
 

@@ -382,6 +382,7 @@ class Service:
             processes={} if self._run is None else self._seen.pids,
             recoveries=self._salvage.recoveries,
             uploads=self._uploads.statuses,
+            uploads_left=self._uploads.left,
             upload_warning=self._uploads.warning,
         )
 

@@ -17,6 +17,7 @@ import contextlib
 import json
 import logging
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from acquire.daemon.copier import FIRST_WAIT_S, MOST_WAIT_S, Copy, Reach, Reached, copy_recordings, url_of
@@ -30,12 +31,10 @@ from acquire.stream.messages import Failed
 from acquire.stream.process import Worker
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from acquire.config import RigConfig
 
 MOST_LISTED = 32
-"""Recordings that are copied, the latest, of which the status tells."""
+"""Recordings that are copied, and that are not, of which the status tells: the latest."""
 ANSWER_S = 5.0
 """How long arming waits for the store's answer."""
 _END_S = 3.0
@@ -79,8 +78,9 @@ class Uploads:
     def __init__(self, target: str | None = None, journal: Path | None = None) -> None:
         self._target = target
         self._journal = journal
-        self._noted: list[str] = []
         self._found: dict[Path, UploadStatus] = {}
+        self._noted = True
+        """The journal names those that are left."""
         self._ours: set[Path] = set()
         self._worker: Worker | None = None
         self._born_s = 0.0
@@ -94,8 +94,15 @@ class Uploads:
 
     @property
     def statuses(self) -> list[UploadStatus]:
-        """The latest that are copied, and all that are not."""
-        return list(self._found.values())
+        """The latest of those that are copied, and of those that are not."""
+        left = [one for one in self._found.values() if one.state not in _OVER]
+        over = [one for one in self._found.values() if one.state in _OVER]
+        return [*over, *left[-MOST_LISTED:]]
+
+    @property
+    def left(self) -> int:
+        """Recordings that are not copied, those that are refused included."""
+        return sum(one.state not in _OVER for one in self._found.values())
 
     def begin(self) -> None:
         """Start the process; it goes on with what an earlier daemon has not finished."""
@@ -120,6 +127,7 @@ class Uploads:
         """Bring a copy up to date, or begin it."""
         if self._target is not None:
             self._expect(path)
+            self._note()
             self._post(Copy(path, path in self._ours))
 
     def recovered(self, path: Path) -> None:
@@ -179,14 +187,18 @@ class Uploads:
         before = self._found.get(path)
         if before is None or before.state in _OVER:
             self._tell(UploadStatus(path=path, url=url_of(self._target, path), state="waiting"))
-        self._note()
 
     def _tell(self, said: UploadStatus) -> None:
-        self._found.pop(said.path, None)  # the latest come last
+        before = self._found.pop(said.path, None)  # the latest come last
         self._found[said.path] = said
+        was_left = before is not None and before.state not in _OVER
+        if was_left == (said.state not in _OVER):
+            return
+        self._noted = False
         over = [path for path, one in self._found.items() if one.state in _OVER]
         for path in over[:-MOST_LISTED]:
             del self._found[path]
+            self._ours.discard(path)
 
     def _post(self, message: object) -> None:
         if self._worker is not None:
@@ -197,13 +209,14 @@ class Uploads:
             return
         try:
             self._born_s = time.monotonic()
-            self._worker = Worker("uploads", copy_recordings, self._target)
+            self._worker = Worker("uploads", copy_recordings, self._target, self._copies())
         except DeviceError as error:
             self._wait_for_another(str(error))
-            return
-        for path, one in self._found.items():
-            if one.state not in _OVER:
-                self._post(Copy(path, path in self._ours))
+
+    def _copies(self) -> tuple[Copy, ...]:
+        """All that is left, in order."""
+        left = [path for path, one in self._found.items() if one.state not in _OVER]
+        return tuple(Copy(path, path in self._ours) for path in left)
 
     def _hear(self, worker: Worker) -> str | None:
         """Take what the process says; why it ends, if it says so."""
@@ -222,6 +235,8 @@ class Uploads:
             log.warning("upload of %s %s: %s", said.path, said.state, said.error)
         elif said.state == "copied":
             log.info("upload of %s: %d lines are in %s", said.path, said.lines, said.url)
+        if said.state in ("copying", "copied"):
+            self.warning = None
         self._tell(said)
 
     def _bury(self, worker: Worker, why: str) -> None:
@@ -236,7 +251,8 @@ class Uploads:
         wait_s = min(FIRST_WAIT_S * 2**self._deaths, MOST_WAIT_S)
         self._deaths += 1
         self._not_before_s = time.monotonic() + wait_s
-        log.error("the uploading process: %s; another takes its place in %g s", why, wait_s)
+        self.warning = f"the uploading process: {why}"
+        log.error("%s; another takes its place in %g s", self.warning, wait_s)
 
     def _ask(self) -> Reached | None:
         """The store's answer, or None when there is none in time."""
@@ -254,22 +270,20 @@ class Uploads:
     def _read_journal(self) -> list[Path]:
         if self._journal is None:
             return []
-        make = type(self._journal)
         try:
-            self._noted = [str(path) for path in json.loads(self._journal.read_bytes())["not_uploaded"]]
+            return [Path(path) for path in json.loads(self._journal.read_bytes())["not_uploaded"]]
         except FileNotFoundError:
             return []
         except (OSError, ValueError, LookupError, TypeError) as error:
             log.error("%s does not say what is to be uploaded: %s", self._journal, error)  # noqa: TRY400
             return []
-        return [make(path) for path in self._noted]
 
     def _note(self) -> None:
         """Write down what is not copied, where that has changed."""
-        left = [str(path) for path, one in self._found.items() if one.state not in _OVER]
-        if self._journal is None or sorted(left) == sorted(self._noted):
+        if self._journal is None or self._noted:
             return
-        self._noted = left
+        self._noted = True
+        left = [str(path) for path, one in self._found.items() if one.state not in _OVER]
         text = json.dumps({"not_uploaded": left}, indent=1).encode()
         try:
             scratch = self._journal.with_name(f"{self._journal.name}.next")

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 from acquire.errors import DataError, StateError, UsageError
 from acquire.lines import ARMS
 from acquire.store.files import DISK, locked
-from acquire.store.layout import group_document, to_json
+from acquire.store.layout import PARSE_ERRORS, group_document, to_json
 from acquire.store.opening import open_recording
 from acquire.store.remote import RemoteSource
 from acquire.store.retention import keep_from, release, shard_files
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 LOOK_S = 0.5
 """How often a growing recording is looked at."""
+_ELSEWHERE = "another name there: acquire upload RECORDING URL"
 _HINT = (
     "the network, the store, and the environment's credentials; what is there stays: a copy goes on with it"
 )
@@ -155,6 +156,8 @@ class Mirror:
         readers there see once it is complete. Raises DataError when the store fails; a later step goes on.
         """
         recording = open_recording(self.path)
+        if recording.attrs["run_id"] != self._run_id:
+            raise DataError(f"{self.path} is another recording than it was: run {recording.attrs['run_id']}")
         sealed = recording.state == "sealed"
         if sealed and not self._sealed:  # who recovered it may have mended what was copied
             self._sealed, self._next = True, 0
@@ -192,13 +195,18 @@ class Mirror:
             return
         if "zarr.json" in self._there:
             root = self.target.read("zarr.json")
-            said = json.loads(root)["attributes"].get("run_id")
+            try:
+                said = json.loads(root)["attributes"].get("run_id")
+            except PARSE_ERRORS as error:
+                raise UsageError(
+                    f"{self.target} holds something damaged: {error!r}", hint=_ELSEWHERE
+                ) from error
             if said == self._run_id:
                 self._root = root
                 return
-            raise UsageError(f"{self.target} holds another recording: run {said}", hint="another URL")
+            raise UsageError(f"{self.target} holds another recording: run {said}", hint=_ELSEWHERE)
         if any(key.split("/")[0] not in (*ARMS, "gaps", "events") for key in self._there):
-            raise UsageError(f"{self.target} holds something that is no recording", hint="another URL")
+            raise UsageError(f"{self.target} holds something that is no recording", hint=_ELSEWHERE)
 
     def _copy_shard(self, shard: int) -> None:
         """A shard that is whole is never written again: what is there of the right size is the same."""

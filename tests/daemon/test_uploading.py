@@ -149,6 +149,7 @@ def test_what_cannot_be_is_told_and_the_others_go_on(place: Place) -> None:
     assert "run another" in said(uploads, "taken.zarr").error
     assert "damaged" in said(uploads, "broken.zarr").error
     assert sorted(place.left()) == ["broken.zarr", "taken.zarr"]
+    assert uploads.left == 2
 
 
 def test_two_do_not_copy_the_same(place: Place) -> None:

@@ -202,10 +202,19 @@ def test_one_process_copies_a_recording(path, tmp_path):
 
 def test_another_recording_is_not_written_over(path, tmp_path):
     place = f"memory://{uuid.uuid4()}/run.zarr"
-    mirror(write(path), place)
+    copying = Mirror(write(path), place)
+    copying.step()
     other = write(tmp_path / "other.zarr", spec=make_spec(run_id="run-2"))
     with pytest.raises(UsageError, match="another recording: run run-1"):
         mirror(other, place)
+    path.rename(tmp_path / "moved.zarr")
+    other.rename(path)
+    with pytest.raises(DataError, match="another recording than it was"):
+        copying.step()
+    RemoteSource(place).put("zarr.json", b"{")
+    with pytest.raises(UsageError, match="something damaged"):
+        mirror(path, place)
+    assert RemoteSource(place).read("zarr.json") == b"{"
 
 
 def test_a_recording_is_not_copied_onto_itself(path, tmp_path):
