@@ -140,6 +140,8 @@ class Mirror:
         self._bytes = 0
         self._shards = 0
         self._directories: set[str] = set()
+        self._sent: dict[str, bytes] = {}
+        """Metadata and tables → as they are there."""
         self._root = b""
         self._sealed = False
         self._next = 0
@@ -254,8 +256,12 @@ class Mirror:
         ]
 
     def _put(self, key: str, data: bytes) -> None:
+        """Most of it is the same from one time to the next, and a store takes its time for each part."""
+        if self._sent.get(key) == data:
+            return
         self._make_way(key)
         self.target.put(key, data)
+        self._sent[key] = data
         self._bytes += len(data)
 
     def _make_way(self, key: str) -> None:

@@ -22,7 +22,7 @@ from acquire.store import (
     verify,
 )
 from acquire.store.mirror import Mirror, only_copy
-from acquire.store.remote import RemoteSource
+from acquire.store.remote import PROOF, RemoteSource
 
 SPEC = make_spec()
 SHARD = 64
@@ -246,3 +246,7 @@ def test_what_cannot_be_reached_is_told(bucket, path):
         open_recording(f"{bucket}/no.zarr")
     with pytest.raises(DataError, match="nobucketofthisname"):
         mirror(write(path), "s3://nobucketofthisname/x.zarr")
+    with pytest.raises(FileNotFoundError, match="nobucketofthisname"):
+        RemoteSource("s3://nobucketofthisname").prove()
+    RemoteSource(bucket).prove()
+    assert b"acquire" in RemoteSource(bucket).read(PROOF)
