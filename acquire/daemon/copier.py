@@ -13,6 +13,7 @@ so the process may be ended, or killed, at any moment.
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import select
 import time
@@ -90,6 +91,11 @@ class Job:
         """The next try begins with a look at what is there."""
         self.mirror, self.shards = None, 0
         self.lock.close()
+
+
+def wait_s(tries: int) -> float:
+    """Until the next one, after so many that failed one after the other, and one more."""
+    return min(math.ldexp(FIRST_WAIT_S, min(tries, 16)), MOST_WAIT_S)
 
 
 def url_of(target: str, path: Path) -> str:
@@ -191,11 +197,11 @@ class Copier:
     def _advance(self, job: Job, mirror: Mirror) -> None:
         done = mirror.step(most_shards=1)
         before, job.shards = job.shards, done.shards
-        job.tries, job.grows = 0, not done.sealed
+        job.tries, job.grows = 0, mirror.grows
         facts = {"lines": done.lines, "waiting_lines": done.waiting_lines, "bytes": done.bytes}
         if done.sealed:
-            self._end(job, state="copied", error="", hint="", **facts)
             self._renew_first(job.path)
+            self._end(job, state="copied", error="", hint="", **facts)
             return
         self._tell(job, state="copying", error="", hint="", **facts)
         if done.shards == before:
@@ -215,7 +221,7 @@ class Copier:
 
     def _put_off(self, job: Job, error: str = "", hint: str = "") -> None:
         job.let_go()
-        job.not_before_s = time.monotonic() + min(FIRST_WAIT_S * 2**job.tries, MOST_WAIT_S)
+        job.not_before_s = time.monotonic() + wait_s(job.tries)
         job.tries += 1
         here = _lines_of(job.path)
         waiting = None if here is None else max(0, here - job.said.lines)

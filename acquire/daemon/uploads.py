@@ -20,7 +20,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from acquire.daemon.copier import FIRST_WAIT_S, MOST_WAIT_S, Copy, Reach, Reached, copy_recordings, url_of
+from acquire.daemon.copier import MOST_WAIT_S, Copy, Reach, Reached, copy_recordings, url_of, wait_s
 from acquire.daemon.messages import UploadStatus
 from acquire.errors import ConfigError, DataError, DeviceError, UsageError
 from acquire.store.files import Publisher
@@ -248,11 +248,11 @@ class Uploads:
     def _wait_for_another(self, why: str) -> None:
         if time.monotonic() - self._born_s > MOST_WAIT_S:
             self._deaths = 0
-        wait_s = min(FIRST_WAIT_S * 2**self._deaths, MOST_WAIT_S)
+        later_s = wait_s(self._deaths)
         self._deaths += 1
-        self._not_before_s = time.monotonic() + wait_s
+        self._not_before_s = time.monotonic() + later_s
         self.warning = f"the uploading process: {why}"
-        log.error("%s; another takes its place in %g s", self.warning, wait_s)
+        log.error("%s; another takes its place in %g s", self.warning, later_s)
 
     def _ask(self) -> Reached | None:
         """The store's answer, or None when there is none in time."""

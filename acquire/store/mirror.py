@@ -153,6 +153,11 @@ class Mirror:
         except OSError as error:
             raise DataError(f"{url} cannot be used: {error}", hint=_HINT) from error
 
+    @property
+    def grows(self) -> bool:
+        """The recording was not sealed yet at the latest step."""
+        return not self._sealed
+
     def step(self, most_shards: int | None = None) -> Mirrored:
         """Copy what is new and whole, or the next ``most_shards`` of it; what is new of a sealed recording
         readers there see once it is complete. Raises DataError when the store fails; a later step goes on.

@@ -10,18 +10,25 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from acquire.capacity.load import Load, recording_spec
+from acquire.capacity.load import Load, recording_spec, trigger_run
 from acquire.clock import ClockFit
 from acquire.config import load_rig
+from acquire.daemon.copier import FIRST_WAIT_S, MOST_WAIT_S, Copier, wait_s
 from acquire.daemon.messages import UploadStatus
 from acquire.daemon.uploads import Uploads, check_upload
 from acquire.errors import ConfigError, UsageError
+from acquire.lines import ARMS, LineBlock
 from acquire.store import Continuation, RecordingWriter, RunCondition, mirror, open_recording, recover
 from acquire.store.mirror import only_copy
+from acquire.stream.tagger import Tagger
 
-SPEC = recording_spec(Load(8, "uint16", 1000.0), ClockFit(90_000_000, 0, 0))
+CLOCK = ClockFit(90_000_000, 0, 0)
+SHARD_LINES = 16
+LOAD = Load(8, "uint16", 1000.0, chunk_lines=SHARD_LINES, shard_chunks=1)
+SPEC = recording_spec(LOAD, CLOCK)
 WAIT_S = 60.0
 
 
@@ -68,6 +75,27 @@ def place(tmp_path: Path) -> Iterator[Place]:
     made = Place(tmp_path)
     yield made
     made.close()
+
+
+def fill(writer: RecordingWriter, lines: int) -> None:
+    tagger = Tagger(trigger_run(LOAD), LOAD.stages, CLOCK)
+    for arm in ARMS:
+        pixels, flags = np.zeros((lines, LOAD.pixels), np.uint16), np.zeros(lines, np.uint16)
+        writer.append(tagger.tag(LineBlock(arm, writer.next_line(arm), pixels, flags)))
+    writer.commit()
+
+
+class Box:
+    """The copier's end of a pipe at whose other end nobody says anything."""
+
+    def __init__(self) -> None:
+        self.posted: list[UploadStatus] = []
+
+    def take(self) -> None:
+        return None
+
+    def post(self, message: UploadStatus) -> None:
+        self.posted.append(message)
 
 
 def states(uploads: Uploads) -> dict[str, str]:
@@ -161,6 +189,28 @@ def test_two_do_not_copy_the_same(place: Place) -> None:
     look_until(uploads, lambda: states(uploads) == {"x.zarr": "copied"})
 
 
+def test_what_grows_goes_before_what_waits_on_the_disk(place: Place) -> None:
+    """Its lines are held until they are copied; those of a sealed recording are in nobody's way."""
+    old, new = place.here / "old.zarr", place.here / "new.zarr"
+    with RecordingWriter.create(old, SPEC) as writer:
+        fill(writer, 3 * SHARD_LINES)
+        writer.seal(RunCondition.GOOD, "done", {})
+    copier = Copier(box := Box(), f"file://{place.far}")  # type: ignore[arg-type]
+    with RecordingWriter.create(new, SPEC) as writer:
+        fill(writer, 2 * SHARD_LINES)
+        for path in (old, new):
+            copier.add(path, ours=True)
+        while not any(one.state == "copied" for one in box.posted):
+            copier.turn()
+    assert [(one.path.stem, one.lines // SHARD_LINES, one.state) for one in box.posted] == [
+        ("old", 1, "copying"),
+        ("new", 1, "copying"),
+        ("new", 2, "copying"),
+        ("old", 2, "copying"),
+        ("old", 3, "copied"),
+    ]
+
+
 def test_a_process_that_is_killed_is_replaced(place: Place, caplog: pytest.LogCaptureFixture) -> None:
     uploads = place.daemon()
     uploads.prove()
@@ -171,6 +221,11 @@ def test_a_process_that_is_killed_is_replaced(place: Place, caplog: pytest.LogCa
     uploads.add(place.write("x.zarr"))
     look_until(uploads, lambda: states(uploads) == {"x.zarr": "copied"})
     assert "killed by SIGKILL; another takes its place" in caplog.text
+
+
+def test_waits_grow_and_are_bounded() -> None:
+    waits = [wait_s(tries) for tries in (0, 1, 2, 100, 100_000)]
+    assert waits == [FIRST_WAIT_S, 2 * FIRST_WAIT_S, 4 * FIRST_WAIT_S, MOST_WAIT_S, MOST_WAIT_S]
 
 
 def test_a_place_that_says_no_is_refused_unless_forced(place: Place) -> None:
