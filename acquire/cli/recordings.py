@@ -157,6 +157,9 @@ def upload(
     Example: [bold]acquire upload run.zarr s3://bucket/run.zarr --follow[/]
     """
     from acquire.store import mirror
+    from acquire.store.remote import be_patient
+
+    be_patient()
 
     def report(done: Mirrored) -> None:
         if not json:

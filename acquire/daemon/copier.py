@@ -25,7 +25,7 @@ from acquire.errors import AcquireError, DataError, UsageError
 from acquire.store import open_recording
 from acquire.store.mirror import LOOK_S, Mirror, only_copy
 from acquire.store.opening import read_root
-from acquire.store.remote import RemoteSource
+from acquire.store.remote import RemoteSource, be_patient
 from acquire.store.source import LocalSource
 
 if TYPE_CHECKING:
@@ -106,6 +106,7 @@ def url_of(target: str, path: Path) -> str:
 def copy_recordings(mailbox: Mailbox, target: str, copies: tuple[Copy, ...]) -> None:
     """Life of the process, until its owner ends it; it begins with ``copies``."""
     os.nice(_NICE)
+    be_patient()
     copier = Copier(mailbox, target)
     for copy in copies:
         copier.add(copy.path, ours=copy.ours)

@@ -7,6 +7,7 @@ none of them is ever written anywhere.
 from __future__ import annotations
 
 import importlib.util
+import os
 import re
 from contextlib import contextmanager
 from datetime import timedelta
@@ -28,8 +29,19 @@ _ATTEMPTS = re.compile(r" in [\d.]+\w+, after \d+ retries, max_retries: \d+, ret
 """What obstore tells of that is another text each time."""
 
 
+PATIENCE = "120s"
 PROOF = ".acquire"
 """A part beside the recordings, put to see whether one can be."""
+
+
+def be_patient() -> None:
+    """Give each request of this process the time that a slow store needs; what the environment says is kept.
+
+    An upload has a dozen parts of 5 MB under way at once: with `PATIENCE` for each a store that takes
+    0.5 MB/s will do. obstore's own 30 s ask for 2 MB/s, and one that is slower never gets a large part.
+    """
+    for store in ("AWS", "GOOGLE", "AZURE"):
+        os.environ.setdefault(f"{store}_TIMEOUT", PATIENCE)
 
 
 def is_url(place: Path | str) -> bool:

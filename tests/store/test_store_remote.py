@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import uuid
 
@@ -22,7 +23,7 @@ from acquire.store import (
     verify,
 )
 from acquire.store.mirror import Mirror, only_copy
-from acquire.store.remote import PROOF, RemoteSource
+from acquire.store.remote import PATIENCE, PROOF, RemoteSource, be_patient
 
 SPEC = make_spec()
 SHARD = 64
@@ -235,6 +236,19 @@ def test_a_writer_that_is_gone_is_told(path, tmp_path):
         mirror(path, place, follow=True, idle_s=0)
     recover(path)
     assert mirror(path, place).lines == 96
+
+
+def test_a_slow_store_has_time_unless_somebody_says_how_much(monkeypatch):
+    for store in ("AWS", "GOOGLE"):
+        monkeypatch.setenv(f"{store}_TIMEOUT", "7s")  # so that it is put back afterwards
+        monkeypatch.delenv(f"{store}_TIMEOUT")
+    monkeypatch.setenv("AZURE_TIMEOUT", "7s")
+    be_patient()
+    assert [os.environ[f"{store}_TIMEOUT"] for store in ("AWS", "GOOGLE", "AZURE")] == [
+        PATIENCE,
+        PATIENCE,
+        "7s",
+    ]
 
 
 def test_what_cannot_be_reached_is_told(bucket, path):
