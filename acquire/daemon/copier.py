@@ -25,7 +25,7 @@ from acquire.errors import AcquireError, DataError, UsageError
 from acquire.store import open_recording
 from acquire.store.mirror import LOOK_S, Mirror, only_copy
 from acquire.store.opening import read_root
-from acquire.store.remote import RemoteSource, be_patient
+from acquire.store.remote import RemoteSource, be_patient, url_below
 from acquire.store.source import LocalSource
 
 if TYPE_CHECKING:
@@ -98,11 +98,6 @@ def wait_s(tries: int) -> float:
     return min(math.ldexp(FIRST_WAIT_S, min(tries, 16)), MOST_WAIT_S)
 
 
-def url_of(target: str, path: Path) -> str:
-    """Where a recording is copied to."""
-    return f"{target}/{path.name}"
-
-
 def copy_recordings(mailbox: Mailbox, target: str, copies: tuple[Copy, ...]) -> None:
     """Life of the process, until its owner ends it; it begins with ``copies``."""
     os.nice(_NICE)
@@ -148,7 +143,7 @@ class Copier:
         if (job := self._jobs.get(path)) is not None:
             job.ours, job.not_before_s = job.ours or ours, 0.0
             return
-        said = UploadStatus(path=path, url=url_of(self._target, path), state="waiting")
+        said = UploadStatus(path=path, url=url_below(self._target, path), state="waiting")
         self._jobs[path] = Job(path, ours, said)
 
     def _reach(self, number: int) -> Reached:

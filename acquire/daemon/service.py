@@ -163,7 +163,8 @@ class Service:
         """Look at the capture path once and act on what is seen. Any failure of it becomes a fault."""
         self._recovered(self._salvage.look(capturing=self._run is not None))
         self._uploads.look()
-        if self._uploads.statuses != self._status.uploads:
+        told = self._status.uploads, self._status.upload_warning
+        if (self._uploads.statuses, self._uploads.warning) != told:
             self._publish()
         if self._run is None:
             return

@@ -7,7 +7,7 @@
                         └▶ .uploads-<rig>.json: what is not copied, for the next daemon
 
 Nobody waits for it: recordings are written to the local disk, which is the spool, and retention leaves alone
-what is not copied (`Retention.copied`). The process is ended by force when it does not end in time, and
+what is not copied (`Retention.copied_to`). The process is ended by force when it does not end in time, and
 replaced when it dies: a copy goes on where it was.
 """
 
@@ -20,12 +20,12 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from acquire.daemon.copier import MOST_WAIT_S, Copy, Reach, Reached, copy_recordings, url_of, wait_s
+from acquire.daemon.copier import MOST_WAIT_S, Copy, Reach, Reached, copy_recordings, wait_s
 from acquire.daemon.messages import UploadStatus
 from acquire.errors import ConfigError, DataError, DeviceError, UsageError
 from acquire.store.files import Publisher
 from acquire.store.opening import read_root
-from acquire.store.remote import check_url
+from acquire.store.remote import check_url, url_below
 from acquire.store.source import LocalSource
 from acquire.stream.messages import Failed
 from acquire.stream.process import Worker
@@ -186,7 +186,7 @@ class Uploads:
         assert self._target is not None
         before = self._found.get(path)
         if before is None or before.state in _OVER:
-            self._tell(UploadStatus(path=path, url=url_of(self._target, path), state="waiting"))
+            self._tell(UploadStatus(path=path, url=url_below(self._target, path), state="waiting"))
 
     def _tell(self, said: UploadStatus) -> None:
         before = self._found.pop(said.path, None)  # the latest come last

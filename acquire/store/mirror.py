@@ -193,7 +193,7 @@ class Mirror:
         if line is None:
             release(self.path, self._disk)
         elif line != self._kept_from:
-            keep_from(self.path, line, self._disk)
+            keep_from(self.path, line, self.target.url, self._disk)
             self._kept_from = line
 
     def _check_target(self) -> None:

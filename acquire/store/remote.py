@@ -49,6 +49,11 @@ def is_url(place: Path | str) -> bool:
     return isinstance(place, str) and "://" in place
 
 
+def url_below(target: str, path: Path) -> str:
+    """Where below ``target`` the copy of the recording at ``path`` is."""
+    return f"{target}/{path.name}"
+
+
 class RemoteSource:
     """Bytes below a URL; see `source.Source`. Every failure is an OSError."""
 

@@ -15,12 +15,14 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
+from zlib import crc32
 
 from acquire.errors import DataError, UsageError
 from acquire.lines import ARMS
 from acquire.store.files import DISK, Publisher
 from acquire.store.layout import PARSE_ERRORS, line_columns
 from acquire.store.opening import open_recording
+from acquire.store.remote import url_below
 from acquire.store.shard import shard_key
 
 if TYPE_CHECKING:
@@ -30,7 +32,6 @@ if TYPE_CHECKING:
     from acquire.store.terms import Retention
 
 ALL_LINES = 2**62
-COPY = "0-copy.json"
 _NOT_COPIED = "not copied yet"
 
 HOLDS = ".holds"
@@ -86,12 +87,14 @@ def hold(path: Path, first_line: int, count: int, why: str = "", disk: Disk = DI
     return held
 
 
-def keep_from(path: Path, line: int, disk: Disk = DISK) -> None:
-    """Hold every line from ``line`` on, those to come included; a later call replaces an earlier one."""
+def keep_from(path: Path, line: int, url: str, disk: Disk = DISK) -> None:
+    """Hold every line from ``line`` on, those to come included, for a copy to ``url``; a later call for the
+    same place replaces an earlier one.
+    """
     text = json.dumps({"first_line": line, "count": ALL_LINES, "why": _NOT_COPIED}).encode()
     try:
         disk.make_directory(_holds(path), parents=True)
-        Publisher(_holds(path) / ".copy", disk).replace(_holds(path) / COPY, text, durable=True)
+        Publisher(_holds(path) / ".copy", disk).replace(_copy_hold(path, url), text, durable=True)
     except OSError as error:
         raise DataError(f"{path}: lines cannot be held: {error.strerror}") from error
 
@@ -194,7 +197,8 @@ class Keeper:
     def _marks(self) -> list[Hold]:
         """By `hold`, and by a copy that is to come and has not begun."""
         marks = holds_of(self.path)
-        if self.policy.copied and not (_holds(self.path) / COPY).exists():
+        target = self.policy.copied_to
+        if target is not None and not _copy_hold(self.path, url_below(target, self.path)).exists():
             marks.append(Hold(self.first_line, ALL_LINES, _NOT_COPIED))
         return marks
 
@@ -245,6 +249,11 @@ def delete_shard(disk: Disk, path: Path, shard: int) -> None:
 
 def _holds(path: Path) -> Path:
     return path / ARMS[0] / "lines" / HOLDS
+
+
+def _copy_hold(path: Path, url: str) -> Path:
+    """The file that says how far a copy has come."""
+    return _holds(path) / f"0-copy-{crc32(url.encode()):08x}.json"
 
 
 def _with(stretches: list[range], number: int) -> list[range]:

@@ -140,14 +140,15 @@ def test_the_spool_is_bounded_and_no_line_is_lost(path):
 
 def test_nothing_goes_before_its_copy_has_begun(path):
     """The rig copies its recordings: the writer waits for whoever will do it."""
-    policy = {"max_age_lines": SHARD, "margin_lines": 1}
-    spec = make_spec(retention=Retention(**policy, copied=True))
+    target = f"memory://{uuid.uuid4()}"
+    spec = make_spec(retention=Retention(max_age_lines=SHARD, margin_lines=1, copied_to=target))
     with RecordingWriter.create(path, spec) as writer:
         for _ in range(3):
             fill(writer, 2 * SHARD, block_lines=32)
             writer.commit()
+            Mirror(path, f"memory://{uuid.uuid4()}/run.zarr").step()  # to another place
         assert open_recording(path).dropped == ()
-        copying = Mirror(path, f"memory://{uuid.uuid4()}/run.zarr")
+        copying = Mirror(path, f"{target}/run.zarr")
         assert copying.step(most_shards=2).waiting_lines == 4 * SHARD
         for _ in range(2):
             fill(writer, 32, block_lines=32)
