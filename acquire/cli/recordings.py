@@ -28,9 +28,6 @@ RecordingArgument = Annotated[Path, typer.Argument(metavar="RECORDING", help="A 
 LISTED = 20
 """Damaged stretches that are printed; --json has all of them."""
 
-ALL_LINES = 2**62
-"""Held from some line on."""
-
 CELL_CHARACTERS = 72
 """What a table shows of an error; --json has all of it."""
 
@@ -296,6 +293,8 @@ def _outage(segment: dict[str, Any] | None) -> str | None:
 
 def _stretches(stretches: list[list[Any]]) -> str | None:
     """Stretches of lines, at most some of them; what has no end is what a copy still needs."""
+    from acquire.store.retention import ALL_LINES
+
     shown = [
         f"{first} on" if count >= ALL_LINES else f"{first} to {first + count - 1}"
         for first, count, *_ in stretches[:LISTED]
