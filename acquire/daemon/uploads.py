@@ -110,6 +110,7 @@ class Uploads:
             if self._target is None:
                 log.warning("%s was not uploaded, and will not be: recording.upload_to is not set", path)
             else:
+                log.info("%s was not uploaded: going on with it", path)
                 self._expect(path)
         self._spawn()
 
