@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Literal
+from urllib.parse import urlsplit
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from acquire.effect_config import FrozenModel
 
@@ -70,3 +71,21 @@ class RecordingConfig(FrozenModel):
         description="of the disk left free; a recording is sealed before that",
     )
     retention: RetentionConfig | None = Field(default=None, description="absent: all is kept")
+    upload_to: str | None = Field(
+        default=None,
+        description="URL below which the daemon copies every recording while it grows: s3://bucket/prefix; "
+        "endpoint and credentials come from the environment; needs pip install 'tdi-acquire[remote]'",
+    )
+
+    @field_validator("upload_to")
+    @classmethod
+    def _is_a_place(cls, url: str | None) -> str | None:
+        """The configuration goes into every recording: no place for secrets."""
+        if url is None:
+            return None
+        parts = urlsplit(url)
+        if not parts.scheme or "://" not in url or not (parts.netloc or parts.path.strip("/")):
+            raise ValueError("not a URL; possible: s3://bucket/prefix, file:///mnt/archive")
+        if "@" in parts.netloc or parts.query or parts.fragment:
+            raise ValueError("credentials and options come from the environment, as AWS_ACCESS_KEY_ID")
+        return url.rstrip("/")

@@ -30,12 +30,14 @@ def check(file: FileArgument, json: JsonFlag = False) -> None:
     Example: [bold]acquire config check rig-demo[/]
     """
     from acquire.config import check_directory, load_rig, load_scene
+    from acquire.daemon.uploads import check_upload
     from acquire.rig import check_rig
 
     rig = load_rig(file)
     check_rig(rig)
     load_scene(rig.simulation.scene)
     check_directory(rig)
+    check_upload(rig)
     facts = _facts(rig)
     if json:
         print_json({"file": file, "valid": True, **facts})
@@ -49,6 +51,7 @@ def check(file: FileArgument, json: JsonFlag = False) -> None:
             "lines": quantity(facts["line_rate_hz"], "Hz"),
             "sub-steps": quantity(facts["substep_rate_hz"], "Hz"),
             "data": f"{quantity(facts['bytes_per_s'], 'B')}/s from both arms, {facts['dtype']}",
+            "uploads to": facts["upload_to"],
             "socket": facts["socket"],
         }
     )
@@ -91,6 +94,7 @@ def _facts(rig: RigConfig) -> dict[str, Any]:
         "substep_rate_hz": rig.line_rate_hz * substeps,
         "dtype": rig.cameras.a.dtype,
         "bytes_per_s": 2 * rig.line_rate_hz * stages * sample_bytes,
+        "upload_to": rig.recording.upload_to,
         "socket": str(rig.control.socket),
     }
 

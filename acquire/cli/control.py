@@ -13,15 +13,15 @@ from acquire.errors import DataError, UsageError
 
 if TYPE_CHECKING:
     from acquire.daemon.client import Client
-    from acquire.daemon.messages import CheckStatus, LastRecording, Status
+    from acquire.daemon.messages import CheckStatus, LastRecording, Status, UploadStatus
 
 SocketOption = Annotated[
     Path | None, typer.Option("--socket", envvar="ACQUIRE_SOCKET", help="The daemon's control socket.")
 ]
 DAMAGED = ("INCOMPLETE", "ABORTED", None)
 """Conditions of a recording that lost something."""
-RECOVERIES = 3
-"""Recordings that were not sealed, of which the status tells in words; --json has more."""
+RECOVERIES = UPLOADS = 3
+"""Recordings not sealed, or on their way to a store, of which the status tells in words; --json has more."""
 
 
 def register(app: typer.Typer) -> None:
@@ -31,7 +31,8 @@ def register(app: typer.Typer) -> None:
 
 def arm(
     force: Annotated[
-        bool, typer.Option("--force", help="Even where this host is too slow for the configured rate.")
+        bool,
+        typer.Option("--force", help="Even where this host is too slow, or the store of uploads refuses."),
     ] = False,
     socket: SocketOption = None,
     json: JsonFlag = False,
@@ -39,7 +40,8 @@ def arm(
     """Start trigger and cameras; nothing is written yet.
 
     The daemon measures first what ring, codec and disk sustain here (a second; valid for ten minutes), and
-    refuses, exit code 2, where that is less than what is configured.
+    refuses, exit code 2, where that is less than what is configured. So it does where recordings are to be
+    uploaded and the store says no; one that cannot be reached is a warning.
 
     Example: [bold]acquire arm[/]
     """
@@ -157,6 +159,7 @@ def _show(status: Status, json: bool) -> None:
             "recording": _recording(status),
             "last": _last(status.last),
             "not sealed": _recoveries(status),
+            "uploads": _uploads(status),
             "sustains": _capacity(status),
             "possible": ", ".join(status.possible) or "wait until it is idle",
         }
@@ -199,6 +202,22 @@ def _recoveries(status: Status) -> str | None:
     ]
     more = len(status.recoveries) - len(shown)
     return "; ".join([*shown, *([f"and {more} before"] if more else [])]) or None
+
+
+def _uploads(status: Status) -> str | None:
+    """Recordings on their way to the remote store, those that are not there yet last."""
+    found = sorted(status.uploads, key=lambda one: one.state != "copied")
+    shown = [f"WARNING: {status.upload_warning}"] if status.upload_warning else []
+    if status.uploads_left > UPLOADS:
+        shown.append(f"{status.uploads_left} recordings are not copied yet")
+    return "; ".join([*shown, *map(_upload, found[-UPLOADS:])]) or None
+
+
+def _upload(one: UploadStatus) -> str:
+    waiting = f", {one.waiting_lines} more here" if one.waiting_lines else ""
+    why = f": {one.error}" if one.error else ""
+    hint = f" (try: {one.hint})" if one.error and one.hint else ""
+    return f"{one.path.name} {one.state}, {one.lines} lines there{waiting}{why}{hint}"
 
 
 def _show_arms(status: Status) -> None:

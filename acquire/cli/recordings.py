@@ -157,6 +157,9 @@ def upload(
     Example: [bold]acquire upload run.zarr s3://bucket/run.zarr --follow[/]
     """
     from acquire.store import mirror
+    from acquire.store.remote import be_patient
+
+    be_patient()
 
     def report(done: Mirrored) -> None:
         if not json:
@@ -289,8 +292,13 @@ def _outage(segment: dict[str, Any] | None) -> str | None:
 
 
 def _stretches(stretches: list[list[Any]]) -> str | None:
-    """Stretches of lines, at most some of them."""
-    shown = [f"{first} to {first + count - 1}" for first, count, *_ in stretches[:LISTED]]
+    """Stretches of lines, at most some of them; what has no end is what a copy still needs."""
+    from acquire.store.retention import ALL_LINES
+
+    shown = [
+        f"{first} on" if count >= ALL_LINES else f"{first} to {first + count - 1}"
+        for first, count, *_ in stretches[:LISTED]
+    ]
     more = [f"and {len(stretches) - LISTED} more"] if len(stretches) > LISTED else []
     return ", ".join(shown + more) or None
 

@@ -39,12 +39,14 @@ def serve(
 
     from acquire.config import check_directory, load_rig, parse_settings
     from acquire.daemon.server import serve as run_daemon
+    from acquire.daemon.uploads import check_upload
 
     overrides = parse_settings(settings or [])
     if socket is not None:
         overrides["control.socket"] = str(socket.absolute())
     rig = load_rig(config, overrides)
     check_directory(rig)
+    check_upload(rig)
     logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO)
     logging.getLogger("uvicorn").setLevel(logging.WARNING)
     if owned:

@@ -6,6 +6,7 @@
                                      (messages)                   server      states      devices
 
 ``states`` is the table of what may follow what; ``service`` does the work on devices, in one thread;
-``proof`` measures what the host sustains, before; ``salvage`` seals what a killed process left open, after.
+``proof`` measures what the host sustains, before; ``salvage`` seals what a killed process left open, after;
+``uploads`` has recordings copied to a remote store, by the process ``copier``.
 ``control`` is the API; ``server`` is the process: socket, signals, supervision.
 """

@@ -23,7 +23,10 @@ class _Message(BaseModel):
 class ArmRequest(_Message):
     """How to arm."""
 
-    force: bool = Field(default=False, description="even where the host is too slow for the configured rate")
+    force: bool = Field(
+        default=False,
+        description="even where the host is too slow for the configured rate, or uploads are refused",
+    )
 
 
 class StartRequest(_Message):
@@ -158,6 +161,22 @@ class RecoveryStatus(_Message):
     text: str = Field(default="", description="how it came to that; once it is recovered, its end reason")
 
 
+class UploadStatus(_Message):
+    """A recording on its way to `recording.upload_to`."""
+
+    path: Path
+    url: str
+    state: Literal["waiting", "copying", "copied", "refused", "gone"] = Field(
+        description="waiting for its turn, its end or the store; under way, while it grows or after; whole "
+        "there; something else is there; deleted here before it was copied"
+    )
+    lines: int = Field(default=0, description="of each arm that are there")
+    waiting_lines: int | None = Field(default=None, description="that a reader finds here only")
+    bytes: int = Field(default=0, description="sent since the copy was begun or gone on with")
+    error: str = Field(default="", description="why the last try failed; it is tried again while waiting")
+    hint: str = ""
+
+
 class CapacityStatus(_Message):
     """What this host sustains, as measured before the run was armed; line rates of both arms."""
 
@@ -190,6 +209,12 @@ class Status(_Message):
     recoveries: list[RecoveryStatus] = Field(
         default=[], description="the latest recordings that were not sealed"
     )
+    uploads: list[UploadStatus] = Field(
+        default=[],
+        description="recordings that are not copied to where the rig wants them, and the latest that are",
+    )
+    uploads_left: int = Field(default=0, description="recordings that are not copied, listed or not")
+    upload_warning: str | None = Field(default=None, description="why copies may have to wait")
 
 
 class ErrorMessage(_Message):

@@ -23,11 +23,13 @@ from acquire.daemon.plan import Run
 from acquire.daemon.proof import Proof
 from acquire.daemon.salvage import Salvage
 from acquire.daemon.service import Service
+from acquire.daemon.uploads import Uploads
 from acquire.errors import EXIT_INTERRUPTED, StateError
 from acquire.rig import Rig
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from pathlib import Path
 
     from acquire.config import RigConfig
 
@@ -48,9 +50,16 @@ def serve(config: RigConfig) -> int:
     with contextlib.closing(Endpoint(config.control.socket.absolute())) as endpoint, Rig(config) as rig:
         salvage = Salvage(config.recording.directory.absolute())
         salvage.search()
+        uploads = Uploads(config.recording.upload_to, _journal(config))
+        uploads.begin()
         proof = Proof(config)
-        service = Service(config, lambda: Run(config, rig, proof.choose), proof, salvage)
+        service = Service(config, lambda: Run(config, rig, proof.choose), proof, salvage, uploads)
         return asyncio.run(Daemon(service, endpoint).run())
+
+
+def _journal(config: RigConfig) -> Path:
+    """The file that says which recordings are not copied yet."""
+    return config.recording.directory.absolute() / f".uploads-{config.name}.json"
 
 
 class _Server(uvicorn.Server):

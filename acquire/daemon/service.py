@@ -23,6 +23,7 @@ from acquire.daemon.plan import default_path
 from acquire.daemon.report import Rates, arm_statuses, delivered_lines
 from acquire.daemon.salvage import Salvage
 from acquire.daemon.states import Event, State, after, commands
+from acquire.daemon.uploads import Uploads
 from acquire.errors import AcquireError, DeviceError
 from acquire.store import RunCondition
 from acquire.stream import CaptureStatus
@@ -75,11 +76,13 @@ class Service:
         open_run: Callable[[], Run],
         prove: Prove | None = None,
         salvage: Salvage | None = None,
+        uploads: Uploads | None = None,
     ) -> None:
         self._config = config
         self._open_run = open_run
         self._prove = prove
         self._salvage = salvage or Salvage(config.recording.directory.absolute())
+        self._uploads = uploads or Uploads()
         self._capacity: CapacityStatus | None = None
         self._hurried = threading.Event()
         self._born = time.monotonic()
@@ -112,10 +115,11 @@ class Service:
 
     def arm(self, request: ArmRequest = ARM) -> None:
         """idle → armed. Raises what the devices refuse with, and UsageError where the host is too slow for
-        them and that is not forced; the state is idle then.
+        them, or where recordings are to be copied is refused, and that is not forced; the state is idle then.
         """
         with self._doing(Event.ARM):
             self._recovered(self._salvage.look(capturing=True))  # what is under way would be measured, too
+            self._uploads.prove(force=request.force)
             if self._prove is not None:
                 self._capacity = self._prove(force=request.force)
             run = self._open_run()
@@ -158,6 +162,10 @@ class Service:
     def supervise(self) -> None:
         """Look at the capture path once and act on what is seen. Any failure of it becomes a fault."""
         self._recovered(self._salvage.look(capturing=self._run is not None))
+        self._uploads.look()
+        told = self._status.uploads, self._status.upload_warning
+        if (self._uploads.statuses, self._uploads.warning) != told:
+            self._publish()
         if self._run is None:
             return
         try:
@@ -183,6 +191,7 @@ class Service:
             finally:
                 self._recovered(self._salvage.wait(RECOVERY_S))
                 self._salvage.close()
+                self._uploads.close()
 
     def _stop(self, reason: str) -> None:
         assert self._run is not None
@@ -219,12 +228,16 @@ class Service:
         assert self._run is not None
         self._seen = self._run.poll()
         self._salvage.add(self._seen.orphans)
+        if self._seen.path is not None:
+            self._uploads.add(Path(self._seen.path))
         self._rates.look(delivered_lines(self._seen))
         return self._seen
 
     def _begin(self, path: Path | None, lines: int | None, window: Window, *, resume: bool = False) -> None:
         assert self._run is not None
         path = self._run.start(path or default_path(self._config), lines, window, resume=resume)
+        self._uploads.forget(path)
+        self._uploads.add(path)
         if window.post_lines is not None:
             lines = window.pre_lines + window.post_lines
         self._target = path, lines
@@ -307,6 +320,8 @@ class Service:
     def _recovered(self, found: list[RecoveryStatus]) -> None:
         """The latest recording may have been among what its recorder did not seal."""
         for one in found:
+            if one.state == "recovered":
+                self._uploads.recovered(one.path)
             if one.condition is not None and self._last is not None and self._last.path == one.path:
                 update = {"lines": one.lines, "condition": one.condition, "end_reason": one.text}
                 self._last = self._last.model_copy(update=update)
@@ -367,6 +382,9 @@ class Service:
             capacity=self._capacity,
             processes={} if self._run is None else self._seen.pids,
             recoveries=self._salvage.recoveries,
+            uploads=self._uploads.statuses,
+            uploads_left=self._uploads.left,
+            upload_warning=self._uploads.warning,
         )
 
     def _recording(self) -> RecordingStatus | None:

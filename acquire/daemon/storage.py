@@ -74,4 +74,5 @@ def _retention(config: RetentionConfig, rig: RigConfig) -> Retention:
         margin_lines=depth + config.segment_lines,
         hold_events=config.hold_events,
         hold_lines=(ceil(config.hold_before_s * rate), ceil(config.hold_after_s * rate)),
+        copied_to=rig.recording.upload_to,
     )

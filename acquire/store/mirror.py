@@ -7,6 +7,7 @@
 The order is the writer's: the root is last, and says only what has come before it. A copy that was
 interrupted goes on where it was. What is not copied yet is held, so that retention can bound the spool and
 no line is lost: a store that is too slow ends the recording in good order, when the disk gets full.
+A recording is copied by one process at a time.
 """
 
 from __future__ import annotations
@@ -14,20 +15,21 @@ from __future__ import annotations
 import copy
 import json
 import time
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from acquire.errors import DataError, UsageError
+from acquire.errors import DataError, StateError, UsageError
 from acquire.lines import ARMS
-from acquire.store.files import DISK
-from acquire.store.layout import group_document, to_json
+from acquire.store.files import DISK, locked
+from acquire.store.layout import PARSE_ERRORS, group_document, to_json
 from acquire.store.opening import open_recording
 from acquire.store.remote import RemoteSource
 from acquire.store.retention import keep_from, release, shard_files
 from acquire.store.scan import COLUMNS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from acquire.store.files import Disk
@@ -36,17 +38,29 @@ if TYPE_CHECKING:
 
 LOOK_S = 0.5
 """How often a growing recording is looked at."""
+_ELSEWHERE = "another name there: acquire upload RECORDING URL"
+_HINT = (
+    "the network, the store, and the environment's credentials; what is there stays: a copy goes on with it"
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Mirrored:
-    """How far a copy has come: lines, shards and bytes since it was begun or gone on with."""
+    """How far a copy has come.
+
+    Attributes
+    ----------
+    lines, waiting_lines : that are there; that a reader finds here, and not there yet
+    shards, bytes : copied since the copy was begun or gone on with
+    sealed : it is whole, and says so
+    """
 
     url: str
     lines: int
     shards: int
     bytes: int
     sealed: bool
+    waiting_lines: int = 0
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -62,10 +76,18 @@ def mirror(
 ) -> Mirrored:
     """Copy the recording at ``path`` to ``url``; with ``follow`` until it is sealed.
 
-    Raises UsageError where ``url`` holds something else, DataError when the store fails, and when a recording
-    that is followed has not grown for ``idle_s``: its writer is gone.
+    Raises UsageError where ``url`` holds something else, StateError while another process copies it,
+    DataError when the store fails, and when a recording that is followed has not grown for ``idle_s``: its
+    writer is gone.
     """
-    copying = Mirror(path, url)
+    open_recording(path)  # which says what else it may be
+    with only_copy(path):
+        return _mirror(Mirror(path, url), path, follow, idle_s, report)
+
+
+def _mirror(
+    copying: Mirror, path: Path, follow: bool, idle_s: float, report: Callable[[Mirrored], None]
+) -> Mirrored:
     done = copying.step()
     moved = time.monotonic()
     while follow and not done.sealed:
@@ -73,65 +95,125 @@ def mirror(
         before, done = done, copying.step()
         if done != before:
             moved = time.monotonic()
+        if done.bytes != before.bytes:
             report(done)
         if time.monotonic() - moved > idle_s:
             raise DataError(
                 f"{path} has not grown for {idle_s:g} s and is not sealed",
-                possible=f"{done.lines} lines are in {url}",
+                possible=f"{done.lines} lines are in {copying.target}",
                 hint=f"acquire recover {path}, then copy again",
             )
     return done
 
 
-class Mirror:
-    """One copy; `step` brings it up to date."""
+@contextmanager
+def only_copy(path: Path) -> Iterator[None]:
+    """Keep other processes from copying the recording at ``path``; StateError while one does."""
+    with ExitStack() as held:
+        try:
+            held.enter_context(locked(path / ARMS[0], "copying"))
+        except StateError as error:
+            raise StateError(f"{path} is being copied by another process", hint="acquire status") from error
+        except OSError as error:
+            raise DataError(f"{path} cannot be copied: {error.strerror}") from error
+        yield
 
-    def __init__(self, path: Path, url: str, disk: Disk = DISK) -> None:
+
+def _nothing() -> None:
+    pass
+
+
+class Mirror:
+    """One copy; `step` brings it up to date.
+
+    ``pause`` is called before anything is put; what it raises ends the copy, and another goes on with it.
+    """
+
+    def __init__(self, path: Path, url: str, disk: Disk = DISK, pause: Callable[[], None] = _nothing) -> None:
         self.path = path
         self.target = RemoteSource(url)
         self._disk = disk
+        self._pause = pause
         self._run_id = str(open_recording(path).attrs["run_id"])
+        if (there := self.target.path) is not None and there.exists() and there.samefile(path):
+            raise UsageError(f"{url} is the recording itself, not a place for its copy", hint="another URL")
+        self._bytes = 0
+        self._shards = 0
+        self._directories: set[str] = set()
+        self._sent: dict[str, bytes] = {}
+        """Metadata and tables → as they are there."""
+        self._root = b""
+        self._sealed = False
+        self._next = 0
+        """The first shard that may not be there."""
+        self._kept_from = -1
         try:
             self._there = self.target.sizes()
             self._check_target()
         except OSError as error:
-            raise DataError(f"{url} cannot be used: {error}") from error
-        self._bytes = 0
-        self._shards = 0
-        self._directories: set[str] = set()
-        self._root = b""
+            raise DataError(f"{url} cannot be used: {error}", hint=_HINT) from error
 
-    def step(self) -> Mirrored:
-        """Copy what is new and whole. Raises DataError when the store fails; a later step goes on."""
+    @property
+    def grows(self) -> bool:
+        """The recording was not sealed yet at the latest step."""
+        return not self._sealed
+
+    def step(self, most_shards: int | None = None) -> Mirrored:
+        """Copy what is new and whole, or the next ``most_shards`` of it; what is new of a sealed recording
+        readers there see once it is complete. Raises DataError when the store fails; a later step goes on.
+        """
         recording = open_recording(self.path)
+        if recording.attrs["run_id"] != self._run_id:
+            raise DataError(f"{self.path} is another recording than it was: run {recording.attrs['run_id']}")
         sealed = recording.state == "sealed"
+        if sealed and not self._sealed:  # who recovered it may have mended what was copied
+            self._sealed, self._next = True, 0
         rows = recording.arms[ARMS[0]].reader("lines").shape.shard_rows
-        whole = recording.lines // rows
-        shards = range(whole + (1 if sealed and recording.lines % rows else 0))
-        lines = recording.lines if sealed else whole * rows
+        end = -(-recording.lines // rows) if sealed else recording.lines // rows
         try:
-            for shard in shards:
-                self._copy_shard(shard)
-            self._publish(recording, lines)
+            self._copy_shards(end, most_shards)
+            lines = min(self._next * rows, recording.lines)
+            whole = sealed and self._next == end
+            if whole or not sealed:
+                self._publish(recording, lines)
         except OSError as error:
-            raise DataError(f"copying {self.path} to {self.target}: {error}") from error
-        if sealed:
+            raise DataError(f"copying {self.path} to {self.target}: {error}", hint=_HINT) from error
+        self._let_go(None if sealed else recording.first_line + lines)
+        waiting = recording.lines - lines
+        return Mirrored(str(self.target), lines, self._shards, self._bytes, whole, waiting)
+
+    def _copy_shards(self, end: int, most: int | None) -> None:
+        before = self._shards
+        while self._next < end and (most is None or self._shards - before < most):
+            self._copy_shard(self._next)
+            self._next += 1
+
+    def _let_go(self, line: int | None) -> None:
+        """Retention may have what is copied: lines before ``line``; all of a recording that is sealed."""
+        if line is None:
             release(self.path, self._disk)
-        else:
-            keep_from(self.path, recording.first_line + lines, self._disk)
-        return Mirrored(str(self.target), lines, self._shards, self._bytes, sealed)
+        elif line != self._kept_from:
+            keep_from(self.path, line, self.target.url, self._disk)
+            self._kept_from = line
 
     def _check_target(self) -> None:
         """Only a copy of the same run may be there."""
         if not self._there:
             return
         if "zarr.json" in self._there:
-            said = json.loads(self.target.read("zarr.json"))["attributes"].get("run_id")
+            root = self.target.read("zarr.json")
+            try:
+                said = json.loads(root)["attributes"].get("run_id")
+            except PARSE_ERRORS as error:
+                raise UsageError(
+                    f"{self.target} holds something damaged: {error!r}", hint=_ELSEWHERE
+                ) from error
             if said == self._run_id:
+                self._root = root
                 return
-            raise UsageError(f"{self.target} holds another recording: run {said}", hint="another URL")
+            raise UsageError(f"{self.target} holds another recording: run {said}", hint=_ELSEWHERE)
         if any(key.split("/")[0] not in (*ARMS, "gaps", "events") for key in self._there):
-            raise UsageError(f"{self.target} holds something that is no recording", hint="another URL")
+            raise UsageError(f"{self.target} holds something that is no recording", hint=_ELSEWHERE)
 
     def _copy_shard(self, shard: int) -> None:
         """A shard that is whole is never written again: what is there of the right size is the same."""
@@ -179,11 +261,16 @@ class Mirror:
         ]
 
     def _put(self, key: str, data: bytes) -> None:
+        """Most of it is the same from one time to the next, and a store takes its time for each part."""
+        if self._sent.get(key) == data:
+            return
         self._make_way(key)
         self.target.put(key, data)
+        self._sent[key] = data
         self._bytes += len(data)
 
     def _make_way(self, key: str) -> None:
+        self._pause()
         directory = key.rpartition("/")[0]
         if self.target.has_directories and directory not in self._directories:
             self.target.make_directory_of(key)

@@ -7,27 +7,51 @@ none of them is ever written anywhere.
 from __future__ import annotations
 
 import importlib.util
+import os
+import re
 from contextlib import contextmanager
 from datetime import timedelta
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from acquire.errors import UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from pathlib import Path
 
     from zarr.abc.store import Store
 
 OBJECT_STORES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss")
 RETRY = {"max_retries": 4, "retry_timeout": timedelta(seconds=30)}
 """For how long a store that does not answer is asked again."""
+_ATTEMPTS = re.compile(r" in [\d.]+\w+, after \d+ retries, max_retries: \d+, retry_timeout: \w+ ?")
+"""What obstore tells of that is another text each time."""
+
+
+PATIENCE = "120s"
+PROOF = ".acquire"
+"""A part beside the recordings, put to see whether one can be."""
+
+
+def be_patient() -> None:
+    """Give each request of this process the time that a slow store needs; what the environment says is kept.
+
+    An upload has a dozen parts of 5 MB under way at once: with `PATIENCE` for each a store that takes
+    0.5 MB/s will do. obstore's own 30 s ask for 2 MB/s, and one that is slower never gets a large part.
+    """
+    for store in ("AWS", "GOOGLE", "AZURE"):
+        os.environ.setdefault(f"{store}_TIMEOUT", PATIENCE)
 
 
 def is_url(place: Path | str) -> bool:
     """Whether a place is meant as a URL."""
     return isinstance(place, str) and "://" in place
+
+
+def url_below(target: str, path: Path) -> str:
+    """Where below ``target`` the copy of the recording at ``path`` is."""
+    return f"{target}/{path.name}"
 
 
 class RemoteSource:
@@ -90,10 +114,25 @@ class RemoteSource:
         with _as_os_errors():
             self._fs.put_file(str(file), self._path(key))
 
+    def prove(self) -> None:
+        """Find out whether parts can be put here, by a small one that stays: `PROOF`.
+
+        Raises PermissionError and FileNotFoundError (no such bucket) where the store says no, and OSError
+        where it cannot be asked.
+        """
+        if self.has_directories:
+            self.make_directory_of(PROOF)
+        self.put(PROOF, b"acquire copies recordings to this place\n")
+
     def make_directory_of(self, key: str) -> None:
         """What a file system needs before a part can be put; an object store needs nothing."""
         with _as_os_errors():
             self._fs.makedirs(self._path(key).rpartition("/")[0], exist_ok=True)
+
+    @property
+    def path(self) -> Path | None:
+        """Where it is on a disk of this machine, if it is."""
+        return Path(self._root) if self.url.partition("://")[0] in ("file", "local") else None
 
     @property
     def has_directories(self) -> bool:
@@ -103,22 +142,38 @@ class RemoteSource:
         return f"{self._root}/{key}"
 
 
-def _file_system(url: str) -> tuple[Any, str]:
+def check_url(url: str) -> None:
+    """Raise UsageError for a URL that cannot be one, or whose packages are not installed; asks nobody."""
     if importlib.util.find_spec("fsspec") is None:
         raise UsageError(f"{url}: fsspec is not installed", hint="pip install 'tdi-acquire[remote]'")
     import fsspec
 
     protocol = url.partition("://")[0]
     _register(protocol)
-    try:
+    with _told(url):
+        fsspec.get_filesystem_class(protocol)
+
+
+def _file_system(url: str) -> tuple[Any, str]:
+    check_url(url)
+    import fsspec
+
+    with _told(url):
         system, root = fsspec.core.url_to_fs(url, **_options(url))
+    return system, root
+
+
+@contextmanager
+def _told(url: str) -> Iterator[None]:
+    """What fsspec says of a URL, in words."""
+    try:
+        yield
     except (ValueError, ImportError) as error:
         raise UsageError(
             f"{url}: {error}",
             possible=f"{', '.join(OBJECT_STORES)}, file, memory and what else fsspec has a package for",
             hint="pip install 'tdi-acquire[remote]'",
         ) from error
-    return system, root
 
 
 def _options(url: str) -> dict[str, Any]:
@@ -145,14 +200,22 @@ def _as_os_errors() -> Iterator[None]:
     """obstore has an exception tree of its own."""
     try:
         yield
-    except _store_errors() as error:
-        raise OSError(str(error).partition("\n")[0][:300]) from error
+    except tuple(_store_errors()) as error:
+        kinds = (kind for known, kind in _store_errors().items() if isinstance(error, known))
+        text = _ATTEMPTS.sub("", str(error).partition("\n")[0])
+        raise next(kinds)(text[:300]) from error
 
 
 @cache
-def _store_errors() -> tuple[type[Exception], ...]:
+def _store_errors() -> dict[type[Exception], type[OSError]]:
+    """What obstore raises, the particular first → what that is here."""
     if not _has_obstore():
-        return ()
-    from obstore.exceptions import BaseError
+        return {}
+    from obstore.exceptions import BaseError, NotFoundError, PermissionDeniedError, UnauthenticatedError
 
-    return (BaseError,)
+    return {
+        NotFoundError: FileNotFoundError,
+        PermissionDeniedError: PermissionError,
+        UnauthenticatedError: PermissionError,
+        BaseError: OSError,
+    }

@@ -15,12 +15,14 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
+from zlib import crc32
 
 from acquire.errors import DataError, UsageError
 from acquire.lines import ARMS
 from acquire.store.files import DISK, Publisher
 from acquire.store.layout import PARSE_ERRORS, line_columns
 from acquire.store.opening import open_recording
+from acquire.store.remote import url_below
 from acquire.store.shard import shard_key
 
 if TYPE_CHECKING:
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
     from acquire.store.terms import Retention
 
 ALL_LINES = 2**62
-COPY = "0-copy.json"
+_NOT_COPIED = "not copied yet"
 
 HOLDS = ".holds"
 """Directory of the files of `hold`, where no Zarr reader lists names."""
@@ -85,12 +87,14 @@ def hold(path: Path, first_line: int, count: int, why: str = "", disk: Disk = DI
     return held
 
 
-def keep_from(path: Path, line: int, disk: Disk = DISK) -> None:
-    """Hold every line from ``line`` on, those to come included; a later call replaces an earlier one."""
-    text = json.dumps({"first_line": line, "count": ALL_LINES, "why": "not copied yet"}).encode()
+def keep_from(path: Path, line: int, url: str, disk: Disk = DISK) -> None:
+    """Hold every line from ``line`` on, those to come included, for a copy to ``url``; a later call for the
+    same place replaces an earlier one.
+    """
+    text = json.dumps({"first_line": line, "count": ALL_LINES, "why": _NOT_COPIED}).encode()
     try:
         disk.make_directory(_holds(path), parents=True)
-        Publisher(_holds(path) / ".copy", disk).replace(_holds(path) / COPY, text, durable=True)
+        Publisher(_holds(path) / ".copy", disk).replace(_copy_hold(path, url), text, durable=True)
     except OSError as error:
         raise DataError(f"{path}: lines cannot be held: {error.strerror}") from error
 
@@ -150,7 +154,7 @@ class Keeper:
         ``missing_bytes`` more than the limits ask for, where the disk is nearly full.
         """
         self._measure(rows)
-        self.marked = holds_of(self.path)
+        self.marked = self._marks()
         held = [hold.lines for hold in (*self.holds, *self.marked)]
         newest = self.first_line + rows
         partly = max(self.sizes.values(), default=0)
@@ -172,7 +176,7 @@ class Keeper:
 
         Returns the latter: they count as kept again.
         """
-        held = [hold.lines for hold in holds_of(self.path)]
+        held = [hold.lines for hold in self._marks()]
         saved = [shard for shard in shards if self._held(shard, held)]
         for shard in shards:
             if shard in saved:
@@ -189,6 +193,14 @@ class Keeper:
         ]
         holds = [[hold.first_line, hold.count, hold.why] for hold in (*self.holds, *self.marked)]
         return {"dropped": stretches, "holds": holds}
+
+    def _marks(self) -> list[Hold]:
+        """By `hold`, and by a copy that is to come and has not begun."""
+        marks = holds_of(self.path)
+        target = self.policy.copied_to
+        if target is not None and not _copy_hold(self.path, url_below(target, self.path)).exists():
+            marks.append(Hold(self.first_line, ALL_LINES, _NOT_COPIED))
+        return marks
 
     def _measure(self, rows: int) -> None:
         known = max([-1, *self.sizes, *(rows.stop - 1 for rows in self.gone)])
@@ -237,6 +249,11 @@ def delete_shard(disk: Disk, path: Path, shard: int) -> None:
 
 def _holds(path: Path) -> Path:
     return path / ARMS[0] / "lines" / HOLDS
+
+
+def _copy_hold(path: Path, url: str) -> Path:
+    """The file that says how far a copy has come."""
+    return _holds(path) / f"0-copy-{crc32(url.encode()):08x}.json"
 
 
 def _with(stretches: list[range], number: int) -> list[range]:

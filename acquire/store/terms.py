@@ -19,6 +19,8 @@ class Retention:
     margin_lines : on either side of what is held, and behind the newest line whatever the limits: M + L_R
     hold_events : kinds of events that hold lines
     hold_lines : before and after such an event
+    copied_to : URL below which the recording is copied while it grows: nothing goes before it is there, nor
+        while the copy has not begun
     """
 
     max_bytes: int | None = None
@@ -26,6 +28,7 @@ class Retention:
     margin_lines: int = 4096
     hold_events: tuple[str, ...] = ("mark",)
     hold_lines: tuple[int, int] = (2**16, 2**16)
+    copied_to: str | None = None
 
     def __post_init__(self) -> None:
         numbers = (self.max_bytes or 1, self.max_age_lines or 1, self.margin_lines + 1, *self.hold_lines)

@@ -270,6 +270,16 @@ def test_hold_keeps_lines_of_a_recording_that_grows(cli: Cli, tmp_path: Path) ->
         assert cli("cut", path, "--first-line", FIRST, "--lines", 5, "--out", tmp_path / "c.npz").code == 0
 
 
+def test_what_a_copy_still_needs_is_held_without_an_end(cli: Cli, tmp_path: Path) -> None:
+    path = tmp_path / "endless.zarr"
+    policy = Retention(max_age_lines=16, margin_lines=4, copied_to=f"memory://{tmp_path.name}")
+    with RecordingWriter.create(path, replace(spec(), retention=policy, shard_chunks=1)) as writer:
+        for arm in ARMS:
+            writer.append(block(arm, range(0)))
+        writer.commit()
+        assert f"held        {FIRST} on\n" in cli("info", path).out
+
+
 def test_recordings_at_urls(cli: Cli, recording: Path, tmp_path: Path) -> None:
     url = f"memory://{tmp_path.name}/one.zarr"
     answer = cli("upload", recording, url)

@@ -96,14 +96,14 @@ def acquire(*words: object, socket: Path | None = None, cwd: Path | None = None)
 class Daemon:
     """A running ``acquire serve``, in a directory of its own."""
 
-    def __init__(self, home: Path, **environment: str) -> None:
+    def __init__(self, home: Path, *settings: str, **environment: str) -> None:
         self.home = home
         self.socket = home / "c.sock"
         self.log = home / "serve.log"
         self.config = write_rig(home)
         with self.log.open("ab") as log:
             self.process = subprocess.Popen(
-                [*OBEY_PERMISSIONS, *COMMAND, "serve", "--config", str(self.config)],
+                [*OBEY_PERMISSIONS, *COMMAND, "serve", "--config", str(self.config), *_set(settings)],
                 stderr=log,
                 stdout=log,
                 env=os.environ | environment,
@@ -149,6 +149,10 @@ class Daemon:
             except subprocess.TimeoutExpired:
                 self.process.kill()
                 self.process.wait(END_S)
+
+
+def _set(settings: tuple[str, ...]) -> list[str]:
+    return [word for setting in settings for word in ("--set", setting)]
 
 
 def write_rig(home: Path) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 import uuid
 
@@ -10,7 +11,7 @@ import pytest
 import zarr
 from store_helpers import Truth, check_rows, fill, make_spec
 
-from acquire.errors import DataError, UsageError
+from acquire.errors import DataError, StateError, UsageError
 from acquire.store import (
     RecordingWriter,
     Retention,
@@ -21,8 +22,8 @@ from acquire.store import (
     recover,
     verify,
 )
-from acquire.store.mirror import Mirror
-from acquire.store.remote import RemoteSource
+from acquire.store.mirror import Mirror, only_copy
+from acquire.store.remote import PATIENCE, PROOF, RemoteSource, be_patient
 
 SPEC = make_spec()
 SHARD = 64
@@ -137,12 +138,94 @@ def test_the_spool_is_bounded_and_no_line_is_lost(path):
     check_rows(zarr.open_group(RemoteSource(place).zarr_store(), mode="r"), spec, 14 * SHARD)
 
 
+def test_nothing_goes_before_its_copy_has_begun(path):
+    """The rig copies its recordings: the writer waits for whoever will do it."""
+    target = f"memory://{uuid.uuid4()}"
+    spec = make_spec(retention=Retention(max_age_lines=SHARD, margin_lines=1, copied_to=target))
+    with RecordingWriter.create(path, spec) as writer:
+        for _ in range(3):
+            fill(writer, 2 * SHARD, block_lines=32)
+            writer.commit()
+            Mirror(path, f"memory://{uuid.uuid4()}/run.zarr").step()  # to another place
+        assert open_recording(path).dropped == ()
+        copying = Mirror(path, f"{target}/run.zarr")
+        assert copying.step(most_shards=2).waiting_lines == 4 * SHARD
+        for _ in range(2):
+            fill(writer, 32, block_lines=32)
+            writer.commit()
+        assert open_recording(path).dropped == ((spec.first_line, SHARD),)  # the margin is kept
+
+
+def test_a_copy_in_small_steps_is_one_recording_at_any_time(path):
+    place = f"memory://{uuid.uuid4()}/run.zarr"
+    with RecordingWriter.create(path, SPEC) as writer:
+        fill(writer, 200)
+        writer.commit()
+        copying = Mirror(path, place)
+        assert [copying.step(most_shards=1).lines for _ in range(2)] == [SHARD, 2 * SHARD]
+        check_rows(zarr.open_group(RemoteSource(place).zarr_store(), mode="r"), SPEC, 2 * SHARD)
+        fill(writer, 130)
+        writer.seal(RunCondition.GOOD, "done", {})
+    seen = [copying.step(most_shards=2) for _ in range(2)]
+    assert [(done.lines, done.waiting_lines, done.sealed) for done in seen] == [
+        (4 * SHARD, 330 - 4 * SHARD, False),
+        (330, 0, True),
+    ]
+    assert verify(place).intact
+
+
+def test_what_recovery_mended_after_it_was_copied_is_copied_again(path, place):
+    with RecordingWriter.create(path, SPEC) as writer:
+        fill(writer, 230)
+        writer.commit()
+        copying = Mirror(path, place)
+        assert copying.step().lines == 3 * SHARD
+    file = path / "b" / "lines" / "c" / "1" / "0"
+    data = bytearray(file.read_bytes())
+    data[4096 + 20] ^= 1
+    file.write_bytes(data)
+    assert [found.first_line for found in recover(path).damage] == [1064]
+    assert copying.step().sealed
+    there = open_recording(place)
+    assert there.gaps == open_recording(path).gaps
+    assert there.source.read("b/flags/c/1") == (path / "b" / "flags" / "c" / "1").read_bytes()
+    assert verify(place).contradictions == ()
+
+
+def test_one_process_copies_a_recording(path, tmp_path):
+    place = f"file://{tmp_path}/far.zarr"
+    write(path)
+    with only_copy(path), pytest.raises(StateError, match="another process"):
+        mirror(path, place)
+    assert mirror(path, place).sealed
+    with pytest.raises(DataError, match="does not exist"):
+        mirror(tmp_path / "none.zarr", place)
+
+
 def test_another_recording_is_not_written_over(path, tmp_path):
     place = f"memory://{uuid.uuid4()}/run.zarr"
-    mirror(write(path), place)
+    copying = Mirror(write(path), place)
+    copying.step()
     other = write(tmp_path / "other.zarr", spec=make_spec(run_id="run-2"))
     with pytest.raises(UsageError, match="another recording: run run-1"):
         mirror(other, place)
+    path.rename(tmp_path / "moved.zarr")
+    other.rename(path)
+    with pytest.raises(DataError, match="another recording than it was"):
+        copying.step()
+    RemoteSource(place).put("zarr.json", b"{")
+    with pytest.raises(UsageError, match="something damaged"):
+        mirror(path, place)
+    assert RemoteSource(place).read("zarr.json") == b"{"
+
+
+def test_a_recording_is_not_copied_onto_itself(path, tmp_path):
+    before = (write(path) / "zarr.json").read_bytes()
+    (tmp_path / "link").symlink_to(tmp_path)
+    for place in (f"file://{path}", f"file://{tmp_path}/link/run.zarr"):
+        with pytest.raises(UsageError, match="the recording itself"):
+            mirror(path, place)
+    assert (path / "zarr.json").read_bytes() == before
 
 
 def test_a_writer_that_is_gone_is_told(path, tmp_path):
@@ -156,6 +239,19 @@ def test_a_writer_that_is_gone_is_told(path, tmp_path):
     assert mirror(path, place).lines == 96
 
 
+def test_a_slow_store_has_time_unless_somebody_says_how_much(monkeypatch):
+    for store in ("AWS", "GOOGLE"):
+        monkeypatch.setenv(f"{store}_TIMEOUT", "7s")  # so that it is put back afterwards
+        monkeypatch.delenv(f"{store}_TIMEOUT")
+    monkeypatch.setenv("AZURE_TIMEOUT", "7s")
+    be_patient()
+    assert [os.environ[f"{store}_TIMEOUT"] for store in ("AWS", "GOOGLE", "AZURE")] == [
+        PATIENCE,
+        PATIENCE,
+        "7s",
+    ]
+
+
 def test_what_cannot_be_reached_is_told(bucket, path):
     with pytest.raises(DataError, match="does not exist"):
         open_recording(f"memory://{uuid.uuid4()}/no.zarr")
@@ -165,3 +261,7 @@ def test_what_cannot_be_reached_is_told(bucket, path):
         open_recording(f"{bucket}/no.zarr")
     with pytest.raises(DataError, match="nobucketofthisname"):
         mirror(write(path), "s3://nobucketofthisname/x.zarr")
+    with pytest.raises(FileNotFoundError, match="nobucketofthisname"):
+        RemoteSource("s3://nobucketofthisname").prove()
+    RemoteSource(bucket).prove()
+    assert b"acquire" in RemoteSource(bucket).read(PROOF)
