@@ -212,10 +212,10 @@ def cut_case(directory: Path) -> None:
         times = [_cut_cold(path, line) for line in _places()]
     finally:
         DISK.remove_tree(path)
-    names = ("open and cut", "cut alone", "cut again, warm", "bare O_DIRECT read of its chunks")
+    names = ("open and cut", "cut alone", "the same, warm", "others, cold", "bare O_DIRECT read of chunks")
     for name, values in zip(names, zip(*times, strict=True), strict=True):
         found = f"median {np.median(values):.1f} ms, worst {max(values):.1f} ms"
-        print(f"{CUT_LINES} lines of an hour, {name}: {found}")
+        print(f"{CUT_LINES} lines of an hour, a fresh process, {name}: {found}")
 
 
 def _places() -> list[int]:
@@ -224,18 +224,23 @@ def _places() -> list[int]:
 
 
 def _cut_cold(path: Path, line: int) -> list[float]:
-    """In a process of its own, its files out of the page cache: ms to open and cut, to cut, to cut again,
-    and to read its chunks of lines barely.
+    """In a process of its own, its files out of the page cache: ms to open and cut, to cut, to cut the same
+    again, to cut others once the files are out of the cache again, and to read their chunks barely.
     """
+    _chill(path)
+    command = [sys.executable, __file__, "--cut", str(path), str(line)]
+    return list(
+        map(float, subprocess.run(command, check=True, capture_output=True, text=True).stdout.split())
+    )
+
+
+def _chill(path: Path) -> None:
+    """Have the files of the lines out of the page cache."""
     for file in shard_files(path, MIDDLE // SHARD_LINES):
         fd = os.open(file, os.O_RDONLY)
         os.fsync(fd)
         os.posix_fadvise(fd, 0, 0, os.POSIX_FADV_DONTNEED)
         os.close(fd)
-    command = [sys.executable, __file__, "--cut", str(path), str(line)]
-    return list(
-        map(float, subprocess.run(command, check=True, capture_output=True, text=True).stdout.split())
-    )
 
 
 def cut_here(path: Path, line: int) -> None:
@@ -246,8 +251,14 @@ def cut_here(path: Path, line: int) -> None:
     cut = time.perf_counter()
     recording.cut(line, CUT_LINES)
     again = time.perf_counter()
-    bare_s = _bare_read(path, line)
-    print(*(1e3 * seconds for seconds in (cut - begun, cut - opened, again - cut, bare_s)))
+    _chill(path)
+    other = MIDDLE + (line - MIDDLE + SHARD_LINES // 2) % (SHARD_LINES - CUT_LINES)
+    chilled = time.perf_counter()
+    recording.cut(other, CUT_LINES)
+    others = time.perf_counter()
+    bare_s = _bare_read(path, other)
+    seconds = cut - begun, cut - opened, again - cut, others - chilled, bare_s
+    print(*(1e3 * value for value in seconds))
 
 
 def _bare_read(path: Path, line: int) -> float:
