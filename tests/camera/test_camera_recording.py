@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from waiting import until
 
 from acquire.config import RigConfig, load_rig
 from acquire.daemon.plan import Run
@@ -24,7 +25,6 @@ from acquire.store import Recording, RunCondition, open_recording
 needs_compiler = pytest.mark.needs_compiler
 
 STAGES = 16
-WAIT_S = 60.0
 
 SMALL: dict[str, Any] = {
     "geometry.stages": STAGES,
@@ -44,13 +44,6 @@ def rig_config(**changes: Any) -> RigConfig:
     given = SMALL | changes
     given |= {f"cameras.{arm}.settings": settings for arm in "ab"}
     return load_rig("rig-demo-gentl", given)
-
-
-def until(condition: Callable[[], object], what: str) -> None:
-    deadline = time.monotonic() + WAIT_S
-    while not condition():
-        assert time.monotonic() < deadline, f"waited in vain for {what}"
-        time.sleep(0.01)
 
 
 def record(

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from live_daemon import SUBSTEPS, Daemon, acquire, until_gone, write_rig
+from waiting import until
 
 from acquire.daemon.states import State
 from acquire.store import Recording, open_recording
@@ -43,13 +44,6 @@ def record(daemon: Daemon, committed_lines: int = 300) -> Path:
             assert time.monotonic() < deadline
             time.sleep(0.02)
     return path
-
-
-def until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 60
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def check_contiguous(recording: Recording, at_least: int) -> None:

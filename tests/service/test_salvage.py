@@ -6,18 +6,17 @@ import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import psutil
 import pytest
 from live_daemon import Daemon, acquire, until_gone
+from waiting import until
 
 from acquire.store import open_recording, verify
 
 Start = Callable[..., Daemon]
-WAIT_S = 60.0
 KILLED = "recovered: its recorder was killed by SIGKILL"
 
 
@@ -33,13 +32,6 @@ def start(tmp_path: Path) -> Iterator[Start]:
     yield start_one
     for daemon in started:
         daemon.close()
-
-
-def until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + WAIT_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def record(daemon: Daemon, name: str = "x.zarr") -> Path:

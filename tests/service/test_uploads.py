@@ -5,13 +5,14 @@ from __future__ import annotations
 import signal
 import time
 import uuid
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
 import pytest
 from live_daemon import Daemon, until_gone
 from s3_server import BUCKET, S3Server
+from waiting import until
 
 from acquire.daemon.messages import UploadStatus
 from acquire.store import open_recording, verify
@@ -60,13 +61,6 @@ def lab(tmp_path: Path, server: S3Server) -> Iterator[Lab]:
     yield made
     server.open.set()
     made.close()
-
-
-def until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + WAIT_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
 
 
 def record(daemon: Daemon, name: str = "x.zarr") -> Path:

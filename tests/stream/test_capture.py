@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +17,7 @@ import numpy as np
 import psutil
 import pytest
 import zarr
+from waiting import until
 from wired_devices import (
     CLOCK_HZ,
     CODE,
@@ -38,15 +39,7 @@ from acquire.store import Recording, RunCondition, open_recording
 from acquire.stream import Capture, CaptureStatus
 from acquire.trigger.base import TriggerRun
 
-PATIENCE_S = 30.0
 UNCONFIRMED = LineFlag.TIME_ESTIMATED | LineFlag.CODE_UNVERIFIED
-
-
-def until(condition: Callable[[], object], what: str) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline, f"waited {PATIENCE_S} s for {what}"
-        time.sleep(0.005)
 
 
 @contextmanager

@@ -11,7 +11,7 @@ import errno
 import math
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -22,6 +22,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from slow_disks import FailingDisk, SlowDisk
 from throttle import Throttle
+from waiting import until
 
 from acquire.capacity.load import CLOCK_HZ, Load, capture_plan, recording_spec
 from acquire.device_config import TriggerConfig
@@ -77,13 +78,6 @@ def check_lines(path: Path) -> None:
         expected = Pattern(arm, LOAD.pixels, LOAD.dtype, 4095).lines(recording.first_line, recording.lines)
         np.testing.assert_array_equal(recording.camera(arm).lines[:], expected)
         assert not recording.camera(arm).flags[:].any() & 1
-
-
-def until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + WAIT_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 def check_graceful_end(capture: Capture, path: Path) -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import itertools
 import os
 import signal
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
 import pytest
+from waiting import until
 
 from acquire.config import RigConfig, builtin_directory, load_rig
 from acquire.daemon.plan import Run
@@ -65,13 +65,6 @@ def run(config: RigConfig) -> Iterator[Run]:
             yield run
         finally:
             run.close()
-
-
-def until(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + WAIT_S
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 def kill(run: Run, name: str) -> int:

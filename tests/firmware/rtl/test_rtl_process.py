@@ -5,12 +5,12 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from waiting import until
 
 import acquire.sim.rtl
 from acquire.cli.demo_capture import record
@@ -30,13 +30,6 @@ from acquire.trigger.driver import TriggerDriver
 
 CLOCK_HZ, TICKS = 6_000_000, 60
 CODE = PrbsCode(64, mix_seed(3, 64))
-
-
-def until(condition: Callable[[], object], limit_s: float = 30.0) -> None:
-    deadline = time.monotonic() + limit_s
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
 
 
 @pytest.fixture
@@ -176,12 +169,12 @@ def test_a_killed_demo_leaves_nothing_behind(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "acquire", "demo", "--trigger", "rtl", "--lines", "3000000"]
     demo = subprocess.Popen([*command, "--out", str(tmp_path / "out")], stderr=subprocess.DEVNULL)
     try:
-        until(lambda: list((tmp_path).glob("out/recording.zarr/*")), 60)
+        until(lambda: list((tmp_path).glob("out/recording.zarr/*")))
         family = _descendants(demo.pid)
         assert any("firmware.twin" in _command(process) for process in family)
         demo.send_signal(signal.SIGKILL)
         demo.wait()
-        until(lambda: not any(_lives(process) for process in family), 60)
+        until(lambda: not any(_lives(process) for process in family))
     finally:
         demo.kill()
         demo.wait()

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from trigger_twins import CLOCK_HZ, CODE, TWINS, Bench, run
+from waiting import until
 
 from acquire.codes import ConstantCode, PrbsCode, prbs
 from acquire.errors import TriggerError
@@ -30,13 +31,6 @@ def collect(driver: TriggerDriver, lines: int, limit_s: float = 20.0) -> list:
         assert time.monotonic() < deadline, f"{len(tags)} tags"
         tags += driver.tags(0.5)
     return tags
-
-
-def until(condition, limit_s: float = 20.0) -> None:
-    deadline = time.monotonic() + limit_s
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.002)
 
 
 def test_the_device_says_who_it_is(bench: Bench) -> None:
