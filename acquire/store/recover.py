@@ -5,8 +5,9 @@
     scan every chunk ─▶ mend indices ─▶ flag what is lost ─▶ tables ─▶ lengths ─▶ root: sealed, INTERRUPTED
 
 Nothing that was committed is cut off: lines of which a part is not on disk stay, flagged as missing and
-listed in gaps. Whole chunks that were written after the last commit are added. A second run finds nothing
-to do; one that is interrupted is simply run again, since the root is written last.
+listed in gaps. Whole chunks that were written after the last commit are added; pixels without tags are no
+lines, and are left where they are, behind the last. A second run finds nothing to do; one that is interrupted
+is simply run again, since the root is written last.
 
 Where the machine has run on since, what was committed is where it was written: then only what came after the
 last commit is looked at, and it takes a moment however long the recording is.

@@ -15,6 +15,7 @@ from s3_server import BUCKET, S3Server
 from waiting import until
 
 from acquire.daemon.messages import UploadStatus
+from acquire.lines import ARMS
 from acquire.store import open_recording, verify
 
 WAIT_S = 60.0
@@ -83,11 +84,18 @@ def upload(daemon: Daemon, name: str = "x.zarr") -> UploadStatus:
 
 
 def files(path: Path) -> dict[str, bytes]:
-    """All but the root's: the copy of that does not tell of holds."""
+    """All that have lines, or say something of them, but for the root's: the copy of that does not tell of
+    holds. A recorder that is killed may leave pixels behind the last line, whose tags it did not write.
+    """
+    recording = open_recording(path)
+    shards = -(-recording.lines // recording.arms["a"].reader("lines").shape.shard_rows)
+    found = {file.relative_to(path): file for file in path.rglob("*") if file.is_file()}
     return {
-        str(file.relative_to(path)): file.read_bytes()
-        for file in path.rglob("*")
-        if file.is_file() and file != path / "zarr.json" and not file.name.startswith(".")
+        str(name): file.read_bytes()
+        for name, file in found.items()
+        if name != Path("zarr.json")
+        and not name.name.startswith(".")
+        and not (name.parts[0] in ARMS and name.parts[2:3] == ("c",) and int(name.parts[3]) >= shards)
     }
 
 
