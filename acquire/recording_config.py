@@ -15,6 +15,7 @@ USUAL_CHUNK_BYTES = 2 * 2**20
 USUAL_CHUNK_S = 0.1
 """What is held in memory until its chunk is whole, in seconds of lines."""
 USUAL_TAG_LINES = 4096
+"""In the longest chunk of tags: 32 KB of an array at most, written at the cost of a few bytes."""
 
 
 def usual_chunk_lines(line_bytes: int, line_rate_hz: float) -> int:
