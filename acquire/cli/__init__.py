@@ -32,7 +32,7 @@ from acquire.cli import (
     tradeoff,
     trigger,
 )
-from acquire.cli.output import print_error
+from acquire.cli.output import print_error, say
 from acquire.errors import EXIT_INTERRUPTED, AcquireError, UsageError
 
 MODULES = (
@@ -103,5 +103,5 @@ def _options(
     if version:
         from acquire import __version__
 
-        typer.echo(__version__)
+        say(__version__)
         raise typer.Exit

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, quantity
+from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, quantity, say
 from acquire.errors import DataError, UsageError
 
 if TYPE_CHECKING:
@@ -81,13 +81,13 @@ def _show_parts(load: Load, parts: Parts, directory: Path) -> None:
 
 
 def _tell(trial: Trial) -> None:
-    typer.echo(f"  {quantity(trial.line_rate_hz, 'Hz')}: {'held' if trial.held else 'not held'}", err=True)
+    say(f"  {quantity(trial.line_rate_hz, 'Hz')}: {'held' if trial.held else 'not held'}", err=True)
 
 
 def _show(load: Load, trials: list[Trial], found: Trial) -> None:
     columns = ("lines/s", "MB/s", "lost", "ring peak", "cores", "latency p99.9", "")
     rows = [_row(load, trial, found) for trial in sorted(trials, key=lambda trial: trial.line_rate_hz)]
-    typer.echo()
+    say()
     print_table(columns, rows)
 
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json as json_text
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from acquire.cli.output import JsonFlag, print_facts, print_json, quantity
+from acquire.cli.output import JsonFlag, json_text, print_facts, print_json, quantity, say
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -42,7 +41,7 @@ def check(file: FileArgument, json: JsonFlag = False) -> None:
     if json:
         print_json({"file": file, "valid": True, **facts})
         return
-    typer.echo(f"{file}: valid")
+    say(f"{file}: valid")
     print_facts(
         {
             "rig": facts["name"],
@@ -69,7 +68,7 @@ def show(file: FileArgument, json: JsonFlag = False) -> None:
         print_json(table)
         return
     for line in dotted(table):
-        typer.echo(line)
+        say(line)
 
 
 def schema() -> None:
@@ -105,4 +104,4 @@ def dotted(table: dict[str, Any], prefix: str = "") -> Iterator[str]:
         if isinstance(value, dict):
             yield from dotted(value, f"{prefix}{key}.")
         elif value is not None:
-            yield f"{prefix}{key} = {json_text.dumps(value, ensure_ascii=False)}"
+            yield f"{prefix}{key} = {json_text(value)}"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from acquire.cli.durations import seconds
-from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, quantity
+from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, quantity, say
 from acquire.errors import DataError, UsageError
 
 if TYPE_CHECKING:
@@ -232,7 +232,7 @@ def _show_arms(status: Status) -> None:
         ring = (f"{arm.ring.fill}/{arm.ring.slots}", arm.ring.peak, arm.ring.drops)
         account = "-" if arm.ledger is None else "balances" if arm.ledger.balanced else "DOES NOT BALANCE"
         rows.append((name, quantity(arm.rate_hz, "Hz"), *counts, lost, *ring, _check(arm.check), account))
-    typer.echo()
+    say()
     print_table(columns, rows)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
-import typer
+from acquire.cli.output import say
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -34,4 +34,4 @@ class Journal:
         seconds = time.perf_counter() - started
         self.stages.append(Stage(name, seconds, note.get("detail", "")))
         detail = f"  {note['detail']}" if "detail" in note else ""
-        typer.echo(f"{name:<34} {seconds:6.1f} s{detail}", err=True)
+        say(f"{name:<34} {seconds:6.1f} s{detail}", err=True)

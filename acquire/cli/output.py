@@ -1,11 +1,18 @@
-"""How commands speak: facts on stdout, as text or JSON; errors on stderr."""
+"""How commands speak: facts on stdout, as text or JSON; errors on stderr.
+
+Everything that is printed passes through here, where foreign text is made visible: a name or an attribute
+of somebody else's recording can neither forge a line nor send an escape sequence to the terminal.
+"""
 
 from __future__ import annotations
 
 import json
+import re
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from acquire.text import visible
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -15,9 +22,25 @@ if TYPE_CHECKING:
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print JSON instead of text.")]
 
 
+_IN_JSON = re.compile(r"[^ -~\n]")
+
+
+def say(text: str = "", *, err: bool = False) -> None:
+    """One line."""
+    typer.echo(visible(text), err=err)
+
+
 def print_json(value: Any) -> None:
     """One JSON document; what JSON does not know is written as text."""
-    typer.echo(json.dumps(value, indent=2, default=str, ensure_ascii=False))
+    typer.echo(json_text(value, indent=2))
+
+
+def json_text(value: Any, indent: int | None = None) -> str:
+    """JSON that can be encoded and shown anywhere: what is not printable is ``\\u`` and its number."""
+    text = json.dumps(value, indent=indent, default=str, ensure_ascii=False)
+    return _IN_JSON.sub(
+        lambda found: found[0] if found[0].isprintable() else json.dumps(found[0])[1:-1], text
+    )
 
 
 def print_facts(facts: Mapping[str, Any]) -> None:
@@ -25,7 +48,7 @@ def print_facts(facts: Mapping[str, Any]) -> None:
     shown = {name: value for name, value in facts.items() if value is not None}
     width = max(map(len, shown), default=0)
     for name, value in shown.items():
-        typer.echo(f"{name:<{width}}  {_words(value)}")
+        say(f"{name:<{width}}  {_words(value)}")
 
 
 def _words(value: Any) -> str:
@@ -38,7 +61,7 @@ def _words(value: Any) -> str:
 
 def print_table(columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
     """A plain table, aligned; numbers to the right. Never cut: it is read by people and by grep."""
-    cells = [[str(cell) for cell in row] for row in rows]
+    cells = [[visible(cell) for cell in row] for row in rows]
     titles = list(columns)
     widths = [max(map(len, column)) for column in zip(titles, *cells, strict=True)]
     right = [bool(cells) and all(row[i][:1].isdigit() for row in cells) for i in range(len(titles))]
@@ -47,23 +70,26 @@ def print_table(columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
             cell.rjust(width) if to_right else cell.ljust(width)
             for cell, width, to_right in zip(line, widths, right, strict=True)
         )
-        typer.echo("  ".join(padded).rstrip())
+        say("  ".join(padded).rstrip())
 
 
 def print_error(error: AcquireError, *, as_json: bool) -> None:
     """What was asked, what is possible, what to try; on stderr."""
     if as_json:
-        typer.echo(json.dumps(error.to_dict(), ensure_ascii=False), err=True)
+        typer.echo(json_text(error.to_dict()), err=True)
         return
-    typer.echo(f"acquire: error: {error.message}", err=True)
+    first, *others = error.message.split("\n")
+    say(f"acquire: error: {first}", err=True)
+    for line in others:
+        say(f"  {line.strip()}", err=True)
     for word, text in (("possible", error.possible), ("try", error.hint)):
         if text:
-            typer.echo(f"  {word}: {text}", err=True)
+            say(f"  {word}: {text}", err=True)
 
 
 def print_warning(text: str) -> None:
     """What a user should know although the command did what was asked; on stderr."""
-    typer.echo(f"acquire: warning: {text}", err=True)
+    say(f"acquire: warning: {text}", err=True)
 
 
 def quantity(value: float, unit: str) -> str:

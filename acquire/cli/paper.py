@@ -63,7 +63,7 @@ def paper(
         print_json({"page": str(page), "figures": made})
         return
     for each in made:
-        typer.echo(f"Fig. {each['name'][3:]}  {each['title']}")
+        say(f"Fig. {each['name'][3:]}  {each['title']}")
         print_table(("", "the paper", "here"), [tuple(row.values()) for row in each["rows"]])
-        typer.echo()
-    typer.echo(f"page  {page}")
+        say()
+    say(f"page  {page}")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from acquire.cli.interrupts import first_interrupt_asks
-from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, print_warning
+from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, print_warning, say
 from acquire.cli.progress import stage_progress
 from acquire.cli.recordings import PlaceArgument
 from acquire.errors import EXIT_INTERRUPTED, UsageError
@@ -175,7 +175,7 @@ def _report(outcomes: list[Outcome], *, json: bool, brief: bool) -> None:
         if brief:
             continue
         if len(segments) > 1:
-            typer.echo()
+            say()
             _print_segments(segments)
         for text in dict.fromkeys(text for part in segments for text in part["warnings"]):
             print_warning(text)
@@ -226,4 +226,4 @@ def _print_plan(plan: ReconstructionPlan) -> None:
         for number, part in enumerate(plan.segments, 1)
     ]
     print_table(("segment", "length", "voxels", "because"), rows)
-    typer.echo()
+    say()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, quantity
+from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, quantity, say
 from acquire.cli.progress import stage_progress
 from acquire.errors import AcquireError, DataError, UsageError
 
@@ -52,7 +52,7 @@ def list_recordings(
     if json:
         print_json(found)
     elif not found:
-        typer.echo(f"no recordings in {directory}")
+        say(f"no recordings in {directory}")
     else:
         print_table(("recording", "lines", "duration", "size", "state", "started (UTC)"), map(_row, found))
 
@@ -75,7 +75,7 @@ def info(recording: PlaceArgument, json: JsonFlag = False) -> None:
         return
     print_facts(_readable(facts))
     if opened.gaps:
-        typer.echo()
+        say()
         rows = [(gap.arm, gap.first_line, gap.count, gap.cause) for gap in opened.gaps]
         print_table(("arm", "first lost line", "lines", "cause"), rows)
 
@@ -116,9 +116,9 @@ def recover(recording: RecordingArgument, json: JsonFlag = False) -> None:
     added = done.lines - done.lines_before
     found = f"; {added} lines were on disk that no commit listed" if added else ""
     what = f"recovered and sealed{found}" if done.changed else "nothing to recover"
-    typer.echo(f"{done.path}: {done.lines} lines, {what}")
+    say(f"{done.path}: {done.lines} lines, {what}")
     if done.indices_mended:
-        typer.echo(f"  {done.indices_mended} indices of files were mended")
+        say(f"  {done.indices_mended} indices of files were mended")
     _print_list("lost, flagged as missing", map(str, done.damage))
 
 
@@ -141,7 +141,7 @@ def hold(
     if json:
         print_json({"path": str(recording), "first_line": held.first_line, "lines": held.count, "why": why})
     else:
-        typer.echo(f"{recording}: lines {first_line} to {first_line + lines - 1} are held")
+        say(f"{recording}: lines {first_line} to {first_line + lines - 1} are held")
 
 
 def upload(
@@ -163,14 +163,14 @@ def upload(
 
     def report(done: Mirrored) -> None:
         if not json:
-            typer.echo(f"{url}: {done.lines} lines, {quantity(done.bytes, 'B')} copied", err=True)
+            say(f"{url}: {done.lines} lines, {quantity(done.bytes, 'B')} copied", err=True)
 
     done = mirror(recording, url, follow=follow, report=report)
     if json:
         print_json(done.to_dict())
     else:
         state = "sealed" if done.sealed else "still growing"
-        typer.echo(f"{url}: {done.lines} lines, {state}; {quantity(done.bytes, 'B')} copied now")
+        say(f"{url}: {done.lines} lines, {state}; {quantity(done.bytes, 'B')} copied now")
 
 
 def cut(
@@ -194,13 +194,13 @@ def cut(
     if json:
         print_json(facts)
     else:
-        typer.echo(f"{out}: lines {first_line} to {first_line + lines - 1}, {quantity(size, 'B')}")
+        say(f"{out}: lines {first_line} to {first_line + lines - 1}, {quantity(size, 'B')}")
 
 
 def _print_verification(found: Verification) -> None:
     verdict = "intact" if found.intact else "DAMAGED"
     size = quantity(found.bytes, "B")
-    typer.echo(f"{found.path}: {verdict}; {found.state}, {found.lines} lines, {size}")
+    say(f"{found.path}: {verdict}; {found.state}, {found.lines} lines, {size}")
     _print_list("not intact on disk", map(str, found.damage))
     _print_list("contradictions", found.contradictions)
     _print_list("note", found.notes)
@@ -210,9 +210,9 @@ def _print_list(title: str, items: Iterable[str]) -> None:
     """Some items under a title; those that are too many are counted."""
     listed = list(items)
     for item in listed[:LISTED]:
-        typer.echo(f"  {title}: {item}")
+        say(f"  {title}: {item}")
     if len(listed) > LISTED:
-        typer.echo(f"  {title}: and {len(listed) - LISTED} more; --json has them all")
+        say(f"  {title}: and {len(listed) - LISTED} more; --json has them all")
 
 
 def _may_be_one(path: Path) -> bool:

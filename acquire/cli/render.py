@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from acquire.cli.output import JsonFlag, print_json, quantity
+from acquire.cli.output import JsonFlag, print_json, quantity, say
 from acquire.cli.progress import stage_progress
 from acquire.errors import UsageError
 
@@ -60,7 +60,7 @@ def render(
     if json:
         print_json({"path": str(out), "frames": shown, "bytes": size})
     else:
-        typer.echo(f"{out}: {shown} frames, {quantity(size, 'B')}")
+        say(f"{out}: {shown} frames, {quantity(size, 'B')}")
 
 
 def _check(count: int, height: int, fps: float, peak: float | None) -> None:

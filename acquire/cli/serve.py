@@ -34,10 +34,10 @@ def serve(
 
     Example: [bold]acquire serve --config rig-demo[/]
     """
-    import logging
     import threading
 
     from acquire.config import check_directory, load_rig, parse_settings
+    from acquire.daemon.logs import write_log
     from acquire.daemon.server import serve as run_daemon
     from acquire.daemon.uploads import check_upload
 
@@ -47,8 +47,7 @@ def serve(
     rig = load_rig(config, overrides)
     check_directory(rig)
     check_upload(rig)
-    logging.basicConfig(format="%(asctime)s %(levelname)s %(message)s", level=logging.INFO)
-    logging.getLogger("uvicorn").setLevel(logging.WARNING)
+    write_log()
     if owned:
         threading.Thread(target=_end_with_owner, name="acquire-owner", daemon=True).start()
     raise typer.Exit(run_daemon(rig))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from acquire.cli.output import JsonFlag, print_facts, print_json, print_table
+from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, say
 from acquire.cli.progress import stage_progress
 from acquire.errors import UsageError
 
@@ -93,14 +93,14 @@ def _readable(facts: dict[str, Any]) -> dict[str, Any]:
 
 
 def _print_study(found: Study, *, explain: bool) -> None:
-    typer.echo()
+    say()
     if explain:
         rows = [("Eq. (1)", "forward", f"{found.bare_us_per_line:.2f}")]
         rows += [(worth.effect, worth.place, f"{worth.us_per_line:.2f}") for worth in found.effects]
         rows.append(("all", "", f"{found.all_us_per_line:.2f}"))
         print_table(("stage", "acts on", "us per line and arm"), rows)
-        typer.echo()
-    typer.echo(
+        say()
+    say(
         f"signal {found.signal_dn:.3g} DN RMS, temporal noise {found.noise_dn:.3g} DN RMS (rounding included)"
     )
     if found.effects:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from acquire.cli.output import JsonFlag, print_json, print_table
+from acquire.cli.output import JsonFlag, print_json, print_table, say
 from acquire.cli.progress import stage_progress, told
 
 if TYPE_CHECKING:
@@ -75,9 +75,10 @@ def tradeoff(
         print_json({"page": str(page), "learned": kept and str(kept), "rows": table(runs)})
         return
     _print(runs)
-    typer.echo(f"\npage     {page}")
+    say()
+    say(f"page     {page}")
     if kept is not None:
-        typer.echo(f"learned  {kept}")
+        say(f"learned  {kept}")
 
 
 def _first(recording: Recording, first_line: int | None, lines: int) -> int:

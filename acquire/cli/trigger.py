@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from acquire.cli.output import JsonFlag, print_facts, print_json
+from acquire.cli.output import JsonFlag, print_facts, print_json, say
 from acquire.errors import TriggerError, UsageError
 
 if TYPE_CHECKING:
@@ -154,7 +154,7 @@ def stop(
     if json:
         print_json({"lines": lines})
         return
-    typer.echo(f"stopped; {lines} lines")
+    say(f"stopped; {lines} lines")
 
 
 def selftest(
@@ -175,7 +175,7 @@ def selftest(
     if json:
         print_json({"passed": True})
         return
-    typer.echo("self test passed")
+    say("self test passed")
 
 
 def monitor(
@@ -196,7 +196,7 @@ def monitor(
         for tag in islice(_watch(driver.device(), seconds), tags):
             facts = _tag_facts(tag)
             text = json_text.dumps(facts) if json else "  ".join(f"{k} {v}" for k, v in facts.items())
-            typer.echo(text)
+            say(text)
 
 
 def _watch(device: Device, seconds: float | None) -> Iterator[TagRecord]:

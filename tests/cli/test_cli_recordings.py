@@ -317,3 +317,23 @@ def test_lines_that_do_not_follow_the_code_are_named(tmp_path: Path, cli: Cli) -
     verified = cli("verify", path)
     assert verified.code == 0  # they are there, and as they were recorded
     assert "b: lines 150 to 163 do not follow the light's code: shifted by +3 sub-steps" in verified.out
+
+
+HOSTILE = "\x1b[2J\x9b31m\u202eDOOG\n/d/forged.zarr: intact\udcff"
+
+
+def test_what_others_wrote_reaches_no_terminal_as_it_is(cli: Cli, recording: Path) -> None:
+    root = recording / "zarr.json"
+    meta = json.loads(root.read_text())
+    meta["attributes"] |= {"end_reason": HOSTILE, "run_id": HOSTILE}
+    meta["attributes"]["code"]["note"] = HOSTILE
+    root.write_text(json.dumps(meta))
+    odd = recording.rename(recording.with_name("\x1b[31mone\n.zarr"))
+    for words in (("info", odd), ("verify", odd), ("ls", recording.parent), ("recover", odd)):
+        for form in ((), ("--json",)):
+            answer = cli(*words, *form)
+            assert all(c.isprintable() for c in (answer.out + answer.err).replace("\n", ""))
+            assert "\n/d/forged" not in answer.out + answer.err
+    answer = cli("info", odd, "--json")
+    assert answer.code == 0, answer.err
+    assert answer.json["end_reason"] == HOSTILE

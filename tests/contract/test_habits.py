@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -24,3 +25,15 @@ def test_rule(rule: str) -> None:
         [sys.executable, *TOOLS[rule]], cwd=ROOT, capture_output=True, text=True, timeout=110, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_commands_print_through_one_door() -> None:
+    """`acquire.cli.output` makes foreign text harmless; what is printed past it is not."""
+    past = [
+        f"{path.name}: {line.strip()}"
+        for path in sorted((ROOT / "acquire/cli").glob("*.py"))
+        if path.name != "output.py"
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if re.search(r"\btyper\.(s?echo)\b|\bprint\(|sys\.stdout\.write", line)
+    ]
+    assert past == []

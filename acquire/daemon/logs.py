@@ -1,0 +1,89 @@
+"""The daemon's log: one line per entry, whatever foreign text is in it, and a bounded number of lines.
+
+An entry that repeats, as of a connection that cannot be accepted, is written some times a minute; how often
+it came besides is told once the minute is over. So the log can neither be forged nor fill the disk.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from acquire.text import visible
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+REPEATS = 30
+"""Entries of one kind that are written within `WINDOW_S`."""
+WINDOW_S = 60.0
+MOST_KINDS = 256
+"""Kinds of entries that are told apart at a time."""
+MOST_CHARACTERS = 4000
+"""Of one entry."""
+MOST_TRACEBACK_LINES = 60
+
+Kind = tuple[str, int, str]
+"""Logger, level and the message before its arguments are put in."""
+
+
+class OneLine(logging.Formatter):
+    """Time, level and message on one line; the lines of a traceback are indented below it."""
+
+    def __init__(self) -> None:
+        super().__init__("%(asctime)s %(levelname)s %(message)s")
+
+    def format(self, record: logging.LogRecord) -> str:
+        text = f"{self.formatTime(record)} {record.levelname} {visible(record.getMessage())}"
+        lines = [text if len(text) <= MOST_CHARACTERS else f"{text[:MOST_CHARACTERS]}…"]
+        if record.exc_info:
+            told = self.formatException(record.exc_info).splitlines()
+            lines += [f"  {visible(line)[:MOST_CHARACTERS]}" for line in told[-MOST_TRACEBACK_LINES:]]
+        return "\n".join(lines)
+
+
+@dataclass(slots=True)
+class _Count:
+    began_s: float
+    seen: int = 0
+
+
+class Bounded(logging.Filter):
+    """Lets `REPEATS` entries of a kind pass in `WINDOW_S`, and then tells how many it kept back."""
+
+    def __init__(self, tell: Callable[[str], None], now_s: Callable[[], float] = time.monotonic) -> None:
+        super().__init__()
+        self._tell = tell
+        self._now_s = now_s
+        self._counts: dict[Kind, _Count] = {}
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        now_s = self._now_s()
+        self._end_windows(now_s)
+        kind = (record.name, record.levelno, str(record.msg)[:MOST_CHARACTERS])
+        count = self._counts.setdefault(kind, _Count(now_s))
+        count.seen += 1
+        return count.seen <= REPEATS
+
+    def _end_windows(self, now_s: float) -> None:
+        for kind, count in list(self._counts.items()):
+            if now_s - count.began_s < WINDOW_S and len(self._counts) < MOST_KINDS:
+                break  # kinds are in the order in which their windows began
+            del self._counts[kind]
+            if count.seen > REPEATS:
+                self._tell(f"{count.seen - REPEATS} more entries like this one were not written: {kind[2]}")
+
+
+def write_log() -> None:
+    """Log to stderr from now on, in this process."""
+    handler = logging.StreamHandler()
+    handler.setFormatter(OneLine())
+    handler.addFilter(Bounded(lambda text: handler.emit(_entry(text))))
+    logging.basicConfig(level=logging.INFO, handlers=[handler])
+    logging.getLogger("uvicorn").setLevel(logging.WARNING)
+
+
+def _entry(text: str) -> logging.LogRecord:
+    return logging.LogRecord("acquire.daemon", logging.WARNING, __file__, 0, text, None, None)

@@ -1,0 +1,51 @@
+"""The daemon's log cannot be forged, and what repeats does not fill the disk."""
+
+from __future__ import annotations
+
+import logging
+
+from acquire.daemon.logs import MOST_CHARACTERS, REPEATS, WINDOW_S, Bounded, OneLine
+
+
+def record(text: str, *words: object, level: int = logging.INFO) -> logging.LogRecord:
+    return logging.LogRecord("acquire.daemon", level, __file__, 1, text, words, None)
+
+
+def test_a_mark_is_one_line_whatever_is_in_it() -> None:
+    line = OneLine().format(record("event: %s", "a\n2026-01-01 00:00:00 ERROR forged\x1b[31m\x00\u202e"))
+    assert line.count("\n") == 0
+    assert line.endswith(r"event: a\n2026-01-01 00:00:00 ERROR forged\x1b[31m\x00\u202e")
+
+
+def test_a_traceback_stays_below_its_entry() -> None:
+    entry = record("failed")
+    error = ValueError("a\nERROR forged\x1b[2J")
+    entry.exc_info = (type(error), error, None)
+    first, *others = OneLine().format(entry).splitlines()
+    assert first.endswith("INFO failed")
+    assert others[-1] == r"  ERROR forged\x1b[2J"
+    assert all(line.startswith("  ") for line in others)
+
+
+def test_an_entry_is_of_bounded_length() -> None:
+    assert len(OneLine().format(record("x" * 10**6))) < MOST_CHARACTERS + 10
+
+
+def test_what_repeats_is_counted_instead() -> None:
+    told: list[str] = []
+    clock = [0.0]
+    bounded = Bounded(told.append, lambda: clock[0])
+    passed = sum(bounded.filter(record("too many files: %d", i)) for i in range(1000))
+    assert passed == REPEATS
+    assert bounded.filter(record("another"))
+    assert told == []
+    clock[0] = WINDOW_S
+    assert bounded.filter(record("too many files: %d", 1))
+    assert told == [f"{1000 - REPEATS} more entries like this one were not written: too many files: %d"]
+
+
+def test_kinds_without_number_are_bounded_too() -> None:
+    told: list[str] = []
+    bounded = Bounded(told.append, lambda: 0.0)
+    assert all(bounded.filter(record(f"kind {i}")) for i in range(5000))
+    assert len(bounded._counts) <= 256

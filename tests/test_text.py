@@ -1,0 +1,40 @@
+"""Foreign text is shown as it is where it is harmless, and as its escapes where it is not."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from acquire.text import shortened, visible
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("33.3 kHz → Grüße, 試験 µ", "33.3 kHz → Grüße, 試験 µ"),
+        ("a\n2026-01-01 ERROR b\r", r"a\n2026-01-01 ERROR b\r"),
+        ("\x1b[2J\x07\x00\x7f\x9b31m", r"\x1b[2J\x07\x00\x7f\x9b31m"),
+        ("a\u202eb\u2066c\u200bd\u2028e\ufeff", r"a\u202eb\u2066c\u200bd\u2028e\ufeff"),
+        ("caf\udce9.zarr", r"caf\udce9.zarr"),
+    ],
+)
+def test_visible(text: str, shown: str) -> None:
+    assert visible(text) == shown
+
+
+def test_lines_of_our_own_stay_lines() -> None:
+    assert visible("a\n\tb\x1b\r", lines=True) == "a\n\tb\\x1b\\r"
+
+
+@given(st.text(st.characters(exclude_categories=())))
+def test_whatever_it_is_can_be_encoded_and_is_one_line(text: str) -> None:
+    shown = visible(text)
+    shown.encode()
+    assert len(shown.splitlines()) <= 1
+    assert visible(shown) == shown
+
+
+def test_shortened_tells_that_it_was() -> None:
+    assert shortened("x" * 500, 10) == "x" * 9 + "…"
+    assert shortened("x" * 10, 10) == "x" * 10
