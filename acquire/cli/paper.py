@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from acquire.cli.output import JsonFlag, print_json, print_table
+from acquire.cli.output import JsonFlag, print_json, print_table, say
 from acquire.cli.progress import told
 from acquire.errors import UsageError
 
@@ -50,9 +50,9 @@ def paper(
     options = Options(preset, solver, None, budget)  # type: ignore[arg-type]  # checked there
     made: list[dict[str, Any]] = []
     pictures: dict[str, Path] = {}
-    with told() as say, limit_blas(idle_cores()):
+    with told() as tell, limit_blas(idle_cores()):
         for name in chosen:
-            studio = Studio(out, options, seed, lambda text, name=name: say(f"{name}: {text}"))  # type: ignore[misc]
+            studio = Studio(out, options, seed, lambda text, name=name: tell(f"{name}: {text}"))  # type: ignore[misc]
             figure = make(name, studio)
             pictures |= draw(figure, out)
             made.append(summarise(figure))

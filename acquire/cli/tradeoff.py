@@ -100,12 +100,12 @@ def _opened(source: str, out: Path, lines: int) -> tuple[Recording, Study | None
     scene = load_scene(source)
     rig = load_rig(scene.rig)
     out.mkdir()
-    with told() as say:
-        say(f"recording {source}")
+    with told() as tell:
+        tell(f"recording {source}")
         simulate(rig, scene, out / "recording.zarr", lines)
         if not scene.effects:
             return open_recording(out / "recording.zarr"), None
-        say("leaving out one effect after the other")
+        tell("leaving out one effect after the other")
         return open_recording(out / "recording.zarr"), study(bench_of(rig, scene), rig.code.build())
 
 
