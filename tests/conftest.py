@@ -6,10 +6,13 @@ go. Things that a library makes once and keeps for the life of the process are m
 
 from __future__ import annotations
 
+import contextlib
+import faulthandler
 import gc
 import importlib
 import importlib.util
 import multiprocessing.resource_tracker
+import os
 import re
 import sys
 import threading
@@ -23,8 +26,10 @@ import psutil
 import pytest
 import zarr
 import zarr.storage
+from hypothesis import HealthCheck, settings
 from numcodecs import blosc
 
+from acquire.cores import usable_cores
 from acquire.forward.kernels import transpose_frames
 
 pytest_plugins = ["left_out"]
@@ -41,8 +46,33 @@ Found = dict[str, str]
 """Key of a thing that exists → how to name it to the reader."""
 
 
+MOST_WORKERS = 8
+"""More would wait for the longest test, and each imports everything."""
+
+CLEANING_UP_S = 120.0
+"""What a test that failed may take to end: one that was late may hang there again."""
+
+settings.register_profile("any speed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("any speed")
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addini("leak_grace_s", "seconds that a test's leftovers may take to go", default="5")
+    parser.addini("leak_grace_s", "seconds that a test's leftovers may take to go", default="60")
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """A process per core for folders; files and single tests run here, where no process has to be started."""
+    if all(Path(asked).is_dir() for asked in config.args):
+        return min(usable_cores(), MOST_WORKERS)
+    return 0
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_exception_interact(node: pytest.Item | pytest.Collector) -> None:
+    """pytest has just called off the end of a process that hangs, for a debugger's sake."""
+    if isinstance(node, pytest.Item):
+        faulthandler.dump_traceback_later(CLEANING_UP_S, file=sys.__stderr__, exit=True)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -100,14 +130,27 @@ def threads() -> Found:
 def children() -> Found:
     """Descendants of this process, by number and birth, since numbers are used again."""
     found: Found = {}
-    for child in psutil.Process().children(recursive=True):
+    for number in descendants(os.getpid()):
         try:
+            child = psutil.Process(number)
             found[f"process {child.pid} {child.create_time()}"] = (
                 f"process {child.pid} ({' '.join(child.cmdline())[-120:]}), {child.status()}"
             )
         except psutil.NoSuchProcess:
             continue  # gone while it was looked at: not left behind
     return found
+
+
+def descendants(pid: int) -> Iterator[int]:
+    """As psutil finds them, which reads every process of the machine, twice for each test."""
+    if not Path("/proc/thread-self/children").exists():  # a kernel that does not list them
+        yield from (child.pid for child in psutil.Process(pid).children(recursive=True))
+        return
+    for thread in Path(f"/proc/{pid}/task").glob("*"):
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has ended
+            for child in (thread / "children").read_text(encoding="ascii").split():
+                yield int(child)
+                yield from descendants(int(child))
 
 
 def descriptors() -> Found:

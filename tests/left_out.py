@@ -1,4 +1,8 @@
-"""Tests that need what a machine lacks are left out there, and the summary says so."""
+"""Tests that need what a machine lacks are left out there, and the summary says so.
+
+What is missing is found once, by the process that was started, and handed to its workers (pytest-xdist), so
+that all of them leave out the same tests; each worker reports what it left out, for the one summary.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +17,7 @@ from typing import Any
 
 import pytest
 from throttle import can_throttle
+from umockdev_here import missing as missing_for_umockdev
 
 from acquire.arrays import open_arrays
 from acquire.camera import aravis
@@ -49,42 +54,81 @@ def _can_mount() -> bool:
         return True
 
 
-MISSING = {
-    "needs_aravis": not _have_aravis() and "Aravis' library",
-    "needs_gige_camera": not (_have_aravis() and which(FAKE_GIGE)) and f"Aravis and {FAKE_GIGE}",
-    "needs_compiler": not (compiler() and _HAVE_GENICAM) and "a C compiler and the genicam package",
-    "needs_dask": importlib.util.find_spec("distributed") is None and "dask.distributed",
-    "needs_gpu": not _have_gpu() and "CuPy and a GPU",
-    "needs_mount": not _can_mount() and "the right to mount a small file system",
-    "needs_throttle": not can_throttle(Path(tempfile.gettempdir())) and "the right to slow a disk down",
-    "needs_genicam": not _HAVE_GENICAM and "the genicam package",
+NEEDS = {
+    "needs_aravis": "loads Aravis' shared library",
+    "needs_gige_camera": "runs Aravis' GigE Vision camera on loopback",
+    "needs_compiler": "builds the simulated GenTL producer",
+    "needs_dask": "spreads work over a Dask cluster",
+    "needs_gpu": "computes on CUDA",
+    "needs_mount": "fills a small file system of its own",
+    "needs_throttle": "has the kernel slow a disk down for a process",
+    "needs_umockdev": "runs libusb on a made-up bus",
+    "needs_genicam": "loads a GenTL producer",
 }
+"""Marker → what a test that carries it does."""
+
+_missing: dict[str, str] = {}
+"""Marker → what this machine lacks for it."""
 _left_out: Counter[str] = Counter()
+"""Line of the summary → tests; 0 where they were not even collected."""
+
+
+def find_missing() -> dict[str, str]:
+    lacks: dict[str, str | bool | None] = {
+        "needs_aravis": not _have_aravis() and "Aravis' library",
+        "needs_gige_camera": not (_have_aravis() and which(FAKE_GIGE)) and f"Aravis and {FAKE_GIGE}",
+        "needs_compiler": not (compiler() and _HAVE_GENICAM) and "a C compiler and the genicam package",
+        "needs_dask": importlib.util.find_spec("distributed") is None and "dask.distributed",
+        "needs_gpu": not _have_gpu() and "CuPy and a GPU",
+        "needs_mount": not _can_mount() and "the right to mount a small file system",
+        "needs_throttle": not can_throttle(Path(tempfile.gettempdir())) and "the right to slow a disk down",
+        "needs_umockdev": missing_for_umockdev(),
+        "needs_genicam": not _HAVE_GENICAM and "the genicam package",
+    }
+    return {marker: str(what) for marker, what in lacks.items() if what}
+
+
+def leave_out_folder(folder: str, reason: str) -> None:
+    """A folder whose tests cannot even be imported here: its conftest.py ignores it, the summary names it."""
+    _left_out[f"{folder} was left out: {reason}"] = 0
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    config.addinivalue_line("markers", "needs_compiler: builds the simulated GenTL producer")
-    config.addinivalue_line("markers", "needs_dask: spreads work over a Dask cluster")
-    config.addinivalue_line("markers", "needs_gpu: computes on CUDA")
-    config.addinivalue_line("markers", "needs_mount: fills a small file system of its own")
-    config.addinivalue_line("markers", "needs_throttle: has the kernel slow a disk down for a process")
-    config.addinivalue_line("markers", "needs_genicam: loads a GenTL producer")
-    config.addinivalue_line("markers", "needs_aravis: loads Aravis' shared library")
-    config.addinivalue_line("markers", "needs_gige_camera: runs Aravis' GigE Vision camera on loopback")
+    for marker, does in NEEDS.items():
+        config.addinivalue_line("markers", f"{marker}: {does}")
+    handed = getattr(config, "workerinput", None)
+    _missing.update(find_missing() if handed is None else handed["missing"])
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_configure_node(node: Any) -> None:
+    node.workerinput["missing"] = _missing
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     out: list[pytest.Item] = []
     for item in items:
-        wants = next((m for m, what in MISSING.items() if what and item.get_closest_marker(m)), None)
+        wants = next((marker for marker in _missing if item.get_closest_marker(marker)), None)
         if wants:
             out.append(item)
-            _left_out[str(MISSING[wants])] += 1
+            _left_out[f"left out, for want of {_missing[wants]}"] += 1
     if out:
         config.hook.pytest_deselected(items=out)
         items[:] = [item for item in items if item not in out]
 
 
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    if hasattr(session.config, "workeroutput"):
+        session.config.workeroutput["left_out"] = dict(_left_out)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any) -> None:
+    """Every worker collects every test, so that one's numbers are those of all."""
+    for line, count in getattr(node, "workeroutput", {}).get("left_out", {}).items():
+        _left_out[line] = count
+
+
 def pytest_terminal_summary(terminalreporter: Any) -> None:
-    for what, count in _left_out.items():
-        terminalreporter.write_line(f"left out, for want of {what}: {count} tests")
+    for line, count in _left_out.items():
+        terminalreporter.write_line(f"{line}: {count} tests" if count else line, yellow=True)

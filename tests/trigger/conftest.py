@@ -2,22 +2,12 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from typing import Any
 
 import pytest
 from trigger_twins import TWINS, Bench
-from umockdev_here import missing
 
 from acquire.errors import TriggerError
 from acquire.trigger.transports import lock
-
-collect_ignore = ["usb"] if missing() else []
-
-
-def pytest_terminal_summary(terminalreporter: Any) -> None:
-    if reason := missing():
-        terminalreporter.write_line(f"tests/trigger/usb was left out: {reason}", yellow=True)
-
 
 SHARED = lock.SHARED
 
