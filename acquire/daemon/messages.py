@@ -95,10 +95,12 @@ class LedgerStatus(_Message):
     issued: int = Field(description="by the trigger, as far as tags and lines tell")
     preroll: int = Field(description="exposed before the run's start")
     stored: int = Field(description="in recordings")
-    discarded: int = Field(description="in none, since nobody asked for them")
+    discarded: int = Field(description="in none: nobody asked for them, or the recording had ended before")
     lost: dict[str, int] = Field(description="cause → lines")
     waiting: int = Field(description="in the ring")
-    pending: int = Field(description="in camera or driver")
+    pending: int = Field(
+        description="in camera or driver; once idle: what was there when the trigger stopped, of no recording"
+    )
     balanced: bool
 
 

@@ -323,10 +323,11 @@ class Capture:
         return counts
 
     def _lost(self, arm: str) -> dict[str, int]:
-        grabbed, unsaved = self._counters[arm], self._counters[RECORDER][f"unsaved_{arm}"]
+        grabbed, recorded = self._counters[arm], self._counters[RECORDER]
+        unsaved = recorded[f"unsaved_{arm}"]
         return {
             str(Cause.CAMERA): grabbed[Cause.CAMERA],
-            str(Cause.RING_FULL): self._rings[arm].statistics().dropped_lines,
+            str(Cause.RING_FULL): recorded[f"overrun_{arm}"],
             **{
                 str(cause): grabbed[cause]
                 for cause in (*grabber.CAMERA_CAUSES[1:], Cause.GRABBER_LOST)
@@ -335,10 +336,16 @@ class Capture:
             **({str(Cause.WRITE_ERROR): unsaved} if unsaved else {}),
         }
 
+    def _discarded(self, arm: str) -> int:
+        """Lines of no recording: a line that finds its ring full ends the recording before it."""
+        recorded = self._counters[RECORDER]
+        dropped = self._rings[arm].statistics().dropped_lines - recorded[f"overrun_{arm}"]
+        return recorded[f"discarded_{arm}"] + self._left_over[arm] + dropped
+
     def _account(self, arm: str, supervisor: Supervisor) -> ArmLedger:
         """Counts are read against the way of the lines: what one knows of, the next has counted."""
         recorded, ring = self._counters[RECORDER], self._rings[arm]
-        stored, discarded = recorded[f"stored_{arm}"], recorded[f"discarded_{arm}"] + self._left_over[arm]
+        stored, discarded = recorded[f"stored_{arm}"], self._discarded(arm)
         lost = self._lost(arm)
         next_line = max(self._counters[arm]["next_line"], ring.newest_line)
         depth = self._plan.depth_lines
@@ -351,6 +358,7 @@ class Capture:
             stored=stored,
             discarded=discarded,
             lost=lost,
+            recorded_to=supervisor.began.first_line + recorded[f"rows_{arm}"] if supervisor.began else 0,
             room=ring.shape.slots * ring.shape.rows,
             block=ring.shape.rows,
         )
@@ -371,7 +379,7 @@ class Capture:
         return {
             "delivered": grabbed["delivered"],
             "preroll": grabbed["preroll"],
-            "discarded": recorded[f"discarded_{arm}"] + self._left_over[arm],
+            "discarded": self._discarded(arm),
             "lost": self._lost(arm),
             "check": self._check(arm),
             "recorded": recorded[f"rows_{arm}"] if began else 0,

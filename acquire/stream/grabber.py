@@ -271,7 +271,7 @@ class Intake:
         count = len(flags)
         slot = self._ring.claim()
         if slot is None:
-            self._ring.drop(count)
+            self._ring.drop(first_line, count)
             self._losses.add(Loss(first_line, count, Cause.RING_FULL))
             return
         slot.pixels[:count] = pixels

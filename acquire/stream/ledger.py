@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 UNDELIVERED = "undelivered"
-"""Loss at the end of a run: pulses whose lines the camera never gave, as of a block that did not fill."""
+"""Loss at the end of a run: pulses whose lines a recording wanted, and the camera never gave."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +31,7 @@ class Counted:
     depth : lines that come before the trigger's line 0
     stored, discarded : what the recorder took from the ring: in recordings, in none
     lost : cause → lines
+    recorded_to : line after the last row of the latest recording, there or missing
     room, block : lines that the ring and one of its slots hold at most
     """
 
@@ -42,6 +43,7 @@ class Counted:
     lost: Mapping[str, int]
     room: int
     block: int
+    recorded_to: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +67,8 @@ def account(counted: Counted, *, closed: bool) -> ArmLedger:
     """The account of a running arm, whose counts are up to a block apart, or of a ``closed`` one: exact.
 
     A line that came proves its pulse, whatever tags have told so far. Once closed, nothing waits, and what
-    is pending will not come.
+    is pending will not come: it is lost as far as a recording has rows for it. The rest was under way when
+    the trigger stopped, as a block that did not fill, and belongs to no recording.
     """
     read = max(0, counted.next_line + counted.depth)
     issued = counted.pulses if closed else max(counted.pulses, read)
@@ -75,8 +78,10 @@ def account(counted: Counted, *, closed: bool) -> ArmLedger:
     pending = issued - read
     if closed:
         balanced = waiting == 0 and pending >= 0
-        lost |= {UNDELIVERED: pending} if pending > 0 else {}
-        return ArmLedger(issued, preroll, counted.stored, counted.discarded, lost, waiting, 0, balanced)
+        owed = max(0, min(pending, counted.recorded_to - max(counted.next_line, 0)))
+        lost |= {UNDELIVERED: owed} if owed else {}
+        pending -= owed
+        return ArmLedger(issued, preroll, counted.stored, counted.discarded, lost, waiting, pending, balanced)
     balanced = -counted.block <= waiting <= counted.room + counted.block
     return ArmLedger(
         issued, preroll, counted.stored, counted.discarded, lost, max(0, waiting), pending, balanced

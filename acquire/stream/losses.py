@@ -27,7 +27,8 @@ class Cause(StrEnum):
     RECORDER_LOST = "recorder_lost"
     """The recorder's process died with the line in its hands; the ring had it no more for the next one."""
     RING_FULL = "ring_full"
-    """The recorder was late: the grabber found no free slot."""
+    """The recorder was late: the grabber found no free slot. A recording ends before the first such line; one
+    that goes on after its recorder was killed lists as a gap what found no slot meanwhile."""
     MIXED = "mixed"
     """Too many different losses at one place to tell them apart."""
     STALLED = "stalled"
@@ -56,7 +57,8 @@ class Loss:
 class LossLog:
     """Losses since the last committed slot. They follow one another without a hole, so they stay few.
 
-    Past ``MAX_LOSSES`` the last one grows and becomes `Cause.MIXED`: bounded, and never silent.
+    Past ``MAX_LOSSES`` the last one grows and becomes `Cause.MIXED`: bounded, and never silent. Where lines
+    found the ring full it becomes `Cause.RING_FULL`, since no recording goes past these.
     """
 
     def __init__(self) -> None:
@@ -72,7 +74,9 @@ class LossLog:
         elif len(self._losses) < MAX_LOSSES:
             self._losses.append(loss)
         else:
-            self._losses[-1] = Loss(last.first_line, last.count + loss.count, Cause.MIXED)
+            overrun = Cause.RING_FULL in (last.cause, loss.cause)
+            cause = Cause.RING_FULL if overrun else Cause.MIXED
+            self._losses[-1] = Loss(last.first_line, last.count + loss.count, cause)
 
     def take(self) -> tuple[Loss, ...]:
         """All of them, in order; the log is empty afterwards."""

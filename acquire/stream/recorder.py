@@ -63,13 +63,14 @@ if TYPE_CHECKING:
 COUNTERS = (
     *("recorded", "committed", "draining", "rows_a", "rows_b", "missing_a", "missing_b"),
     *("discarded_a", "discarded_b", "stored_a", "stored_b", "turns", "awaited_a", "awaited_b"),
-    *("unsaved_a", "unsaved_b", "writing"),
+    *("unsaved_a", "unsaved_b", "overrun_a", "overrun_b", "overrun_to_a", "overrun_to_b", "writing"),
 )
 """Of the latest recording: rows in both arms, rows that a reader finds, whether its last line is known; per
 arm the rows written and those of them that are missing. Since armed: per arm the lines taken from its ring
-that no recording holds, those that one does, and those that a disk which failed did not keep; turns of the
-loop, which stand still when it hangs, and whether it was writing lines then. The owner alone counts how often
-it has seen that an arm's next grabber is only starting: its silence means nothing then."""
+that no recording holds, those that one does, and those that a disk which failed did not keep; those that
+found their ring full and are a gap in a recording, and the line after the last of these; turns of the loop,
+which stand still when it hangs, and whether it was writing lines then. The owner alone counts how often it
+has seen that an arm's next grabber is only starting: its silence means nothing then."""
 
 _WAIT_S = 0.02
 _COMMIT_INTERVAL_S = 0.1
@@ -256,6 +257,11 @@ class Recorder:
         """The line before which everything has come, from one arm at least."""
         return max(arm.ring.newest_line for arm in self._arms.values())
 
+    def _next_line(self) -> int:
+        """The line that both arms have still to deliver, and for which they have room."""
+        dropped_end = max(arm.ring.dropped_end for arm in self._arms.values())
+        return max(self._newest_line(), dropped_end)
+
     def _common_line(self) -> int:
         """The line up to which both arms have delivered."""
         return min(arm.ring.newest_line for arm in self._arms.values())
@@ -263,21 +269,30 @@ class Recorder:
     # ---- the disk's answers
 
     def _look_at_disk(self) -> None:
-        if self._opening is not None and self._opening.writer.done():
+        if self._opening is not None and self._opening.writer.done() and self._is_ready_for(self._opening):
             opening, self._opening = self._opening, None
             self._opened(opening)
         if self._closing is not None and self._closing[1].done():
             (session, sealed), self._closing = self._closing, None
             self._publish(session)
+            for name, lines in session.surplus.items():
+                self._counters.add(f"stored_{name}", -lines)
+                self._counters.add(f"discarded_{name}", lines)
             for name, lines in session.left_out.items():
                 self._counters.add(f"stored_{name}", -lines)
                 # Of a block that was taken in part, all lines are counted as discarded.
                 self._counters.add(f"unsaved_{name}" if lines > 0 else f"discarded_{name}", lines)
             self._mailbox.post(sealed.result())
 
+    def _is_ready_for(self, opening: Opening) -> bool:
+        """What waits goes first: a recording must not begin with rings that are about to overflow."""
+        if opening.span is not None or opening.writer.exception() is not None:
+            return True
+        return all(2 * arm.ring.fill < arm.ring.shape.slots for arm in self._arms.values())
+
     def _opened(self, opening: Opening) -> None:
         """From the newest line on: both arms have still to deliver what comes after it; or from the past."""
-        first_line = self._newest_line() if opening.span is None else opening.span.first_line
+        first_line = self._next_line() if opening.span is None else opening.span.first_line
         try:
             writer = opening.writer.result()
             writer.begin(first_line)
@@ -309,6 +324,7 @@ class Recorder:
         window = opening.begin.window
         if window.padded:
             session.before = Cause.RECORDER_LOST
+            session.bridges_to = self._newest_line()
         if window.kind:
             self._notes.append(Note(at, window.kind, window.text))
         if doubt := self._witness.doubt():
@@ -331,7 +347,7 @@ class Recorder:
                 error = error or another
         self._session = None
         self._counters["writing"] = 0
-        self._free_from = max(book.next_line for book in session.books.values())
+        self._free_from = min(session.end_line, max(book.next_line for book in session.books.values()))
         self._publish(session)
         self._closing = session, self._disk.submit(session.close, error)
 
@@ -378,15 +394,31 @@ class Recorder:
         arm.watch(time.monotonic(), self._counters[f"awaited_{name}"])
 
     def _take(self, name: str, arm: Arm, block: RingBlock, session: Session) -> None:
-        """Write the block; end while all lines are still there, should the disk be too slow for them."""
+        """Write the block; end while all lines are still there, should the disk be too slow for them.
+
+        Once the ring has overflowed, before the first line that it had no room for: whatever held us up, the
+        recording has every line that it covers.
+        """
         assert arm.lent is not None
+        if (line := session.overrun(name, block)) is not None:
+            session.cut(line, f"too slow to write: the ring of arm {name} was full at line {line}")
+        self._count_overrun(name, block, session)
         with self._counting():
             arm.lent.written = session.take(name, block, hurry=arm.ring.fill > _CALM_BLOCKS)
         fill, slots = arm.ring.fill, arm.ring.shape.slots
-        if arm.backlog.grows(fill, slots, time.monotonic()) and not session.ending:
+        if arm.backlog.grows(fill, slots) and not session.ending:
             # Before the slot is released: nothing has been lost as long as the ring is not overtaken.
             reason = f"too slow to write: {fill} of {slots} ring slots of arm {name} wait for disk or codec"
             session.end(self._common_line(), reason, RunCondition.INTERRUPTED)
+
+    def _count_overrun(self, name: str, block: RingBlock, session: Session) -> None:
+        """Lines that found the ring full are lost where a recording lists them; each once."""
+        for loss in block.losses:
+            first = max(loss.first_line, session.books[name].next_line, self._counters[f"overrun_to_{name}"])
+            end = min(loss.end_line, session.end_line)
+            if loss.cause is Cause.RING_FULL and first < end:
+                self._counters.add(f"overrun_{name}", end - first)
+                self._counters[f"overrun_to_{name}"] = end
 
     def _release(self, name: str, arm: Arm) -> None:
         """Give the arm's last block back to its ring, once it is written."""

@@ -3,7 +3,7 @@ observers that it does not.
 
 ::
 
-    control   head peak drops newest | tail | cursor peak lost | …   words of 8 bytes, a cache line per writer
+    control   head peak drops newest dropped | tail | cursor peak lost | …   8-byte words, a line per writer
     headers   sequence first_line count time total losses               one per slot
     flags     (slot, row) uint16
     pixels    (slot, row, pixel)
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-_HEAD, _PEAK, _DROPPED_BLOCKS, _DROPPED_LINES, _NEWEST = range(5)
+_HEAD, _PEAK, _DROPPED_BLOCKS, _DROPPED_LINES, _NEWEST, _DROPPED_END = range(6)
 _TAIL = 8
 _OBSERVERS = 16
 _LINE_WORDS = 8
@@ -193,10 +193,11 @@ class Ring:
         self._control[_HEAD] = head + 1
         os.eventfd_write(self._bell, 1)
 
-    def drop(self, lines: int) -> None:
+    def drop(self, first_line: int, lines: int) -> None:
         """Count a block that found the ring full."""
         self._control[_DROPPED_BLOCKS] += 1
         self._control[_DROPPED_LINES] += lines
+        self._control[_DROPPED_END] = first_line + lines
 
     # ---- the reader that is waited for
 
@@ -259,6 +260,11 @@ class Ring:
     def newest_line(self) -> int:
         """The line after the last committed one; 0 before the first."""
         return int(self._control[_NEWEST])
+
+    @property
+    def dropped_end(self) -> int:
+        """The line after the last one that found the ring full; 0 before the first."""
+        return int(self._control[_DROPPED_END])
 
     @property
     def committed_lines(self) -> int:

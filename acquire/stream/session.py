@@ -104,13 +104,12 @@ class Book:
         return lines == self.stored + self.missing.total()
 
     def end_at(self, line: int, missed: Counter[Cause]) -> int:
-        """Forget what the disk did not take from ``line`` on, ``missed`` of it; the lines that it cost."""
+        """Forget what was taken from ``line`` on, ``missed`` of it missing; the lines that it cost."""
         forgotten = self.next_line - line
         self.next_line = line
         self.missing -= missed
         lost = forgotten - missed.total()
         self.stored -= lost
-        self.left_out += lost
         return lost
 
     def to_attrs(self, lines: int) -> dict[str, Any]:
@@ -140,6 +139,10 @@ class Session:
     verified : arm → the line up to which it is known to follow the light's code
     left_out : arm → lines that were taken, and that a disk which failed did not keep; below 0: which were
         not taken, and are there all the same
+    surplus : arm → lines that were taken before the other arm's ring overflowed at an earlier line: no part
+        of the recording
+    bridges_to : lines up to this one that found their ring full are a gap, because there was no recorder;
+        later ones end the recording
     """
 
     def __init__(
@@ -156,6 +159,8 @@ class Session:
         self.trigger: dict[str, int] = {}
         self.cameras: dict[str, dict[str, int]] = {}
         self.left_out: dict[str, int] = {}
+        self.surplus: dict[str, int] = {}
+        self.bridges_to = -1
         self.verified: dict[str, int] = {}
         self._writer = writer
         self._tagger = tagger
@@ -213,6 +218,27 @@ class Session:
         self._append(taken, hurry=hurry)
         return len(taken)
 
+    def overrun(self, arm: str, block: RingBlock) -> int | None:
+        """The first line before the block that this recording lacks because its ring was full."""
+        start = self.books[arm].next_line
+        for loss in block.losses:
+            first = max(loss.first_line, start)
+            is_lost = loss.cause is Cause.RING_FULL and loss.first_line > self.bridges_to
+            if is_lost and first < min(loss.end_line, self.end_line):
+                return first
+        return None
+
+    def cut(self, line: int, reason: str) -> None:
+        """End before ``line``, although one arm may be past it: the other's ring had no room for it."""
+        if line >= self.end_line:
+            return
+        if self._floor is not RunCondition.INTERRUPTED:
+            self.end_reason = reason
+            self._note("fault", line, reason)
+        self.end_line = line
+        self._told_to_end = True
+        self._floor = _worse(self._floor, RunCondition.INTERRUPTED)
+
     def give_back(self, arm: str) -> None:
         """Wait until the block that the arm's `take` was given may be reused."""
         self._writer.give_back(arm)
@@ -224,7 +250,7 @@ class Session:
     def end(self, line: int, reason: str, condition: RunCondition = RunCondition.GOOD) -> None:
         """End before ``line``, or after what is written already; the condition is at best ``condition``."""
         reach = max(book.next_line for book in self.books.values())
-        last = max(reach, min(line, self.end_line))
+        last = min(self.end_line, max(reach, line))
         if last < self.end_line or _worse(self._floor, condition) is not self._floor:
             self.end_reason = reason
             self._note("stopped" if condition is RunCondition.GOOD else "fault", last, reason)
@@ -264,29 +290,39 @@ class Session:
         """Seal the recording; as aborted after a write ``error``, or one now, if the disk still allows it."""
         if error is None:
             try:
+                if self.done:
+                    self.surplus = self._end_at(self.end_line - self.first_line)
                 return self._seal(self._condition(), self.end_reason)
             except (AcquireError, OSError) as found:
                 error = found
         reason = f"write error: {_words(error)}"
         try:
-            self._end_at(self._writer.rescue())
+            self._leave_out(self._writer.rescue())
             return self._seal(RunCondition.ABORTED, reason)
         except (AcquireError, OSError) as second:
-            self._end_at(self._writer.committed_lines)
+            self._leave_out(self._writer.committed_lines)
             self._writer.close()
             reason = f"{reason}; not sealed: {_words(second)}"
             return Sealed(RunCondition.ABORTED, reason, self._ledger(), on_disk=False)
 
-    def _end_at(self, rows: int) -> None:
-        """Only so many rows were taken by the disk: no others are in the books."""
+    def _leave_out(self, rows: int) -> None:
+        """Only so many rows were taken by the disk."""
+        for arm, lines in self._end_at(rows).items():
+            self.left_out[arm] = self.left_out.get(arm, 0) + lines
+            self.books[arm].left_out += lines
+
+    def _end_at(self, rows: int) -> dict[str, int]:
+        """No more than so many rows are in the books; arm → the lines that are not any more."""
         self.end_line = self.first_line + rows
+        forgotten = {}
         for arm, book in self.books.items():
             missed: Counter[Cause] = Counter()
             for of, lines, cause in self._gaps:
                 if of == arm:
                     missed[cause] += max(0, lines.stop - max(lines.start, self.end_line))
-            self.left_out[arm] = self.left_out.get(arm, 0) + book.end_at(self.end_line, +missed)
+            forgotten[arm] = book.end_at(self.end_line, +missed)
         self._gaps = [(arm, lines, cause) for arm, lines, cause in self._gaps if lines.stop <= self.end_line]
+        return forgotten
 
     def _seal(self, condition: RunCondition, reason: str) -> Sealed:
         ledger = self._ledger()

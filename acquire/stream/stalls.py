@@ -21,8 +21,9 @@ if TYPE_CHECKING:
 
 NEARLY_FULL = 0.9
 """Of a ring: the recording is ended while the rest can still take what comes."""
-PATIENCE_S = 0.25
-"""A ring that is more than half full for less than this says nothing: processes are made to wait for less."""
+PATIENCE_SHARE = 8
+"""A ring that is more than half full says nothing before one part in so many of its slots was emptied: it may
+have leapt there in a pause."""
 _LONGEST_LOOK_S = 0.5
 _EXCESS_S = 1.0
 
@@ -41,22 +42,26 @@ class Backlog:
 
     A ring that leapt to full in a pause empties, and costs nothing more; so does one that begins full, with
     what was before. One that is nearly full, and has not emptied since it was first seen more than half full,
-    will overflow.
+    will overflow. All is counted in blocks, so that it holds at any rate. A ring that overflows before that
+    is seen, since it is short or the pause long, ends the recording as well: see `Session.overrun`.
     """
 
     def __init__(self) -> None:
         self._caught_up = False
-        self._first: tuple[int, float] | None = None
+        self._first_fill: int | None = None
+        self._taken = 0
 
-    def grows(self, fill: int, slots: int, now_s: float) -> bool:
-        """The next blocks would be lost; ``fill`` of ``slots`` wait."""
+    def grows(self, fill: int, slots: int) -> bool:
+        """The next blocks would find no slot; ``fill`` of ``slots`` wait."""
         if 2 * fill < slots:
-            self._caught_up, self._first = True, None
+            self._caught_up, self._first_fill = True, None
             return False
-        first_fill, since_s = self._first = self._first or (fill, now_s)
-        if not self._caught_up or now_s - since_s < PATIENCE_S:
+        if self._first_fill is None:
+            self._first_fill, self._taken = fill, 0
+        self._taken += 1
+        if not self._caught_up or self._taken <= max(1, slots // PATIENCE_SHARE):
             return False
-        return fill >= max(first_fill, NEARLY_FULL * slots)
+        return fill >= max(self._first_fill, NEARLY_FULL * slots)
 
 
 @dataclass(slots=True)

@@ -221,7 +221,7 @@ class Supervisor:
         """To the recorder; should it be too late to take them, later tags confirm the same lines."""
         slot = self._tags.claim()
         if slot is None:
-            self._tags.drop(len(tags))
+            self._tags.drop(tags[0].line, len(tags))
             return
         slot.pixels[: len(tags)] = tag_rows(tags)
         self._tags.commit(0, len(tags))

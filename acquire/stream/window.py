@@ -88,7 +88,10 @@ def hold(window: Window, rings: Mapping[str, Ring], free_from: int) -> Held:
     at = min(ring.newest_line for ring in rings.values()) if window.at is None else window.at
     wanted = max(at - window.pre_lines, free_from, 0)
     taken = {name: ring.lease(wanted) for name, ring in rings.items()}
-    return Held(at, max(free_from, *(_whole_from(ring) for ring in rings.values())), taken)
+    whole_from = max(_whole_from(ring) for ring in rings.values())
+    if not window.padded:  # else what found its ring full is missing, as what the ring does not hold any more
+        whole_from = max(whole_from, *(ring.dropped_end for ring in rings.values()))
+    return Held(at, max(free_from, whole_from), taken)
 
 
 def span(window: Window, lines: int | None, held: Held, line_rate_hz: float) -> Span:

@@ -12,9 +12,9 @@ from acquire.stream.ledger import UNDELIVERED, Counted, account
 lines = st.integers(0, 10_000)
 
 
-@given(lines, lines, lines, lines, lines, lines, st.integers(0, 65))
+@given(lines, lines, lines, lines, lines, lines, st.integers(0, 65), lines)
 def test_what_is_counted_right_balances(
-    stored: int, discarded: int, camera: int, ring: int, waiting: int, pending: int, preroll: int
+    stored: int, discarded: int, camera: int, ring: int, waiting: int, pending: int, preroll: int, owed: int
 ) -> None:
     came = stored + discarded + camera + ring + waiting
     preroll = 65 if came else preroll
@@ -31,9 +31,10 @@ def test_what_is_counted_right_balances(
     running = account(counted, closed=False)
     assert running.balanced
     assert (running.preroll, running.waiting, running.pending) == (preroll, waiting, pending)
-    closed = account(replace(counted, discarded=discarded + waiting), closed=True)
+    recorded_to = came + owed
+    closed = account(replace(counted, discarded=discarded + waiting, recorded_to=recorded_to), closed=True)
     assert closed.balanced
-    assert closed.lost.get(UNDELIVERED, 0) == pending
+    assert closed.lost.get(UNDELIVERED, 0) == min(owed, pending)
     for ledger in (running, closed):
         placed = ledger.preroll + ledger.stored + ledger.discarded + ledger.waiting + ledger.pending
         assert ledger.issued == placed + sum(ledger.lost.values())

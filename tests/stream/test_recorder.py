@@ -17,10 +17,12 @@ from acquire.errors import DataError
 from acquire.lines import ARMS
 from acquire.store import RunCondition, Suspect, open_recording, suspect_lines
 from acquire.store.suspect import DOUBTFUL, VERIFIED
+from acquire.stream.losses import Cause, Loss, LossLog
 from acquire.stream.messages import Began, Begin, End, Note, Refused, RunStarted, Sealed
 from acquire.stream.recorder import COUNTERS, Recorder, RecorderPlan
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.shared import Counters
+from acquire.stream.window import NOW, Window
 from acquire.stream.witness import Witness
 from acquire.trigger.base import TriggerRun
 
@@ -68,16 +70,11 @@ class SlowDisk:
             future.set_result(target())
 
 
-def deliver(ring: Ring, line: int) -> None:
-    slot = ring.claim()
-    assert slot is not None, "the recorder does not empty the ring"
-    slot.pixels[:] = np.arange(line, line + ROWS)[:, None]
-    slot.flags[:] = 0
-    ring.commit(line, ROWS)
-
-
 class Bed:
+    """A recorder between rings that the test fills and a disk that the test moves."""
+
     def __init__(self) -> None:
+        self.losses = {arm: LossLog() for arm in ARMS}
         self.rings = {arm: Ring(arm, RingShape(SLOTS, ROWS, PIXELS, "uint16")) for arm in ARMS}
         self.tags = Ring("tags", RingShape(4, 16, 3, "uint64"))
         self.counters = Counters(COUNTERS)
@@ -93,10 +90,42 @@ class Bed:
     def lines(self, blocks: int = 1) -> None:
         """The cameras deliver, and the recorder has a turn after each block."""
         for _ in range(blocks):
-            for ring in self.rings.values():
-                deliver(ring, self.line)
+            for arm, ring in self.rings.items():
+                assert ring.fill < SLOTS, "the recorder does not empty the ring"
+                self.offer(arm, self.line)
             self.line += ROWS
             self.recorder.turn()
+
+    def offer(self, arm: str, line: int) -> None:
+        """The camera's lines come while the recorder is held up, and may find the ring full."""
+        ring = self.rings[arm]
+        slot = ring.claim()
+        if slot is None:
+            ring.drop(line, ROWS)
+            self.losses[arm].add(Loss(line, ROWS, Cause.RING_FULL))
+            return
+        slot.pixels[:] = np.arange(line, line + ROWS)[:, None]
+        slot.flags[:] = 0
+        ring.commit(line, ROWS, self.losses[arm].take())
+
+    def begin(self, path: Path, window: Window = NOW) -> int:
+        """A recording without an end; its first line."""
+        self.lines()
+        self.post.waiting.append(Begin(path, make_spec(), None, window))
+        self.lines()
+        self.disk.finish()
+        self.lines()
+        began = self.post.said.pop()
+        assert isinstance(began, Began)
+        return began.first_line
+
+    def sealed(self) -> Sealed:
+        self.recorder.turn()
+        self.disk.finish()
+        self.recorder.turn()
+        sealed = self.post.said.pop()
+        assert isinstance(sealed, Sealed)
+        return sealed
 
     def close(self) -> None:
         for ring in (*self.rings.values(), self.tags):
@@ -199,3 +228,94 @@ def test_a_verdict_that_comes_late_says_where_it_begins(bed: Bed, tmp_path: Path
         Suspect("a", slip, bed.line - 10 - slip, "inverted"),
         Suspect("b", first, end - first, "dark"),
     )
+
+
+@pytest.mark.parametrize(("late", "other"), [("a", "b"), ("b", "a")])
+def test_a_ring_that_overflows_ends_the_recording_before_the_line(
+    bed: Bed, tmp_path: Path, late: str, other: str
+) -> None:
+    """The other arm is past the line before that is seen: the recording has what both have, and no gap."""
+    first_line = bed.begin(tmp_path / "r.zarr")
+    for k in range(SLOTS + 2):
+        bed.offer(late, bed.line + k * ROWS)
+    full_at = bed.line + SLOTS * ROWS
+    for k in range(SLOTS + 2):
+        bed.offer(other, bed.line + k * ROWS)
+        bed.recorder.turn()
+    bed.offer(late, full_at + 2 * ROWS)
+    sealed = bed.sealed()
+    assert sealed.condition is RunCondition.INTERRUPTED
+    assert sealed.end_reason == f"too slow to write: the ring of arm {late} was full at line {full_at}"
+    recording = open_recording(tmp_path / "r.zarr")
+    assert not recording.gaps
+    assert (recording.first_line, recording.lines) == (first_line, full_at - first_line)
+    for arm in ARMS:
+        book = sealed.ledger[arm]
+        assert (book["stored"], book["missing"], book["balanced"]) == (recording.lines, {}, True)
+        assert (bed.counters[f"stored_{arm}"], bed.counters[f"overrun_{arm}"]) == (recording.lines, 0)
+        assert recording.camera(arm).lines[:, 0].tolist() == list(range(first_line, full_at))
+    assert bed.counters[f"discarded_{other}"] == first_line + 2 * ROWS
+
+
+def test_a_recording_begins_after_what_found_the_rings_full(bed: Bed, tmp_path: Path) -> None:
+    """It would begin with what was: the lines that were dropped are no part of it."""
+    bed.lines()
+    for k in range(2 * SLOTS):
+        for arm in ARMS:
+            bed.offer(arm, bed.line + k * ROWS)
+    dropped_end = bed.line = bed.line + 2 * SLOTS * ROWS
+    bed.recorder.turn()
+    first_line = bed.begin(tmp_path / "r.zarr", Window(pre_lines=10**6, exact=False))
+    assert first_line == dropped_end
+    bed.post.waiting.append(End("stopped"))
+    assert bed.sealed().condition is not RunCondition.INTERRUPTED
+    assert open_recording(tmp_path / "r.zarr").lines > 0
+
+
+def test_a_recording_waits_for_rings_that_are_about_to_overflow(bed: Bed, tmp_path: Path) -> None:
+    bed.lines(3)
+    bed.post.waiting.append(Begin(tmp_path / "r.zarr", make_spec(), None))
+    bed.recorder.turn()
+    bed.disk.finish()
+    for k in range(SLOTS + 1):
+        for arm in ARMS:
+            bed.offer(arm, bed.line + k * ROWS)
+    bed.recorder.turn()
+    assert bed.post.said == []
+    bed.recorder.turn()
+    assert bed.post.said == [Began(bed.line + (SLOTS + 1) * ROWS)]
+    bed.post.waiting.append(End("stopped"))
+    assert bed.sealed().ledger["a"]["missing"] == {}
+
+
+def test_what_found_no_slot_without_a_recorder_is_a_gap_and_counted_once(bed: Bed, tmp_path: Path) -> None:
+    """A recorder that takes another's place reads the same block again, should it be killed as well."""
+    bed.lines(3)
+    at = bed.line
+    for k in range(SLOTS + 2):
+        for arm in ARMS:
+            bed.offer(arm, at + k * ROWS)
+    for arm in ARMS:
+        assert bed.rings[arm].dropped_end == at + (SLOTS + 2) * ROWS
+    bed.counters["overrun_to_b"] = at + (SLOTS + 1) * ROWS  # as the one before had counted
+    bed.counters["overrun_b"] = ROWS
+    bed.post.waiting.append(
+        Begin(tmp_path / "r.zarr", make_spec(), None, Window(at, exact=False, padded=True))
+    )
+    bed.recorder.turn()
+    bed.disk.finish()
+    bed.recorder.turn()
+    bed.line = at + (SLOTS + 2) * ROWS
+    for arm in ARMS:
+        bed.offer(arm, bed.line)
+    bed.recorder.turn()
+    bed.recorder.turn()
+    bed.post.waiting.append(End("stopped"))
+    sealed = bed.sealed()
+    assert sealed.condition is RunCondition.INCOMPLETE
+    for arm in ARMS:
+        assert sealed.ledger[arm]["missing"] == {"ring_full": 2 * ROWS}
+        assert bed.counters[f"overrun_{arm}"] == 2 * ROWS
+    assert {(gap.first_line, gap.count) for gap in open_recording(tmp_path / "r.zarr").gaps} == {
+        (at + SLOTS * ROWS, 2 * ROWS)
+    }

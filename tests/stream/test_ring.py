@@ -93,7 +93,7 @@ class RingMachine(RuleBasedStateMachine):
         slot = self.ring.claim()
         assert (slot is None) == (self.head - self.tail == self.slots)
         if slot is None:
-            self.ring.drop(lines)
+            self.ring.drop(self.line, lines)
             self.dropped_blocks += 1
             self.dropped_lines += lines
         else:
@@ -283,7 +283,7 @@ def produce_for_ever(ring: Ring) -> None:
     while True:
         slot = ring.claim()
         if slot is None:
-            ring.drop(BIG.rows)
+            ring.drop(line, BIG.rows)
             time.sleep(0.0005)
         else:
             slot.pixels[:] = pattern(line, BIG.rows, BIG.width)

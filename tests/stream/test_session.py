@@ -165,13 +165,15 @@ def test_every_line_has_its_row_and_every_loss_its_cause(
     assert writer.ending == (sealed.condition, "line budget reached", sealed.ledger)
 
 
-def test_more_losses_than_a_slot_can_tell_are_one_mixed_loss() -> None:
+@pytest.mark.parametrize(("other", "told"), [(Cause.ID_GAP, Cause.MIXED), (Cause.RING_FULL, Cause.RING_FULL)])
+def test_more_losses_than_a_slot_can_tell_are_one_loss(other: Cause, told: Cause) -> None:
+    """A full ring shows in it whatever else was lost: a recording ends there."""
     log = LossLog()
     for k in range(MAX_LOSSES + 5):
-        log.add(Loss(10 * k, 10, Cause.CAMERA if k % 2 else Cause.RING_FULL))
+        log.add(Loss(10 * k, 10, Cause.CAMERA if k % 2 else other))
     losses = log.take()
     assert len(losses) == MAX_LOSSES
-    assert losses[-1] == Loss(10 * (MAX_LOSSES - 1), 60, Cause.MIXED)
+    assert losses[-1] == Loss(10 * (MAX_LOSSES - 1), 60, told)
     assert log.take() == ()
 
 
