@@ -6,13 +6,13 @@ from __future__ import annotations
 
 import math
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from acquire.camera.base import CameraBlock, CameraLoss, LossCause
-from acquire.camera.frames import FrameCount
+from acquire.camera.frames import FrameCount, Tally
 from acquire.camera.pixels import LineReader, PixelLayout, layout_of
 from acquire.errors import CameraError
 from acquire.lines import LineFlag
@@ -22,11 +22,14 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from acquire.camera.frames import FrameFacts
+    from acquire.camera.frames import FrameFacts, FramePlace
     from acquire.camera.settings import Features, Node
     from acquire.camera.spec import GenicamSpec
 
-STATISTICS = ("lines", "lost", "incomplete_frames")
+STATISTICS = ("lines", "lost", "incomplete_frames", "stale_frames")
+"""Lines delivered and lost; frames that arrived incomplete; frames that were late or sent twice."""
+_WAITING_SHARE = 4
+"""Of a camera's buffers, one in so many may hold frames whose place is not known yet."""
 _LEAST_BUFFERS = 16
 _MOST_BUFFER_BYTES = 1 << 30
 
@@ -100,59 +103,112 @@ class MissedTriggers:
         source = modules["remote"].find("CounterEventSource")
         counts = source is not None and source.readable and source.read() == "LineTriggerMissed"
         self._value = modules["remote"].find("CounterValue") if counts else None
-        self._before = 0
-        self._before = self.count()
+        self._tally = Tally(self._read())
+
+    def _read(self) -> int:
+        return int(self._value.read()) if self._value is not None else 0
 
     def count(self) -> int:
         """Missed since the counter was found."""
-        return int(self._value.read()) - self._before if self._value is not None else 0
+        return self._tally.note(self._read())
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """One buffer as the driver got it: its lines are in the first ``filled`` bytes of ``memory``, each
+    followed by ``padding`` bytes; not more than ``rows``, where the library says how many (else 0).
+
+    ``buffer`` is the driver's handle. ``facts`` have no frame id where the frame did not arrive whole and the
+    library does not vouch for it.
+    """
+
+    buffer: Any
+    memory: NDArray[np.uint8]
+    filled: int
+    facts: FrameFacts
+    complete: bool
+    padding: int = 0
+    rows: int = 0
 
 
 class Assembly:
-    """Makes blocks of the frames of one acquisition, and counts."""
+    """Makes blocks of the frames of one acquisition, and counts.
 
-    def __init__(self, found: FrameFormat, spec: GenicamSpec) -> None:
+    A frame without a number waits until the next one with a number has come: see `acquire.camera.frames`.
+    """
+
+    def __init__(
+        self, found: FrameFormat, spec: GenicamSpec, buffers: int, skips_zero: bool | None = None
+    ) -> None:
         self._format = found
-        self._count = FrameCount(found.height, spec.frame_id_bits, spec.frame_id_first)
+        self._count = FrameCount(found.height, spec.frame_id_bits, spec.frame_id_first, skips_zero)
         self._reader: LineReader | None = None
+        self._most_waiting = max(1, buffers // _WAITING_SHARE)
+        self._waiting: list[Frame] = []
+        self._unnumbered = 0
         self._owed: tuple[CameraLoss, ...] = ()
         self._statistics = dict.fromkeys(STATISTICS, 0)
 
-    def block(
-        self,
-        memory: NDArray[np.uint8],
-        filled: int,
-        padding: int,
-        facts: FrameFacts,
-        *,
-        complete: bool,
-        rows: int = 0,
-    ) -> CameraBlock:
-        """The lines in the first ``filled`` bytes of ``memory``, each followed by ``padding`` bytes; not more
-        than ``rows``, where the library tells them.
+    def take(self, frame: Frame) -> tuple[list[tuple[CameraBlock, Any]], list[Any]]:
+        """Blocks that have their place now, with their buffers and in order; buffers that are free again.
 
-        Lines of a frame that is not ``complete`` are flagged; those that it lacks are losses before the
-        next block.
+        Raises CameraError when the camera's frame ids make no sense.
         """
-        found = self._format
+        self._statistics["incomplete_frames"] += not frame.complete
+        if frame.facts.frame_id is None:
+            return [], self._wait(frame)
+        keep = len(self._waiting) == self._unnumbered
+        place = self._count.place(frame.facts, self._unnumbered, keep=keep)
+        if place is None:
+            self._statistics["stale_frames"] += 1
+            return [], [frame.buffer]
         if self._reader is None:
-            self._reader = LineReader.for_frames(found.layout, found.width, padding, found.height, filled)
-        place = self._count.place(facts)
-        count = found.height if filled >= self._reader.size(found.height) else filled // self._reader.pitch
-        count = min(count, rows or count)
-        flag = LineFlag(0) if complete and not place.doubtful else LineFlag.INCOMPLETE
+            found = self._format
+            self._reader = LineReader.for_frames(
+                found.layout, found.width, frame.padding, found.height, frame.filled
+            )
+        waiting, self._waiting, self._unnumbered = self._waiting, [], 0
+        frames = [*waiting, frame] if place.kept else [frame]
+        first = place.first_line - (len(frames) - 1) * self._format.height
+        places = [replace(place, first_line=first + k * self._format.height) for k in range(len(frames))]
+        blocks = [(self._block(*pair), pair[0].buffer) for pair in zip(frames, places, strict=True)]
+        free = [] if place.kept else [waited.buffer for waited in waiting]
+        return (
+            [(block, buffer) for block, buffer in blocks if block is not None],
+            free + [buffer for block, buffer in blocks if block is None],
+        )
+
+    def _wait(self, frame: Frame) -> list[Any]:
+        """The buffers that have to be given up for the frame to wait."""
+        self._unnumbered += 1
+        self._waiting.append(frame)
+        if len(self._waiting) <= self._most_waiting:
+            return []
+        free, self._waiting = [waited.buffer for waited in self._waiting], []
+        return free
+
+    def _block(self, frame: Frame, place: FramePlace) -> CameraBlock | None:
+        """Lines of a frame that is not complete are flagged; those that it lacks are losses before the next
+        block. None for a frame without a line.
+        """
+        height, reader, filled = self._format.height, self._reader, frame.filled
+        assert reader is not None
+        count = height if filled >= reader.size(height) else filled // reader.pitch
+        count = min(count, frame.rows or count)
         losses = self._owed + place.losses
-        short = found.height - count
-        self._owed = (CameraLoss(LossCause.INCOMPLETE, short),) if short else ()
+        self._owed = (CameraLoss(LossCause.INCOMPLETE, height - count),) if count < height else ()
+        if not count:
+            self._owed = losses + self._owed
+            return None
+        flag = LineFlag(0) if frame.complete and not place.doubtful else LineFlag.INCOMPLETE
         self._statistics["lines"] += count
         self._statistics["lost"] += sum(loss.count for loss in losses)
-        self._statistics["incomplete_frames"] += not complete
         return CameraBlock(
             place.first_line,
-            self._reader.lines(memory, count),
+            reader.lines(frame.memory, count),
             np.full(count, flag, np.uint16),
             losses,
-            facts.time_ns,
+            frame.facts.time_ns,
         )
 
     def statistics(self) -> dict[str, int]:

@@ -17,6 +17,7 @@ import signal
 import threading
 import time
 import warnings
+from collections import deque
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -26,6 +27,7 @@ import numpy as np
 from acquire.camera.assembly import (
     STATISTICS,
     Assembly,
+    Frame,
     MissedTriggers,
     buffer_count,
     check_format,
@@ -33,7 +35,7 @@ from acquire.camera.assembly import (
     read_settings,
 )
 from acquire.camera.base import CameraIdentity
-from acquire.camera.frames import FrameFacts
+from acquire.camera.frames import FrameFacts, Tally
 from acquire.camera.genapi import GenapiFeatures, Words, is_gone, told
 from acquire.camera.producers import find_producers
 from acquire.camera.settings import apply_settings
@@ -89,6 +91,7 @@ class HarvestersCamera:
         self._assembly: Assembly | None = None
         self._views: dict[int, Any] = {}
         self._held: dict[CameraBlock, Any] = {}
+        self._ready: deque[tuple[CameraBlock, Any]] = deque()
         try:
             self._open()
         except BaseException:
@@ -119,29 +122,34 @@ class HarvestersCamera:
         found = frame_format(self._features)
         self._views.clear()
         self._missed = MissedTriggers(self._features)
-        self._assembly = Assembly(found, self._spec)
+        buffers = buffer_count(self._spec, found)
+        self._assembly = Assembly(found, self._spec, buffers)
         with told(f"arm camera {self._spec.serial}"), _signals_kept():
             acquirer = self._acquirer
-            acquirer.num_buffers = buffer_count(self._spec, found)
+            acquirer.num_buffers = buffers
             # harvesters keeps its monitors to itself; without one there is no word of incomplete buffers.
             self._stream = acquirer.data_streams[0]
             self._monitor = acquirer._new_buffer_event_monitor_dict[self._stream]
-            self._underruns_before = self._underruns()
+            self._underruns = Tally(self._read_underruns())
             acquirer.start()
             self._armed = True
         self._heard_s = time.monotonic()
 
     def next_block(self, timeout_s: float) -> CameraBlock | None:
-        """The next frame's lines; those of an incomplete frame are flagged, the absent ones told as lost."""
+        """The next frame's lines; those of an incomplete one are flagged, absent ones are losses."""
         if not self._armed:
             raise CameraError("a block was asked of a camera that is not armed", hint="arm it")
-        buffer = self._await_buffer(timeout_s)
-        if buffer is None:
-            self._ask_alive()
+        if not self._ready:
+            buffer = self._await_buffer(timeout_s)
+            if buffer is None:
+                self._ask_alive()
+                return None
+            self._heard_s = time.monotonic()
+            with told(f"camera {self._spec.serial}"):
+                self._take(buffer)
+        if not self._ready:
             return None
-        self._heard_s = time.monotonic()
-        with told(f"camera {self._spec.serial}"):
-            block = self._read_out(buffer)
+        block, buffer = self._ready.popleft()
         self._held[block] = buffer
         return block
 
@@ -165,22 +173,29 @@ class HarvestersCamera:
             if node is not None:
                 node.read_afresh()
 
-    def _read_out(self, buffer: Any) -> CameraBlock:
-        facts = FrameFacts(
-            int(buffer.frame_id),
-            self._underruns() - self._underruns_before,
-            self._missed.count(),
-            _or(lambda: int(buffer.timestamp_ns), 0) or None,
-        )
-        assert self._assembly is not None
-        return self._assembly.block(
+    def _take(self, buffer: Any) -> None:
+        """Put a filled buffer in its place among the frames."""
+        complete = bool(buffer.is_complete())
+        time_ns = _or(lambda: int(buffer.timestamp_ns), 0) or None
+        frame = Frame(
+            buffer,
             self._memory(buffer),
             int(buffer.size_filled),
-            _or_zero(lambda: buffer.padding_x),
-            facts,
-            complete=buffer.is_complete(),
+            FrameFacts(  # producers differ in what they say of a frame that is not complete
+                int(buffer.frame_id) if complete else None,
+                self._underruns.note(self._read_underruns()),
+                self._missed.count(),
+                time_ns if complete else None,
+            ),
+            complete,
+            padding=_or_zero(lambda: buffer.padding_x),
             rows=_or_zero(lambda: buffer.delivered_image_height),
         )
+        assert self._assembly is not None
+        blocks, free = self._assembly.take(frame)
+        self._ready += blocks
+        for idle in free:
+            self._stream.module.queue_buffer(idle, False)
 
     def _memory(self, buffer: Any) -> Any:
         """The announced bytes as an array; made once per buffer."""
@@ -189,7 +204,7 @@ class HarvestersCamera:
             self._views[key] = np.frombuffer(buffer.raw_buffer, np.uint8)
         return self._views[key]
 
-    def _underruns(self) -> int:
+    def _read_underruns(self) -> int:
         return _or_zero(lambda: self._stream.module.num_underrun)
 
     def release(self, block: CameraBlock) -> None:
@@ -204,6 +219,7 @@ class HarvestersCamera:
             return
         self._armed = False
         self._held.clear()
+        self._ready.clear()
         self._views.clear()
         _stop(self._acquirer)
 

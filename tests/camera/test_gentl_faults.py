@@ -114,6 +114,7 @@ def test_a_fault_is_counted_exactly_and_located(bench: GentlBench, open_camera: 
         "lines": 1000 - lost + (take.next_line - 1000),
         "lost": lost,
         "incomplete_frames": len(flagged),
+        "stale_frames": 0,
     }
 
 
@@ -142,6 +143,31 @@ def test_faults_after_one_another_are_told_apart(bench: GentlBench, open_camera:
         (839, CameraLoss(LossCause.INCOMPLETE, 1)),
     ]
     assert take.flagged == [(560, 40), (800, 39)]
+
+
+@pytest.mark.parametrize("which", ["64", "8", "8-skips-0"])
+def test_incomplete_frames_with_the_ids_of_earlier_ones_are_no_wrap(
+    bench: GentlBench, open_camera: Any, which: str
+) -> None:
+    """Every buffer has been filled before, and ids of 8 bits wrap among the incomplete frames."""
+    memory, camera = memory_of(bench, which), open_camera(which)
+    for kind, frame in (
+        ("BAD", 254),
+        ("BAD", 255),
+        ("SHORT", 256),
+        ("BAD", 300),
+        ("DROP", 301),
+        ("BAD", 310),
+    ):
+        memory.inject(kind, frame, 1)
+    camera.arm()
+    take = Take(camera).until(320 * HEIGHT)
+    assert take.losses == [
+        (256 * HEIGHT + 1, CameraLoss(LossCause.INCOMPLETE, HEIGHT - 1)),
+        (300 * HEIGHT, CameraLoss(LossCause.INCOMPLETE, HEIGHT)),
+        (301 * HEIGHT, CameraLoss(LossCause.ID_GAP, HEIGHT)),
+    ]
+    assert [first // HEIGHT for first, _ in take.flagged] == [254, 255, 256, 310]
 
 
 @pytest.mark.parametrize("which", ["8", "8-skips-0"])

@@ -109,9 +109,10 @@ class CameraMemory:
     def inject(self, kind: str, at: int, count: int = 1) -> None:
         """Let a fault happen at frame ``at`` since acquisition start, once.
 
-        ``BAD`` marks the frame incomplete · ``SHORT`` delivers its first ``count`` lines only · ``DROP``
-        loses ``count`` frames on the link · ``OVERRUN`` finds no buffer for ``count`` frames · ``GONE``
-        unplugs the device · ``MISSED`` blinds the camera for ``count`` trigger pulses from line ``at`` on.
+        ``BAD`` marks the frame incomplete · ``SHORT`` delivers its first ``count`` lines only; both leave id
+        and time as they were in the buffer · ``DROP`` loses ``count`` frames on the link · ``OVERRUN`` finds
+        no buffer for ``count`` frames · ``GONE`` unplugs the device · ``MISSED`` blinds the camera for
+        ``count`` trigger pulses from line ``at`` on.
         """
         if kind not in layout.FAULT_KINDS[1:]:
             raise UsageError(f"fault {kind!r}", possible=", ".join(layout.FAULT_KINDS[1:]))

@@ -827,7 +827,7 @@ static void end_frame(struct stream *s, const struct shape *shape, struct fillin
     struct buffer *b = f->buffer;
     if (b) {
         pthread_mutex_lock(&s->lock);
-        b->frame_id = id_of(s->device, f->frame);
+        if (!f->bad) b->frame_id = id_of(s->device, f->frame); /* else the header is lost: what was there stays */
         b->height = f->cut;
         b->width = shape->width;
         b->format = shape->format;
@@ -863,7 +863,7 @@ static void take_line(struct stream *s, const struct shape *shape, struct fillin
     if (f->skip) { f->skip--; return; }
     if (!f->lines) {
         begin_frame(s, shape, f);
-        if (f->buffer) memcpy(&f->buffer->time_ns, base + d->words[W_HEADERS_AT] + slot * HEADER_BYTES + 8, 8);
+        if (f->buffer && !f->bad) memcpy(&f->buffer->time_ns, base + d->words[W_HEADERS_AT] + slot * HEADER_BYTES + 8, 8);
     }
     if (f->buffer && f->lines < f->cut && shape->pitch * (f->lines + 1) <= f->buffer->size) {
         uint8_t *out = f->buffer->memory + shape->pitch * f->lines;

@@ -1,5 +1,7 @@
 """The process of a simulated GigE Vision camera: it answers control packets, and sends what its sensor reads
 out, ``Height`` lines at a time. One per loopback address.
+
+Packets that the host misses are sent again while the camera still has their frame.
 """
 
 from __future__ import annotations
@@ -7,6 +9,9 @@ from __future__ import annotations
 import select
 import socket
 import struct
+from collections import deque
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,8 +23,6 @@ from acquire.sim.gige import protocol
 from acquire.stream.messages import Ready
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from numpy.typing import NDArray
 
     from acquire.sim.gentl.feeder import Sensor
@@ -30,11 +33,39 @@ _BLOCK_WAIT_S = 0.002
 _BASE = protocol.BOOTSTRAP_BYTES
 
 
+_KEPT_FRAMES = 16
+"""Of which packets can be sent again."""
+Link = Callable[[int, list[bytes]], Iterable[bytes]]
+"""Which of a frame's packets reach the host, and in what order; frames count from 0."""
+
+
+@dataclass(frozen=True, slots=True)
+class Transmission:
+    """How frames are numbered, and what becomes of them on their way. Picklable if ``link`` is.
+
+    ``first_id`` : of every acquisition; ids skip 0. ``extended`` : ids of 64 bits instead of 16.
+    ``resends`` : packets are sent again when the host asks. ``link`` : None loses nothing.
+    """
+
+    first_id: int = 1
+    extended: bool = False
+    resends: bool = True
+    link: Link | None = None
+
+    def frame_id(self, frame: int) -> int:
+        """The id of a frame; frames count from 0."""
+        return 1 + (self.first_id - 1 + frame) % (2**64 - 1 if self.extended else 0xFFFF)
+
+
 def serve(
-    mailbox: Mailbox, model: CameraModel, opener: Callable[[], Any], address: str = "127.0.0.1"
+    mailbox: Mailbox,
+    model: CameraModel,
+    opener: Callable[[], Any],
+    address: str = "127.0.0.1",
+    transmission: Transmission = Transmission(),
 ) -> None:
     """Life of the camera: control and lines in turn, until told to end."""
-    with GigeCamera(model, opener(), address) as camera:
+    with GigeCamera(model, opener(), address, transmission) as camera:
         mailbox.post(Ready())
         while True:
             mailbox.take()
@@ -44,7 +75,7 @@ def serve(
 class GigeCamera:
     """See the module. Raises DeviceError when the address is taken."""
 
-    def __init__(self, model: CameraModel, sensor: Sensor, address: str) -> None:
+    def __init__(self, model: CameraModel, sensor: Sensor, address: str, transmission: Transmission) -> None:
         space = gige(model).space(_BASE)
         url = f"Local:camera.xml;{_BASE + XML_AT:X};{len(gige(model).xml(_BASE)):X}"
         texts = {
@@ -55,12 +86,16 @@ class GigeCamera:
             protocol.XML_URL: url,
         }
         self._registers = protocol.Registers(space, texts, socket.inet_aton(address))
+        self.transmission = transmission
+        if not transmission.resends:
+            self._registers.set(protocol.CAPABILITY, 0)
         self._sensor, self._bits = sensor, model.bits
         self._control = [_bound(address, shared=False), _bound("255.255.255.255", shared=True)]
         self._lines = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._lines.bind((address, 0))
         self._acquiring = False
         self._frames = 0
+        self._sent: deque[tuple[int, list[bytes]]] = deque(maxlen=_KEPT_FRAMES)
         self._waiting: list[tuple[int, NDArray[Any]]] = []
 
     def turn(self) -> None:
@@ -76,6 +111,9 @@ class GigeCamera:
     def _answer(self, control: socket.socket) -> None:
         packet, sender = control.recvfrom(2048)
         request = protocol.parse(packet)
+        if request is not None and request.command == protocol.Command.RESEND:
+            self._send_again(*protocol.parse_resend(request))
+            return
         reply = self._registers.handle(request) if request is not None else None
         if reply is not None:
             self._obey()  # the host may start the trigger once it has the answer
@@ -93,6 +131,7 @@ class GigeCamera:
                 self._set_register(name, 0)
                 self._acquiring = wanted
                 self._waiting.clear()
+                self._sent.clear()
                 self._frames = 0
                 if wanted:
                     self._sensor.arm()
@@ -112,12 +151,25 @@ class GigeCamera:
         code = self._register("PixelFormat")
         offset, width = self._register("OffsetX"), self._register("Width")
         data = _pack(lines[:, offset : offset + width], self._bits, code)
-        number = 1 + self._frames % 0xFFFF
+        sent = self.transmission
+        number = sent.frame_id(self._frames)
+        frame = protocol.Frame(number, time_ns, code, width, len(lines), data, sent.extended)
+        packets = list(protocol.packets(frame, self._registers.get(protocol.PACKET_SIZE) & 0xFFFF))
+        self._sent.append((number, packets))
+        self._put(packets if sent.link is None else sent.link(self._frames, packets))
         self._frames += 1
-        frame = protocol.Frame(number, time_ns, code, width, len(lines), data)
+
+    def _send_again(self, number: int, first: int, last: int) -> None:
+        """Packets of a frame that is not kept any more are not worth an answer: the host gives them up."""
+        if self.transmission.resends:
+            for kept, packets in self._sent:
+                if kept == number:
+                    self._put(packets[first : last + 1])
+
+    def _put(self, packets: Iterable[bytes]) -> None:
         port = self._registers.get(protocol.STREAM_PORT) & 0xFFFF
         host = socket.inet_ntoa(struct.pack(">I", self._registers.get(protocol.STREAM_ADDRESS)))
-        for packet in protocol.packets(frame, self._registers.get(protocol.PACKET_SIZE) & 0xFFFF):
+        for packet in packets:
             self._lines.sendto(packet, (host, port))
 
     def _register(self, name: str) -> int:

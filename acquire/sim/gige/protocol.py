@@ -19,13 +19,13 @@ if TYPE_CHECKING:
 
 PORT = 3956
 KEY = 0x42
-OVERHEAD = 20 + 8 + 8
-"""Bytes of IP, UDP and GVSP headers within the packet size that the host sets."""
+IP_AND_UDP_BYTES = 20 + 8
+"""Of headers within the packet size that the host sets; GVSP's own come on top."""
 
 DEVICE_MODE, MAC, ADDRESS = 0x0004, 0x0008, 0x0024
 VENDOR, MODEL, FIRMWARE, SERIAL, XML_URL = 0x0048, 0x0068, 0x0088, 0x00D8, 0x0200
 DISCOVERY_BYTES = 0xF8
-STREAM_CHANNELS, HEARTBEAT_MS, TICK_HIGH, TICK_LOW = 0x0904, 0x0938, 0x093C, 0x0940
+STREAM_CHANNELS, CAPABILITY, HEARTBEAT_MS, TICK_HIGH, TICK_LOW = 0x0904, 0x0934, 0x0938, 0x093C, 0x0940
 PRIVILEGE, STREAM_PORT, PACKET_SIZE, STREAM_ADDRESS = 0x0A00, 0x0D00, 0x0D04, 0x0D18
 BOOTSTRAP_BYTES = 0x1_0000
 """Registers of the standard below, the camera's own from here."""
@@ -33,6 +33,10 @@ BOOTSTRAP_BYTES = 0x1_0000
 _HEADER = struct.Struct(">BBHHH")
 _ANSWER = struct.Struct(">HHHH")
 _GVSP = struct.Struct(">HHI")
+_GVSP_EXTENDED = struct.Struct(">HHIQI")
+_EXTENDED = 0x8000_0000
+_EXTENDED_REQUEST = 0x10
+_RESENDS = 1 << 2
 _LEADER = struct.Struct(">HHQIIIIIHH")
 _TRAILER = struct.Struct(">HHI")
 _IMAGE = 1
@@ -40,6 +44,7 @@ _IMAGE = 1
 
 class Command(IntEnum):
     DISCOVERY = 0x0002
+    RESEND = 0x0040
     READ_REGISTER = 0x0080
     WRITE_REGISTER = 0x0082
     READ_MEMORY = 0x0084
@@ -53,15 +58,25 @@ class Request:
     command: int
     number: int
     body: bytes
+    flags: int = 0
 
 
 def parse(packet: bytes) -> Request | None:
     """A GVCP command, or None for what is none."""
     if len(packet) < _HEADER.size:
         return None
-    key, _, command, length, number = _HEADER.unpack_from(packet)
+    key, flags, command, length, number = _HEADER.unpack_from(packet)
     body = packet[_HEADER.size : _HEADER.size + length]
-    return Request(command, number, body) if key == KEY and len(body) == length else None
+    return Request(command, number, body, flags) if key == KEY and len(body) == length else None
+
+
+def parse_resend(request: Request) -> tuple[int, int, int]:
+    """Number of the frame, first and last packet that the host asks for again."""
+    if request.flags & _EXTENDED_REQUEST:
+        first, last, number = struct.unpack(">4xIIQ", request.body[:20])
+    else:
+        number, first, last = struct.unpack(">III", request.body[:12])
+    return number, first & 0xFF_FFFF, last & 0xFF_FFFF
 
 
 def answer(request: Request, body: bytes) -> bytes:
@@ -77,7 +92,8 @@ class Registers:
             self.memory[at : at + len(text)] = text.encode()
         self.memory[ADDRESS : ADDRESS + 4] = address
         numbers = {0: 0x1_0000, DEVICE_MODE: 0x8000_0000, STREAM_CHANNELS: 1, HEARTBEAT_MS: 3000}
-        for at, value in (numbers | {TICK_LOW: 1_000_000_000, PACKET_SIZE: 1400}).items():
+        numbers |= {CAPABILITY: _RESENDS, TICK_LOW: 1_000_000_000, PACKET_SIZE: 1400}
+        for at, value in numbers.items():
             self.set(at, value)
 
     def get(self, at: int) -> int:
@@ -112,7 +128,7 @@ class Registers:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """One block of lines on its way: ``number`` is 16 bits and never 0."""
+    """One block of lines on its way. ``number`` is never 0: 16 bits of it, or 64 in ``extended`` headers."""
 
     number: int
     time_ns: int
@@ -120,15 +136,23 @@ class Frame:
     width: int
     height: int
     data: bytes
+    extended: bool = False
 
 
 def packets(frame: Frame, packet_size: int) -> Iterator[bytes]:
     """Leader, payload and trailer."""
-    step = packet_size - OVERHEAD
+    size = (_GVSP_EXTENDED if frame.extended else _GVSP).size
+    step = packet_size - IP_AND_UDP_BYTES - size
     leader = (0, _IMAGE, frame.time_ns, frame.pixel_format, frame.width, frame.height, 0, 0, 0, 0)
-    yield _GVSP.pack(0, frame.number, 1 << 24) + _LEADER.pack(*leader)
+    yield _header(frame, 1, 0) + _LEADER.pack(*leader)
     count = 0
     for at in range(0, len(frame.data), step):
         count += 1
-        yield _GVSP.pack(0, frame.number, 3 << 24 | count) + frame.data[at : at + step]
-    yield _GVSP.pack(0, frame.number, 2 << 24 | count + 1) + _TRAILER.pack(0, _IMAGE, frame.height)
+        yield _header(frame, 3, count) + frame.data[at : at + step]
+    yield _header(frame, 2, count + 1) + _TRAILER.pack(0, _IMAGE, frame.height)
+
+
+def _header(frame: Frame, content: int, packet: int) -> bytes:
+    if frame.extended:
+        return _GVSP_EXTENDED.pack(0, 0, _EXTENDED | content << 24, frame.number, packet)
+    return _GVSP.pack(0, frame.number, content << 24 | packet)

@@ -1,0 +1,288 @@
+"""One camera through Aravis: opened, set, armed; its buffers become blocks of lines."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import time
+from collections import deque
+from ctypes import byref, c_size_t, c_uint64
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.camera.aravis.features import AravisFeatures
+from acquire.camera.aravis.library import errors, load
+from acquire.camera.aravis.stream import StreamParameters, usual_parameters
+from acquire.camera.assembly import (
+    STATISTICS,
+    Assembly,
+    Frame,
+    MissedTriggers,
+    buffer_count,
+    check_format,
+    frame_format,
+    read_settings,
+)
+from acquire.camera.base import CameraBlock, CameraIdentity
+from acquire.camera.frames import FrameFacts
+from acquire.camera.settings import apply_settings
+from acquire.errors import CameraError, CameraLostError
+
+if TYPE_CHECKING:
+    from acquire.camera.settings import Features
+    from acquire.camera.spec import GenicamSpec
+
+FAKE = "Fake"
+"""Interface of Aravis' own camera, for tests; off unless the spec's ``cti`` asks for it."""
+_ALIVE_S = 0.5
+_SUCCESS, _ABORTED = 0, 7
+_NO_ID = 2**64 - 1
+"""Given to a buffer before it is filled. Only the packet that begins a frame brings its number, and a buffer
+whose frame lost that packet would still have the number of the frame before."""
+_HEADERS_BYTES = 36
+"""Of IP, UDP and GVSP in every packet of a frame."""
+
+
+@dataclass(frozen=True, slots=True)
+class AravisOpener:
+    """Opens the camera in the process that calls it."""
+
+    spec: GenicamSpec
+
+    def __call__(self) -> AravisCamera:
+        return AravisCamera(self.spec)
+
+
+class AravisCamera:
+    """One camera, opened and set; see `acquire.camera.base.Camera`."""
+
+    def __init__(self, spec: GenicamSpec) -> None:
+        self._spec = spec
+        self._library = library = load()
+        self._stream: int | None = None
+        self._armed = False
+        self._assembly: Assembly | None = None
+        self._taken: set[int] = set()
+        self._held: dict[CameraBlock, int] = {}
+        self._ready: deque[tuple[CameraBlock, int]] = deque()
+        self._payload = 0
+        self._camera: int | None = None
+        device_id = spec.cti.encode() if spec.cti not in ("", FAKE) else _find(library, spec)
+        with errors(f"open camera {spec.serial}") as error:
+            self._camera = library.arv_camera_new(device_id, error)
+        try:
+            self._device = library.arv_camera_get_device(self._camera)
+            self._features = AravisFeatures(library, self._device)
+            self._identity = _identify(self._features)
+            _check_identity(self._identity, spec)
+            self._parameters = StreamParameters(library, self._device, self._prepare, self._drop)
+            apply_settings(spec.settings, self.features())
+            check_format(frame_format({"remote": self._features}), spec)
+        except BaseException:
+            self.close()
+            raise
+
+    def identify(self) -> CameraIdentity:
+        return self._identity
+
+    def settings(self) -> dict[str, Any]:
+        return read_settings(self.features())
+
+    def features(self) -> dict[str, Features]:
+        """Of the camera itself, and the parameters of Aravis' stream."""
+        return {"remote": self._features, "stream": self._parameters}
+
+    def _prepare(self) -> int:
+        """The stream of the next acquisition: its socket is new, and gets no packet of an earlier one."""
+        if self._stream is None:
+            found = frame_format({"remote": self._features})
+            with errors(f"stream of camera {self._spec.serial}") as error:
+                self._stream = self._library.arv_camera_create_stream(self._camera, None, None, error)
+            assert self._stream is not None
+            self._parameters.furnish(self._stream, usual_parameters(found.height / self._spec.line_rate_hz))
+        return self._stream
+
+    def _drop(self) -> None:
+        stream, self._stream = self._stream, None
+        if stream is not None:
+            self._library.g_object_unref(stream)
+
+    def arm(self) -> None:
+        self.disarm()
+        library, found = self._library, frame_format({"remote": self._features})
+        self._missed = MissedTriggers(self.features())
+        what = f"arm camera {self._spec.serial}"
+        with errors(what) as error:
+            self._payload = library.arv_camera_get_payload(self._camera, error)
+        bits, skips_zero = self._frame_ids()
+        buffers = buffer_count(self._spec, found)
+        self._assembly = Assembly(found, replace(self._spec, frame_id_bits=bits), buffers, skips_zero)
+        self._packets = self._packets_per_frame()
+        stream = self._prepare()
+        for _ in range(buffers):
+            self._give(stream, library.arv_buffer_new_allocate(self._payload))
+        self._armed = True
+        with errors(what) as error:
+            library.arv_camera_start_acquisition(self._camera, error)
+        self._heard_s = time.monotonic()
+
+    def _frame_ids(self) -> tuple[int, bool | None]:
+        """Bits of the ids, and whether they skip 0: as GigE Vision and USB3 Vision have them."""
+        if self._library.arv_camera_is_uv_device(self._camera):
+            return self._spec.frame_id_bits or 64, False
+        mode = self._features.find("GevGVSPExtendedIDMode")
+        extended = mode is not None and mode.readable and mode.read() == "On"
+        return self._spec.frame_id_bits or (64 if extended else 16), True
+
+    def _packets_per_frame(self) -> int:
+        """Over GigE Vision a frame that finds no buffer is counted once for each of its packets."""
+        if not self._library.arv_camera_is_gv_device(self._camera):
+            return 1
+        with errors(f"arm camera {self._spec.serial}") as error:
+            size = self._library.arv_camera_gv_get_packet_size(self._camera, error)
+        return 2 + math.ceil(self._payload / max(1, int(size) - _HEADERS_BYTES))
+
+    def _give(self, stream: int, buffer: int) -> None:
+        """Let Aravis fill a buffer."""
+        self._library.arv_buffer_set_frame_id(buffer, _NO_ID)
+        self._library.arv_buffer_set_timestamp(buffer, 0)
+        self._library.arv_stream_push_buffer(stream, buffer)
+
+    def next_block(self, timeout_s: float) -> CameraBlock | None:
+        """The next frame's lines; those of an incomplete frame are flagged."""
+        if not self._armed:
+            raise CameraError("a block was asked of a camera that is not armed", hint="arm it")
+        if not self._ready:
+            self._fetch(timeout_s)
+        if not self._ready:
+            return None
+        block, buffer = self._ready.popleft()
+        self._held[block] = buffer
+        return block
+
+    def _fetch(self, timeout_s: float) -> None:
+        """Put the next filled buffer in its place among the frames."""
+        library = self._library
+        assert self._stream is not None
+        assert self._assembly is not None
+        buffer = library.arv_stream_timeout_pop_buffer(self._stream, round(timeout_s * 1e6))
+        if not buffer:
+            self._ask_alive()
+            return
+        self._heard_s = time.monotonic()
+        status = library.arv_buffer_get_status(buffer)
+        if status == _ABORTED:
+            self._give(self._stream, buffer)
+            return
+        self._taken.add(buffer)
+        blocks, free = self._assembly.take(self._frame(buffer, status == _SUCCESS))
+        self._ready += blocks
+        for idle in free:
+            self._taken.remove(idle)
+            self._give(self._stream, idle)
+
+    def _frame(self, buffer: int, success: bool) -> Frame:
+        library, size = self._library, c_size_t()
+        address = library.arv_buffer_get_data(buffer, byref(size))
+        memory = np.ctypeslib.as_array((ctypes.c_uint8 * self._payload).from_address(address))
+        counts = c_uint64(), c_uint64(), c_uint64()
+        library.arv_stream_get_statistics(self._stream, *map(byref, counts))
+        frame_id = library.arv_buffer_get_frame_id(buffer)
+        complete = success and frame_id != _NO_ID
+        facts = FrameFacts(
+            None if frame_id == _NO_ID else frame_id,
+            math.ceil(counts[2].value / self._packets),
+            self._missed.count(),
+            library.arv_buffer_get_timestamp(buffer) or None,
+        )
+        # Aravis does not say how much of an incomplete frame has come.
+        return Frame(buffer, memory, size.value if complete else self._payload, facts, complete)
+
+    def _ask_alive(self) -> None:
+        if time.monotonic() - self._heard_s > _ALIVE_S:
+            self._heard_s = time.monotonic()
+            try:
+                frame_format({"remote": self._features})
+            except CameraError as error:
+                raise CameraLostError(f"camera {self._spec.serial} is gone: {error.message}") from error
+
+    def release(self, block: CameraBlock) -> None:
+        buffer = self._held.pop(block, None)
+        if buffer is not None and self._stream is not None:
+            self._taken.remove(buffer)
+            self._give(self._stream, buffer)
+
+    def disarm(self) -> None:
+        if not self._armed:
+            return
+        self._armed = False
+        self._held.clear()
+        self._ready.clear()
+        while self._taken:
+            self._library.g_object_unref(self._taken.pop())
+        try:
+            with errors("stop") as error:
+                self._library.arv_camera_stop_acquisition(self._camera, error)
+        except CameraError:
+            return  # a camera that is gone has stopped
+        finally:
+            self._drop()
+
+    def statistics(self) -> dict[str, int]:
+        return self._assembly.statistics() if self._assembly else dict.fromkeys(STATISTICS, 0)
+
+    def close(self) -> None:
+        self.disarm()
+        self._drop()
+        if self._camera is not None:
+            self._library.g_object_unref(self._camera)
+            self._camera = None
+
+
+def list_cameras() -> list[tuple[str, str]]:
+    """Serial number and model of every camera that answers. Raises CameraError where there is no Aravis."""
+    library = load()
+    library.arv_update_device_list()
+    ask = (library.arv_get_device_serial_nbr, library.arv_get_device_model)
+    found = [[(what(k) or b"").decode() for what in ask] for k in range(library.arv_get_n_devices())]
+    return [(serial, model) for serial, model in found]
+
+
+def _find(library: Any, spec: GenicamSpec) -> bytes:
+    """The device with the serial number, of all that answer."""
+    if spec.cti == FAKE:
+        library.arv_enable_interface(FAKE.encode())
+    library.arv_update_device_list()
+    found = {
+        (library.arv_get_device_serial_nbr(k) or b"").decode(): k for k in range(library.arv_get_n_devices())
+    }
+    if spec.serial not in found:
+        raise CameraError(
+            f"there is no camera with serial number {spec.serial!r}",
+            possible=", ".join(found) or "no camera answers",
+        )
+    device_id: bytes = library.arv_get_device_id(found[spec.serial])
+    return device_id
+
+
+def _identify(features: AravisFeatures) -> CameraIdentity:
+    """By the camera's own features; older ones have the serial number as DeviceID."""
+    serial = _text(features, "DeviceSerialNumber") or _text(features, "DeviceID")
+    firmware = _text(features, "DeviceFirmwareVersion") or _text(features, "DeviceVersion")
+    return CameraIdentity(
+        _text(features, "DeviceVendorName"), _text(features, "DeviceModelName"), serial, firmware
+    )
+
+
+def _text(features: AravisFeatures, name: str) -> str:
+    node = features.find(name)
+    return str(node.read()) if node is not None and node.readable else ""
+
+
+def _check_identity(found: CameraIdentity, spec: GenicamSpec) -> None:
+    if found.serial != spec.serial:
+        raise CameraError(f"the camera at {spec.cti} has serial number {found.serial!r}, not {spec.serial!r}")
+    if spec.model and found.model != spec.model:
+        raise CameraError(f"camera {spec.serial} is a {found.model!r}, not a {spec.model!r}")

@@ -1,0 +1,148 @@
+"""What a camera describes of itself, as Aravis reads it."""
+
+from __future__ import annotations
+
+import ctypes
+from ctypes import byref, c_double, c_int64, c_uint, c_void_p
+from typing import TYPE_CHECKING, Any
+
+from acquire.camera.aravis.library import errors
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from acquire.camera.settings import Kind, Value
+
+_KINDS: tuple[tuple[bytes, Kind], ...] = (
+    (b"ArvGcCommand", "command"),
+    (b"ArvGcBoolean", "boolean"),
+    (b"ArvGcEnumeration", "enumeration"),
+    (b"ArvGcString", "text"),
+    (b"ArvGcFloat", "float"),
+    (b"ArvGcInteger", "integer"),
+)
+"""GObject types and interfaces, the first that a node has counting: there are more classes of nodes than ways
+to read one, and some have several (an enumeration is also an integer)."""
+
+
+class AravisFeatures:
+    """`acquire.camera.settings.Features` of a device."""
+
+    def __init__(self, library: Any, device: int) -> None:
+        self._library, self._device = library, device
+
+    def find(self, name: str) -> AravisNode | None:
+        node = self._library.arv_device_get_feature(self._device, name.encode())
+        kind = self._kind(node) if node else None
+        return AravisNode(self._library, self._device, node, name, kind) if kind else None
+
+    def _kind(self, node: int) -> Kind | None:
+        """How the node is read and written; None for what is no feature but a category."""
+        library = self._library
+        if self._is_category(node):
+            return None
+        kinds = (
+            kind
+            for name, kind in _KINDS
+            if (known := library.g_type_from_name(name)) and library.g_type_check_instance_is_a(node, known)
+        )
+        return next(kinds, "other")
+
+    def _is_category(self, node: int) -> bool:
+        return bool(self._library.g_type_name_from_instance(node) == b"ArvGcCategory")
+
+    def names(self) -> list[str]:
+        return [name for names in self.categories().values() for name in names]
+
+    def categories(self) -> dict[str, list[str]]:
+        found: dict[str, list[str]] = {}
+        self._collect("Root", found)
+        return {name: names for name, names in found.items() if names}
+
+    def _collect(self, category: str, found: dict[str, list[str]]) -> None:
+        node = self._library.arv_device_get_feature(self._device, category.encode())
+        names = found.setdefault(category, [])
+        for name in _strings(self._library.arv_gc_category_get_features(node)) if node else ():
+            below = self._library.arv_device_get_feature(self._device, name.encode())
+            if below and self._is_category(below):
+                if name not in found:
+                    self._collect(name, found)
+            elif below:
+                names.append(name)
+
+
+def _strings(node: int | None) -> Iterator[str]:
+    """The texts of a GSList."""
+    while node:
+        data, node = (c_void_p * 2).from_address(node)
+        if data:
+            yield ctypes.string_at(data).decode()
+
+
+class AravisNode:
+    """`acquire.camera.settings.Node` of an Aravis feature."""
+
+    def __init__(self, library: Any, device: int, node: int, name: str, kind: Kind) -> None:
+        self._library, self._device, self._node = library, device, node
+        self.name, self.kind = name, kind
+        self._key = name.encode()
+        self._word = {"enumeration": "string", "text": "string"}.get(kind, kind)
+
+    @property
+    def readable(self) -> bool:
+        return self.kind not in ("command", "other") and self._available and self._access in (0, 2)
+
+    @property
+    def writable(self) -> bool:
+        return self._available and self._access in (1, 2)
+
+    @property
+    def _available(self) -> bool:
+        with errors(self.name) as error:
+            return bool(self._library.arv_device_is_feature_available(self._device, self._key, error))
+
+    @property
+    def _access(self) -> int:
+        mode: int = self._library.arv_gc_feature_node_get_actual_access_mode(self._node)
+        return mode
+
+    @property
+    def selected(self) -> bool:
+        """Aravis does not say: what a selector points at is read back when it is written."""
+        return True
+
+    def read(self) -> Value:
+        with errors(f"read {self.name}") as error:
+            get = getattr(self._library, f"arv_device_get_{self._word}_feature_value")
+            value = get(self._device, self._key, error)
+        return value.decode() if isinstance(value, bytes) else value or (0 if value is not None else "")
+
+    def write(self, value: Value) -> None:
+        with errors(f"set {self.name} to {value!r}") as error:
+            if self.kind != "command":
+                given = value.encode() if isinstance(value, str) else value
+                put = getattr(self._library, f"arv_device_set_{self._word}_feature_value")
+                put(self._device, self._key, given, error)
+            elif value:
+                self._library.arv_device_execute_command(self._device, self._key, error)
+
+    def limits(self) -> tuple[float, float, float]:
+        number = c_int64 if self.kind == "integer" else c_double
+        low, high, step = number(), number(), 0
+        with errors(self.name) as error:
+            bounds = getattr(self._library, f"arv_device_get_{self.kind}_feature_bounds")
+            bounds(self._device, self._key, byref(low), byref(high), error)
+        if self.kind == "integer":
+            with errors(self.name) as error:
+                step = self._library.arv_device_get_integer_feature_increment(self._device, self._key, error)
+        return low.value, high.value, step
+
+    def entries(self) -> list[str]:
+        count = c_uint()
+        with errors(self.name) as error:
+            found = self._library.arv_device_dup_available_enumeration_feature_values_as_strings(
+                self._device, self._key, byref(count), error
+            )
+        names = [found[k].decode() for k in range(count.value)]
+        self._library.g_free(found)
+        return names

@@ -1,0 +1,223 @@
+"""Parameters of Aravis' stream as features of the module "stream": how long it waits for packets and frames,
+whether it asks for lost packets again, how much the socket holds.
+
+They are properties of GObjects, under Aravis' own names (``frame-retention``, in microseconds), and exist
+only with a stream: `StreamParameters` remembers what was written, and gives it to every stream that is made.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from ctypes import byref, c_double, c_int, c_uint, c_void_p
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from acquire.camera.settings import Kind, Value
+
+_READ_WRITE, _CONSTRUCT_ONLY = 3, 8
+_KINDS: dict[bytes, Kind] = {
+    b"gboolean": "boolean",
+    b"gint": "integer",
+    b"guint": "integer",
+    b"gdouble": "float",
+    b"GEnum": "enumeration",
+}
+_BASES = (b"ArvStream", b"ArvDevice")
+"""Their properties are Aravis' own affairs."""
+
+
+class _ParamSpec(ctypes.Structure):
+    """GParamSpec, its public part, and GObject's own after it."""
+
+    _fields_ = (
+        ("instance", c_void_p),
+        ("name", ctypes.c_char_p),
+        ("flags", c_uint),
+        ("value_type", ctypes.c_size_t),
+        ("owner_type", ctypes.c_size_t),
+        ("private", c_void_p * 3),
+        ("counts", c_uint * 2),
+    )
+
+
+class _EnumValue(ctypes.Structure):
+    _fields_ = (("value", c_int), ("name", ctypes.c_char_p), ("nick", ctypes.c_char_p))
+
+
+class _EnumClass(ctypes.Structure):
+    _fields_ = (
+        ("type", ctypes.c_size_t),
+        ("minimum", c_int),
+        ("maximum", c_int),
+        ("count", c_uint),
+        ("values", ctypes.POINTER(_EnumValue)),
+    )
+
+
+class _Data(ctypes.Union):
+    _fields_ = (("v_int", c_int), ("v_uint", c_uint), ("v_double", c_double), ("all", ctypes.c_uint64 * 2))
+
+
+class _GValue(ctypes.Structure):
+    _fields_ = (("type", ctypes.c_size_t), ("data", _Data))
+
+
+@dataclass(frozen=True, slots=True)
+class _Property:
+    """One property of a GObject: its type, and what it can be."""
+
+    name: str
+    kind: Kind
+    value_type: int
+    field: str
+    limits: tuple[float, float]
+    entries: dict[str, int]
+
+
+class StreamParameters:
+    """`acquire.camera.settings.Features` of the module "stream".
+
+    Parameters
+    ----------
+    device : whose own properties say how its packets are sized
+    stream : the stream that is there now, made if there is none
+    drop : takes that stream away; the packets of the next one are sized anew
+    """
+
+    def __init__(
+        self, library: Any, device: int, stream: Callable[[], int], drop: Callable[[], None]
+    ) -> None:
+        self._library, self._device, self._stream, self._drop = library, device, stream, drop
+        self._of_device = _properties(library, device)
+        self._written: dict[str, Value] = {}
+        self._no_resend = False
+
+    def furnish(self, stream: int, usual: Mapping[str, Value]) -> None:
+        """Give a new stream what was written, and the ``usual`` parameters where it has them."""
+        known = _properties(self._library, stream)
+        resend = known.get("packet-resend")
+        self._no_resend = resend is not None and self._get(stream, resend) == "never"
+        for name, value in {**usual, **self._written}.items():
+            if name in known:
+                self._put(stream, known[name], value)
+
+    def find(self, name: str) -> StreamNode | None:
+        found = self._of_device.get(name) or _properties(self._library, self._stream()).get(name)
+        return StreamNode(self, found) if found else None
+
+    def names(self) -> list[str]:
+        return [*self._of_device, *_properties(self._library, self._stream())]
+
+    def categories(self) -> dict[str, list[str]]:
+        return {"StreamControl": names} if (names := self.names()) else {}
+
+    def read(self, wanted: _Property) -> Value:
+        owner = self._device if wanted.name in self._of_device else self._stream()
+        return self._get(owner, wanted)
+
+    def write(self, wanted: _Property, value: Value) -> None:
+        if wanted.name in self._of_device:
+            self._put(self._device, wanted, value)
+            self._drop()  # its packets have been sized
+        else:
+            self._put(self._stream(), wanted, value)
+            self._written[wanted.name] = value
+
+    def entries(self, wanted: _Property) -> list[str]:
+        """Aravis switches requests for lost packets off where the camera does not answer them."""
+        self._stream()
+        return ["never"] if wanted.name == "packet-resend" and self._no_resend else list(wanted.entries)
+
+    def _get(self, owner: int, wanted: _Property) -> Value:
+        place = _GValue()
+        self._library.g_value_init(byref(place), wanted.value_type)
+        self._library.g_object_get_property(owner, wanted.name.encode(), byref(place))
+        number: int | float = getattr(place.data, wanted.field)
+        if wanted.kind == "enumeration":
+            return next(nick for nick, value in wanted.entries.items() if value == number)
+        return bool(number) if wanted.kind == "boolean" else number
+
+    def _put(self, owner: int, wanted: _Property, value: Value) -> None:
+        place = _GValue()
+        self._library.g_value_init(byref(place), wanted.value_type)
+        setattr(place.data, wanted.field, wanted.entries[str(value)] if wanted.entries else value)
+        self._library.g_object_set_property(owner, wanted.name.encode(), byref(place))
+
+
+class StreamNode:
+    """`acquire.camera.settings.Node` of a parameter."""
+
+    def __init__(self, parameters: StreamParameters, of: _Property) -> None:
+        self._parameters, self._property = parameters, of
+        self.name, self.kind = of.name, of.kind
+
+    readable = writable = True
+    selected = False
+
+    def read(self) -> Value:
+        return self._parameters.read(self._property)
+
+    def write(self, value: Value) -> None:
+        self._parameters.write(self._property, value)
+
+    def limits(self) -> tuple[float, float, float]:
+        return *self._property.limits, 1 if self.kind == "integer" else 0
+
+    def entries(self) -> list[str]:
+        return self._parameters.entries(self._property)
+
+
+def _properties(library: Any, owner: int) -> dict[str, _Property]:
+    """The properties of an object that can be read and written, but for those of every stream or device."""
+    count = c_uint()
+    specs = library.g_object_class_list_properties(c_void_p.from_address(owner).value, byref(count))
+    found: dict[str, _Property] = {}
+    for k in range(count.value):
+        spec = _ParamSpec.from_address(specs[k])
+        kind = _KINDS.get(library.g_type_name(library.g_type_fundamental(spec.value_type)))
+        usable = spec.flags & (_READ_WRITE | _CONSTRUCT_ONLY) == _READ_WRITE
+        if kind and usable and library.g_type_name(spec.owner_type) not in _BASES:
+            found[spec.name.decode()] = _describe(library, specs[k], spec, kind)
+    library.g_free(specs)
+    return found
+
+
+def _describe(library: Any, at: int, spec: _ParamSpec, kind: Kind) -> _Property:
+    """What is behind the common part of a GParamSpec depends on its type."""
+    behind = at + ctypes.sizeof(_ParamSpec)
+    limits, entries = (0.0, 0.0), {}
+    field = "v_int"
+    if kind == "enumeration":
+        known = _EnumClass.from_address(c_void_p.from_address(behind).value or 0)
+        entries = {known.values[k].nick.decode(): known.values[k].value for k in range(known.count)}
+    elif kind != "boolean":
+        field, number = _NUMBERS[library.g_type_name(spec.value_type)]
+        low, high = (number * 2).from_address(behind)
+        limits = (low, high)
+    return _Property(spec.name.decode(), kind, spec.value_type, field, limits, entries)
+
+
+_NUMBERS: dict[bytes, tuple[str, Any]] = {
+    b"gint": ("v_int", c_int),
+    b"guint": ("v_uint", c_uint),
+    b"gdouble": ("v_double", c_double),
+}
+
+
+def usual_parameters(frame_period_s: float) -> dict[str, Value]:
+    """A frame of a slow line rate comes over a longer time than Aravis waits for its packets by default: it
+    would be given up half-way, or asked for before it is sent.
+    """
+    period_us = round(frame_period_s * 1e6)
+    return {
+        "packet-timeout": min(max(_PACKET_TIMEOUT_US, period_us), _MOST_US),
+        "frame-retention": min(max(_FRAME_RETENTION_US, 4 * period_us), _MOST_US),
+    }
+
+
+_PACKET_TIMEOUT_US, _FRAME_RETENTION_US = 20_000, 100_000
+"""Aravis' own."""
+_MOST_US = 2**32 - 1
