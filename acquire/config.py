@@ -38,9 +38,9 @@ M = TypeVar("M", bound=BaseModel)
 
 
 def default_socket() -> Path:
-    """The control socket where none is configured: the user's runtime directory, else /tmp."""
-    runtime = os.environ.get("XDG_RUNTIME_DIR")
-    return Path(runtime) / "acquire.sock" if runtime else Path(f"/tmp/acquire-{os.getuid()}.sock")  # noqa: S108
+    """The control socket where none is configured: in the user's runtime directory, else in one in /tmp."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR") or f"/tmp/acquire-{os.geteuid()}"  # noqa: S108
+    return Path(runtime) / "acquire.sock"
 
 
 class GeometryConfig(FrozenModel):

@@ -10,26 +10,32 @@
 
 from __future__ import annotations
 
-import socket
+import http.client
+import json
 import time
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
-import httpx
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
-from acquire.daemon.messages import ArmRequest, ErrorMessage, StartRequest, Status
+from acquire.daemon.messages import ArmRequest, ErrorMessage, MarkRequest, StartRequest, Status
+from acquire.daemon.peer import connect
 from acquire.daemon.states import State
 from acquire.errors import AcquireError, NoDaemonError, StateError, UsageError
+from acquire.text import shortened
 
 if TYPE_CHECKING:
     from collections.abc import Collection
     from pathlib import Path
 
-CONNECT_TIMEOUT_S = 2.0
-STATUS_TIMEOUT_S = 5.0
+CONNECT_TIMEOUT_S = 5.0
+STATUS_TIMEOUT_S = 10.0
 COMMAND_TIMEOUT_S = 120.0
 """Above the sum of what the daemon allows itself for the slowest command and one before it in the queue."""
 POLL_S = 0.1
+MOST_BYTES = 2**24
+"""Of an answer."""
+
+R = TypeVar("R", bound=BaseModel)
 
 
 class Client:
@@ -40,18 +46,12 @@ class Client:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._http = httpx.Client(
-            transport=httpx.HTTPTransport(uds=str(path)), base_url="http://acquire", trust_env=False
-        )
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        self._http.close()
+        """A call has its own connection: nothing is left to be closed."""
 
     def status(self) -> Status:
         """What the daemon is doing; answered at once, whatever it is busy with."""
@@ -59,7 +59,7 @@ class Client:
 
     def arm(self, *, force: bool = False) -> Status:
         """idle → armed: cameras and trigger run, nothing is written. ``force``: however slow the host."""
-        return self._call("POST", "arm", body=ArmRequest(force=force).model_dump())
+        return self._call("POST", "arm", body=ArmRequest(force=force))
 
     def start(
         self,
@@ -77,25 +77,21 @@ class Client:
         another way to say how long it is to go on. With ``resume``, ``path`` is a sealed recording that goes
         on in a segment beside it.
         """
-        try:
-            request = StartRequest(
-                path=None if path is None else path.absolute(),
-                lines=lines,
-                duration_s=duration_s,
-                pre_s=pre_s,
-                post_s=post_s,
-                resume=resume,
-            )
-        except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(map(str, first["loc"]))
-            why = first["msg"].removeprefix("Value error, ")
-            raise UsageError(f"start: {where} {why}".replace("  ", " ")) from error
-        return self._call("POST", "start", body=request.model_dump(mode="json"))
+        request = _request(
+            "start",
+            StartRequest,
+            path=None if path is None else path.absolute(),
+            lines=lines,
+            duration_s=duration_s,
+            pre_s=pre_s,
+            post_s=post_s,
+            resume=resume,
+        )
+        return self._call("POST", "start", body=request)
 
     def mark(self, text: str = "") -> Status:
         """An event at the newest line; it starts a recording where the rig's ``[events]`` say so."""
-        return self._call("POST", "mark", body={"text": text})
+        return self._call("POST", "mark", body=_request("mark", MarkRequest, text=text))
 
     def stop(self) -> Status:
         """recording → idle: returns once the recording is sealed."""
@@ -123,39 +119,44 @@ class Client:
         return status
 
     def _call(
-        self, method: str, command: str, timeout_s: float = COMMAND_TIMEOUT_S, body: Any = None
+        self, method: str, command: str, timeout_s: float = COMMAND_TIMEOUT_S, body: BaseModel | None = None
     ) -> Status:
-        timeout = httpx.Timeout(timeout_s, connect=CONNECT_TIMEOUT_S)
-        self._knock()
-        try:
-            response = self._http.request(method, f"/{command}", json=body, timeout=timeout)
-        except httpx.TimeoutException as error:
-            raise NoDaemonError(
-                f"the daemon on {self.path} gave no answer to {command} within {timeout_s:g} s"
-            ) from error
-        except httpx.TransportError as error:
-            raise NoDaemonError(f"the daemon on {self.path} went away during {command}") from error
-        return self._read(response, command)
+        with connect(self.path, CONNECT_TIMEOUT_S) as connection:
+            connection.settimeout(timeout_s)
+            http_connection = http.client.HTTPConnection("acquire")
+            http_connection.sock = connection
+            headers = {"Connection": "close"} | ({"Content-Type": "application/json"} if body else {})
+            text = None if body is None else json.dumps(body.model_dump(mode="json"))
+            try:
+                http_connection.request(method, f"/{command}", text, headers)
+                response = http_connection.getresponse()
+                return self._read(response.status, response.read(MOST_BYTES), command)
+            except TimeoutError as error:
+                raise NoDaemonError(
+                    f"the daemon on {self.path} gave no answer to {command} within {timeout_s:g} s"
+                ) from error
+            except (OSError, http.client.HTTPException) as error:
+                raise NoDaemonError(f"the daemon on {self.path} went away during {command}") from error
+            finally:
+                http_connection.close()
 
-    def _read(self, response: httpx.Response, command: str) -> Status:
+    def _read(self, status: int, content: bytes, command: str) -> Status:
         try:
-            if response.is_success:
-                return Status.model_validate_json(response.content)
-            raise ErrorMessage.model_validate_json(response.content).rebuild()
+            if status < http.client.BAD_REQUEST:
+                return Status.model_validate_json(content)
+            raise ErrorMessage.model_validate_json(content).rebuild()
         except ValidationError as error:
             raise AcquireError(
-                f"{command}: the daemon on {self.path} speaks another version of this program"
-                f" (HTTP {response.status_code})"
+                f"{command}: the daemon on {self.path} speaks another version of this program (HTTP {status})"
             ) from error
 
-    def _knock(self) -> None:
-        """Raise NoDaemonError with the system's reason where nobody listens (httpx leaks the socket then)."""
-        with socket.socket(socket.AF_UNIX) as knock:
-            knock.settimeout(CONNECT_TIMEOUT_S)
-            try:
-                knock.connect(str(self.path))
-            except OSError as error:
-                raise NoDaemonError(
-                    f"no daemon listens on {self.path} ({error.strerror or error})",
-                    hint=f"acquire serve --config rig-demo --socket {self.path}",
-                ) from error
+
+def _request(command: str, model: type[R], **fields: Any) -> R:
+    """What a command asks for; refused here already where it is impossible as asked."""
+    try:
+        return model(**fields)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"]))
+        why = first["msg"].removeprefix("Value error, ")
+        raise UsageError(shortened(f"{command}: {where} {why}".replace("  ", " "), 1000)) from error

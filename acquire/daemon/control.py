@@ -25,6 +25,7 @@ from acquire.daemon.messages import (
     http_status,
 )
 from acquire.errors import AcquireError, UsageError
+from acquire.text import shortened
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -33,6 +34,15 @@ if TYPE_CHECKING:
 
 MAX_BODY_BYTES = 2**16
 """No request is longer than a path and a number."""
+MOST_EXPLAINED = 5
+"""Things to mend that an answer lists."""
+REFUSALS = {
+    400: "the body is not JSON",
+    404: "there is no such path",
+    405: "the path takes another method",
+    413: f"the body is longer than {MAX_BODY_BYTES} bytes",
+}
+"""What is refused before any command sees it."""
 
 
 class Commands(Protocol):
@@ -52,7 +62,10 @@ def build_app(service: Commands, run: Callable[[Callable[[], None]], Awaitable[N
         title="acquire",
         version=__version__,
         description="Control of the capture service.",
-        responses={code: {"model": ErrorMessage} for _, code in HTTP_STATUS},
+        responses={
+            **{code: {"model": ErrorMessage, "description": why} for code, why in REFUSALS.items()},
+            **{code: {"model": ErrorMessage, "description": f"{kind.__doc__}"} for kind, code in HTTP_STATUS},
+        },
         docs_url=None,  # the pages would load scripts from elsewhere
         redoc_url=None,
     )
@@ -118,22 +131,28 @@ def _add_errors(app: FastAPI) -> None:
 
     @app.exception_handler(RequestValidationError)
     async def malformed(_: Request, error: RequestValidationError) -> JSONResponse:
-        return _answer(UsageError("; ".join(map(_explain, error.errors()))))
+        found = error.errors()
+        told = [_explain(item) for item in found[:MOST_EXPLAINED]]
+        more = [f"and {len(found) - MOST_EXPLAINED} more"] if len(found) > MOST_EXPLAINED else []
+        return _answer(UsageError("; ".join(told + more), possible="/openapi.json"))
 
     @app.exception_handler(HTTPException)
     async def unknown(request: Request, error: HTTPException) -> JSONResponse:
-        told = UsageError(f"{request.method} {request.url.path}: {error.detail}", possible="/openapi.json")
+        asked = shortened(f"{request.method} {request.url.path}")
+        told = UsageError(f"{asked}: {shortened(error.detail)}", possible="/openapi.json")
         return JSONResponse(error_body(told), error.status_code, error.headers)
 
     @app.exception_handler(Exception)
     async def defect(_: Request, error: Exception) -> JSONResponse:
         # The server logs the traceback; the user gets one line and a way to tell us.
-        return _answer(AcquireError(f"defect in the daemon: {error!r}", hint="see the daemon's log"))
+        told = f"defect in the daemon: {shortened(repr(error), 400)}"
+        return _answer(AcquireError(told, hint="see the daemon's log"))
 
 
 def _explain(item: dict[str, Any]) -> str:
+    """What is wrong with a value; of a long one its beginning, since it comes from whoever asked."""
     key = ".".join(str(part) for part in item["loc"] if part != "body") or "request"
-    return f"{key} = {item.get('input')!r}: {item['msg']}"
+    return f"{shortened(key)} = {shortened(repr(item.get('input')))}: {shortened(item['msg'], 400)}"
 
 
 def _answer(error: AcquireError) -> JSONResponse:

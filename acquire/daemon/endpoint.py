@@ -1,5 +1,8 @@
 """The control socket: one daemon at a time, reachable by its user only.
 
+The default socket lies in a directory that only its user can enter; one that another user has made first,
+in /tmp, is refused. `acquire.daemon.peer` is the client's side of that.
+
 A lock on a file beside the socket says whether a daemon lives. The kernel frees it when the process
 ends, however it ends, so that a socket left behind by a killed daemon is recognised and replaced.
 The lock file stays: to remove it would let two daemons lock two files of one name.
@@ -7,16 +10,22 @@ The lock file stays: to remove it would let two daemons lock two files of one na
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import os
 import socket
 import stat
 from pathlib import Path
 
+from acquire.config import default_socket
+from acquire.daemon.connections import Listener
+from acquire.daemon.peer import ELSEWHERE
 from acquire.errors import StateError, UsageError
 
 LONGEST_PATH = 107
 """Bytes of a Unix socket's path that the kernel takes."""
+LONGEST_LOCK = 32
+"""Bytes of a lock file: a process number and a newline."""
 
 
 class Endpoint:
@@ -36,12 +45,17 @@ class Endpoint:
             os.close(self._lock)
             raise
 
+    def remove(self) -> None:
+        """Nobody finds the socket any more. From any thread; the lock ends with the process."""
+        with contextlib.suppress(OSError):
+            self.path.unlink(missing_ok=True)
+
     def close(self) -> None:
         """Remove the socket and let the next daemon in. Idempotent."""
         if self._lock < 0:
             return
         self.socket.close()
-        self.path.unlink(missing_ok=True)
+        self.remove()
         os.close(self._lock)
         self._lock = -1
 
@@ -52,39 +66,75 @@ def lock_path(path: Path) -> Path:
 
 def _check(path: Path) -> None:
     if len(os.fsencode(path)) > LONGEST_PATH:
-        raise UsageError(f"control socket {path}", possible=f"a path of at most {LONGEST_PATH} bytes")
+        raise UsageError(
+            f"control socket {path}", possible=f"a path of at most {LONGEST_PATH} bytes", hint=ELSEWHERE
+        )
+    if path == default_socket():
+        _own(path.parent)
     if not path.parent.is_dir():
-        raise UsageError(f"control socket {path}: its directory does not exist")
-    if path.exists() and not stat.S_ISSOCK(path.stat().st_mode):
+        raise UsageError(f"control socket {path}: its directory does not exist", hint=ELSEWHERE)
+    if os.path.lexists(path) and not stat.S_ISSOCK(path.lstat().st_mode):
         raise UsageError(f"control socket {path}: something else lies there, it stays untouched")
 
 
-def _lock(path: Path) -> int:
+def _own(directory: Path) -> None:
+    """Make the directory of the default socket, or make sure that it is this user's alone."""
+    in_tmp = not os.environ.get("XDG_RUNTIME_DIR")
+    if in_tmp:
+        with contextlib.suppress(OSError):  # what keeps it from being made is told by what is found
+            directory.mkdir(mode=0o700)
     try:
-        lock = os.open(lock_path(path), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
+        found = directory.lstat() if in_tmp else directory.stat()
     except OSError as error:
-        raise UsageError(f"control socket {path}: cannot lock it: {error.strerror}") from error
+        raise UsageError(f"control socket in {directory}: {error.strerror}", hint=ELSEWHERE) from error
+    if not stat.S_ISDIR(found.st_mode):
+        raise UsageError(f"control socket in {directory}: that is no directory", hint=ELSEWHERE)
+    if found.st_uid != os.geteuid():
+        raise UsageError(
+            f"control socket in {directory}: that directory belongs to user {found.st_uid}", hint=ELSEWHERE
+        )
+    if stat.S_IMODE(found.st_mode) & (0o077 if in_tmp else 0o022):
+        raise UsageError(
+            f"control socket in {directory}: that directory is open to others "
+            f"(mode {stat.S_IMODE(found.st_mode):04o})",
+            hint=f"chmod 700 {directory}, or {ELSEWHERE}",
+        )
+
+
+def _lock(path: Path) -> int:
+    flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+    try:
+        lock = os.open(lock_path(path), flags, 0o600)
+    except OSError as error:
+        raise UsageError(f"control socket {path}: cannot lock {lock_path(path)}: {error.strerror}") from error
+    found = os.fstat(lock)
+    if not stat.S_ISREG(found.st_mode) or found.st_size > LONGEST_LOCK:
+        os.close(lock)
+        raise UsageError(f"control socket {path}: {lock_path(path)} is no lock of ours, it stays untouched")
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.ftruncate(lock, 0)
+        os.pwrite(lock, f"{os.getpid()}\n".encode(), 0)
     except BlockingIOError:
-        owner = os.pread(lock, 20, 0).decode().strip()
+        owner = os.pread(lock, LONGEST_LOCK, 0).decode("ascii", "replace").strip()
         os.close(lock)
         raise StateError(
-            f"another daemon (process {owner}) listens on {path}",
+            f"another daemon (process {owner if owner.isdecimal() else 'unknown'}) listens on {path}",
             hint="acquire status, or another --socket",
         ) from None
-    os.ftruncate(lock, 0)
-    os.pwrite(lock, f"{os.getpid()}\n".encode(), 0)
+    except OSError as error:
+        os.close(lock)
+        raise UsageError(f"control socket {path}: cannot lock {lock_path(path)}: {error.strerror}") from error
     return lock
 
 
-def _listen(path: Path) -> socket.socket:
+def _listen(path: Path) -> Listener:
     path.unlink(missing_ok=True)  # left by a daemon that was killed: the lock was free
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    listener = Listener(socket.AF_UNIX, socket.SOCK_STREAM)
     before = os.umask(0o177)
     try:
         listener.bind(str(path))
-        listener.listen(16)
+        listener.listen()
     except OSError as error:
         listener.close()
         raise UsageError(f"control socket {path}: {error.strerror}") from error

@@ -7,13 +7,25 @@ from __future__ import annotations
 
 from datetime import datetime
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, PlainSerializer, field_validator, model_validator
 
 from acquire import errors
 from acquire.daemon.states import State
 from acquire.errors import AcquireError, DeviceError, StateError, UsageError
+from acquire.text import visible
+
+
+def _on_the_wire(text: object) -> str:
+    return visible(text, lines=True)
+
+
+Text = Annotated[str, PlainSerializer(_on_the_wire, return_type=str, when_used="json")]
+"""Whatever is in it, such as the name of a file that is not UTF-8: in JSON it is readable, and harmless."""
+Place = Annotated[Path, PlainSerializer(_on_the_wire, return_type=str, when_used="json")]
+LONGEST_MARK = 400
+"""Characters."""
 
 
 class _Message(BaseModel):
@@ -25,6 +37,7 @@ class ArmRequest(_Message):
 
     force: bool = Field(
         default=False,
+        strict=True,
         description="even where the host is too slow for the configured rate, or uploads are refused",
     )
 
@@ -37,18 +50,37 @@ class StartRequest(_Message):
         description="absolute path of the new recording; absent: named after rig and time in the "
         "configured directory",
     )
-    lines: int | None = Field(default=None, ge=1, le=2**53, description="line budget; absent: until stop")
+    lines: int | None = Field(
+        default=None, strict=True, ge=1, le=2**53, description="line budget; absent: until stop"
+    )
     duration_s: float | None = Field(
-        default=None, gt=0, le=1e9, allow_inf_nan=False, description="budget in seconds instead of lines"
+        default=None,
+        strict=True,
+        gt=0,
+        le=1e9,
+        allow_inf_nan=False,
+        description="budget in seconds instead of lines",
     )
     pre_s: float = Field(
-        default=0.0, ge=0, le=1e6, allow_inf_nan=False, description="of it, from before the request"
+        default=0.0,
+        strict=True,
+        ge=0,
+        le=1e6,
+        allow_inf_nan=False,
+        description="of it, from before the request",
     )
     post_s: float | None = Field(
-        default=None, gt=0, le=1e9, allow_inf_nan=False, description="to record after the request, as budget"
+        default=None,
+        strict=True,
+        gt=0,
+        le=1e9,
+        allow_inf_nan=False,
+        description="to record after the request, as budget",
     )
     resume: bool = Field(
-        default=False, description="path is a sealed recording: go on with it in a further segment beside it"
+        default=False,
+        strict=True,
+        description="path is a sealed recording: go on with it in a further segment beside it",
     )
 
     @model_validator(mode="after")
@@ -76,7 +108,9 @@ class StartRequest(_Message):
 class MarkRequest(_Message):
     """What happens now, in the operator's words."""
 
-    text: str = Field(default="", max_length=400)
+    text: str = Field(
+        default="", max_length=LONGEST_MARK, description="one line, as long as a sentence or two"
+    )
 
 
 class RingStatus(_Message):
@@ -107,7 +141,7 @@ class LedgerStatus(_Message):
 class CheckStatus(_Message):
     """What the lines say of the light's code."""
 
-    verdict: str = Field(description="verified, shifted, inverted, wrong_code, dark or unknown")
+    verdict: Text = Field(description="verified, shifted, inverted, wrong_code, dark or unknown")
     shift: int = Field(description="sub-steps by which the lines are late")
     checked_line: int = Field(description="the line after the last that was looked at")
     lapped: int = Field(description="ring slots that came and went unseen by the check")
@@ -135,7 +169,7 @@ class ArmStatus(_Message):
 class RecordingStatus(_Message):
     """The recording being written."""
 
-    path: Path
+    path: Place
     first_line: int | None = Field(description="the trigger's number of row 0")
     budget_lines: int | None
     recorded_lines: int = Field(description="rows that both arms have")
@@ -145,29 +179,29 @@ class RecordingStatus(_Message):
 class LastRecording(_Message):
     """The recording that was closed last."""
 
-    path: Path
+    path: Place
     lines: int
-    condition: str | None = Field(description="what the lines are worth; null: it could not be sealed")
-    end_reason: str | None
+    condition: Text | None = Field(description="what the lines are worth; null: it could not be sealed")
+    end_reason: Text | None
 
 
 class RecoveryStatus(_Message):
     """A recording that its recorder did not seal, and what the daemon made of it."""
 
-    path: Path
+    path: Place
     state: Literal["waiting", "recovered", "left", "failed"] = Field(
         description="waiting for its turn or a lock; sealed; not to be touched by this daemon; could not be"
     )
     lines: int | None = Field(default=None, description="of each arm that a reader finds")
-    condition: str | None = Field(default=None, description="what the lines are worth, once it is recovered")
-    text: str = Field(default="", description="how it came to that; once it is recovered, its end reason")
+    condition: Text | None = Field(default=None, description="what the lines are worth, once it is recovered")
+    text: Text = Field(default="", description="how it came to that; once it is recovered, its end reason")
 
 
 class UploadStatus(_Message):
     """A recording on its way to `recording.upload_to`."""
 
-    path: Path
-    url: str
+    path: Place
+    url: Text
     state: Literal["waiting", "copying", "copied", "refused", "gone"] = Field(
         description="waiting for its turn, its end or the store; under way, while it grows or after; whole "
         "there; something else is there; deleted here before it was copied"
@@ -175,8 +209,8 @@ class UploadStatus(_Message):
     lines: int = Field(default=0, description="of each arm that are there")
     waiting_lines: int | None = Field(default=None, description="that a reader finds here only")
     bytes: int = Field(default=0, description="sent since the copy was begun or gone on with")
-    error: str = Field(default="", description="why the last try failed; it is tried again while waiting")
-    hint: str = ""
+    error: Text = Field(default="", description="why the last try failed; it is tried again while waiting")
+    hint: Text = ""
 
 
 class CapacityStatus(_Message):
@@ -184,10 +218,18 @@ class CapacityStatus(_Message):
 
     line_rate_hz: float = Field(description="configured")
     sustained_hz: float | None = Field(default=None, description="null: could not be measured")
-    codec: str | None = Field(default=None, description="that was measured, chosen where the rig says auto")
-    limit: str | None = Field(default=None, description="what allows least")
+    codec: Text | None = Field(default=None, description="that was measured, chosen where the rig says auto")
+    limit: Text | None = Field(default=None, description="what allows least")
     limits_hz: dict[str, float] = Field(default={}, description="ring, codec, recorder, processors")
-    warning: str | None = None
+    warning: Text | None = None
+
+
+class TroubleStatus(_Message):
+    """A failure that nobody foresaw, in something that nobody asked for; the service goes on."""
+
+    text: Text = Field(description="where, and what")
+    times: int
+    last: datetime
 
 
 class Status(_Message):
@@ -195,17 +237,17 @@ class Status(_Message):
 
     state: State
     since: datetime
-    possible: list[str] = Field(description="commands that the state allows")
-    busy: str | None = Field(description="the command being carried out")
-    name: str = Field(description="of the rig")
-    version: str
+    possible: list[Text] = Field(description="commands that the state allows")
+    busy: Text | None = Field(description="the command being carried out")
+    name: Text = Field(description="of the rig")
+    version: Text
     pid: int
     uptime_s: float
-    run_id: str | None
+    run_id: Text | None
     recording: RecordingStatus | None
     arms: dict[str, ArmStatus]
     last: LastRecording | None
-    fault: str | None
+    fault: Text | None
     capacity: CapacityStatus | None = None
     processes: dict[str, int] = Field(default={}, description="of the run: name → process number")
     recoveries: list[RecoveryStatus] = Field(
@@ -216,16 +258,17 @@ class Status(_Message):
         description="recordings that are not copied to where the rig wants them, and the latest that are",
     )
     uploads_left: int = Field(default=0, description="recordings that are not copied, listed or not")
-    upload_warning: str | None = Field(default=None, description="why copies may have to wait")
+    upload_warning: Text | None = Field(default=None, description="why copies may have to wait")
+    troubles: list[TroubleStatus] = Field(default=[], description="unforeseen failures, the latest last")
 
 
 class ErrorMessage(_Message):
     """An AcquireError on the wire."""
 
-    error: str = Field(description="name of the class in acquire.errors")
-    message: str
-    possible: str = ""
-    hint: str = ""
+    error: Text = Field(description="name of the class in acquire.errors")
+    message: Text
+    possible: Text = ""
+    hint: Text = ""
     exit_code: int
 
     @classmethod
@@ -254,4 +297,4 @@ def http_status(error: AcquireError) -> int:
 
 
 def error_body(error: AcquireError) -> dict[str, Any]:
-    return ErrorMessage.of(error).model_dump()
+    return ErrorMessage.of(error).model_dump(mode="json")

@@ -1,7 +1,8 @@
 """The daemon's process: socket, signals, supervision, and the order in which all of it ends.
 
 The event loop answers requests; one thread owns the devices, so that commands and supervision come one
-after the other and a slow device never keeps the status from being answered.
+after the other and a slow device never keeps the status from being answered. A signal always ends the
+process: in order where that is possible, by force where a thread hangs (`acquire.daemon.ending`).
 """
 
 from __future__ import annotations
@@ -11,32 +12,34 @@ import contextlib
 import logging
 import os
 import signal
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, TypeVar
 
-import uvicorn
-
+from acquire.daemon.connections import ApiServer, raise_descriptor_limit
 from acquire.daemon.control import build_app
+from acquire.daemon.ending import END_S, LastResort, leave
 from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.notify import notify
 from acquire.daemon.plan import Run
 from acquire.daemon.proof import Proof
 from acquire.daemon.salvage import Salvage
-from acquire.daemon.service import Service
+from acquire.daemon.service import DRAIN_TIMEOUT_S, RECOVERY_S, Service
+from acquire.daemon.troubles import Troubles
 from acquire.daemon.uploads import Uploads
 from acquire.errors import EXIT_INTERRUPTED, StateError
 from acquire.rig import Rig
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable
     from pathlib import Path
 
     from acquire.config import RigConfig
 
 SUPERVISE_S = 0.2
 """Time between two looks at the capture path."""
-GRACE_S = 2
-"""Time that requests under way are given when the daemon ends, in whole seconds."""
+MOST_WAITING = 8
+"""Commands that wait for the one under way; each holds a connection."""
 
 log = logging.getLogger("acquire.daemon")
 T = TypeVar("T")
@@ -47,27 +50,23 @@ def serve(config: RigConfig) -> int:
 
     Raises StateError where another daemon has the socket, before any device is touched.
     """
+    raise_descriptor_limit()
+    troubles = Troubles()
+    threading.excepthook = troubles.in_thread
     with contextlib.closing(Endpoint(config.control.socket.absolute())) as endpoint, Rig(config) as rig:
         salvage = Salvage(config.recording.directory.absolute())
         salvage.search()
         uploads = Uploads(config.recording.upload_to, _journal(config))
         uploads.begin()
         proof = Proof(config)
-        service = Service(config, lambda: Run(config, rig, proof.choose), proof, salvage, uploads)
-        return asyncio.run(Daemon(service, endpoint).run())
+        service = Service(config, lambda: Run(config, rig, proof.choose), proof, salvage, uploads, troubles)
+        code = asyncio.run(Daemon(service, endpoint).run())
+    return leave(code)
 
 
 def _journal(config: RigConfig) -> Path:
     """The file that says which recordings are not copied yet."""
     return config.recording.directory.absolute() / f".uploads-{config.name}.json"
-
-
-class _Server(uvicorn.Server):
-    """Leaves the signals to us: they must drain the recording before the API goes away."""
-
-    @contextlib.contextmanager
-    def capture_signals(self) -> Iterator[None]:
-        yield
 
 
 class Daemon:
@@ -76,36 +75,34 @@ class Daemon:
     def __init__(self, service: Service, endpoint: Endpoint) -> None:
         self._service = service
         self._endpoint = endpoint
+        self._troubles = service.troubles
         self._devices = ThreadPoolExecutor(1, thread_name_prefix="devices")
+        self._waiting = 0
         self._ending = asyncio.Event()
+        self._last_resort = LastResort(endpoint.remove)
         self._exit_code = 0
-        self._server = _Server(
-            uvicorn.Config(
-                build_app(service, self._command),
-                log_config=None,
-                access_log=False,
-                lifespan="off",
-                http="h11",
-                ws="none",
-                timeout_graceful_shutdown=GRACE_S,
-            )
-        )
+        self._server = ApiServer(build_app(service, self._command), endpoint.socket)
 
     async def run(self) -> int:
         """Serve until a signal; the exit code."""
         self._take_signals()
-        serving = asyncio.create_task(self._server.serve(sockets=[self._endpoint.socket]))
+        asyncio.get_running_loop().set_exception_handler(self._troubles.in_loop)
+        serving = asyncio.create_task(self._server.answer())
         log.info("listening on %s (process %d)", self._endpoint.path, os.getpid())
         notify("READY=1")
         try:
             await self._supervise(serving)
         finally:
             await self._end(serving)
+            self._last_resort.cancel()
         return self._exit_code
 
     async def _supervise(self, serving: asyncio.Task[None]) -> None:
         while not (self._ending.is_set() or serving.done()):
-            await self._in_device_thread(self._service.supervise)
+            try:
+                await self._in_device_thread(self._service.supervise)
+            except Exception as error:  # noqa: BLE001 - a defect in one look must not end the service
+                self._troubles.note("supervision", error)
             notify("WATCHDOG=1")
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._ending.wait(), SUPERVISE_S)
@@ -125,7 +122,13 @@ class Daemon:
     async def _command(self, work: Callable[[], None]) -> None:
         if self._ending.is_set():
             raise StateError("the daemon is ending", possible="status")
-        await self._in_device_thread(work)
+        if self._waiting > MOST_WAITING:
+            raise StateError(f"{MOST_WAITING} commands are waiting already", possible="status")
+        self._waiting += 1
+        try:
+            await self._in_device_thread(work)
+        finally:
+            self._waiting -= 1
 
     async def _in_device_thread(self, work: Callable[[], T]) -> T:
         return await asyncio.get_running_loop().run_in_executor(self._devices, work)
@@ -139,7 +142,10 @@ class Daemon:
         if self._ending.is_set():
             log.warning("%s again: ending without waiting for lines on the way", number.name)
             self._service.hurry()
+            self._last_resort.within(END_S)
             return
         log.info("%s: ending", number.name)
+        recording = self._service.status().recording is not None
+        self._last_resort.within(END_S + (DRAIN_TIMEOUT_S + RECOVERY_S if recording else 0.0))
         self._exit_code = EXIT_INTERRUPTED if number is signal.SIGINT else 0
         self._ending.set()

@@ -23,6 +23,7 @@ from acquire.daemon.plan import default_path
 from acquire.daemon.report import Rates, arm_statuses, delivered_lines
 from acquire.daemon.salvage import Salvage
 from acquire.daemon.states import Event, State, after, commands
+from acquire.daemon.troubles import Troubles
 from acquire.daemon.uploads import Uploads
 from acquire.errors import AcquireError, DeviceError
 from acquire.store import RunCondition
@@ -77,12 +78,14 @@ class Service:
         prove: Prove | None = None,
         salvage: Salvage | None = None,
         uploads: Uploads | None = None,
+        troubles: Troubles | None = None,
     ) -> None:
         self._config = config
         self._open_run = open_run
         self._prove = prove
         self._salvage = salvage or Salvage(config.recording.directory.absolute())
         self._uploads = uploads or Uploads()
+        self.troubles = troubles or Troubles()
         self._capacity: CapacityStatus | None = None
         self._hurried = threading.Event()
         self._born = time.monotonic()
@@ -105,7 +108,8 @@ class Service:
 
     def status(self) -> Status:
         """What was published last; never waits."""
-        return self._status.model_copy(update={"uptime_s": round(time.monotonic() - self._born, 3)})
+        uptime_s = round(time.monotonic() - self._born, 3)
+        return self._status.model_copy(update={"uptime_s": uptime_s, "troubles": self.troubles.statuses})
 
     def hurry(self) -> None:
         """Do not wait for lines on the way any more: seal what there is."""
@@ -160,19 +164,34 @@ class Service:
     # ---- supervision
 
     def supervise(self) -> None:
-        """Look at the capture path once and act on what is seen. Any failure of it becomes a fault."""
-        self._recovered(self._salvage.look(capturing=self._run is not None))
-        self._uploads.look()
-        told = self._status.uploads, self._status.upload_warning
-        if (self._uploads.statuses, self._uploads.warning) != told:
-            self._publish()
+        """Look at the capture path once and act on what is seen. Any failure of it becomes a fault.
+
+        What happens beside it, a defect there included, must not keep the capture path from being watched.
+        """
+        for name, look in (("recoveries", self._look_at_salvage), ("uploads", self._look_at_uploads)):
+            try:
+                look()
+            except Exception as error:  # noqa: BLE001 - told in the status; the capture comes first
+                self.troubles.note(name, error)
         if self._run is None:
             return
         try:
             self._look()
         except (AcquireError, OSError) as error:
             self._fail(self._with_cause(str(error)))
+        except Exception as error:  # noqa: BLE001 - nobody would watch the devices otherwise
+            self.troubles.note("watching the capture", error)
+            self._fail(self._with_cause(f"defect in the daemon: {error!r}"))
         self._publish()
+
+    def _look_at_salvage(self) -> None:
+        self._recovered(self._salvage.look(capturing=self._run is not None))
+
+    def _look_at_uploads(self) -> None:
+        self._uploads.look()
+        told = self._status.uploads, self._status.upload_warning
+        if (self._uploads.statuses, self._uploads.warning) != told:
+            self._publish()
 
     def shutdown(self) -> None:
         """Whatever the state: seal, release. Bounded in time; raises only what closing a run raises."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import socket
 import threading
 import time
@@ -13,12 +14,14 @@ from pathlib import Path
 
 import httpx
 import pytest
-import uvicorn
 from fake_run import FakeRun, rig_config
 
 from acquire import errors
 from acquire.daemon import client as client_module
+from acquire.daemon import connections
+from acquire.daemon import server as server_module
 from acquire.daemon.client import Client
+from acquire.daemon.connections import ApiServer
 from acquire.daemon.control import build_app
 from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.messages import ErrorMessage, http_status
@@ -35,11 +38,8 @@ def api(service: Service, endpoint: Endpoint) -> Iterator[None]:
         async def run(work: Callable[[], None]) -> None:
             await asyncio.get_running_loop().run_in_executor(devices, work)
 
-        config = uvicorn.Config(
-            build_app(service, run), log_config=None, lifespan="off", http="h11", ws="none"
-        )
-        server = uvicorn.Server(config)
-        thread = threading.Thread(target=server.run, args=([endpoint.socket],))
+        server = ApiServer(build_app(service, run), endpoint.socket)
+        thread = threading.Thread(target=asyncio.run, args=(server.answer(),))
         thread.start()
         try:
             yield
@@ -220,7 +220,6 @@ def test_daemon_that_answers_strangely(path: Path, answer: bytes, kind: type[Acq
         listener.listen(1)
 
         def reply() -> None:
-            listener.accept()[0].close()  # somebody looked whether anybody listens
             with listener.accept()[0] as connection:
                 connection.recv(4096)
                 connection.sendall(answer)
@@ -250,3 +249,107 @@ def test_unknown_error_of_another_version() -> None:
     message = ErrorMessage(error="FutureError", message="m", exit_code=9)
     assert type(message.rebuild()) is AcquireError
     assert http_status(DeviceError("x")) == 503
+
+
+def raw_client(path: Path) -> httpx.Client:
+    return httpx.Client(transport=httpx.HTTPTransport(uds=str(path)), base_url="http://x")
+
+
+LONG = "x" * 60_000
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        {"lines": True},
+        {"lines": "5"},
+        {"lines": 5.0},
+        {"duration_s": True},
+        {"pre_s": float("1e400")},
+        {"path": LONG},
+        {"path": [LONG]},
+        {LONG: 1},
+        {f"key {i}": LONG[:500] for i in range(100)},
+    ],
+)
+def test_a_refusal_does_not_echo_what_was_sent(path: Path, daemon: Client, body: dict[str, object]) -> None:
+    with raw_client(path) as raw:
+        content = json.dumps(body).encode()
+        answer = raw.post("/start", content=content, headers={"content-type": "application/json"})
+    assert answer.status_code in (400, 422)
+    assert len(answer.content) < 4000
+    ErrorMessage.model_validate_json(answer.content)
+
+
+@pytest.mark.parametrize("content", [b"[" * 60_000, b"9" * 20_000, b'{"lines": ' + b"9" * 10_000 + b"}"])
+def test_json_that_no_parser_takes_is_refused_in_words(path: Path, daemon: Client, content: bytes) -> None:
+    with raw_client(path) as raw:
+        answer = raw.post("/start", content=content, headers={"content-type": "application/json"})
+    assert answer.status_code in (400, 422)
+    assert len(answer.content) < 1000
+    ErrorMessage.model_validate_json(answer.content)
+
+
+def test_marks_are_bounded_and_text(daemon: Client, run: FakeRun) -> None:
+    daemon.arm()
+    with pytest.raises(UsageError, match="mark: text String should have at most 400 characters"):
+        daemon.mark("x" * 401)
+    with pytest.raises(UsageError, match=r"mark: text .*unicode"):
+        daemon.mark("caf\udce9")
+    daemon.mark("a\nb")
+    assert run.calls[-1] == ("mark", "a\nb")
+
+
+def test_every_answer_is_documented(path: Path, daemon: Client) -> None:
+    with raw_client(path) as raw:
+        paths = raw.get("/openapi.json").json()["paths"]
+    for operations in paths.values():
+        for operation in operations.values():
+            assert {"400", "404", "405", "409", "413", "422", "500", "503"} <= set(operation["responses"])
+            assert all(one["description"] for one in operation["responses"].values())
+
+
+def test_whatever_is_in_the_status_it_is_answered(daemon: Client, path: Path, run: FakeRun) -> None:
+    """File names that are not UTF-8, and a device's own words, reach JSON as text."""
+    odd = "caf\udce9 \x1b[2J\u202e"
+    daemon.arm()
+    run.see(fault=odd, path=f"/{odd}.zarr", end_reason=odd)
+    with raw_client(path) as raw:
+        answer = raw.post("/start", json={"path": "/d/x.zarr"})
+        assert answer.status_code == 503
+        assert r"caf\udce9 \x1b[2J\u202e" in answer.json()["message"]
+        answer = raw.get("/status")
+    assert answer.status_code == 200
+    assert r"caf\udce9 \x1b[2J\u202e" in answer.json()["fault"]
+    assert answer.json()["last"]["path"] == r"/caf\udce9 \x1b[2J\u202e.zarr"
+
+
+def test_half_a_request_is_ended_and_a_slow_one_too(
+    path: Path, daemon: Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connections, "REQUEST_S", 0.2)
+    for sent in (b"", b"GET /sta", b"POST /mark HTTP/1.1\r\nHost: x\r\nContent-Length: 9\r\n\r\n{"):
+        with socket.socket(socket.AF_UNIX) as connection:
+            connection.settimeout(30)
+            connection.connect(str(path))
+            connection.sendall(sent)
+            assert connection.recv(100) == b""
+    assert daemon.status().state is State.IDLE
+
+
+def test_commands_that_wait_are_bounded(path: Path, run: FakeRun, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server_module, "MOST_WAITING", 2)
+    run.may_arm.clear()
+
+    async def crowd() -> list[object]:
+        with contextlib.closing(Endpoint(path)) as endpoint:
+            daemon = server_module.Daemon(Service(rig_config(path.parent), lambda: run), endpoint)
+            arming = [asyncio.create_task(daemon._command(daemon._service.arm)) for _ in range(5)]
+            _, waiting = await asyncio.wait(arming, return_when=asyncio.FIRST_COMPLETED)
+            run.may_arm.set()
+            await asyncio.wait(waiting)
+            daemon._devices.shutdown()
+            return [one.exception() for one in arming]
+
+    found = [str(error) for error in asyncio.run(crowd())]
+    assert sum("commands are waiting already" in text for text in found) == 2

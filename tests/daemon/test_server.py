@@ -6,19 +6,21 @@ import asyncio
 import contextlib
 import os
 import signal
-import time
+import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 from fake_run import FakeRun, rig_config
+from waiting import until
 
 from acquire.daemon.client import Client
 from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.server import Daemon
 from acquire.daemon.service import Service
 from acquire.daemon.states import State
+from acquire.daemon.troubles import MOST_LISTED, Troubles
 from acquire.errors import EXIT_INTERRUPTED, StateError
 
 Script = Callable[[Client], None]
@@ -54,8 +56,8 @@ def live(path: Path, run: FakeRun, script: Script) -> int:
     return code
 
 
-def until(client: Client, state: State) -> None:
-    client.wait({state}, 10)
+def until_in(client: Client, state: State) -> None:
+    client.wait({state}, 60)
 
 
 @pytest.mark.parametrize(
@@ -70,7 +72,7 @@ def test_while_it_ends_it_answers_but_obeys_no_more(path: Path, number: signal.S
         client.arm()
         client.start()
         os.kill(os.getpid(), number)
-        until(client, State.DRAINING)
+        until_in(client, State.DRAINING)
         with pytest.raises(StateError, match="the daemon is ending"):
             client.arm()
 
@@ -87,11 +89,9 @@ def test_second_signal_does_not_wait_for_lines(path: Path) -> None:
         client.arm()
         client.start()
         os.kill(os.getpid(), signal.SIGINT)
-        until(client, State.DRAINING)
+        until_in(client, State.DRAINING)
         os.kill(os.getpid(), signal.SIGINT)
-        deadline = time.monotonic() + 10
-        while "close" not in run.names:
-            assert time.monotonic() < deadline
+        until(lambda: "close" in run.names, "the end")
         assert run.seen.condition == "INTERRUPTED"
 
     assert live(path, run, script) == EXIT_INTERRUPTED
@@ -103,7 +103,47 @@ def test_faults_are_seen_without_being_asked_for(path: Path) -> None:
     def script(client: Client) -> None:
         client.arm()
         run.see(fault="camera a is gone")
-        until(client, State.FAULTED)
+        until_in(client, State.FAULTED)
         assert client.status().fault == "camera a is gone"
 
     assert live(path, run, script) == 0
+
+
+def test_a_defect_is_named_in_the_status_and_ends_nothing(
+    path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    looks = []
+
+    def broken(_: Service) -> None:
+        looks.append(1)
+        raise ZeroDivisionError("oops\n\udcff")
+
+    monkeypatch.setattr(Service, "supervise", broken)
+
+    def script(client: Client) -> None:
+        until(lambda: len(looks) > 2, "looks")
+        (trouble,) = client.status().troubles
+        assert trouble.text == r"supervision: ZeroDivisionError: oops\n\udcff"
+        assert trouble.times > 1
+
+    assert live(path, FakeRun(), script) == 0
+    assert "Traceback" in caplog.text
+
+
+def test_a_thread_that_dies_is_named_in_the_status() -> None:
+    troubles = Troubles()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(threading, "excepthook", troubles.in_thread)
+        thread = threading.Thread(target=lambda: 1 // 0, name="reader")
+        thread.start()
+        thread.join()
+    assert [one.text for one in troubles.statuses] == [
+        "thread reader: ZeroDivisionError: integer division or modulo by zero"
+    ]
+
+
+def test_troubles_are_bounded() -> None:
+    troubles = Troubles()
+    for number in range(100):
+        troubles.note("x" * 1000, ValueError(str(number) * 1000))
+    assert len(troubles.statuses) == MOST_LISTED

@@ -349,3 +349,30 @@ def test_a_mark_is_only_noted_where_nobody_asked_for_more(bed: Bed) -> None:
     assert bed.run.window == Window(None, 334, 334, kind="mark", text="acquire start")
     bed.service.mark("hello")
     assert bed.run.calls[-1] == ("mark", "hello")  # nothing is prolonged
+
+
+def test_a_defect_beside_the_capture_does_not_keep_it_from_being_watched(
+    bed: Bed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bed.record()
+
+    def broken(*_: object, **__: object) -> None:
+        raise RecursionError("a nested journal")
+
+    monkeypatch.setattr(bed.service._salvage, "look", broken)
+    monkeypatch.setattr(bed.service._uploads, "look", broken)
+    bed.run.see(fault="camera a is gone")
+    bed.service.supervise()
+    status = bed.service.status()
+    assert (status.state, status.fault) == (State.FAULTED, "camera a is gone")
+    assert {one.text.partition(":")[0] for one in status.troubles} == {"recoveries", "uploads"}
+
+
+def test_a_defect_in_watching_is_a_fault(bed: Bed) -> None:
+    bed.record()
+    bed.run.refuse["poll"] = ZeroDivisionError("oops")
+    bed.service.supervise()
+    status = bed.service.status()
+    assert status.state is State.FAULTED
+    assert "ZeroDivisionError" in (status.fault or "")
+    assert bed.run.names[-1] == "close"

@@ -1,0 +1,203 @@
+"""Connections to the control socket, bounded in number, time and size: the status is answered at any limit.
+
+::
+
+    accept ── a descriptor is set aside for the moment when none is left
+       ▼
+    Connection ── at most MOST_CONNECTIONS: the one that has been idle for longest is closed for the next
+       │          a request has REQUEST_S to arrive, whole; an answer SEND_S to be taken
+       ▼
+    the API ── a body of at most `control.MAX_BODY_BYTES`
+
+Whoever opens two hundred connections, or begins a request and stops in the middle, is disconnected; the
+capture path, in processes of its own, never notices.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import functools
+import logging
+import os
+import resource
+import socket
+from typing import TYPE_CHECKING, Any, cast
+
+import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol, RequestResponseCycle
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from starlette.types import ASGIApp
+
+MOST_CONNECTIONS = 32
+AT_ONCE = 16
+"""Connections that one turn of the event loop takes."""
+WAITING = 128
+"""Connections that wait in the system, at no cost to us, until they are taken."""
+REQUEST_S = 10.0
+"""From a connection, or the first byte of a further request on it, to the last byte of the request."""
+SEND_S = 10.0
+"""For a reader that does not read."""
+IDLE_S = 5
+"""Between two requests on one connection."""
+GRACE_S = 2
+"""Time that requests under way are given when the daemon ends, in whole seconds."""
+MOST_DESCRIPTORS = 65536
+
+log = logging.getLogger("acquire.daemon")
+
+
+def raise_descriptor_limit() -> int:
+    """As many descriptors as this user may have, within reason; the limit from now on."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = MOST_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, MOST_DESCRIPTORS)
+    if soft == resource.RLIM_INFINITY or soft >= wanted:
+        return soft
+    with contextlib.suppress(OSError, ValueError):
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+        return wanted
+    return soft
+
+
+class Listener(socket.socket):
+    """A listening socket that can still accept one connection when the process has no descriptor left."""
+
+    _spare = -1
+    _paused = False
+
+    def keep_spare(self) -> None:
+        """Set a descriptor aside, unless there is one."""
+        if self._spare < 0:
+            with contextlib.suppress(OSError):
+                self._spare = os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
+
+    def listen(self, backlog: int = WAITING, /) -> None:
+        """With a queue of `WAITING`: the event loop's own number is how many it takes in one turn."""
+        super().listen(max(backlog, WAITING))
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        """As any socket's. At the limit the spare descriptor serves; then the event loop waits a second."""
+        if self._paused:  # it has been told once in this turn of the loop, which asks again at once
+            self._paused = False
+            raise BlockingIOError(errno.EAGAIN, "no descriptor is left")
+        self.keep_spare()
+        try:
+            return super().accept()
+        except OSError as error:
+            if error.errno not in (errno.EMFILE, errno.ENFILE):
+                raise
+        if self._give_spare():
+            with contextlib.suppress(OSError):
+                return super().accept()
+        self._paused = True
+        raise OSError(errno.EMFILE, "no descriptor is left for a connection")
+
+    def close(self) -> None:
+        self._give_spare()
+        super().close()
+
+    def _give_spare(self) -> bool:
+        spare, self._spare = self._spare, -1
+        if spare >= 0:
+            os.close(spare)
+        return spare >= 0
+
+
+class Connection(H11Protocol):
+    """One client. uvicorn ends what is idle after an answer; the rest is ended here."""
+
+    def __init__(self, *args: Any, on_lost: Callable[[], None], **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._on_lost = on_lost
+        self._timer: asyncio.TimerHandle | None = None
+        self._waiting_since: float | None = None
+
+    @property
+    def is_working(self) -> bool:
+        """A whole request is here and not answered."""
+        cycle: RequestResponseCycle | None = self.cycle  # none before the first request
+        return cycle is not None and not cycle.more_body and not cycle.response_complete
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        self._wait(REQUEST_S)
+        if len(self.connections) > MOST_CONNECTIONS:
+            self._make_room()
+
+    def data_received(self, data: bytes) -> None:
+        super().data_received(data)
+        if self.is_working:
+            self._cancel()
+        elif self._timer is None:
+            self._wait(REQUEST_S)
+
+    def on_response_complete(self) -> None:
+        super().on_response_complete()
+        if not self.cycle.more_body:
+            self._cancel()
+            self._waiting_since = self.loop.time()
+
+    def pause_writing(self) -> None:
+        super().pause_writing()
+        self._wait(SEND_S)
+
+    def resume_writing(self) -> None:
+        super().resume_writing()
+        self._cancel()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._cancel()
+        super().connection_lost(exc)
+        self.loop.call_soon(self._on_lost)  # the descriptor is free after this call
+
+    def _wait(self, seconds: float) -> None:
+        self._cancel()
+        self._waiting_since = self.loop.time()
+        self._timer = self.loop.call_later(seconds, self.transport.abort)
+
+    def _cancel(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = self._waiting_since = None
+
+    def _make_room(self) -> None:
+        """End the connection that has waited for longest; this one, where all others are at work."""
+        others = [cast("Connection", one) for one in self.connections if one is not self]
+        idle = [one for one in others if not one.is_working] or [self]
+        longest = min(idle, key=lambda one: one._waiting_since or 0.0)
+        self.connections.discard(longest)
+        longest.transport.abort()
+        log.warning("more than %d connections: the longest idle one is closed", MOST_CONNECTIONS)
+
+
+class ApiServer(uvicorn.Server):
+    """Serves an API on a listener, within the bounds of this module. Signals are its owner's business."""
+
+    def __init__(self, app: ASGIApp, listener: Listener) -> None:
+        config = uvicorn.Config(
+            app,
+            log_config=None,
+            access_log=False,
+            lifespan="off",
+            http=functools.partial(Connection, on_lost=listener.keep_spare),  # type: ignore[arg-type]
+            ws="none",
+            backlog=AT_ONCE,
+            timeout_keep_alive=IDLE_S,
+            timeout_graceful_shutdown=GRACE_S,
+        )
+        super().__init__(config)
+        self._listener = listener
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """They must drain the recording before the API goes away."""
+        yield
+
+    async def answer(self) -> None:
+        """Until `should_exit`."""
+        self._listener.keep_spare()
+        await self.serve(sockets=[self._listener])
