@@ -27,7 +27,11 @@ class EventsConfig(FrozenModel):
     average_lines: int = Field(default=64, ge=1, le=65536, description="lines that the mean is taken over")
     pre_s: float = Field(default=0.0, ge=0, description="recorded from before the event, as the ring has it")
     post_s: float = Field(default=1.0, gt=0, description="recorded after the last event")
-    rearm: bool = Field(default=False, description="stay armed after such a recording, for the next event")
+    rearm: bool = Field(
+        default=False,
+        description="every event starts a recording, and the instrument stays armed for the next; "
+        "false: only the first event since it was armed",
+    )
 
     @model_validator(mode="after")
     def _level_known(self) -> EventsConfig:

@@ -71,6 +71,18 @@ class RecordingConfig(FrozenModel):
         ge=0,
         description="of the disk left free; a recording is sealed before that",
     )
+    after: Literal["armed", "idle"] = Field(
+        default="armed",
+        description="the state that a recording's end leads to: 'armed', where the rings go on holding the "
+        "latest lines for the next recording, or 'idle'",
+    )
+    seal_timeout_s: float = Field(
+        default=60.0,
+        gt=0,
+        le=3600,
+        description="longest time in which nothing more of an ending recording reaches the disk; "
+        "beyond it, a fault",
+    )
     retention: RetentionConfig | None = Field(default=None, description="absent: all is kept")
     upload_to: str | None = Field(
         default=None,

@@ -29,7 +29,7 @@ import numpy as np
 
 from acquire.config import builtin_directory
 from acquire.daemon.client import Client
-from acquire.daemon.states import State
+from acquire.daemon.states import SEALED, State
 from acquire.errors import AcquireError
 from acquire.lines import ARMS, LineFlag
 from acquire.sim.pattern import Pattern
@@ -147,7 +147,8 @@ class Storm:
         status = client.status()
         if status.state is State.RECORDING:
             client.stop()
-        client.wait({State.IDLE}, WAIT_S)
+        if client.wait(SEALED, WAIT_S).state is State.ARMED:
+            client.disarm()
 
     def _end_daemon(self, daemon: subprocess.Popen[bytes], status: Status) -> None:
         time.sleep(self._chance.uniform(0, LONGEST_PAUSE_S))

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 SocketOption = Annotated[
     Path | None, typer.Option("--socket", envvar="ACQUIRE_SOCKET", help="The daemon's control socket.")
 ]
+SEALED_WORD = "sealed"
+"""For ``status --wait``: any state in which no recording is under way."""
 DAMAGED = ("INCOMPLETE", "ABORTED", None)
 """Conditions of a recording that lost something."""
 RECOVERIES = UPLOADS = 3
@@ -96,6 +98,8 @@ def mark(
 def stop(socket: SocketOption = None, json: JsonFlag = False) -> None:
     """End the recording; returns once it is sealed. Exit code 6 if lines were lost.
 
+    The instrument stays armed for the next recording, unless the rig says recording.after = "idle".
+
     Example: [bold]acquire stop[/]
     """
     with _daemon(socket) as daemon:
@@ -116,7 +120,11 @@ def disarm(socket: SocketOption = None, json: JsonFlag = False) -> None:
 
 def status(
     wait: Annotated[
-        str | None, typer.Option(metavar="STATE", help="Wait until the daemon is in this state first.")
+        str | None,
+        typer.Option(
+            metavar="STATE",
+            help="First wait for this state, or for 'sealed': no recording is under way any more.",
+        ),
     ] = None,
     timeout: Annotated[float, typer.Option(metavar="SECONDS", help="Longest wait; then exit code 4.")] = 60.0,
     socket: SocketOption = None,
@@ -124,14 +132,15 @@ def status(
 ) -> None:
     """What the daemon is doing, and how well.
 
-    Example: [bold]acquire status --wait idle --timeout 30[/]
+    Example: [bold]acquire status --wait sealed --timeout 30[/]
     """
-    from acquire.daemon.states import State
+    from acquire.daemon.states import SEALED, State
 
-    if wait is not None and wait not in list(State):
-        raise UsageError(f"status --wait {wait}", possible=", ".join(State))
+    waits = {SEALED_WORD: SEALED, **{str(state): frozenset({state}) for state in State}}
+    if wait is not None and wait not in waits:
+        raise UsageError(f"status --wait {wait}", possible=", ".join(waits))
     with _daemon(socket) as daemon:
-        _show(daemon.status() if wait is None else daemon.wait({State(wait)}, timeout), json)
+        _show(daemon.status() if wait is None else daemon.wait(waits[wait], timeout), json)
 
 
 def _daemon(socket: Path | None) -> Client:
@@ -161,7 +170,7 @@ def _show(status: Status, json: bool) -> None:
             "not sealed": _recoveries(status),
             "uploads": _uploads(status),
             "sustains": _capacity(status),
-            "possible": ", ".join(status.possible) or "wait until it is idle",
+            "possible": ", ".join(status.possible),
         }
     )
     if status.arms:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from acquire.cli.demo_plan import trigger_settings
 from acquire.cli.progress import stage_progress
 from acquire.daemon.client import Client
-from acquire.daemon.states import State
+from acquire.daemon.states import SEALED, State
 from acquire.errors import AcquireError, DataError, NoDaemonError
 
 if TYPE_CHECKING:
@@ -143,9 +143,9 @@ def _record(client: Client, path: Path, lines: int) -> Captured:
 
 
 def follow(client: Client, lines: int, advance: Callable[[int, int], None]) -> Status:
-    """Poll until the daemon is idle again; give up when nothing moves."""
+    """Poll until the recording is sealed; give up when nothing moves."""
     seen, moved = -1, time.monotonic()
-    while (status := client.status()).state not in {State.IDLE, State.FAULTED}:
+    while (status := client.status()).state not in SEALED | {State.FAULTED}:
         now = status.recording.recorded_lines if status.recording else lines
         advance(now, lines)
         if now != seen:

@@ -5,7 +5,7 @@
     with Client(Path("/run/user/1000/acquire.sock")) as daemon:
         daemon.arm()
         daemon.start(lines=100_000)
-        daemon.wait({State.IDLE}, timeout_s=60)
+        daemon.wait(SEALED, timeout_s=60)
 """
 
 from __future__ import annotations
@@ -94,7 +94,7 @@ class Client:
         return self._call("POST", "mark", body=_request("mark", MarkRequest, text=text))
 
     def stop(self) -> Status:
-        """recording → idle: returns once the recording is sealed."""
+        """recording → armed: returns once the recording is sealed."""
         return self._call("POST", "stop")
 
     def disarm(self) -> Status:
@@ -114,7 +114,13 @@ class Client:
                     f"waiting for {wanted}, but the daemon is faulted: {status.fault}", hint="acquire disarm"
                 )
             if time.monotonic() >= deadline:
-                raise StateError(f"still {status.state} after waiting {timeout_s:g} s for {wanted}")
+                staying = status.state is State.ARMED and State.IDLE in states
+                raise StateError(
+                    f"still {status.state} after waiting {timeout_s:g} s for {wanted}",
+                    hint="acquire disarm, or wait for sealed: a recording's end leaves the instrument armed"
+                    if staying
+                    else "",
+                )
             time.sleep(POLL_S)
         return status
 

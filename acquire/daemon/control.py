@@ -6,6 +6,7 @@ published last, so that it never waits for a device.
 
 from __future__ import annotations
 
+import asyncio
 from typing import TYPE_CHECKING, Any, Protocol
 
 from fastapi import FastAPI, Request
@@ -22,8 +23,10 @@ from acquire.daemon.messages import (
     StartRequest,
     Status,
     error_body,
+    fault_error,
     http_status,
 )
+from acquire.daemon.states import State
 from acquire.errors import AcquireError, UsageError
 from acquire.text import shortened
 
@@ -32,6 +35,7 @@ if TYPE_CHECKING:
 
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+POLL_S = 0.02
 MAX_BODY_BYTES = 2**16
 """No request is longer than a path and a number."""
 MOST_EXPLAINED = 5
@@ -86,15 +90,19 @@ def build_app(service: Commands, run: Callable[[Callable[[], None]], Awaitable[N
         await run(lambda: service.start(request))
         return service.status()
 
-    @app.post("/mark", summary="armed or recording: an event at the newest line")
+    @app.post("/mark", summary="armed, recording or draining: an event at the newest line")
     async def mark(request: MarkRequest) -> Status:
         await run(lambda: service.mark(request.text))
         return service.status()
 
-    @app.post("/stop", summary="recording → draining → idle; returns once the recording is sealed")
+    @app.post("/stop", summary="recording → draining → armed; returns once the recording is sealed")
     async def stop() -> Status:
         await run(service.stop)
-        return service.status()
+        while (status := service.status()).state is State.DRAINING:
+            await asyncio.sleep(POLL_S)
+        if status.state is State.FAULTED:
+            raise fault_error(status.fault)
+        return status
 
     @app.post("/disarm", summary="armed → idle; clears a fault")
     async def disarm() -> Status:

@@ -29,12 +29,24 @@ def window_of(request: StartRequest, line_rate_hz: float) -> Window:
 
 
 class StandingOrder:
-    """What is to happen at an event."""
+    """What is to happen at an event, from one arming to the next.
+
+    Attributes
+    ----------
+    rearm : every event starts a recording, not only the first
+    used : an event has started a recording
+    """
 
     def __init__(self, config: RigConfig) -> None:
         self._events = config.events
         self._rate_hz = config.line_rate_hz
         self.rearm = config.events.rearm
+        self.used = False
+
+    @property
+    def waits(self) -> bool:
+        """The next event starts a recording."""
+        return self.rearm or not self.used
 
     def covers(self, note: Note) -> bool:
         """The event starts a recording, or prolongs the one that an event started."""

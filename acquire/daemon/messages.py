@@ -128,7 +128,7 @@ class LedgerStatus(_Message):
 
     issued: int = Field(description="by the trigger, as far as tags and lines tell")
     preroll: int = Field(description="exposed before the run's start")
-    stored: int = Field(description="in recordings")
+    stored: int = Field(description="in recordings; a line that several hold counts once")
     discarded: int = Field(description="in none: nobody asked for them, or the recording had ended before")
     lost: dict[str, int] = Field(description="cause → lines")
     waiting: int = Field(description="in the ring")
@@ -154,8 +154,8 @@ class ArmStatus(_Message):
     preroll: int = Field(description="exposed before the run's start, discarded")
     discarded: int = Field(
         default=0,
-        description="taken while nothing was recorded, or outside the recording; once idle, delivered = "
-        "preroll + discarded + lost.ring_full + recorded - missing",
+        description="in no recording; once idle, delivered = preroll + discarded + lost.ring_full + "
+        "ledger.stored",
     )
     lost: dict[str, int] = Field(description="cause → lines")
     recorded: int = Field(description="rows of the latest recording")
@@ -294,6 +294,11 @@ HTTP_STATUS: tuple[tuple[type[AcquireError], int], ...] = (
 
 def http_status(error: AcquireError) -> int:
     return next(status for kind, status in HTTP_STATUS if isinstance(error, kind))
+
+
+def fault_error(fault: str | None) -> DeviceError:
+    """What a command raises that ends in a fault."""
+    return DeviceError(f"fault: {fault}", hint="acquire disarm, then look at the device")
 
 
 def error_body(error: AcquireError) -> dict[str, Any]:

@@ -24,7 +24,8 @@ from acquire.daemon.notify import notify
 from acquire.daemon.plan import Run
 from acquire.daemon.proof import Proof
 from acquire.daemon.salvage import Salvage
-from acquire.daemon.service import DRAIN_TIMEOUT_S, RECOVERY_S, Service
+from acquire.daemon.service import Service
+from acquire.daemon.states import State
 from acquire.daemon.troubles import Troubles
 from acquire.daemon.uploads import Uploads
 from acquire.errors import EXIT_INTERRUPTED, StateError
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
 
 SUPERVISE_S = 0.2
 """Time between two looks at the capture path."""
+DRAIN_S = 0.05
+"""The same while somebody waits for a recording to be sealed."""
 MOST_WAITING = 8
 """Commands that wait for the one under way; each holds a connection."""
 
@@ -104,20 +107,33 @@ class Daemon:
             except Exception as error:  # noqa: BLE001 - a defect in one look must not end the service
                 self._troubles.note("supervision", error)
             notify("WATCHDOG=1")
+            draining = self._service.status().state is State.DRAINING
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._ending.wait(), SUPERVISE_S)
+                await asyncio.wait_for(self._ending.wait(), DRAIN_S if draining else SUPERVISE_S)
 
     async def _end(self, serving: asyncio.Task[None]) -> None:
         """Seal and release first, while the status is still answered; then close the API."""
         self._ending.set()
         notify("STOPPING=1")
+        patience = asyncio.create_task(self._wait_for_the_disk())
         try:
             await self._in_device_thread(self._service.shutdown)
         finally:
+            patience.cancel()
             self._server.should_exit = True
             await serving
             self._devices.shutdown()
         log.info("ended")
+
+    async def _wait_for_the_disk(self) -> None:
+        """Grant a recording that is being sealed more time, as long as more of it reaches the disk."""
+        known = None
+        while not self._service.hurried:
+            now = self._service.status().recording
+            if now is not None and now != known:
+                known = now
+                self._last_resort.within(END_S + self._service.patience_s)
+            await asyncio.sleep(SUPERVISE_S)
 
     async def _command(self, work: Callable[[], None]) -> None:
         if self._ending.is_set():
@@ -145,7 +161,6 @@ class Daemon:
             self._last_resort.within(END_S)
             return
         log.info("%s: ending", number.name)
-        recording = self._service.status().recording is not None
-        self._last_resort.within(END_S + (DRAIN_TIMEOUT_S + RECOVERY_S if recording else 0.0))
+        self._last_resort.within(END_S)
         self._exit_code = EXIT_INTERRUPTED if number is signal.SIGINT else 0
         self._ending.set()

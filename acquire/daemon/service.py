@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import math
 import os
 import threading
 import time
@@ -18,11 +17,12 @@ from typing import TYPE_CHECKING, Protocol
 
 from acquire import __version__
 from acquire.daemon.events import StandingOrder, budget_lines, window_of
-from acquire.daemon.messages import ArmRequest, LastRecording, RecordingStatus, Status
+from acquire.daemon.messages import ArmRequest, LastRecording, Status, fault_error
 from acquire.daemon.plan import default_path
 from acquire.daemon.report import Rates, arm_statuses, delivered_lines
 from acquire.daemon.salvage import Salvage
 from acquire.daemon.states import Event, State, after, commands
+from acquire.daemon.take import Take
 from acquire.daemon.troubles import Troubles
 from acquire.daemon.uploads import Uploads
 from acquire.errors import AcquireError, DeviceError
@@ -37,10 +37,8 @@ if TYPE_CHECKING:
     from acquire.stream import Window
     from acquire.stream.messages import Note
 
-DRAIN_TIMEOUT_S = 30.0
-"""From the last line's number to the sealed recording; more is a fault."""
 RECOVERY_S = 20.0
-"""How long the end of a run waits for recordings of it that are being recovered."""
+"""How long a recording's end waits for parts of it that are being recovered; they are recovered all the same."""
 POLL_S = 0.05
 ARM = ArmRequest()
 
@@ -96,10 +94,7 @@ class Service:
         self._seen = CaptureStatus()
         self._rates = Rates()
         self._order = StandingOrder(config)
-        self._by_event = False
-        self._late: Note | None = None
-        self._target: tuple[Path, int | None] | None = None
-        self._drain_until = math.inf
+        self._take: Take | None = None
         self._last: LastRecording | None = None
         self._fault: str | None = None
         self._publish()
@@ -110,6 +105,15 @@ class Service:
         """What was published last; never waits."""
         uptime_s = round(time.monotonic() - self._born, 3)
         return self._status.model_copy(update={"uptime_s": uptime_s, "troubles": self.troubles.statuses})
+
+    @property
+    def patience_s(self) -> float:
+        """How long a recording's end may take while nothing more of it reaches the disk."""
+        return self._config.recording.seal_timeout_s + RECOVERY_S
+
+    @property
+    def hurried(self) -> bool:
+        return self._hurried.is_set()
 
     def hurry(self) -> None:
         """Do not wait for lines on the way any more: seal what there is."""
@@ -129,6 +133,7 @@ class Service:
             run = self._open_run()
             run.arm()
             self._run, self._seen, self._rates = run, CaptureStatus(), Rates()
+            self._order = StandingOrder(self._config)
             self._go(Event.ARM, run.run_id)
             self.supervise()
 
@@ -138,7 +143,6 @@ class Service:
             rate_hz = self._config.line_rate_hz
             window = window_of(request, rate_hz)
             self._begin(request.path, budget_lines(request, rate_hz), window, resume=request.resume)
-            self._by_event = False
             self.supervise()
 
     def mark(self, text: str) -> None:
@@ -148,9 +152,12 @@ class Service:
             self._heed(self._run.mark(text))
 
     def stop(self) -> None:
-        """recording → draining → idle; returns once the recording is sealed and the devices are released."""
+        """recording → draining. What is on the way is written and sealed while `supervise` looks after it:
+        marks can be taken meanwhile.
+        """
         with self._doing(Event.STOP):
             self._stop("stopped")
+            self.supervise()
 
     def disarm(self) -> None:
         """armed → idle; or clears a fault."""
@@ -199,7 +206,9 @@ class Service:
             if self._state is State.RECORDING:
                 self._stop("signal")
             while self._state is State.DRAINING:
-                self._drain_on()
+                self.supervise()
+                if self._state is State.DRAINING:
+                    self._hurried.wait(POLL_S)
             if self._state is State.ARMED:
                 self.disarm()
         except (AcquireError, OSError) as error:
@@ -216,14 +225,6 @@ class Service:
         assert self._run is not None
         self._run.stop(reason)
         self._go(Event.STOP, reason)
-        while self._state is State.DRAINING:
-            self._drain_on()
-        self._recovered(self._salvage.wait(RECOVERY_S))
-
-    def _drain_on(self) -> None:
-        self.supervise()
-        if self._state is State.DRAINING:
-            self._hurried.wait(POLL_S)
 
     def _look(self) -> None:
         """One step of the state table, as the capture path dictates it."""
@@ -238,10 +239,12 @@ class Service:
             self._go(Event.FULL)
         if self._state is not State.DRAINING:
             return
-        if seen.done or self._hurried.is_set():
-            self._finish()
-        elif time.monotonic() > self._drain_until:
-            self._fail(f"the recording was not sealed within {DRAIN_TIMEOUT_S:g} s after its last line")
+        assert self._take is not None
+        limit_s = self._config.recording.seal_timeout_s
+        if seen.done or self.hurried:
+            self._finish(self._take)
+        elif self._take.idle_s(seen) > limit_s:
+            self._fail(f"the recording was not sealed: nothing more of it reached the disk for {limit_s:g} s")
 
     def _poll(self) -> CaptureStatus:
         assert self._run is not None
@@ -252,14 +255,22 @@ class Service:
         self._rates.look(delivered_lines(self._seen))
         return self._seen
 
-    def _begin(self, path: Path | None, lines: int | None, window: Window, *, resume: bool = False) -> None:
+    def _begin(
+        self,
+        path: Path | None,
+        lines: int | None,
+        window: Window,
+        *,
+        resume: bool = False,
+        by_event: bool = False,
+    ) -> None:
         assert self._run is not None
         path = self._run.start(path or default_path(self._config), lines, window, resume=resume)
         self._uploads.forget(path)
         self._uploads.add(path)
         if window.post_lines is not None:
             lines = window.pre_lines + window.post_lines
-        self._target = path, lines
+        self._take = Take(path, lines, by_event)
         self._go(Event.START, f"{path}, {'until stopped' if lines is None else f'{lines} lines'}")
 
     def _heed(self, note: Note) -> None:
@@ -268,32 +279,40 @@ class Service:
         log.info("event: %s at line %d%s", note.kind, note.line, f": {note.text}" if note.text else "")
         if not self._order.covers(note):
             return
-        if self._state is State.ARMED:
-            self._begin(None, None, self._order.window(note))
-            self._by_event = True
-        elif self._state is State.RECORDING and self._by_event:
+        take = self._take
+        if take is None and self._order.waits:
+            self._begin(None, None, self._order.window(note), by_event=True)
+            self._order.used = True
+        elif take is None:
+            log.info("the event starts no recording: another did since the instrument was armed")
+        elif take.by_event and self._state is State.RECORDING:
             self._run.extend(self._order.end_line(note))
-        elif self._state is State.DRAINING and self._by_event and self._order.rearm:
-            self._late = self._late or note
+        elif take.by_event and take.late is None:
+            take.late = note
 
-    def _finish(self) -> None:
-        if self._by_event and self._order.rearm and self._seen.done and not self._hurried.is_set():
+    def _finish(self, take: Take) -> None:
+        """The recording is over: stay armed for the next, or release the devices."""
+        aborted = self._seen.condition is RunCondition.ABORTED
+        stays = self._config.recording.after == "armed" or (take.by_event and self._order.rearm)
+        stays = stays and self._seen.done and not aborted and not self.hurried
+        if stays:
             self._remember()
-            self._go(Event.KEPT, self._last_words())
-            if (late := self._late) is not None:
-                self._late = None
-                self._heed(late)
-            return
-        self._release()
-        if self._seen.condition is RunCondition.ABORTED:
-            self._fail(f"the recording was aborted: {self._seen.end_reason}")
         else:
-            self._go(Event.SEALED, self._last_words())
+            self._release()
+        self._recovered(self._salvage.wait(RECOVERY_S))
+        if aborted:
+            self._fail(f"the recording was aborted: {self._seen.end_reason}")
+            return
+        self._go(Event.SEALED if stays else Event.RELEASED, self._last_words())
+        if stays and take.late is not None:
+            self._heed(take.late)
 
     def _with_cause(self, trouble: str) -> str:
         """What went wrong while ending often follows from what ended it: that comes first."""
-        seen = self._seen
-        cause = seen.fault or (seen.end_reason if seen.condition is not RunCondition.GOOD else None)
+        seen, cause = self._seen, self._seen.fault
+        ending = self._state in (State.RECORDING, State.DRAINING)
+        if cause is None and ending and seen.condition is not RunCondition.GOOD:
+            cause = seen.end_reason
         return f"{cause}; then, while ending: {trouble}" if cause else trouble
 
     def _fail(self, text: str) -> None:
@@ -325,16 +344,8 @@ class Service:
             self._publish()
 
     def _remember(self) -> None:
-        if self._target is None:
-            return
-        (path, _), self._target = self._target, None
-        path = Path(self._seen.path or path)
-        self._last = LastRecording(
-            path=path,
-            lines=self._seen.committed_lines,
-            condition=None if self._seen.condition is None else str(self._seen.condition),
-            end_reason=self._seen.end_reason,
-        )
+        if self._take is not None:
+            self._last, self._take = self._take.result(self._seen), None
 
     def _recovered(self, found: list[RecoveryStatus]) -> None:
         """The latest recording may have been among what its recorder did not seal."""
@@ -365,7 +376,7 @@ class Service:
         try:
             yield
             if self._state is State.FAULTED:
-                raise DeviceError(f"fault: {self._fault}", hint="acquire disarm, then look at the device")
+                raise fault_error(self._fault)
         except AcquireError as error:
             log.error("%s: %s", command, error)  # noqa: TRY400
             raise
@@ -376,9 +387,6 @@ class Service:
     def _go(self, event: Event, why: str = "") -> None:
         before, self._state = self._state, after(self._state, event)
         self._since = datetime.now(UTC)
-        self._drain_until = math.inf
-        if self._state is State.DRAINING:
-            self._drain_until = time.monotonic() + DRAIN_TIMEOUT_S
         level = logging.ERROR if event is Event.FAULT else logging.INFO
         log.log(level, "%s → %s (%s%s)", before, self._state, event, f": {why}" if why else "")
         self._publish()
@@ -394,7 +402,7 @@ class Service:
             pid=os.getpid(),
             uptime_s=0.0,
             run_id=None if self._run is None else self._run.run_id,
-            recording=self._recording(),
+            recording=None if self._take is None else self._take.status(self._seen),
             arms=arm_statuses(self._seen, self._rates),
             last=self._last,
             fault=self._fault,
@@ -404,16 +412,4 @@ class Service:
             uploads=self._uploads.statuses,
             uploads_left=self._uploads.left,
             upload_warning=self._uploads.warning,
-        )
-
-    def _recording(self) -> RecordingStatus | None:
-        if self._target is None:
-            return None
-        path, budget = self._target
-        return RecordingStatus(
-            path=Path(self._seen.path or path),
-            first_line=self._seen.first_line,
-            budget_lines=budget,
-            recorded_lines=self._seen.recorded_lines,
-            committed_lines=self._seen.committed_lines,
         )

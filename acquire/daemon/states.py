@@ -2,17 +2,20 @@
 
 ::
 
-                ARM             START               STOP, FULL               SEALED
-       idle ──────────▶ armed ──────────▶ recording ──────────▶ draining ──────────▶ idle
-         ▲               │  │ ▲               │                    │
-         │               │  │ └───── KEPT ────┼────────────────────┤
-         ├── DISARM ─────┘  │ FAULT           │ FAULT              │ FAULT
-         │                  ▼                 ▼                    ▼
-         └── DISARM ───────────────────── faulted ◀────────────────┘
+                ARM             START               STOP, FULL
+       idle ──────────▶ armed ──────────▶ recording ──────────▶ draining
+         ▲               │  ▲                 │                  │ │ │
+         │               │  └──────── SEALED ─┼──────────────────┘ │ │
+         ├── DISARM ─────┤                    │                    │ │
+         ├── RELEASED ───┼────────────────────┼────────────────────┘ │
+         │               │ FAULT              │ FAULT                │ FAULT
+         │               ▼                    ▼                      │
+         └── DISARM ── faulted ◀─────────────────────────────────────┘
 
-ARM, START, MARK (armed or recording, which it stays), STOP and DISARM are commands; FULL (the line budget is
-recorded), SEALED (the recording is closed and the devices are released), KEPT (it is closed, and the devices
-wait for the next event) and FAULT come from the capture path. What is not drawn is refused.
+ARM, START, MARK (armed, recording or draining, which it stays), STOP and DISARM are commands. The others come
+from the capture path: FULL (the line budget is recorded), SEALED (the recording is closed, the instrument
+stays armed for the next), RELEASED (it is closed, and the devices are released, as the rig or a signal asks)
+and FAULT. What is not drawn is refused.
 """
 
 from __future__ import annotations
@@ -37,6 +40,10 @@ class State(StrEnum):
     """A device or the capture path failed; the devices are released, the fault waits to be read."""
 
 
+SEALED = frozenset({State.IDLE, State.ARMED})
+"""States in which no recording is under way."""
+
+
 class Event(StrEnum):
     """What can happen to the daemon."""
 
@@ -47,7 +54,7 @@ class Event(StrEnum):
     DISARM = "disarm"
     FULL = "full"
     SEALED = "sealed"
-    KEPT = "kept"
+    RELEASED = "released"
     FAULT = "fault"
 
 
@@ -64,8 +71,9 @@ TABLE: dict[tuple[State, Event], State] = {
     (State.RECORDING, Event.STOP): State.DRAINING,
     (State.RECORDING, Event.FULL): State.DRAINING,
     (State.RECORDING, Event.FAULT): State.FAULTED,
-    (State.DRAINING, Event.SEALED): State.IDLE,
-    (State.DRAINING, Event.KEPT): State.ARMED,
+    (State.DRAINING, Event.MARK): State.DRAINING,
+    (State.DRAINING, Event.SEALED): State.ARMED,
+    (State.DRAINING, Event.RELEASED): State.IDLE,
     (State.DRAINING, Event.FAULT): State.FAULTED,
     (State.FAULTED, Event.DISARM): State.IDLE,
 }
@@ -85,4 +93,4 @@ def commands(state: State) -> tuple[Event, ...]:
 
 
 def _possible(state: State) -> str:
-    return ", ".join(commands(state)) or "wait until it is idle"
+    return ", ".join(commands(state))

@@ -256,7 +256,9 @@ class Capture:
             others = counters[f"discarded_{arm}"] + counters[f"unsaved_{arm}"]
             counters[f"stored_{arm}"] = ring.released_lines - others
         worker = self._new_recorder()
-        worker.post(RunStarted(self.clock))
+        assert self._supervisor is not None
+        kept = {arm: self._supervisor.kept(arm, ring.released_line) for arm, ring in self._rings.items()}
+        worker.post(RunStarted(self.clock, kept))
         return worker
 
     def _next_grabber(self, name: str) -> Worker | None:

@@ -42,9 +42,12 @@ class Failed:
 
 @dataclass(frozen=True, slots=True)
 class RunStarted:
-    """The trigger started; from now on its tags arrive."""
+    """The trigger started; from now on its tags arrive. ``kept``: arm → ranges of lines, first and end, that
+    are in recordings already, for the successor of a recorder.
+    """
 
     clock: ClockFit
+    kept: dict[str, list[tuple[int, int]]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

@@ -32,6 +32,7 @@ from acquire.lines import ARMS
 from acquire.store import RecordingWriter, RunCondition
 from acquire.store.files import DISK, Disk
 from acquire.store.suspect import CODE_EVENTS, DOUBTFUL
+from acquire.stream.kept import Kept
 from acquire.stream.losses import Cause
 from acquire.stream.messages import (
     Began,
@@ -154,7 +155,6 @@ class Recorder:
         self._closing: tuple[Session, Future[Sealed]] | None = None
         self._notes: deque[Note] = deque(maxlen=_NOTES)
         self._line_rate_hz = 0.0
-        self._free_from = 0
         self._trouble: tuple[str, dict[str, Cause]] | None = None
         self._owner = True
         self._busy = False
@@ -204,7 +204,9 @@ class Recorder:
 
     def _obey(self, message: object) -> None:
         match message:
-            case RunStarted(clock):
+            case RunStarted(clock, kept):
+                for name, arm in self._arms.items():
+                    arm.kept = Kept(kept.get(name, ()))
                 self._tagger = Tagger(self._plan.run, self._plan.stages, clock)
                 self._line_rate_hz = clock.clock_hz / self._plan.run.line_period_ticks
             case Begin():
@@ -233,10 +235,17 @@ class Recorder:
 
     def _hold(self, begin: Begin) -> Span:
         """Keep from being discarded what the recording begins with."""
-        held = hold(begin.window, {name: arm.ring for name, arm in self._arms.items()}, self._free_from)
-        for name, lines in held.taken.items():
-            self._counters.add(f"discarded_{name}", -lines)
+        held = hold(begin.window, {name: arm.ring for name, arm in self._arms.items()})
+        for name, blocks in held.taken.items():
+            for lines in blocks:
+                self._count(name, lines.start, lines.stop, -1)
         return span(begin.window, begin.lines, held, self._line_rate_hz)
+
+    def _count(self, name: str, first: int, end: int, sign: int = 1) -> None:
+        """Lines of a block that leaves the ring; with ``sign`` -1, of one that was taken back."""
+        stored = self._arms[name].kept.count(first, end)
+        self._counters.add(f"stored_{name}", sign * stored)
+        self._counters.add(f"discarded_{name}", sign * (end - first - stored))
 
     def _note(self, note: Note) -> None:
         self._notes.append(note)
@@ -276,12 +285,10 @@ class Recorder:
             (session, sealed), self._closing = self._closing, None
             self._publish(session)
             for name, lines in session.surplus.items():
-                self._counters.add(f"stored_{name}", -lines)
-                self._counters.add(f"discarded_{name}", lines)
+                self._forget(name, lines, session.end_line, "discarded")
             for name, lines in session.left_out.items():
-                self._counters.add(f"stored_{name}", -lines)
                 # Of a block that was taken in part, all lines are counted as discarded.
-                self._counters.add(f"unsaved_{name}" if lines > 0 else f"discarded_{name}", lines)
+                self._forget(name, lines, session.end_line, "unsaved" if lines > 0 else "discarded")
             self._mailbox.post(sealed.result())
 
     def _is_ready_for(self, opening: Opening) -> bool:
@@ -289,6 +296,17 @@ class Recorder:
         if opening.span is not None or opening.writer.exception() is not None:
             return True
         return all(2 * arm.ring.fill < arm.ring.shape.slots for arm in self._arms.values())
+
+    def _forget(self, name: str, lines: int, end_line: int, place: str) -> None:
+        """The recording ends before so many lines that were taken for it: they belong to ``place``, unless an
+        earlier recording has them. Below 0: the disk kept more than was counted.
+        """
+        kept = self._arms[name].kept
+        kept.end_at(end_line)
+        if lines > 0:
+            lines -= kept.count(end_line, end_line + lines)
+        self._counters.add(f"stored_{name}", -lines)
+        self._counters.add(f"{place}_{name}", lines)
 
     def _opened(self, opening: Opening) -> None:
         """From the newest line on: both arms have still to deliver what comes after it; or from the past."""
@@ -306,6 +324,7 @@ class Recorder:
         for arm in self._arms.values():
             arm.revive(time.monotonic())
             arm.backlog = Backlog()
+            arm.kept.begin(arm.ring.history_line)
         self._publish(self._session)
         end_line = self._session.end_line
         self._mailbox.post(Began(first_line, None if end_line == OPEN_END else end_line))
@@ -347,7 +366,6 @@ class Recorder:
                 error = error or another
         self._session = None
         self._counters["writing"] = 0
-        self._free_from = min(session.end_line, max(book.next_line for book in session.books.values()))
         self._publish(session)
         self._closing = session, self._disk.submit(session.close, error)
 
@@ -383,7 +401,7 @@ class Recorder:
         block = arm.ring.acquire()
         if block is None or not self._may_go(arm.ring, block):
             return False
-        arm.lent = Lent(len(block.flags))
+        arm.lent = Lent(block.first_line, block.end_line)
         if self._session is None:
             self._release(name, arm)
         else:
@@ -404,7 +422,10 @@ class Recorder:
             session.cut(line, f"too slow to write: the ring of arm {name} was full at line {line}")
         self._count_overrun(name, block, session)
         with self._counting():
-            arm.lent.written = session.take(name, block, hurry=arm.ring.fill > _CALM_BLOCKS)
+            written = session.take(name, block, hurry=arm.ring.fill > _CALM_BLOCKS)
+        if written:
+            end_line = session.books[name].next_line
+            arm.kept.add(end_line - written, end_line)
         fill, slots = arm.ring.fill, arm.ring.shape.slots
         if arm.backlog.grows(fill, slots) and not session.ending:
             # Before the slot is released: nothing has been lost as long as the ring is not overtaken.
@@ -430,8 +451,7 @@ class Recorder:
                 with self._counting():
                     self._session.give_back(name)
         finally:
-            self._counters.add(f"discarded_{name}", lent.lines - lent.written)
-            self._counters.add(f"stored_{name}", lent.written)
+            self._count(name, lent.first_line, lent.end_line)
             arm.ring.release()
 
     @contextmanager

@@ -218,8 +218,8 @@ class Ring:
             raise self._torn(tail)
         self._control[_TAIL] = tail + 1
 
-    def lease(self, first_line: int) -> int:
-        """Take released blocks back, from the one that holds ``first_line`` on; the lines in them.
+    def lease(self, first_line: int) -> list[range]:
+        """Take released blocks back, from the one that holds ``first_line`` on; the lines of each.
 
         Where the history begins later, all of it: see `history_line`. `acquire` gives them once more.
         """
@@ -229,7 +229,8 @@ class Ring:
         while oldest < tail and not (self.is_whole(oldest) and self._end_line(oldest) > first_line):
             oldest += 1
             self._control[_TAIL] = oldest
-        return sum(self._header(block)[_COUNT] for block in range(oldest, tail))
+        headers = map(self._header, range(oldest, tail))
+        return [range(header[_FIRST_LINE], header[_FIRST_LINE] + header[_COUNT]) for header in headers]
 
     def empty(self) -> int:
         """Release everything that waits, unread; returns the number of lines."""
@@ -277,6 +278,12 @@ class Ring:
         """Lines in the blocks that the reader has released, and not taken back."""
         tail = self._control[_TAIL]
         return int(self._header(tail - 1)[_TOTAL]) if tail else 0
+
+    @property
+    def released_line(self) -> int:
+        """The line after the last that the reader has released; 0 before the first."""
+        tail = self._control[_TAIL]
+        return self._end_line(tail - 1) if tail else 0
 
     @property
     def history_line(self) -> int:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from acquire.lines import ARMS
 from acquire.store import RunCondition
+from acquire.stream.kept import Kept
 
 if TYPE_CHECKING:
     from acquire.stream.ring import Ring
@@ -64,21 +65,24 @@ class Backlog:
         return fill >= max(self._first_fill, NEARLY_FULL * slots)
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class Lent:
-    """A block that may still be on its way to the disk: its lines, and how many of them are recorded."""
+    """The lines of a block that may still be on its way to the disk."""
 
-    lines: int
-    written: int = 0
+    first_line: int
+    end_line: int
 
 
 class Arm:
-    """A ring as the recorder sees it: when it last showed life, what waits in it, what is being written."""
+    """A ring as the recorder sees it: when it last showed life, what waits in it, what is being written, and
+    what recordings hold of its lines.
+    """
 
     def __init__(self, ring: Ring) -> None:
         self.ring = ring
         self.backlog = Backlog()
         self.lent: Lent | None = None
+        self.kept = Kept()
         self.alive_s = time.monotonic()
         self._newest = ring.newest_line
         self._awaited = 0

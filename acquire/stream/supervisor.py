@@ -35,6 +35,8 @@ _TAG_WAIT_S = 0.02
 _ANSWER_S = 20.0
 _JOIN_S = 5.0
 _MOST_EVENTS = 1024
+_MOST_KEPT = 256
+"""Recordings whose lines are remembered; those that a ring still holds lines of are fewer."""
 _ASK_EVERY_S = 1.0
 
 
@@ -87,6 +89,7 @@ class Supervisor:
         self._events: deque[Note] = deque(maxlen=_MOST_EVENTS)
         self._dead: set[str] = set()
         self._orphans: list[Orphan] = []
+        self._kept: dict[str, deque[tuple[int, int]]] = {arm: deque(maxlen=_MOST_KEPT) for arm in ARMS}
         self._going_on = False
         self._last_words: dict[str, str] = {}
         self._news = threading.Condition()
@@ -107,6 +110,13 @@ class Supervisor:
     def orphans(self) -> tuple[Orphan, ...]:
         """Recordings that were not sealed; not while another recorder only begins, which has more to do."""
         return () if self._going_on else tuple(self._orphans)
+
+    def kept(self, arm: str, released_line: int) -> list[tuple[int, int]]:
+        """Ranges of the arm's lines that recordings hold, the one under way up to ``released_line``."""
+        ranges = list(self._kept[arm])
+        if self.began is not None and self.sealed is None:
+            ranges.append((self.began.first_line, max(self.began.first_line, released_line)))
+        return ranges
 
     @property
     def pulses(self) -> int:
@@ -341,6 +351,10 @@ class Supervisor:
             self._news.notify_all()
 
     def _take_end(self, sealed: Sealed) -> None:
+        if self.began is not None:
+            first = self.began.first_line
+            for arm, ranges in self._kept.items():
+                ranges.append((first, first + self._counters[RECORDER][f"rows_{arm}"]))
         self.sealed = sealed
         if not sealed.on_disk and self.path is not None:
             self._orphans.append(Orphan(self.path, sealed.end_reason))

@@ -64,11 +64,11 @@ NOW = Window()
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """What the rings hold for a window at line ``at``: everything ``from_line`` on; lines ``taken`` back."""
+    """What the rings hold for a window at line ``at``: everything ``from_line`` on; blocks ``taken`` back."""
 
     at: int
     from_line: int
-    taken: dict[str, int]
+    taken: dict[str, list[range]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,18 +80,15 @@ class Span:
     at: int
 
 
-def hold(window: Window, rings: Mapping[str, Ring], free_from: int) -> Held:
-    """Take back what the window asks for, as far as it is there; from line ``free_from`` on at most.
-
-    What comes before that is in another recording.
-    """
+def hold(window: Window, rings: Mapping[str, Ring]) -> Held:
+    """Take back what the window asks for, as far as it is there, in another recording or in none."""
     at = min(ring.newest_line for ring in rings.values()) if window.at is None else window.at
-    wanted = max(at - window.pre_lines, free_from, 0)
+    wanted = max(at - window.pre_lines, 0)
     taken = {name: ring.lease(wanted) for name, ring in rings.items()}
     whole_from = max(_whole_from(ring) for ring in rings.values())
     if not window.padded:  # else what found its ring full is missing, as what the ring does not hold any more
         whole_from = max(whole_from, *(ring.dropped_end for ring in rings.values()))
-    return Held(at, max(free_from, whole_from), taken)
+    return Held(at, max(0, whole_from), taken)
 
 
 def span(window: Window, lines: int | None, held: Held, line_rate_hz: float) -> Span:

@@ -33,8 +33,8 @@ CALM = CaptureStatus(
 )
 
 
-def rig_config(directory: Path) -> RigConfig:
-    return load_rig("rig-demo", {"recording.directory": str(directory)})
+def rig_config(directory: Path, **settings: object) -> RigConfig:
+    return load_rig("rig-demo", {"recording.directory": str(directory), **settings})
 
 
 class FakeRun:

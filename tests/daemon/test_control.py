@@ -72,7 +72,8 @@ def test_commands(daemon: Client, run: FakeRun, tmp_path: Path) -> None:
     status = daemon.start(tmp_path / "x.zarr", lines=7)
     assert (status.state, status.possible) == (State.RECORDING, ["mark", "stop"])
     assert run.calls[-1] == ("start", tmp_path / "x.zarr", 7)
-    assert daemon.stop().state is State.IDLE
+    assert daemon.stop().state is State.ARMED
+    assert daemon.disarm().state is State.IDLE
 
 
 def test_relative_paths_are_the_callers(

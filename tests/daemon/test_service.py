@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-import threading
 from pathlib import Path
 
 import pytest
 from fake_run import FakeRun, rig_config
+from waiting import until
 
 from acquire.config import load_rig
-from acquire.daemon import service as service_module
 from acquire.daemon.messages import StartRequest
 from acquire.daemon.service import Service
 from acquire.daemon.states import State
@@ -23,10 +22,10 @@ from acquire.stream.messages import Note
 class Bed:
     """A service and the run that it will open."""
 
-    def __init__(self, directory: Path, run: FakeRun) -> None:
+    def __init__(self, directory: Path, run: FakeRun, **settings: object) -> None:
         self.run = run
         self.opened = 0
-        self.service = Service(rig_config(directory), self._open)
+        self.service = Service(rig_config(directory, **settings), self._open)
 
     def _open(self) -> FakeRun:
         self.opened += 1
@@ -47,12 +46,33 @@ def bed(tmp_path: Path) -> Bed:
 
 
 def test_life(bed: Bed, tmp_path: Path) -> None:
+    """Two recordings of one run: staying armed is the default."""
     path = tmp_path / "x.zarr"
     bed.record(path=path, lines=500)
     status = bed.service.status()
     assert (status.state, status.run_id) == (State.RECORDING, "fake-run")
     assert status.recording is not None
     assert (status.recording.path, status.recording.budget_lines) == (path, 500)
+    bed.service.stop()
+    assert bed.run.names == ["arm", "start", "stop"]
+    status = bed.service.status()
+    assert (status.state, status.run_id, status.recording) == (State.ARMED, "fake-run", None)
+    assert status.last is not None
+    assert (status.last.path, status.last.lines, status.last.condition) == (path, 500, "GOOD")
+    bed.run.see(done=False, condition=None)
+    bed.service.start(StartRequest(path=tmp_path / "y.zarr"))
+    bed.service.stop()
+    bed.service.disarm()
+    assert bed.run.names == ["arm", "start", "stop", "start", "stop", "close"]
+    assert bed.state is State.IDLE
+    assert bed.service.status().last is not None
+    assert bed.service.status().last.path == tmp_path / "y.zarr"
+
+
+def test_a_rig_can_ask_for_idle_after_a_recording(tmp_path: Path) -> None:
+    path = tmp_path / "x.zarr"
+    bed = Bed(tmp_path, FakeRun(), **{"recording.after": "idle"})
+    bed.record(path=path, lines=500)
     bed.service.stop()
     assert bed.run.names == ["arm", "start", "stop", "close"]
     status = bed.service.status()
@@ -99,16 +119,16 @@ def test_budget_drains_and_ends_by_itself(bed: Bed) -> None:
     assert "close" not in bed.run.names
     bed.run.seal(reason="line budget reached")
     bed.service.supervise()
-    assert bed.state is State.IDLE
+    assert bed.state is State.ARMED
     assert bed.service.status().last is not None
-    assert "close" in bed.run.names
+    assert "close" not in bed.run.names
 
 
 def test_recording_sealed_between_two_looks(bed: Bed) -> None:
     bed.record(lines=500)
     bed.run.seal()
     bed.service.supervise()
-    assert bed.state is State.IDLE
+    assert bed.state is State.ARMED
 
 
 def test_budget_in_seconds_rounds_up(bed: Bed) -> None:
@@ -118,8 +138,10 @@ def test_budget_in_seconds_rounds_up(bed: Bed) -> None:
 
 def test_default_paths_are_free_and_in_the_configured_directory(bed: Bed, tmp_path: Path) -> None:
     seen = set()
+    bed.service.arm()
     for _ in range(3):
-        bed.record()
+        bed.run.see(done=False)
+        bed.service.start(StartRequest())
         path = bed.run.calls[-1][1]
         assert path.parent == tmp_path
         assert path.name.startswith("demo-2")
@@ -173,7 +195,8 @@ def test_fault_tells_of_a_failing_end_too(tmp_path: Path, error: Exception, told
 
 
 def test_what_ended_the_recording_is_told_before_what_went_wrong_after_it(tmp_path: Path) -> None:
-    bed = Bed(tmp_path, FakeRun(close=DeviceError("grabber b: the process did not end when told to")))
+    run = FakeRun(close=DeviceError("grabber b: the process did not end when told to"))
+    bed = Bed(tmp_path, run, **{"recording.after": "idle"})
     bed.record()
     bed.run.seal(reason="arm b stalled: no line for 3 s", condition=RunCondition.INCOMPLETE)
     bed.service.supervise()
@@ -197,7 +220,7 @@ def test_a_recording_that_the_disk_ended_is_a_fault(bed: Bed) -> None:
 
 
 def test_failing_end_after_sealing_is_a_fault(tmp_path: Path) -> None:
-    bed = Bed(tmp_path, FakeRun(close=CameraError("does not let go")))
+    bed = Bed(tmp_path, FakeRun(close=CameraError("does not let go")), **{"recording.after": "idle"})
     bed.record()
     with pytest.raises(DeviceError, match="does not let go"):
         bed.service.stop()
@@ -205,26 +228,37 @@ def test_failing_end_after_sealing_is_a_fault(tmp_path: Path) -> None:
     assert bed.service.status().last is not None
 
 
-def test_draining_has_an_end(bed: Bed, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(service_module, "DRAIN_TIMEOUT_S", 0.1)
+def test_draining_has_an_end_once_nothing_moves(tmp_path: Path) -> None:
+    bed = Bed(tmp_path, FakeRun(), **{"recording.seal_timeout_s": 0.2})
     bed.run.seals_at_stop = False
     bed.record()
-    with pytest.raises(DeviceError, match="not sealed"):
-        bed.service.stop()
+    bed.service.stop()
+    for lines in range(10):  # a slow disk is no fault
+        bed.run.see(committed_lines=lines)
+        bed.service.supervise()
+        assert bed.state is State.DRAINING
+    until(lambda: bed.service.supervise() or bed.state is not State.DRAINING, "a fault")
     status = bed.service.status()
     assert status.state is State.FAULTED
-    assert "not sealed within 0.1 s" in str(status.fault)
+    assert "nothing more of it reached the disk for 0.2 s" in str(status.fault)
     assert bed.run.names[-1] == "close"
 
 
-def test_hurry_ends_the_wait(bed: Bed) -> None:
+def test_marks_are_taken_while_a_recording_drains(bed: Bed) -> None:
     bed.run.seals_at_stop = False
     bed.record()
-    stopping = threading.Thread(target=bed.service.stop)
-    stopping.start()
+    bed.service.stop()
+    bed.service.mark("meanwhile")
+    assert (bed.state, bed.run.calls[-1]) == (State.DRAINING, ("mark", "meanwhile"))
+
+
+def test_hurry_ends_the_wait_and_the_run(bed: Bed) -> None:
+    bed.run.seals_at_stop = False
+    bed.record()
+    bed.service.stop()
+    assert bed.state is State.DRAINING
     bed.service.hurry()
-    stopping.join(10)
-    assert not stopping.is_alive()
+    bed.service.supervise()
     assert bed.state is State.IDLE
     assert bed.service.status().last is not None
     assert bed.service.status().last.condition == RunCondition.INTERRUPTED
@@ -287,7 +321,8 @@ def eventful(directory: Path, **events: object) -> Bed:
     """A service whose rig records by itself, at a tenth of a second's notice."""
     bed = Bed(directory, FakeRun())
     settings = {"recording.directory": str(directory), "stream.ring_seconds": 1.0}
-    given = {"events.pre_s": 0.1, "events.post_s": 0.2, **{f"events.{key}": events[key] for key in events}}
+    told = {key if "." in key else f"events.{key}": value for key, value in events.items()}
+    given = {"events.pre_s": 0.1, "events.post_s": 0.2, **told}
     bed.service = Service(load_rig("rig-demo", {**settings, **given}), bed._open)
     bed.service.arm()
     return bed
@@ -303,6 +338,21 @@ def test_an_event_starts_a_recording_with_what_was_before(tmp_path: Path) -> Non
     bed.run.happened = [Note(12_000, "input", "")]
     bed.service.supervise()
     assert bed.run.calls[-1] == ("extend", 12_000 + 6667)
+    bed.run.seal()
+    bed.service.supervise()
+    assert (bed.state, "close" in bed.run.names) == (State.ARMED, False)
+    bed.run.see(done=False)
+    bed.run.happened = [Note(30_000, "input", "")]
+    bed.service.supervise()
+    assert bed.state is State.ARMED  # without events.rearm, the first event records
+    bed.service.start(StartRequest())
+    bed.service.mark("the operator records all the same")
+    assert bed.state is State.RECORDING
+
+
+def test_an_event_may_lead_to_idle(tmp_path: Path) -> None:
+    bed = eventful(tmp_path, sources=["mark"], **{"recording.after": "idle"})
+    bed.service.mark("now")
     bed.run.seal()
     bed.service.supervise()
     assert (bed.state, bed.run.names[-1]) == (State.IDLE, "close")

@@ -12,7 +12,8 @@ import pytest
 from live_daemon import LINE_RATE_HZ, SUBSTEPS, Daemon, acquire
 
 from acquire.config import load_rig
-from acquire.daemon.states import State
+from acquire.daemon.states import SEALED, State
+from acquire.errors import UsageError
 from acquire.store import open_recording
 
 
@@ -57,16 +58,16 @@ def test_whole_life(daemon: Daemon) -> None:
     assert recording.attrs["config"] == load_rig(daemon.config).model_dump(mode="json")
     told = [line.split("INFO ")[1].split(" (")[0] for line in daemon.log.read_text().splitlines()[logged:]]
     changes = [words for words in told if "→" in words]
-    assert changes == ["idle → armed", "armed → recording", "recording → draining", "draining → idle"]
+    assert changes == ["idle → armed", "armed → recording", "recording → draining", "draining → armed"]
 
 
 def test_a_recording_goes_on_in_a_segment(daemon: Daemon) -> None:
     """Another day, the same recording: what is there is not touched, the outage is told."""
+    assert daemon("arm").code == 0
     for resume in ((), ("--resume",)):
-        assert daemon("arm").code == 0
         begun = daemon("start", "days.zarr", "--lines", 300, *resume, "--json")
         assert begun.code == 0, begun.err
-        assert daemon("status", "--wait", "idle", "--timeout", 30).code == 0
+        assert daemon("status", "--wait", "sealed", "--timeout", 30).code == 0
     assert begun.json["recording"]["path"] == str(daemon.home / "days-2.zarr")
     first = open_recording(daemon.home / "days.zarr")
     (second,) = first.segments
@@ -77,18 +78,17 @@ def test_a_recording_goes_on_in_a_segment(daemon: Daemon) -> None:
         assert daemon("verify", path).code == 0
     shown = daemon("info", "days-2.zarr").out
     assert "days.zarr after line" in shown
-    assert daemon("arm").code == 0
     refused = daemon("start", "none.zarr", "--resume")
     assert (refused.code, "does not exist" in refused.err) == (6, True)
     assert daemon("disarm").code == 0
 
 
 def test_line_budget(daemon: Daemon) -> None:
-    """The daemon goes idle by itself; both arms hold exactly the budget, contiguous, with the run's code."""
+    """The recording ends itself; both arms hold exactly the budget, contiguous, with the run's code."""
     with daemon.client() as client:
         client.arm()
     assert daemon("start", "budget.zarr", "--lines", 700).code == 0
-    status = daemon("status", "--wait", "idle", "--timeout", 30, "--json").json
+    status = daemon("status", "--wait", "sealed", "--timeout", 30, "--json").json
     assert status["last"] == {
         "path": str(daemon.home / "budget.zarr"),
         "lines": 700,
@@ -106,16 +106,33 @@ def test_line_budget(daemon: Daemon) -> None:
     assert np.array_equal(recording.camera("a").code[:], packed)
 
 
-def test_every_line_is_accounted_for_once_idle(daemon: Daemon) -> None:
+def test_takes_of_one_run_reach_back_and_every_line_is_accounted_for_once_idle(daemon: Daemon) -> None:
+    """The second take holds lines of the first as well; what the ring does not hold any more is refused."""
     with daemon.client() as client:
         client.arm()
-        client.start(daemon.home / "account.zarr", lines=700)
-        arms = client.wait({State.IDLE}, 30).arms
+        client.start(daemon.home / "take-1.zarr", duration_s=2.0)
+        first = client.wait(SEALED, 30)
+        second = client.start(daemon.home / "take-2.zarr", pre_s=2.0, post_s=0.05)
+        again = client.wait(SEALED, 30)
+        assert (first.run_id, again.run_id) == (second.run_id, second.run_id)
+        with pytest.raises(UsageError, match="which both rings hold now"):
+            client.start(daemon.home / "take-3.zarr", pre_s=3600)
+        assert client.status().possible == ["start", "mark", "disarm"]
+        arms = client.disarm().arms
+    takes = [open_recording(daemon.home / f"take-{number}.zarr") for number in (1, 2)]
+    assert takes[0].first_line <= takes[1].first_line < takes[0].first_line + takes[0].lines  # they overlap
+    end = takes[1].first_line + takes[1].lines
     for arm in arms.values():
-        stored = arm.recorded - arm.missing
-        assert arm.delivered == arm.preroll + arm.discarded + arm.lost["ring_full"] + stored
-        assert stored == 700
+        ledger = arm.ledger
+        assert ledger is not None
+        assert ledger.balanced
+        assert ledger.stored == end - takes[0].first_line
+        assert arm.delivered == arm.preroll + arm.discarded + arm.lost["ring_full"] + ledger.stored
         assert arm.ring.fill == 0
+    kept = range(takes[1].first_line - takes[0].first_line, takes[0].lines)
+    for name in ("a", "b"):
+        old, new = (take.camera(name).lines[:] for take in takes)
+        assert np.array_equal(old[kept.start :], new[: len(kept)])
 
 
 def test_refusals_leave_the_daemon_armed(daemon: Daemon) -> None:
@@ -149,7 +166,7 @@ def test_refusals_leave_the_daemon_armed(daemon: Daemon) -> None:
     assert path.parent == daemon.home
     assert path.name.startswith("small-2")
     with daemon.client() as client:
-        client.wait({State.IDLE}, 30)
+        client.wait(SEALED, 30)
     assert open_recording(path).lines == 0.05 * LINE_RATE_HZ
 
 

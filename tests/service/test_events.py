@@ -81,7 +81,7 @@ def test_commands_of_a_user(tmp_path: Path) -> None:
         assert daemon("mark", "the valve opens").code == 0
         begun = daemon("start", "pre.zarr", "--pre", "200ms", "--post", "300ms")
         assert begun.code == 0, begun.err
-        assert daemon("status", "--wait", "idle", "--timeout", 60).code == 0
+        assert daemon("status", "--wait", "sealed", "--timeout", 60).code == 0
     finally:
         daemon.close()
     recording = open_recording(tmp_path / "pre.zarr")
@@ -97,6 +97,7 @@ def test_lines_from_before_reconstruct_as_any_other(tmp_path: Path) -> None:
         service.arm()
         service.start(StartRequest(path=tmp_path / "plain.zarr", lines=12_000))
         plain = last_recording(service)
+        service.disarm()
         service.arm()
         until_lines(service, 9000)
         service.start(StartRequest(path=tmp_path / "pre.zarr", pre_s=0.6, post_s=0.1))
@@ -160,7 +161,7 @@ def test_light_that_comes_late_is_told_flagged_and_taints(tmp_path: Path) -> Non
         service.arm()
         assert until_checked(service) == {"a": ("shifted", 2), "b": ("shifted", 2)}
         service.start(StartRequest(path=tmp_path / "r.zarr", lines=2000))
-        until(service, lambda: service.status().state is State.IDLE, "the seal")
+        until(service, lambda: service.status().state is State.ARMED, "the seal")
     recording = open_recording(tmp_path / "r.zarr")
     assert (recording.attrs["run_condition"], recording.attrs["end_reason"]) == (
         "TAINTED",
@@ -187,6 +188,7 @@ def test_light_that_follows_the_code_is_verified_and_every_pulse_has_its_place(t
         service.start(StartRequest(path=tmp_path / "r.zarr", lines=3000, pre_s=0.1))
         assert all(arm.ledger and arm.ledger.balanced for arm in service.status().arms.values())
         recording = last_recording(service)
+        service.disarm()
         for arm in service.status().arms.values():
             ledger = arm.ledger
             assert ledger is not None

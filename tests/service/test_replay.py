@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from live_daemon import Daemon, acquire
 
+from acquire.daemon.states import SEALED
 from acquire.store import open_recording
 
 
@@ -16,7 +17,7 @@ def test_a_daemons_recording_is_replayed_and_recorded_again_identically(tmp_path
         with daemon.client() as client:
             client.arm()
             client.start(tmp_path / "first.zarr", lines=2500)
-            client.wait({"idle"}, 30)
+            client.wait(SEALED, 30)
     finally:
         daemon.close()
     first = open_recording(tmp_path / "first.zarr")

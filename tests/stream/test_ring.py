@@ -137,7 +137,7 @@ class RingMachine(RuleBasedStateMachine):
         before, self.tail = self.tail, min(self.tail, self.oldest)
         while self.tail < before and sum(self.blocks[self.tail][:2]) <= first_line:
             self.tail += 1
-        taken = sum(lines for _, lines, _ in self.blocks[self.tail : before])
+        taken = [range(first, first + lines) for first, lines, _ in self.blocks[self.tail : before]]
         assert self.ring.lease(first_line) == taken
 
     @rule(who=st.integers(0, OBSERVERS - 1))
@@ -238,6 +238,10 @@ def test_doorbell_rings_until_hushed(ring: Ring) -> None:
     assert ring.acquire() is not None  # what was committed does not depend on the bell
 
 
+def blocks_of(first: int, end: int) -> list[range]:
+    return [range(line, line + 10) for line in range(first, end, 10)]
+
+
 def test_history_is_taken_back_from_the_line_that_is_asked_for() -> None:
     ring = Ring("history", RingShape(slots=16, rows=10, width=1, dtype="uint8", reserve=4))
     for block in range(40):
@@ -245,14 +249,16 @@ def test_history_is_taken_back_from_the_line_that_is_asked_for() -> None:
         ring.commit(10 * block, 10)
         ring.release()
     assert (ring.shape.history_slots, ring.history_line, ring.statistics().history) == (12, 280, 12)
-    assert ring.lease(345) == 60  # the block from 340 on
+    assert ring.released_line == 400
+    assert ring.lease(345) == blocks_of(340, 400)  # the block from 340 on
+    assert ring.released_line == 340
     taken = ring.acquire()
     assert taken is not None
     assert taken.first_line == 340
     assert ring.fill == 6
-    assert ring.lease(0) == 60  # all that there is
+    assert ring.lease(0) == blocks_of(280, 340)  # all that there is
     assert ring.history_line == 280
-    assert (ring.lease(395), ring.fill) == (0, 12)  # what was taken back stays
+    assert (ring.lease(395), ring.fill) == ([], 12)  # what was taken back stays
     for block in range(40, 44):  # the reserve
         assert ring.claim() is not None
         ring.commit(10 * block, 10)

@@ -45,17 +45,21 @@ def make_ring() -> Iterator[Callable[..., Ring]]:
         ring.close()
 
 
+def blocks(first: int, end: int) -> list[range]:
+    return [range(line, line + 10) for line in range(first, end, 10)]
+
+
 def test_both_arms_hold_what_is_asked_for(make_ring: Callable[..., Ring]) -> None:
     rings = {"a": make_ring("a", 40), "b": make_ring("b", 38)}
-    held = hold(Window(pre_lines=45), rings, 0)
-    assert held == Held(at=380, from_line=330, taken={"a": 70, "b": 50})
+    held = hold(Window(pre_lines=45), rings)
+    assert held == Held(at=380, from_line=330, taken={"a": blocks(330, 400), "b": blocks(330, 380)})
     assert span(Window(pre_lines=45), None, held, 1000.0).first_line == 335
 
 
 def test_the_shorter_history_counts(make_ring: Callable[..., Ring]) -> None:
     rings = {"a": make_ring("a", 40), "b": make_ring("b", 5)}
     window = Window(at=390, pre_lines=375)
-    held = hold(window, rings, 0)
+    held = hold(window, rings)
     assert held.from_line == 280  # of arm a; b has everything since line 0, and nothing after 50
     with pytest.raises(UsageError, match=r"375 lines \(0.375 s\).*up to 110 lines \(0.11 s\)"):
         span(window, None, held, 1000.0)
@@ -63,17 +67,9 @@ def test_the_shorter_history_counts(make_ring: Callable[..., Ring]) -> None:
 
 def test_lines_that_were_lost_are_known_to_be(make_ring: Callable[..., Ring]) -> None:
     rings = {"a": make_ring("a", 40), "b": make_ring("b", 40, lost=range(33, 36))}
-    held = hold(Window(pre_lines=60), rings, 0)
-    assert held == Held(400, 340, {"a": 60, "b": 40})
+    held = hold(Window(pre_lines=60), rings)
+    assert held == Held(400, 340, {"a": blocks(340, 400), "b": blocks(360, 400)})
     assert span(Window(pre_lines=60), None, held, 1000.0).first_line == 340
-
-
-def test_what_is_recorded_is_not_recorded_again(make_ring: Callable[..., Ring]) -> None:
-    rings = {"a": make_ring("a", 40), "b": make_ring("b", 40)}
-    window = Window(pre_lines=100, exact=False)
-    held = hold(window, rings, 365)
-    assert held == Held(400, 365, {"a": 40, "b": 40})
-    assert span(window, None, held, 1000.0).first_line == 365
 
 
 @given(
@@ -142,17 +138,34 @@ def test_what_the_ring_does_not_hold_is_refused_with_what_it_does(tmp_path: Path
     check_balance(capture.poll())
 
 
-def test_recordings_of_one_run_follow_one_another_without_a_hole(tmp_path: Path) -> None:
-    with armed(make_bench(ring_slots=1024)) as capture:
+def test_takes_of_one_run_overlap_and_every_line_counts_once(tmp_path: Path) -> None:
+    """The second begins with lines that the first has stored; so does the third, after a recorder's death."""
+    takes = []
+    with armed(make_bench(ring_slots=4096)) as capture:
         until(lambda: capture.poll().lines["b"]["delivered"] > 2000, "history")
-        capture.start(tmp_path / "0.zarr", make_spec(), 1500, Window(pre_lines=1000))
-        first = sealed(capture)
-        capture.start(tmp_path / "1.zarr", make_spec(), 2000, Window(pre_lines=10**6, exact=False))
-        second = sealed(capture)
-    assert first.first_line is not None
-    assert second.first_line == first.first_line + 1500
-    for name in ("0.zarr", "1.zarr"):
+        for name, lines in (("0.zarr", 1500), ("1.zarr", 20_000), ("2.zarr", 40_000)):
+            line = takes[0].first_line if takes else None
+            window = Window(pre_lines=1000) if line is None else Window(line + 700, 0)
+            capture.start(tmp_path / name, make_spec(), lines, window)
+            if name == "2.zarr":
+                until(lambda: capture.poll().committed_lines > 0, "a commit")
+                recorder = capture.pids["recorder"]
+                assert recorder is not None
+                os.kill(recorder, signal.SIGKILL)
+            takes.append(sealed(capture))
+            assert takes[-1].accounts["a"].balanced
+    first = takes[0].first_line
+    assert first is not None
+    assert takes[1].first_line == first + 700
+    assert takes[2].path == str(tmp_path / "2-2.zarr")
+    assert takes[2].first_line is not None
+    end = takes[2].first_line + takes[2].recorded_lines
+    for name in ("0.zarr", "1.zarr", "2-2.zarr"):
         assert not check_rows(tmp_path / name)[1]["b"].any()
+    for account in capture.poll().accounts.values():
+        assert account.balanced
+        assert account.stored == end - first  # all of it, from the first take's beginning to the last one's end
+        assert account.discarded >= 0
 
 
 def test_what_the_trigger_tells_is_in_the_recording_that_begins_before_it(tmp_path: Path) -> None:

@@ -1,0 +1,45 @@
+"""Which lines of one arm recordings hold already, so that a line which two of them hold is counted once.
+
+A recording may begin with lines from the ring's history that another has stored. What is remembered of a
+recording is a range: a line inside it that was lost never comes from the ring again.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+
+class Kept:
+    """The latest recording's range comes last; those before it are kept while the ring may hold their lines."""
+
+    def __init__(self, ranges: Iterable[tuple[int, int]] = ()) -> None:
+        self._ranges = list(ranges)
+
+    def begin(self, oldest_line: int) -> None:
+        """A recording begins; what is older than ``oldest_line`` cannot be asked for any more."""
+        self._ranges = [(first, end) for first, end in self._ranges if end > oldest_line]
+        self._ranges.append((oldest_line, oldest_line))
+
+    def add(self, first: int, end: int) -> None:
+        """The recording holds the lines ``first .. end - 1`` as well; calls come in the order of the lines."""
+        begun, reached = self._ranges[-1]
+        self._ranges[-1] = (begun if reached > begun else first), end
+
+    def end_at(self, line: int) -> None:
+        """The recording ended before ``line``, whatever was added."""
+        begun, reached = self._ranges[-1]
+        if reached > begun:
+            self._ranges[-1] = begun, max(begun, line)
+
+    def count(self, first: int, end: int) -> int:
+        """How many of the lines ``first .. end - 1`` recordings hold."""
+        held = 0
+        for start, stop in sorted(self._ranges):
+            lines = range(max(start, first), min(stop, end))
+            if lines:
+                held += len(lines)
+                first = lines.stop
+        return held
