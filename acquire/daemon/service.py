@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from acquire.stream.messages import Note
 
 RECOVERY_S = 20.0
-"""How long a recording's end waits for parts of it that are being recovered; they are recovered all the same."""
+"""How long the end of a recording waits for parts of it that are being recovered; they are in any case."""
 POLL_S = 0.05
 ARM = ArmRequest()
 

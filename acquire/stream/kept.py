@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 class Kept:
-    """The latest recording's range comes last; those before it are kept while the ring may hold their lines."""
+    """The latest recording's range comes last; earlier ones are kept while the ring may hold their lines."""
 
     def __init__(self, ranges: Iterable[tuple[int, int]] = ()) -> None:
         self._ranges = list(ranges)
@@ -24,7 +24,7 @@ class Kept:
         self._ranges.append((oldest_line, oldest_line))
 
     def add(self, first: int, end: int) -> None:
-        """The recording holds the lines ``first .. end - 1`` as well; calls come in the order of the lines."""
+        """The recording holds ``first .. end - 1`` as well; calls come in the order of the lines."""
         begun, reached = self._ranges[-1]
         self._ranges[-1] = (begun if reached > begun else first), end
 

@@ -164,7 +164,7 @@ def test_takes_of_one_run_overlap_and_every_line_counts_once(tmp_path: Path) -> 
         assert not check_rows(tmp_path / name)[1]["b"].any()
     for account in capture.poll().accounts.values():
         assert account.balanced
-        assert account.stored == end - first  # all of it, from the first take's beginning to the last one's end
+        assert account.stored == end - first
         assert account.discarded >= 0
 
 
