@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_validator
 
 from acquire.codes import TAPS, Code, ConstantCode, PrbsCode, mix_seed
-from acquire.device_config import CamerasConfig, TriggerConfig
+from acquire.device_config import SEEING_CAMERAS, SIMULATED_CAMERAS, CamerasConfig, TriggerConfig
 from acquire.effect_config import FrozenModel
 from acquire.errors import ConfigError
 from acquire.event_config import CheckConfig, EventsConfig
@@ -111,7 +111,11 @@ class ControlConfig(FrozenModel):
 class SimulationConfig(FrozenModel):
     """What simulated devices see, and how fast their time runs."""
 
-    scene: str = Field(description="a scene file, beside this file or one of the built-in ones")
+    scene: str | None = Field(
+        default=None,
+        description="what simulated cameras see: a scene file, beside this file or a built-in one; absent "
+        "where no camera is simulated",
+    )
     speed: float = Field(default=1.0, gt=0, le=1000, description="simulated seconds per second")
     replay: Path | None = Field(default=None, description="a recording whose lines the cameras give instead")
     replay_loop: bool = Field(default=False, description="over and over")
@@ -138,7 +142,7 @@ class RigConfig(FrozenModel):
     events: EventsConfig = EventsConfig()
     check: CheckConfig = CheckConfig()
     control: ControlConfig = Field(default_factory=ControlConfig)
-    simulation: SimulationConfig
+    simulation: SimulationConfig = SimulationConfig()
 
     @model_validator(mode="after")
     def _ring_fits(self) -> RigConfig:
@@ -175,6 +179,29 @@ class RigConfig(FrozenModel):
             if second[0] < first[1]:
                 raise ValueError(f"cameras.a and b overlap in columns {second[0]} to {first[1] - 1}")
         return self
+
+    @property
+    def simulates_cameras(self) -> bool:
+        """Whether the trigger's pulses go to a camera that is simulated."""
+        return any(camera.driver in SIMULATED_CAMERAS for camera in (self.cameras.a, self.cameras.b))
+
+    @property
+    def needs_scene(self) -> bool:
+        """Whether an arm's lines are computed from what its camera sees."""
+        return self.simulation.replay is None and any(
+            camera.driver in SEEING_CAMERAS for camera in (self.cameras.a, self.cameras.b)
+        )
+
+    def scene_file(self) -> str:
+        """What simulated cameras see. Raises ConfigError where nothing is said of it."""
+        if self.simulation.scene is None:
+            scenes = (path.stem for path in sorted(builtin_directory().glob("scene-*.toml")))
+            raise ConfigError(
+                f"rig {self.name}: simulation.scene is missing, which simulated cameras see",
+                possible=f"a scene file, a picture or a video, or one of {', '.join(scenes)}",
+                hint='simulation.scene = "scene-leds", or cameras of another driver',
+            )
+        return self.simulation.scene
 
     @property
     def columns(self) -> dict[str, tuple[int, int]]:
@@ -266,7 +293,9 @@ def load_rig(name: str | Path, overrides: Mapping[str, Any] | None = None) -> Ri
     for key, value in (overrides or {}).items():
         _set(table, key, value)
     rig = _validate(RigConfig, table, path)
-    scene = find(rig.simulation.scene, beside=path).resolve()
+    if not rig.needs_scene:
+        return rig
+    scene = find(rig.scene_file(), beside=path).resolve()
     return rig.model_copy(update={"simulation": rig.simulation.model_copy(update={"scene": str(scene)})})
 
 

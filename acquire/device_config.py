@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 from pydantic import Field, model_validator
 
@@ -12,6 +12,11 @@ PIXEL_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16}
 """SFNC PixelFormat → significant bits of an (unpacked) pixel."""
 
 
+SimulatedDriver = Literal["simulated", "pattern", "gentl-simulated", "gige-simulated"]
+"""Drivers of cameras that only a simulated trigger, or the compiled gateware, can pulse."""
+SIMULATED_CAMERAS: tuple[SimulatedDriver, ...] = get_args(SimulatedDriver)
+SEEING_CAMERAS = ("simulated", "gentl-simulated", "gige-simulated")
+"""Those of them whose lines are computed from a scene."""
 GentlModule = Literal["remote", "interface", "device", "stream", "system"]
 """Where a camera's features are: in the camera itself, or in a module of the host's side."""
 
@@ -83,13 +88,11 @@ class TriggerConfig(FrozenModel):
 class CameraConfig(FrozenModel):
     """One camera. DN = black level + responsivity · Y, with Y of Eq. (1)."""
 
-    driver: Literal["simulated", "pattern", "gentl-simulated", "gige-simulated", "harvesters", "aravis"] = (
-        Field(
-            default="simulated",
-            description="'harvesters': through the maker's GenTL producer; 'aravis': GigE and USB3 Vision; "
-            "'gentl-simulated', 'gige-simulated': simulated cameras through either; "
-            "'pattern': stored lines in place of the scene, at any rate, for loads",
-        )
+    driver: SimulatedDriver | Literal["harvesters", "aravis"] = Field(
+        default="simulated",
+        description="'harvesters': through the maker's GenTL producer; 'aravis': GigE and USB3 Vision; "
+        "'gentl-simulated', 'gige-simulated': simulated cameras through either; "
+        "'pattern': stored lines in place of the scene, at any rate, for loads",
     )
     serial: str = "simulated"
     model: str = Field(default="", description="what the camera must be; absent: any")

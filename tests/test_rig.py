@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import ast
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from acquire.config import load_rig, load_scene
+from acquire.config import builtin_directory, load_rig, load_scene
 from acquire.errors import ConfigError, UsageError
 from acquire.geometry import Geometry
 from acquire.rig import Rig, open_trigger
@@ -93,6 +96,71 @@ def test_a_rig_of_real_cameras_is_not_said_to_be_simulated():
         assert rig.layout == "dual"
 
 
+HARDWARE = {"trigger.driver": "serial", "trigger.url": "/dev/ttyUSB0"}
+
+
+def test_real_devices_need_no_scene_and_nothing_that_makes_one(tmp_path):
+    """Looked at in a process of its own: this one has the simulator."""
+    code = (
+        "import sys, acquire.cli, acquire.daemon.server\n"
+        "from acquire.config import load_rig\n"
+        "from acquire.rig import Rig\n"
+        f"with Rig(load_rig('rig-vt-4k5c-h100', {HARDWARE})) as rig:\n"
+        "    print(sorted(rig.openers()), rig.describe(), rig.layout)\n"
+        "print([name for name in sys.modules if name.startswith('acquire.sim')])\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+    )
+    facts, modules = done.stdout.splitlines()
+    assert facts == "['a', 'b'] {'simulated': False} dual"
+    scenes = {
+        f"acquire.sim.{name}" for name in ("scenes", "scene", "pipeline", "lines", "effects", "instrument")
+    }
+    assert scenes.isdisjoint(ast.literal_eval(modules))
+
+
+def test_a_scene_that_nothing_sees_is_not_looked_for(tmp_path):
+    config = load_rig("rig-vt-4k5c-h100", {"simulation.scene": "nowhere.toml"} | HARDWARE)
+    with Rig(config) as rig:
+        assert rig.layout == "dual"
+        with pytest.raises(UsageError, match="no simulated device"):
+            rig.scene()
+
+
+def without_scene(driver):
+    text = (builtin_directory() / "rig-demo.toml").read_text()
+    return text[: text.index("[simulation]")].replace(
+        'driver = "simulated"\nserial', f'driver = "{driver}"\nserial'
+    )
+
+
+@pytest.mark.parametrize("driver", ["simulated", "gentl-simulated", "gige-simulated"])
+def test_simulated_cameras_without_a_scene_are_refused_with_the_scenes_there_are(tmp_path, driver):
+    (tmp_path / "rig.toml").write_text(without_scene(driver))
+    with pytest.raises(
+        ConfigError, match=r"simulation\.scene is missing.*scene-leds.*try: simulation\.scene"
+    ):
+        load_rig(tmp_path / "rig.toml")
+
+
+def test_stored_lines_are_shown_without_a_scene(tmp_path):
+    (tmp_path / "rig.toml").write_text(without_scene("pattern"))
+    with Rig(load_rig(tmp_path / "rig.toml", {"cameras.b.serial": "other"})) as rig:
+        assert rig.describe() == {"simulated": True}
+        camera = rig.openers()["a"]()
+        camera.arm()
+        rig.trigger.prepare(run_of(rig.config))
+        rig.trigger.start()
+        assert camera.next_block(10.0).first_line == 0
+
+
+def test_real_time_has_one_speed():
+    config = load_rig("rig-vt-4k5c-h100", HARDWARE | {"simulation.speed": 2.0})
+    with pytest.raises(ConfigError, match=r"simulation\.speed = 2 with trigger\.driver = 'serial'"):
+        Rig(config)
+
+
 def test_a_rig_without_its_scene_is_refused_before_anything_is_made(config, tmp_path):
     missing = config.simulation.model_copy(update={"scene": str(tmp_path / "none.toml")})
     before = open_descriptors()
@@ -137,7 +205,7 @@ def test_devices_deliver_what_simulate_writes_effects_layout_losses_and_all(conf
     simulate(config, whole, tmp_path / "r.zarr", 200)
     stored = open_recording(tmp_path / "r.zarr")
     with Rig(config) as rig:
-        rig._scene = whole
+        rig.simulated._scene = whole
         cameras = {arm: opener() for arm, opener in rig.openers().items()}
         for camera in cameras.values():
             camera.arm()

@@ -34,7 +34,8 @@ def check(file: FileArgument, json: JsonFlag = False) -> None:
 
     rig = load_rig(file)
     check_rig(rig)
-    load_scene(rig.simulation.scene)
+    if rig.needs_scene:
+        load_scene(rig.scene_file())
     check_directory(rig)
     check_upload(rig)
     facts = _facts(rig)

@@ -102,7 +102,6 @@ def replay_settings(stored: Recording, speed: float, *, loop: bool, hold_s: floa
         table["code"] = {"kind": "constant", "value": code["value"]}
     table["trigger"] = {**table["trigger"], "driver": "simulated"}
     table["simulation"] = {
-        "scene": "scene-leds",  # which nobody looks at
         "speed": speed,
         "replay": str(stored.path.resolve()),
         "replay_loop": loop,

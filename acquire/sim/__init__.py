@@ -10,15 +10,24 @@
 
 From Python, without files: ``Bench(scene_config, geometry, cameras, substep_s).camera("a", code)``, or any
 object that is a `Scene` under a `StreamingArm`.
+
+Names are imported when they are asked for: a rig with a simulated trigger and real cameras has no scene.
 """
 
-from acquire.sim.functions import FunctionScene
-from acquire.sim.leds import LedScene
-from acquire.sim.lines import StreamingArm
-from acquire.sim.pipeline import Bench
-from acquire.sim.scene import ArrayScene, Scene, SumScene
-from acquire.sim.scenes import build_scene
-from acquire.sim.voxels import truth
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from acquire.sim.functions import FunctionScene
+    from acquire.sim.leds import LedScene
+    from acquire.sim.lines import StreamingArm
+    from acquire.sim.pipeline import Bench
+    from acquire.sim.scene import ArrayScene, Scene, SumScene
+    from acquire.sim.scenes import build_scene
+    from acquire.sim.voxels import truth
+
 
 __all__ = [
     "ArrayScene",
@@ -31,3 +40,20 @@ __all__ = [
     "build_scene",
     "truth",
 ]
+_HOMES = {
+    "ArrayScene": "scene",
+    "Bench": "pipeline",
+    "FunctionScene": "functions",
+    "LedScene": "leds",
+    "Scene": "scene",
+    "StreamingArm": "lines",
+    "SumScene": "scene",
+    "build_scene": "scenes",
+    "truth": "voxels",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -21,7 +21,6 @@ from acquire.clock import NS_PER_S
 from acquire.cores import limit_blas
 from acquire.errors import CameraError
 from acquire.lines import ARMS
-from acquire.sim.pipeline import Bench, Camera, Readout
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -34,6 +33,8 @@ if TYPE_CHECKING:
     from acquire.scene_config import SceneConfig
     from acquire.sim.clock import PulseTrain, Reading, Wire
     from acquire.sim.pins import PinWire
+    from acquire.sim.pipeline import Camera
+    from acquire.sim.readout import Readout
 
 
 class Sensor(Protocol):
@@ -63,6 +64,8 @@ class SimulatedOptics:
 
     def expose(self, train: PulseTrain, code: Code, config: CameraConfig) -> Camera:
         """The lines that the arm's camera gives under a train's timing and the light's code."""
+        from acquire.sim.pipeline import Bench  # with scenes, which other optics do without
+
         substep_s = float(train.line_period_ns / (self.geometry.substeps * NS_PER_S))
         bench = Bench(self.scene, self.geometry, dict.fromkeys(ARMS, config), substep_s)
         return bench.camera(self.arm, code)

@@ -15,7 +15,7 @@ import numpy as np
 
 from acquire.lines import ARMS
 from acquire.sim.devices import SimulatedCamera
-from acquire.sim.pipeline import Readout
+from acquire.sim.readout import Readout
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

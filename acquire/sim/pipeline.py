@@ -21,12 +21,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.errors import UsageError
-from acquire.lines import ARMS, LineFlag
+from acquire.lines import ARMS
 from acquire.sim.effects import in_order
 from acquire.sim.effects.base import TILE_LINES, Setting, Stage
 from acquire.sim.light import Illumination
 from acquire.sim.lines import StreamingArm
 from acquire.sim.optics import binned, mapped
+from acquire.sim.readout import Readout
 from acquire.sim.scenes import build_scene
 
 if TYPE_CHECKING:
@@ -63,18 +64,6 @@ class Converter:
         """DN to whole numbers of the range."""
         pixels: NDArray[Any] = np.clip(np.rint(dn), 0, self.white_dn).astype(self.dtype)
         return pixels
-
-
-@dataclass(frozen=True, slots=True)
-class Readout:
-    """Lines as a camera gives them: pixels (count, M), and which of them did not come (count,)."""
-
-    pixels: NDArray[Any]
-    missing: NDArray[np.bool_]
-
-    @property
-    def flags(self) -> NDArray[np.uint16]:
-        return np.where(self.missing, np.uint16(LineFlag.MISSING), np.uint16(0))
 
 
 @dataclass(frozen=True, slots=True)

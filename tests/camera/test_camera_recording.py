@@ -141,7 +141,7 @@ def test_faults_of_one_camera_are_gaps_by_cause_and_the_other_arm_is_whole(tmp_p
     config = rig_config()
 
     def happen(rig: Rig, run: Run) -> None:
-        memory = rig._gentl._bench.cameras["SIM-A"]
+        memory = rig.simulated._gentl._bench.cameras["SIM-A"]
         frame = memory["FRAMES"] + 100
         for kind, after, count in (("DROP", 0, 2), ("OVERRUN", 20, 3), ("SHORT", 40, 60), ("MISSED", 0, 5)):
             memory.inject(kind, (frame + 60) * 100 + 30 if kind == "MISSED" else frame + after, count)
@@ -162,7 +162,7 @@ def test_a_camera_that_was_away_goes_on_at_the_right_line_and_the_gap_is_recorde
 
     def happen(rig: Rig, run: Run) -> None:
         until(lambda: run.poll().recorded_lines > 10_000, "lines")
-        memory = rig._gentl._bench.cameras["SIM-A"]
+        memory = rig.simulated._gentl._bench.cameras["SIM-A"]
         memory.unplug()
         until(
             lambda: memory["SESSION"] == memory["ACK"] and not memory["SESSION"] & 1, "the driver to let go"
@@ -185,7 +185,7 @@ def test_a_camera_that_does_not_come_back_ends_the_recording_in_time(tmp_path: P
 
     def happen(rig: Rig, run: Run) -> None:
         until(lambda: run.poll().recorded_lines > 5_000, "lines")
-        rig._gentl._bench.cameras["SIM-A"].unplug()
+        rig.simulated._gentl._bench.cameras["SIM-A"].unplug()
         begin = time.monotonic()
         until(lambda: run.poll().done, "the end")
         assert time.monotonic() - begin < 15.0

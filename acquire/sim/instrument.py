@@ -1,0 +1,176 @@
+"""The simulated devices of a rig: a trigger, the cameras that it pulses, and what these look at.
+
+Made where a rig has a simulated device, and imported only there. Cameras see the trigger's pulses on a wire,
+or on the pins of the compiled gateware.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Any, assert_never
+
+from acquire.codes import ConstantCode
+from acquire.config import load_scene
+from acquire.lines import ARMS
+from acquire.sim import rtl
+from acquire.sim.clock import Wire
+from acquire.sim.compact import SideBySideOpener
+from acquire.sim.devices import SimulatedCameraOpener, SimulatedOptics
+from acquire.sim.gentl.arms import GentlArms, sensor_width
+from acquire.sim.gige.arms import GigeArms
+from acquire.sim.pattern import PatternCameraOpener
+from acquire.sim.pins import PinPage, PinWire
+from acquire.sim.pipeline import Bench, describe
+from acquire.sim.replay import ReplayCameraOpener, describe_replay
+from acquire.sim.scenes import build_scene
+from acquire.sim.trigger_model import TriggerModel
+from acquire.sim.twin_links import TwinTransport
+from acquire.store import open_recording
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from acquire.camera.base import CameraOpener
+    from acquire.config import RigConfig
+    from acquire.device_config import SimulatedDriver
+    from acquire.scene_config import SceneConfig
+    from acquire.sim.scene import Scene
+    from acquire.trigger.transports import Transport
+
+
+class SimulatedDevices:
+    """See the module. Reads the scene, if a camera sees one, and touches no device.
+
+    Raises ConfigError for files and values, UsageError for a scene that cannot be shown to these cameras.
+    """
+
+    def __init__(self, config: RigConfig) -> None:
+        self.config = config
+        self._scene = load_scene(config.scene_file()) if config.needs_scene else None
+        if self._scene is not None:
+            _check_scene(config, self._scene)
+        self._wire = Wire()
+        self._pins = PinPage() if config.trigger.driver == "rtl" else None
+        self._gentl, self._gige = GentlArms(config), GigeArms(config)
+
+    def transport(self) -> Callable[[], Transport]:
+        """What opens the way to the trigger."""
+        return _transport(self.config, self._wire, self._pins)
+
+    def opener(self, arm: str, driver: SimulatedDriver) -> CameraOpener:
+        """What opens the arm's camera."""
+        match driver:
+            case "gentl-simulated":
+                return self._gentl.opener(arm, self._sensor)
+            case "gige-simulated":
+                return self._gige.opener(arm, self._sensor)
+            case "simulated":
+                return self._sensor(arm)
+            case "pattern":
+                return self._pattern(arm)
+        assert_never(driver)
+
+    def replay(self, arm: str) -> CameraOpener:
+        """A camera that gives the lines of the recording to be replayed."""
+        simulation = self.config.simulation
+        assert simulation.replay is not None
+        return ReplayCameraOpener(
+            self._wire,
+            simulation.replay,
+            arm,
+            self.config.stream.block_lines,
+            simulation.replay_loop,
+            simulation.replay_hold_s,
+        )
+
+    def _sensor(self, arm: str) -> CameraOpener:
+        """The model of the arm's camera, in the process that opens it."""
+        parts = {arm: self._part(arm) for arm in ARMS}
+        columns = self.config.columns
+        if not columns:
+            return parts[arm]
+        return SideBySideOpener(
+            tuple(parts.values()), tuple(columns[arm][0] for arm in ARMS), sensor_width(self.config)
+        )
+
+    def _part(self, arm: str) -> SimulatedCameraOpener:
+        config = self.config
+        assert self._scene is not None
+        optics = SimulatedOptics(arm, config.geometry, self._scene)
+        camera = config.cameras.arm(arm)
+        return SimulatedCameraOpener(
+            self._pulses(arm), optics, camera, config.stream.block_lines, config.line_rate_hz
+        )
+
+    def _pattern(self, arm: str) -> CameraOpener:
+        config = self.config
+        return PatternCameraOpener(
+            self._pulses(arm),
+            arm,
+            config.geometry,
+            config.cameras.arm(arm),
+            config.stream.block_lines,
+            config.line_rate_hz,
+        )
+
+    def _pulses(self, arm: str) -> Wire | PinWire:
+        """Where an arm's camera sees its trigger's pulses."""
+        return self._wire if self._pins is None else PinWire(self._pins, arm)
+
+    def describe(self) -> dict[str, Any]:
+        """What a recording must say about where its lines come from (JSON)."""
+        if self.config.simulation.replay is not None:
+            return describe_replay(self.config.simulation.replay)
+        if self._scene is not None:
+            return describe(self._scene)
+        return {"simulated": self.config.simulates_cameras}
+
+    @property
+    def layout(self) -> str:
+        """How the instrument is laid out, as the cameras or the scene's optics have it."""
+        if self.config.simulation.replay is not None:
+            return str(open_recording(self.config.simulation.replay).attrs["layout"])
+        if self.config.cameras.layout != "dual" or self._scene is None:
+            return self.config.cameras.layout
+        return self._scene.optics.layout
+
+    def scene(self) -> Scene:
+        """What the cameras see, in camera A's rows and columns; sub-step 0 is the run's first."""
+        trigger, geometry = self.config.trigger, self.config.geometry
+        scene = self._scene or load_scene(self.config.scene_file())
+        return build_scene(
+            scene, geometry.stages * geometry.substeps, trigger.substep_ticks / trigger.clock_hz
+        )
+
+    def close_cameras(self) -> None:
+        """Take the cameras away that have processes of their own."""
+        self._gentl.close()
+        self._gige.close()
+
+    def close_wires(self) -> None:
+        """Take away what carries the trigger's pulses, once the trigger is closed."""
+        self._wire.close()
+        if self._pins is not None:
+            self._pins.close()
+
+
+def lonely_transport(config: RigConfig) -> Callable[[], Transport]:
+    """What opens the way to a simulated trigger whose pulses nobody sees."""
+    return _transport(config, Wire(), None)
+
+
+def _transport(config: RigConfig, wire: Wire, pins: PinPage | None) -> Callable[[], Transport]:
+    """To the trigger's model, or to the compiled gateware."""
+    clock_hz = config.trigger.clock_hz
+    if config.trigger.driver == "rtl":
+        return partial(rtl.RtlTransport, clock_hz, pins)
+    return partial(TwinTransport, TriggerModel(wire, clock_hz, config.simulation.speed))
+
+
+def _check_scene(config: RigConfig, scene: SceneConfig) -> None:
+    """Raise UsageError here rather than in a camera's process."""
+    code = ConstantCode(0)
+    substep_s = config.trigger.substep_ticks / config.trigger.clock_hz
+    bench = Bench(scene, config.geometry, {arm: config.cameras.arm(arm) for arm in ARMS}, substep_s)
+    for arm in ARMS:
+        bench.camera(arm, code)
