@@ -269,18 +269,32 @@ def builtin_directory() -> Path:
     return installed if installed.is_dir() else Path(__file__).parent.parent / "configs"
 
 
-def find(name: str | Path, beside: Path | None = None) -> Path:
-    """The file ``name``: as a path, beside another file, or a built-in one (with or without .toml)."""
+_MARKS = {"rig": {"geometry", "cameras", "trigger"}, "scene": {"kind"}, "plan": {"segments"}}
+"""Keys by which a file shows what it describes."""
+_USES = {
+    "rig": "acquire serve --config {0}, or acquire simulate SCENE --config {0}",
+    "scene": "acquire simulate {0} --out NAME.zarr",
+    "plan": "acquire reconstruct RECORDING --plan {0} --out VIDEO.zarr",
+}
+"""The command that takes a file, by what it describes."""
+
+
+def find(name: str | Path, beside: Path | None = None, kind: str = "") -> Path:
+    """The file ``name``: as a path, beside another file, or a built-in one (with or without .toml).
+
+    ``kind``, one of rig, scene and plan, chooses the built-in files that an error lists.
+    """
     candidates = [Path(name)]
     if beside is not None:
         candidates.append(beside.parent / name)
     candidates += [builtin_directory() / name, builtin_directory() / f"{name}.toml"]
     for path in candidates:
-        if path.is_file():
+        if os.path.isfile(path):  # noqa: PTH113  # Path's raises for a name that no file can have
             return path
-    have = ", ".join(sorted(p.name for p in builtin_directory().glob("*.toml")))
-    why = "is a directory" if Path(name).is_dir() else "does not exist"
-    raise ConfigError(f"configuration file {str(name)!r} {why}", possible=f"a path, or one of {have}")
+    have = ", ".join(sorted(p.stem for p in builtin_directory().glob(f"{kind}*.toml")))
+    why = "is a directory" if name and os.path.isdir(name) else "does not exist"  # noqa: PTH112
+    what = f"{kind} file" if kind else "configuration file"
+    raise ConfigError(f"{what} {str(name)!r} {why}", possible=f"a path, or one of the built-in {have}")
 
 
 def load_rig(name: str | Path, overrides: Mapping[str, Any] | None = None) -> RigConfig:
@@ -288,14 +302,15 @@ def load_rig(name: str | Path, overrides: Mapping[str, Any] | None = None) -> Ri
 
     Relative paths of scenes are resolved against the file.
     """
-    path = find(name)
+    path = find(name, kind="rig")
     table = _read(path)
+    _check_kind(table, "rig", path)
     for key, value in (overrides or {}).items():
         _set(table, key, value)
     rig = _validate(RigConfig, table, path)
     if not rig.needs_scene:
         return rig
-    scene = find(rig.scene_file(), beside=path).resolve()
+    scene = find(rig.scene_file(), beside=path, kind="scene").resolve()
     return rig.model_copy(update={"simulation": rig.simulation.model_copy(update={"scene": str(scene)})})
 
 
@@ -326,16 +341,20 @@ def load_scene(name: str | Path) -> SceneConfig:
 
     Relative paths in it are resolved against the file.
     """
-    path = find(name)
+    path = find(name, kind="scene")
     if path.suffix != ".toml":
         return VideoSceneConfig(kind="video", title=path.name, path=path.resolve())
-    return anchored(_validate(SceneFile, _read(path), path).root, path.parent)
+    table = _read(path)
+    _check_kind(table, "scene", path)
+    return anchored(_validate(SceneFile, table, path).root, path.parent)
 
 
 def load_plan(name: str | Path) -> ReconstructionPlan:
     """Read and validate the plan of a combinatorial reconstruction."""
-    path = find(name)
-    return check_plan(_read(path), path)
+    path = find(name, kind="plan")
+    table = _read(path)
+    _check_kind(table, "plan", path)
+    return check_plan(table, path)
 
 
 def check_plan(table: dict[str, Any], origin: str | Path) -> ReconstructionPlan:
@@ -350,6 +369,17 @@ def _read(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path} is not TOML: {error}") from error
     except OSError as error:
         raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
+
+
+def _check_kind(table: dict[str, Any], wanted: str, path: Path) -> None:
+    """Raise ConfigError for a file that shows that it describes something else than what is ``wanted``."""
+    shown = [kind for kind, keys in _MARKS.items() if keys & table.keys()]
+    if len(shown) == 1 and shown != [wanted]:
+        raise ConfigError(
+            f"{path} describes a {shown[0]}, and a {wanted} was asked for",
+            possible=f"a {wanted} file",
+            hint=_USES[shown[0]].format(path.stem if path.parent == builtin_directory() else path),
+        )
 
 
 def _set(table: dict[str, Any], dotted: str, value: Any) -> None:

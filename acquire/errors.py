@@ -4,14 +4,16 @@
 
     AcquireError                1  (a defect of ours, or a refused computation)
     ├── UsageError              2  what was asked for is impossible as asked
-    │   └── ConfigError         2  a configuration file or value
+    │   ├── ConfigError         2  a configuration file or value
+    │   └── PlaceError          2  nothing of the kind is at a path or URL, or this user may not use it
     ├── NoDaemonError           3  nobody answers on the control socket
     ├── StateError              4  the daemon cannot do this now
     ├── DeviceError             5  trigger, camera or host hardware
     │   ├── TriggerError        5
-    │   └── CameraError         5
-    │       └── CameraLostError 5  it does not answer any more; it may come back
-    ├── DataError               6  a recording is damaged, or lines were lost
+    │   ├── CameraError         5
+    │   │   └── CameraLostError 5  it does not answer any more; it may come back
+    │   └── StoreError          5  a disk or a remote store fails, is full, or does not answer
+    ├── DataError               6  a recording is damaged, or lines were lost; never anything else
     └── NumericsError           1  a computation left the finite numbers
 
 A message states what was asked; ``possible`` and ``hint`` add what can be had and what to try.
@@ -72,6 +74,10 @@ class ConfigError(UsageError):
     """A configuration file or one of its values; the message names the key."""
 
 
+class PlaceError(UsageError):
+    """A path or URL holds nothing of the kind that was asked for, or this user may not use it."""
+
+
 class NoDaemonError(AcquireError):
     """Nobody answers on the control socket."""
 
@@ -102,8 +108,12 @@ class CameraLostError(CameraError):
     """A camera that was open does not answer any more; it may come back."""
 
 
+class StoreError(DeviceError):
+    """A disk or a remote store fails, is full, or does not answer; no recorded line is known to be lost."""
+
+
 class DataError(AcquireError):
-    """A recording is damaged, incomplete, or not a recording."""
+    """A recording is damaged or incomplete, or lines were lost."""
 
     exit_code = 6
 

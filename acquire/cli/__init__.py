@@ -10,6 +10,7 @@ goes away ends a command without any.
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 
@@ -32,8 +33,9 @@ from acquire.cli import (
     tradeoff,
     trigger,
 )
-from acquire.cli.output import print_error, say
-from acquire.errors import EXIT_INTERRUPTED, AcquireError, UsageError
+from acquire.cli.output import json_asked, print_error, say
+from acquire.cli.usage import not_installed, run
+from acquire.errors import EXIT_INTERRUPTED, AcquireError, DeviceError, UsageError
 
 MODULES = (
     demo,
@@ -54,6 +56,9 @@ MODULES = (
 )
 """Modules of commands, in the order of the help; each has ``register(app)``. New groups are added here."""
 
+HOST_ERRORS = (errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
+"""What a host runs out of, or fails at, whatever is asked for."""
+
 app = typer.Typer(
     name="acquire",
     help="Record and reconstruct with TDI-based compressed video.",
@@ -73,19 +78,30 @@ for module in MODULES:
 def main() -> int:
     """Entry point; the exit code is `acquire.errors`'."""
     try:
-        app()
+        return run(app)
     except AcquireError as error:
-        print_error(error, as_json="--json" in sys.argv)
-        return error.exit_code
+        return _failed(error)
+    except ModuleNotFoundError as error:
+        return _failed(not_installed(error))
     except OSError as error:
         _give_up_stdout()
-        where = f"{error.filename}: " if error.filename else ""
-        refused = UsageError(f"{where}{error.strerror or error}")
-        print_error(refused, as_json="--json" in sys.argv)
-        return refused.exit_code
+        if error.errno == errno.EPIPE:
+            return 1
+        return _failed(_refused(error))
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
-    return 0
+
+
+def _failed(error: AcquireError) -> int:
+    print_error(error, as_json=json_asked())
+    return error.exit_code
+
+
+def _refused(error: OSError) -> AcquireError:
+    """What the system refuses: a path or a right is the user's matter, all else is the host's."""
+    where = f"{error.filename}: " if error.filename else ""
+    kind = DeviceError if error.errno in HOST_ERRORS else UsageError
+    return kind(f"{where}{error.strerror or error}")
 
 
 def _give_up_stdout() -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -73,10 +74,17 @@ def print_table(columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
         say("  ".join(padded).rstrip())
 
 
+def json_asked() -> bool:
+    """Whether this command was given ``--json``; also where its words are wrong and were never taken."""
+    return "--json" in sys.argv[1:]
+
+
 def print_error(error: AcquireError, *, as_json: bool) -> None:
-    """What was asked, what is possible, what to try; on stderr."""
+    """What was asked, what is possible, what to try; on stderr. As JSON: one line, ``{"error": {…}}``."""
     if as_json:
-        typer.echo(json_text(error.to_dict()), err=True)
+        facts = error.to_dict()
+        about = {"kind": facts.pop("error"), **facts}
+        typer.echo(json_text({"error": about}), err=True)
         return
     first, *others = error.message.split("\n")
     say(f"acquire: error: {first}", err=True)

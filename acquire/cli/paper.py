@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from acquire.cli.output import JsonFlag, print_json, print_table, say
+from acquire.cli.places import new_directory
 from acquire.cli.progress import told
 from acquire.errors import UsageError
 
@@ -43,14 +44,11 @@ def paper(
     from acquire.evaluate.paper import Studio, make
     from acquire.evaluate.paper.page import draw, summarise, write_page
     from acquire.reconstruct import Options
-    from acquire.store.files import check_new_path
 
-    check_new_path(out)
-    out.mkdir()
     options = Options(preset, solver, None, budget)  # type: ignore[arg-type]  # checked there
     made: list[dict[str, Any]] = []
     pictures: dict[str, Path] = {}
-    with told() as tell, limit_blas(idle_cores()):
+    with new_directory(out), told() as tell, limit_blas(idle_cores()):
         for name in chosen:
             studio = Studio(out, options, seed, lambda text, name=name: tell(f"{name}: {text}"))  # type: ignore[misc]
             figure = make(name, studio)

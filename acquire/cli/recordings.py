@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, quantity, say
+from acquire.cli.places import local_path
 from acquire.cli.progress import stage_progress
 from acquire.errors import AcquireError, DataError, UsageError
 
@@ -23,7 +24,9 @@ PlaceArgument = Annotated[
     str, typer.Argument(metavar="RECORDING", help="A directory NAME.zarr, or its URL: s3://bucket/NAME.zarr.")
 ]
 
-RecordingArgument = Annotated[Path, typer.Argument(metavar="RECORDING", help="A directory NAME.zarr.")]
+RecordingArgument = Annotated[
+    Path, typer.Argument(metavar="RECORDING", help="A directory NAME.zarr.", parser=local_path)
+]
 
 LISTED = 20
 """Damaged stretches that are printed; --json has all of them."""
@@ -46,9 +49,11 @@ def list_recordings(
 
     Example: [bold]acquire ls /data[/]
     """
-    if not directory.is_dir():
-        raise UsageError(f"ls {directory}: no such directory")
-    found = [_summary(path) for path in sorted(directory.glob("*.zarr")) if _may_be_one(path)]
+    from acquire.store.refusals import refused
+
+    with refused(directory, "listed", "a directory that holds recordings; `acquire info` describes one"):
+        named = sorted(path for path in directory.iterdir() if path.name.endswith(".zarr"))
+    found = [_summary(path) for path in named if _may_be_one(path)]
     if json:
         print_json(found)
     elif not found:
@@ -221,7 +226,7 @@ def _may_be_one(path: Path) -> bool:
 
     try:
         return path.is_dir() and not (format_of(path) or "").startswith("acquire-video/")
-    except DataError:
+    except AcquireError:
         return True
 
 
@@ -340,8 +345,11 @@ def _save(segment: Segment, out: Path) -> int:
     """Write the segment; a file that is there is whole. The file's size."""
     import numpy as np
 
+    from acquire.store.refusals import refusal, refused
+
     part = out.with_name(f".{out.name}.{os.getpid()}.partial")
-    file = part.open("xb")
+    with refused(out, "written"):
+        file = part.open("xb")
     try:
         with file:
             np.savez(
@@ -359,9 +367,9 @@ def _save(segment: Segment, out: Path) -> int:
             )
         os.link(part, out)  # refuses where a rename would replace
     except FileExistsError as error:
-        raise UsageError(f"cut to {out}: it came into being meanwhile", hint="another --out") from error
+        raise UsageError(f"{out} was made by somebody else meanwhile", hint="another --out") from error
     except OSError as error:
-        raise DataError(f"cut to {out}: {error.strerror}") from error
+        raise refusal(out, error, "written") from error
     finally:
         part.unlink(missing_ok=True)
     return out.stat().st_size

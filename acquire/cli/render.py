@@ -37,7 +37,7 @@ def render(
 
     Example: [bold]acquire render fish-1x820.zarr fish-3x4.zarr --out fish.mp4[/]
     """
-    from acquire.evaluate.rendering import Look, Panel
+    from acquire.evaluate.rendering import Look, Panel, check_suffix
     from acquire.evaluate.rendering import render as draw
     from acquire.store import open_video
     from acquire.store.files import check_new_path
@@ -46,6 +46,7 @@ def render(
     count = frames if frames is not None else SHEET_FRAMES if sheet else MOVIE_FRAMES
     look = Look(height or (192 if sheet else 384), peak, fps)
     _check(count, look.panel_px, fps, peak)
+    check_suffix(out)
     check_new_path(out)
     panels = [Panel(PurePosixPath(place).stem, open_video(place)) for place in video]
     part = out.with_name(f".{os.getpid()}.{out.name}")
@@ -71,4 +72,4 @@ def _check(count: int, height: int, fps: float, peak: float | None) -> None:
         ("--peak", 1.0 if peak is None else peak, 1e-30, 1e30),
     ):
         if not low <= value <= high:
-            raise UsageError(f"{name} {value}", possible=f"{low} to {high}")
+            raise UsageError(f"{name} {value} is out of range", possible=f"{low} to {high}")

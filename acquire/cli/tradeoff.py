@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import os
 import shlex
 import sys
 from datetime import UTC, datetime
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from acquire.cli.output import JsonFlag, print_json, print_table, say
+from acquire.cli.places import new_directory
 from acquire.cli.progress import stage_progress, told
 
 if TYPE_CHECKING:
@@ -52,7 +54,6 @@ def tradeoff(
     from acquire.recon import ITERATIONS
     from acquire.recon.request import preset_iterations
     from acquire.reconstruct.learned import remember
-    from acquire.store.files import check_new_path
 
     kinds = [parse_voxels(text) for text in voxels or ["3x1"]]
     presets = tuple(preset or ("fast", "balanced"))
@@ -61,15 +62,15 @@ def tradeoff(
         for kind in presets:
             preset_iterations(each, kind)
     dtypes = [open_arrays("cpu", each).dtype for each in dtype or DTYPES]
-    check_new_path(out)
-    recording, study = _opened(source, out, (first_line or FIRST_LINE) + lines)
-    segment = recording.cut(_first(recording, first_line, lines), lines)
-    judge, runs = Judge.of(recording, segment), []
-    for shape, each, exact in itertools.product(kinds, solvers, dtypes):
-        with stage_progress(f"{each} {shape} {exact}") as advance, limit_blas(idle_cores()):
-            runs.append(measure(judge, each, shape, presets, budget, advance, dtype=exact))  # type: ignore[arg-type]
-    command = f"acquire {shlex.join(sys.argv[1:])}"
-    page = write_page(runs, study, out, Path(source).stem, command, datetime.now(UTC))
+    with new_directory(out):
+        recording, study = _opened(source, out, (first_line or FIRST_LINE) + lines)
+        segment = recording.cut(_first(recording, first_line, lines), lines)
+        judge, runs = Judge.of(recording, segment), []
+        for shape, each, exact in itertools.product(kinds, solvers, dtypes):
+            with stage_progress(f"{each} {shape} {exact}") as advance, limit_blas(idle_cores()):
+                runs.append(measure(judge, each, shape, presets, budget, advance, dtype=exact))  # type: ignore[arg-type]
+        command = f"acquire {shlex.join(sys.argv[1:])}"
+        page = write_page(runs, study, out, Path(source).stem, command, datetime.now(UTC))
     kept = remember(_lessons(runs)) if learn else None
     if json:
         print_json({"page": str(page), "learned": kept and str(kept), "rows": table(runs)})
@@ -93,13 +94,11 @@ def _opened(source: str, out: Path, lines: int) -> tuple[Recording, Study | None
     from acquire.simulate import bench_of, simulate, study
     from acquire.store import open_recording
 
-    if (Path(source) / "zarr.json").exists():
-        recording = open_recording(Path(source))
-        out.mkdir()
+    if "://" in source or os.path.isdir(source):  # noqa: PTH112  # Path's raises for an impossible name
+        recording = open_recording(source)
         return recording, None
     scene = load_scene(source)
     rig = load_rig(scene.rig)
-    out.mkdir()
     with told() as tell:
         tell(f"recording {source}")
         simulate(rig, scene, out / "recording.zarr", lines)

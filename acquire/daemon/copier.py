@@ -21,10 +21,11 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from acquire.daemon.messages import ErrorMessage, UploadStatus
-from acquire.errors import AcquireError, DataError, UsageError
+from acquire.errors import AcquireError, PlaceError, UsageError
 from acquire.store import open_recording
 from acquire.store.mirror import LOOK_S, Mirror, only_copy
 from acquire.store.opening import read_root
+from acquire.store.refusals import refusal
 from acquire.store.remote import RemoteSource, be_patient, url_below
 from acquire.store.source import LocalSource
 
@@ -152,10 +153,8 @@ class Copier:
         except UsageError as error:
             return Reached(number, ErrorMessage.of(error), refused=True)
         except OSError as error:
-            told = DataError(f"{self._target}: {error}")
-            return Reached(
-                number, ErrorMessage.of(told), isinstance(error, FileNotFoundError | PermissionError)
-            )
+            told = refusal(self._target, error, "written")
+            return Reached(number, ErrorMessage.of(told), refused=isinstance(told, PlaceError))
         return Reached(number)
 
     def _serve(self, job: Job) -> None:
@@ -163,6 +162,8 @@ class Copier:
             if job.mirror is not None or self._begin(job):
                 assert job.mirror is not None
                 self._advance(job, job.mirror)
+        except PlaceError as error:  # a bucket, rights or credentials may come
+            self._put_off(job, error.message, error.hint)
         except UsageError as error:
             self._end(job, state="refused", error=error.message, hint=error.hint)
         except AcquireError as error:

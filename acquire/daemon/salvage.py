@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from acquire.daemon.messages import RecoveryStatus
-from acquire.errors import AcquireError, DataError, DeviceError, StateError
+from acquire.errors import AcquireError, DataError, DeviceError, PlaceError, StateError
 from acquire.store import FORMAT, Circumstances, recover
 from acquire.store.files import DISK, locked
 from acquire.store.host import has_run_on, is_here
@@ -231,7 +231,7 @@ def open_recordings(directory: Path) -> list[Path]:
 def _is_open(path: Path) -> bool:
     try:
         attributes = read_root(LocalSource(path))["attributes"]
-    except DataError:
+    except (DataError, PlaceError):
         return False  # none, or none that can say what it is: `acquire ls` names it
     return (attributes.get("format"), attributes.get("state")) == (FORMAT, "recording")
 

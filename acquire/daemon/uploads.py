@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 
 from acquire.daemon.copier import MOST_WAIT_S, Copy, Reach, Reached, copy_recordings, wait_s
 from acquire.daemon.messages import UploadStatus
-from acquire.errors import ConfigError, DataError, DeviceError, UsageError
+from acquire.errors import ConfigError, DataError, DeviceError, PlaceError, UsageError
 from acquire.store.files import Publisher
 from acquire.store.opening import read_root
 from acquire.store.remote import check_url, url_below
@@ -61,7 +61,7 @@ def _wants_copy(path: Path) -> bool:
     """The rig that recorded it copies its recordings."""
     try:
         config = read_root(LocalSource(path))["attributes"].get("config", {})
-    except DataError:
+    except (DataError, PlaceError):
         return False
     return bool(config.get("recording", {}).get("upload_to"))
 
@@ -164,7 +164,7 @@ class Uploads:
             raise UsageError(
                 f"arm: recordings cannot be uploaded: {told.message}",
                 possible=told.possible,
-                hint=told.hint or "recording.upload_to and the environment's credentials, or arm --force",
+                hint=f"{told.hint or 'recording.upload_to'}; or arm --force",
             )
         if answer is not None and answer.error is not None:
             self.warning = answer.error.message

@@ -55,6 +55,17 @@ class Panel:
         return frame
 
 
+def check_suffix(path: Path) -> None:
+    """Raise UsageError for a file name that says none of `SUFFIXES`."""
+    if path.suffix.lower() not in SUFFIXES:
+        raise UsageError(
+            f"{path} cannot be rendered: "
+            + (f"{path.suffix} is no format that is known" if path.suffix else "its name has no suffix"),
+            possible=".mp4 (a movie), .gif or .webp (an animation), .png (a sheet of stills)",
+            hint=f"--out {path.with_suffix('.mp4')}",
+        )
+
+
 def common_times(panels: Sequence[Panel], count: int) -> NDArray[np.int64]:
     """At most ``count`` instants, equally spaced, at which frames of the finest panel begin and all have one.
 
@@ -65,7 +76,10 @@ def common_times(panels: Sequence[Panel], count: int) -> NDArray[np.int64]:
     end = min(panel.file.time_ns[-1] + panel.file.interval_ns for panel in panels)
     times = finest[(finest >= begin) & (finest < end)]
     if not len(times):
-        raise UsageError("videos side by side that have no time in common")
+        raise UsageError(
+            "the videos have no time in common, so they cannot be shown side by side",
+            hint="each of them by itself",
+        )
     step = -(-len(times) // max(1, count))
     chosen: NDArray[np.int64] = times[::step]
     return chosen
@@ -80,10 +94,9 @@ def render(
 ) -> int:
     """Write ``count`` frames or fewer, as ``path``'s suffix says; the number of them.
 
-    UsageError for a suffix that is none of `SUFFIXES`, or for MP4 without the extra it needs.
+    UsageError as `check_suffix`, or for MP4 without the extra it needs.
     """
-    if path.suffix.lower() not in SUFFIXES:
-        raise UsageError(f"rendering to {path.name}", possible=", ".join(SUFFIXES))
+    check_suffix(path)
     times = common_times(panels, count)
     peaks = [look.peak or _peak(panel) for panel in panels]
     pictures = _pictures(panels, times, peaks, look, progress)

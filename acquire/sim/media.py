@@ -248,7 +248,10 @@ def _open_container(path: Path) -> Source:
     try:
         return _Container(path)
     except (av.FFmpegError, ValueError) as error:
-        raise UsageError(f"{path} is no picture and no video: {error}") from error
+        raise UsageError(
+            f"{path} is neither a picture nor a video that can be read: {error}",
+            possible="a scene file (.toml), pictures, videos and arrays (.npy)",
+        ) from error
 
 
 class _Container:

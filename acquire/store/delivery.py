@@ -14,16 +14,13 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
-from acquire.errors import DataError, UsageError
+from acquire.errors import UsageError
 from acquire.store.files import DISK, check_new_path
+from acquire.store.refusals import refused
 from acquire.store.remote import RemoteSource, is_url
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 ROOT = "zarr.json"
 
@@ -34,14 +31,14 @@ class Delivery(Protocol):
     partial: Path
 
     def deliver(self) -> None:
-        """It appears at its place. UsageError where something is by now, DataError when that fails."""
+        """It appears at its place. UsageError where something is by now, StoreError when that fails."""
 
     def clear(self) -> None:
         """Nothing of it stays here; what was delivered does."""
 
 
 def delivery_to(place: Path | str) -> Delivery:
-    """UsageError where nothing new can be created at a place; DataError for a store that does not answer."""
+    """UsageError where nothing new can be created at a place; StoreError for a store that does not answer."""
     return _FarDelivery(str(place)) if is_url(place) else _LocalDelivery(Path(place))
 
 
@@ -60,7 +57,7 @@ class _LocalDelivery:
         self.partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
 
     def deliver(self) -> None:
-        with told(self._path):
+        with refused(self._path, "written"):
             DISK.sync_tree(self.partial)
             check_new_path(self._path)
             self.partial.rename(self._path)
@@ -83,7 +80,7 @@ class _FarDelivery:
         files.sort(
             key=lambda file: (file == self.partial / ROOT, file.name != ROOT)
         )  # what it is comes first
-        with told(self._target):
+        with refused(self._target, "written"):
             for file in files:
                 key = file.relative_to(self.partial).as_posix()
                 if self._target.has_directories:
@@ -96,7 +93,7 @@ class _FarDelivery:
 
 def _check_free(target: RemoteSource) -> None:
     """Where an upload has failed, there are arrays without a root; anything else is not ours to replace."""
-    with told(target):
+    with refused(target, "read"):
         there = target.sizes()
     if ROOT in there:
         raise UsageError(f"{target} exists already", hint="another name; nothing is ever overwritten")
@@ -104,14 +101,3 @@ def _check_free(target: RemoteSource) -> None:
     foreign = sorted(key for key in there if key.partition("/")[0] not in arrays)
     if foreign:
         raise UsageError(f"{target} holds something else, such as {foreign[0]}", hint="another URL")
-
-
-@contextmanager
-def told(place: object) -> Iterator[None]:
-    """What a disk or a store refuses, in words."""
-    try:
-        yield
-    except OSError as error:
-        raise DataError(
-            f"{place} cannot be written: {error.strerror or error}", hint="another place"
-        ) from error

@@ -24,6 +24,7 @@ from acquire.lines import ARMS
 from acquire.store.files import DISK, locked
 from acquire.store.layout import PARSE_ERRORS, group_document, to_json
 from acquire.store.opening import open_recording
+from acquire.store.refusals import refusal
 from acquire.store.remote import RemoteSource
 from acquire.store.retention import keep_from, release, shard_files
 from acquire.store.scan import COLUMNS
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
+    from acquire.errors import AcquireError
     from acquire.store.files import Disk
     from acquire.store.layout import Document
     from acquire.store.reader import Recording
@@ -39,9 +41,7 @@ if TYPE_CHECKING:
 LOOK_S = 0.5
 """How often a growing recording is looked at."""
 _ELSEWHERE = "another name there: acquire upload RECORDING URL"
-_HINT = (
-    "the network, the store, and the environment's credentials; what is there stays: a copy goes on with it"
-)
+_HINT = "what is there already stays: the same command goes on with it"
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +77,8 @@ def mirror(
     """Copy the recording at ``path`` to ``url``; with ``follow`` until it is sealed.
 
     Raises UsageError where ``url`` holds something else, StateError while another process copies it,
-    DataError when the store fails, and when a recording that is followed has not grown for ``idle_s``: its
-    writer is gone.
+    StoreError and PlaceError when the store fails or refuses, and DataError when a recording that is followed
+    has not grown for ``idle_s``: its writer is gone.
     """
     open_recording(path)  # which says what else it may be
     with only_copy(path):
@@ -115,8 +115,14 @@ def only_copy(path: Path) -> Iterator[None]:
         except StateError as error:
             raise StateError(f"{path} is being copied by another process", hint="acquire status") from error
         except OSError as error:
-            raise DataError(f"{path} cannot be copied: {error.strerror}") from error
+            raise refusal(path, error, "copied") from error
         yield
+
+
+def _not_copied(copying: Mirror, error: OSError) -> AcquireError:
+    """A copy fails for what is read here, or for what is written there."""
+    here = error.filename is not None and str(error.filename).startswith(str(copying.path))
+    return refusal(copying.path, error, "read") if here else refusal(copying.target, error, "written", _HINT)
 
 
 def _nothing() -> None:
@@ -151,7 +157,7 @@ class Mirror:
             self._there = self.target.sizes()
             self._check_target()
         except OSError as error:
-            raise DataError(f"{url} cannot be used: {error}", hint=_HINT) from error
+            raise refusal(url, error, "used", _HINT) from error
 
     @property
     def grows(self) -> bool:
@@ -160,7 +166,8 @@ class Mirror:
 
     def step(self, most_shards: int | None = None) -> Mirrored:
         """Copy what is new and whole, or the next ``most_shards`` of it; what is new of a sealed recording
-        readers there see once it is complete. Raises DataError when the store fails; a later step goes on.
+        readers there see once it is complete. Raises StoreError when the store fails and
+        PlaceError when it refuses; a later step goes on.
         """
         recording = open_recording(self.path)
         if recording.attrs["run_id"] != self._run_id:
@@ -177,7 +184,7 @@ class Mirror:
             if whole or not sealed:
                 self._publish(recording, lines)
         except OSError as error:
-            raise DataError(f"copying {self.path} to {self.target}: {error}", hint=_HINT) from error
+            raise _not_copied(self, error) from error
         self._let_go(None if sealed else recording.first_line + lines)
         waiting = recording.lines - lines
         return Mirrored(str(self.target), lines, self._shards, self._bytes, whole, waiting)

@@ -7,22 +7,29 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from acquire.codes import code_from_attrs
-from acquire.errors import DataError, UsageError
+from acquire.errors import DataError, PlaceError, UsageError
+from acquire.lines import ARMS
 from acquire.store.camera_stream import DAMAGE, CameraStream
 from acquire.store.layout import line_columns
 from acquire.store.reader import Recording
+from acquire.store.refusals import refusal, refused
 from acquire.store.source import source_of
 from acquire.store.spec import CAMERA_KEYS, FORMAT
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from acquire.errors import AcquireError
     from acquire.store.layout import Document
     from acquire.store.source import Source
 
 
 def open_recording(place: Path | str) -> Recording:
-    """Open a recording, growing or sealed. Raises DataError where there is none, or a damaged one."""
+    """Open a recording, growing or sealed.
+
+    Raises PlaceError where there is none, DataError for a damaged one, and StoreError where that cannot be
+    found out.
+    """
     return open_source(source_of(place))
 
 
@@ -42,26 +49,48 @@ def open_source(source: Source) -> Recording:
 
 
 def format_of(place: Path | str) -> str | None:
-    """The format that a Zarr group names, if any; DataError where there is no group to ask."""
+    """The format that a Zarr group names, if any. Raises as `read_root` does."""
     return _format(read_root(source_of(place)))
 
 
 def read_root(source: Source) -> Document:
-    """The root's zarr.json, with attributes. Raises DataError where there is none."""
+    """The root's zarr.json, with attributes.
+
+    Raises PlaceError where there is no Zarr group, DataError where its metadata is damaged or was removed,
+    and StoreError where a disk or a store does not say.
+    """
     try:
         document: Document = json.loads(source.read("zarr.json"))
         dict(document["attributes"])
-    except (FileNotFoundError, NotADirectoryError) as error:
-        if not source.exists():
-            raise DataError(f"{source} does not exist", hint="the path of a directory NAME.zarr") from error
-        raise DataError(
-            f"{source} is not a recording: it holds no zarr.json", hint="the path of a directory NAME.zarr"
-        ) from error
+    except (FileNotFoundError, NotADirectoryError, IsADirectoryError) as error:
+        raise _no_root(source) from error
     except OSError as error:
-        raise DataError(f"{source} cannot be read: {error.strerror or error}") from error
+        raise refusal(source, error, "read") from error
     except (ValueError, LookupError, TypeError) as error:
         raise DataError(f"{source}: zarr.json is damaged: {error}", hint="a copy of the recording") from error
     return document
+
+
+def _no_root(source: Source) -> AcquireError:
+    """Why there is no root metadata at a place: nothing, something else, or a recording that lost it."""
+    hint = "the path or URL of a directory NAME.zarr; `acquire ls DIR` lists those of a directory"
+    with refused(source, "read"):
+        if not source.exists():
+            return PlaceError(f"{source} does not exist", hint=hint)
+        if _has(source, f"{ARMS[0]}/lines/zarr.json"):
+            return DataError(
+                f"{source} is a recording whose root metadata, zarr.json, is missing",
+                hint="zarr.json from a copy of the recording; the lines themselves are still in a/ and b/",
+            )
+    return PlaceError(f"{source} is not a recording: it holds no zarr.json", hint=hint)
+
+
+def _has(source: Source, key: str) -> bool:
+    try:
+        source.size(key)
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    return True
 
 
 def _format(document: Document) -> str | None:
@@ -73,12 +102,17 @@ def _check_format(source: Source, name: str | None) -> None:
     if name == FORMAT:
         return
     if name is not None and name.startswith(FORMAT.split("/")[0] + "/"):
-        raise DataError(
+        raise PlaceError(
             f"{source} is a recording of format {name!r}",
             possible=f"{FORMAT!r}",
             hint="a newer version of acquire",
         )
-    raise DataError(f"{source} is a Zarr group, but not a recording: format {name!r}", possible=f"{FORMAT!r}")
+    video = name is not None and name.startswith("acquire-video/")
+    raise PlaceError(
+        f"{source} is a {'video' if video else 'Zarr group'}, but not a recording: format {name!r}",
+        possible=f"{FORMAT!r}",
+        hint="acquire render, which shows videos" if video else "the path of a recording",
+    )
 
 
 def _check_complete(recording: Recording) -> None:

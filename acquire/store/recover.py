@@ -110,8 +110,8 @@ def recover(
     """Recover the recording at ``path``, and list it where it goes on in segments; idempotent.
 
     ``progress`` is told chunks looked at, and how many there are; what it raises ends the recovery, which
-    can begin anew at any time. Raises DataError where there is no recording or the disk refuses, StateError
-    while somebody writes it.
+    can begin anew at any time. Raises PlaceError where there is no recording, DataError where the disk
+    refuses, StateError while somebody writes it.
     """
     open_recording(path)
     with locked(path, "recovering", surely=not known.alone):

@@ -1,7 +1,8 @@
 """Recordings far away: anything that fsspec reaches, with obstore for object stores (S3, Google, Azure).
 
 Credentials and endpoints come from the environment, as those stores document it (AWS_ENDPOINT and the like);
-none of them is ever written anywhere.
+none of them is ever written anywhere. Where there are none, a store is refused at once: obstore would ask the
+metadata service of the cloud's machines, which no other machine can reach, and wait for it.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from acquire.errors import UsageError
+from acquire.errors import PlaceError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -27,7 +28,49 @@ RETRY = {"max_retries": 4, "retry_timeout": timedelta(seconds=30)}
 """For how long a store that does not answer is asked again."""
 _ATTEMPTS = re.compile(r" in [\d.]+\w+, after \d+ retries, max_retries: \d+, retry_timeout: \w+ ?")
 """What obstore tells of that is another text each time."""
+_STATUS = re.compile(r"status code: (\d+)")
+_STATUS_ERRORS: dict[str, type[OSError]] = {
+    "401": PermissionError,
+    "403": PermissionError,
+    "404": FileNotFoundError,
+}
 
+WAYS_IN = {
+    "s3": (
+        ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"),
+        ("AWS_WEB_IDENTITY_TOKEN_FILE",),
+        ("AWS_CONTAINER_CREDENTIALS_RELATIVE_URI",),
+        ("AWS_CONTAINER_CREDENTIALS_FULL_URI",),
+        ("AWS_SKIP_SIGNATURE",),
+        ("AWS_METADATA_ENDPOINT",),
+    ),
+    "gs": (
+        ("GOOGLE_APPLICATION_CREDENTIALS",),
+        ("GOOGLE_SERVICE_ACCOUNT",),
+        ("GOOGLE_SERVICE_ACCOUNT_PATH",),
+        ("GOOGLE_SERVICE_ACCOUNT_KEY",),
+        ("GOOGLE_SKIP_SIGNATURE",),
+        ("GCE_METADATA_HOST",),
+    ),
+    "az": (
+        ("AZURE_STORAGE_ACCOUNT_KEY",),
+        ("AZURE_STORAGE_ACCESS_KEY",),
+        ("AZURE_STORAGE_SAS_TOKEN",),
+        ("AZURE_STORAGE_SAS_KEY",),
+        ("AZURE_STORAGE_TOKEN",),
+        ("AZURE_STORAGE_CLIENT_ID",),
+        ("AZURE_CLIENT_ID",),
+        ("AZURE_FEDERATED_TOKEN_FILE",),
+        ("AZURE_USE_AZURE_CLI",),
+        ("AZURE_STORAGE_USE_EMULATOR",),
+        ("AZURE_SKIP_SIGNATURE",),
+        ("AZURE_MSI_ENDPOINT",),
+        ("IDENTITY_ENDPOINT",),
+    ),
+}
+"""Variables of the environment, any of these groups of which gives access to a kind of object store."""
+_FAMILIES = {"s3a": "s3", "gcs": "gs", "abfs": "az", "abfss": "az"}
+_GOOGLE_FILE = ".config/gcloud/application_default_credentials.json"
 
 PATIENCE = "120s"
 PROOF = ".acquire"
@@ -58,7 +101,9 @@ class RemoteSource:
     """Bytes below a URL; see `source.Source`. Every failure is an OSError."""
 
     def __init__(self, url: str) -> None:
-        """Raises UsageError for a URL that cannot be one, or whose packages are not installed."""
+        """Raises UsageError for a URL that cannot be one, or whose packages are not installed, and PlaceError
+        for an object store without credentials in the environment.
+        """
         self.url = url.rstrip("/")
         self._fs, self._root = _file_system(self.url)
 
@@ -154,8 +199,28 @@ def check_url(url: str) -> None:
         fsspec.get_filesystem_class(protocol)
 
 
+def _check_credentials(url: str) -> None:
+    """Raise PlaceError for an object store to which nothing in the environment gives access; asks nobody."""
+    protocol = url.partition("://")[0]
+    family = _FAMILIES.get(protocol, protocol)
+    if family not in WAYS_IN or not _has_obstore():
+        return
+    known = {name.upper() for name, value in os.environ.items() if value}
+    if any(known.issuperset(way) for way in WAYS_IN[family]):
+        return
+    if family == "gs" and (Path.home() / _GOOGLE_FILE).is_file():
+        return
+    usual, *others = (" and ".join(way) for way in WAYS_IN[family])
+    raise PlaceError(
+        f"{url} cannot be reached: the environment holds no credentials for {family}:// stores",
+        possible=f"{usual}; or one of {', '.join(others)}",
+        hint=f"export {usual.replace(' and ', '=… ')}=…",
+    )
+
+
 def _file_system(url: str) -> tuple[Any, str]:
     check_url(url)
+    _check_credentials(url)
     import fsspec
 
     with _told(url):
@@ -201,9 +266,16 @@ def _as_os_errors() -> Iterator[None]:
     try:
         yield
     except tuple(_store_errors()) as error:
-        kinds = (kind for known, kind in _store_errors().items() if isinstance(error, known))
-        text = _ATTEMPTS.sub("", str(error).partition("\n")[0])
-        raise next(kinds)(text[:300]) from error
+        text = _ATTEMPTS.sub("", str(error).partition("\n")[0].partition(": <?xml")[0])
+        raise _kind_of(error, text)(text[:300]) from error
+
+
+def _kind_of(error: Exception, text: str) -> type[OSError]:
+    """obstore names the reason of most refusals; of a listing it gives the server's status alone."""
+    status = _STATUS.search(text)
+    if status is not None and status[1] in _STATUS_ERRORS:
+        return _STATUS_ERRORS[status[1]]
+    return next(kind for known, kind in _store_errors().items() if isinstance(error, known))
 
 
 @cache

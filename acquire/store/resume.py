@@ -16,7 +16,7 @@ from dataclasses import replace
 from glob import escape
 from typing import TYPE_CHECKING
 
-from acquire.errors import DataError, UsageError
+from acquire.errors import DataError, PlaceError, UsageError
 from acquire.lines import ARMS
 from acquire.store.files import DISK, SCRATCH, Publisher, locked
 from acquire.store.layout import to_json
@@ -89,7 +89,7 @@ def _segments_beside(first: Path) -> list[str]:
     for path in first.parent.glob(f"{escape(first.stem)}-*{escape(first.suffix)}"):
         try:
             attributes = read_root(LocalSource(path))["attributes"]
-        except DataError:
+        except (DataError, PlaceError):
             continue  # no recording, or none that could say what it is
         segment = attributes.get("segment")
         if segment and (segment["of"], attributes.get("run_id")) == (first.name, run_id):

@@ -22,6 +22,7 @@ from acquire.lines import ARMS
 from acquire.store.files import DISK, Publisher
 from acquire.store.layout import PARSE_ERRORS, line_columns
 from acquire.store.opening import open_recording
+from acquire.store.refusals import refusal
 from acquire.store.remote import url_below
 from acquire.store.shard import shard_key
 
@@ -76,7 +77,7 @@ def hold(path: Path, first_line: int, count: int, why: str = "", disk: Disk = DI
         name = f"{first_line}-{count}.json"
         Publisher(directory / f".{name}", disk).replace(directory / name, text, durable=True)
     except OSError as error:
-        raise DataError(f"{path}: lines cannot be held: {error.strerror}") from error
+        raise refusal(f"{path}: lines {first_line} to {first_line + count - 1}", error, "held") from error
     for first, gone in open_recording(path).dropped:
         if first < first_line + count and first_line < first + gone:
             last = min(first + gone, first_line + count) - 1
@@ -96,7 +97,7 @@ def keep_from(path: Path, line: int, url: str, disk: Disk = DISK) -> None:
         disk.make_directory(_holds(path), parents=True)
         Publisher(_holds(path) / ".copy", disk).replace(_copy_hold(path, url), text, durable=True)
     except OSError as error:
-        raise DataError(f"{path}: lines cannot be held: {error.strerror}") from error
+        raise refusal(f"{path}: lines from {line} on", error, "held") from error
 
 
 def holds_of(path: Path) -> list[Hold]:

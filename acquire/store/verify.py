@@ -66,7 +66,7 @@ class Verification:
 
 def verify(place: Path | str, progress: Callable[[int, int], None] | None = None) -> Verification:
     """Read all of a recording, here or far away: presence, length and checksum of every chunk, and that
-    numbering, gaps, flags and ledger agree. Raises DataError where there is no recording to look at.
+    numbering, gaps, flags and ledger agree. Raises as `open_recording` does.
     """
     source = source_of(place)
     recording = open_source(source)

@@ -22,11 +22,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import zarr
 from zarr.codecs import BloscCodec, Crc32cCodec
+from zarr.errors import GroupNotFoundError
 
-from acquire.errors import DataError, UsageError
+from acquire.errors import DataError, PlaceError, UsageError
 from acquire.store.camera_stream import DAMAGE, child_array
-from acquire.store.delivery import delivery_to, told
+from acquire.store.delivery import delivery_to
 from acquire.store.layout import group_document, to_json
+from acquire.store.refusals import refused
 from acquire.store.source import source_of
 
 if TYPE_CHECKING:
@@ -37,6 +39,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 FORMAT = "acquire-video/1"
+_VIDEO = "the path of a video (a directory NAME.zarr), as `acquire reconstruct --out` writes one"
 CHUNK_BYTES = 4 * 2**20
 DTYPES = ("uint8", "uint16", "float32")
 
@@ -90,7 +93,7 @@ def write_video(
 
     ``pixel_size`` is the side of a pixel in ``pixel_unit``, a UDUNITS-2 name of a length, or None where only
     ratios are known. The image appears whole or not at all. UsageError for what cannot be written, before
-    anything is touched; DataError when the disk refuses.
+    anything is touched; StoreError when the disk refuses.
     """
     _check(video, time_ns, pixel_size, frame_interval_ns, provenance)
     rows, columns = video.shape[1:]
@@ -121,7 +124,7 @@ class VideoWriter:
         self._place, self._delivery = place, delivery_to(place)
         name = PurePosixPath(str(place)).stem
         self._ome = _ome(name, (frame_interval_ns * 1e-9, pixel_size, pixel_size), pixel_unit)
-        with told(place):
+        with refused(place, "written"):
             self._group = zarr.create_group(self._delivery.partial, zarr_format=3)
             self._image = _image(self._group, shape, dtype)
             self._columns = {"time": _column(self._group, "time", "int64", TIME_ATTRIBUTES)}
@@ -133,7 +136,7 @@ class VideoWriter:
     def append(
         self, video: NDArray[Any], time_ns: NDArray[np.int64], quality: NDArray[np.float32] | None = None
     ) -> None:
-        """The next frames (t, y, x). Whole chunks go to the disk; DataError when it refuses."""
+        """The next frames (t, y, x). Whole chunks go to the disk; StoreError when it refuses."""
         columns = (time_ns,) if quality is None else (time_ns, quality)
         self._chunk.append((video, *columns))
         self.frames += len(video)
@@ -147,7 +150,7 @@ class VideoWriter:
         _check_provenance(provenance)
         self._flush(whole_chunks=False)
         attributes = {"format": FORMAT, "ome": self._ome, "provenance": dict(provenance)}
-        with told(self._place):
+        with refused(self._place, "written"):
             # Consolidated by hand: zarr-python warns of its own, and xarray warns where there is none.
             partial, names = self._delivery.partial, ("0", *self._columns)
             nodes = {n: json.loads((partial / n / "zarr.json").read_bytes()) for n in names}
@@ -159,7 +162,7 @@ class VideoWriter:
         chunk, waiting = self._image.chunks[0], len(arrays[0])
         count = waiting // chunk * chunk if whole_chunks else waiting
         first = self._image.shape[0]
-        with told(self._place):
+        with refused(self._place, "written"):
             for array, values in zip((self._image, *self._columns.values()), arrays, strict=True):
                 array.resize((first + count, *array.shape[1:]))
                 array[first:] = values[:count]
@@ -175,18 +178,30 @@ class VideoWriter:
 
 
 def open_video(place: Path | str) -> VideoFile:
-    """Open a video that `write_video` wrote. Raises DataError when ``place`` is not one, or is damaged."""
+    """Open a video that `write_video` wrote.
+
+    Raises PlaceError where there is none, DataError for a damaged one, and StoreError where that cannot be
+    found out.
+    """
     source = source_of(place)
     try:
-        if not source.exists():
-            raise DataError(f"{source} does not exist", hint="the path of a video (a directory NAME.zarr)")
+        with refused(source, "read"):
+            there = source.exists()
+        if not there:
+            raise PlaceError(f"{source} does not exist", hint=_VIDEO)
         group = zarr.open_group(source.zarr_store(), mode="r", zarr_format=3)
         attributes = dict(group.attrs)
         if attributes.get("format") != FORMAT:
-            raise DataError(f"{source} is not a video of ours: format {attributes.get('format')!r}")
+            raise PlaceError(
+                f"{source} is not a video of ours: format {attributes.get('format')!r}",
+                possible=f"{FORMAT!r}",
+                hint="acquire reconstruct, which makes videos of recordings",
+            )
         time_ns = np.asarray(child_array(group, "time")[:], np.int64)
         quality = np.asarray(child_array(group, "quality")[:]) if "quality" in group else None
         return VideoFile(child_array(group, "0"), time_ns, attributes, quality)
+    except (GroupNotFoundError, NotADirectoryError) as error:
+        raise PlaceError(f"{source} is not a video: it is no Zarr group", hint=_VIDEO) from error
     except DAMAGE as error:
         raise DataError(f"{source} is not a video, or is damaged: {error}") from error
 

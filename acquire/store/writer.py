@@ -28,6 +28,7 @@ from acquire.store.arm_writer import ArmWriter
 from acquire.store.codecs import EncodeOnce
 from acquire.store.files import DISK, SCRATCH, Publisher, check_new_path, lock
 from acquire.store.pages import keep_freed_memory
+from acquire.store.refusals import refusal
 from acquire.store.resume import list_segment
 from acquire.store.retention import Keeper, release
 from acquire.store.room import RoomWatch
@@ -42,18 +43,6 @@ if TYPE_CHECKING:
     from acquire.store.files import Disk
     from acquire.store.room import Room
     from acquire.store.spec import RecordingSpec
-
-NOT_A_PLACE = (
-    errno.EACCES,
-    errno.EINVAL,
-    errno.ELOOP,
-    errno.ENAMETOOLONG,
-    errno.ENOENT,
-    errno.ENOTDIR,
-    errno.EPERM,
-    errno.EROFS,
-)
-"""Why a directory cannot be made where it was asked for; all other reasons are the disk's."""
 
 OWN_INTERVAL_S = 1.0
 """How much older than the root the metadata of a group or an array opened by itself may be."""
@@ -123,7 +112,7 @@ class RecordingWriter:
         """Do all that takes time; ``path`` becomes a recording, and takes lines, once `begin` was called.
 
         Raises UsageError when ``path`` exists or cannot be created, before anything is touched, and
-        DataError when the disk refuses; then nothing is left behind.
+        StoreError or DataError when the disk refuses; then nothing is left behind.
         """
         check_new_path(path)
         try:
@@ -131,8 +120,7 @@ class RecordingWriter:
         except FileExistsError as error:  # somebody was faster
             raise UsageError(f"{path} exists already", hint="another name") from error
         except OSError as error:
-            kind = UsageError if error.errno in NOT_A_PLACE else DataError
-            raise kind(f"{path} cannot be created: {error.strerror}") from error
+            raise refusal(path, error, "created") from error
         writer = None
         try:
             writer = cls(path, spec, disk)

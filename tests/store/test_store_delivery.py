@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from acquire.errors import DataError, UsageError
+from acquire.errors import PlaceError, StoreError, UsageError
 from acquire.store import open_video, write_video
 from acquire.store.delivery import check_new_place
 from acquire.store.remote import RemoteSource
@@ -67,10 +67,10 @@ def test_a_reader_sees_no_part_of_an_upload_that_failed_and_it_can_be_tried_agai
 
     with monkeypatch.context() as patch:
         patch.setattr(RemoteSource, "put_file", fails)
-        with pytest.raises(DataError, match="the line is dead"):
+        with pytest.raises(StoreError, match="the line is dead"):
             write(place)
     assert "zarr.json" not in RemoteSource(place).sizes()
-    with pytest.raises(DataError):
+    with pytest.raises(PlaceError):
         open_video(place)
     write(place)
     np.testing.assert_array_equal(open_video(place).video[:], VIDEO)
@@ -92,9 +92,9 @@ def test_the_root_is_put_last_and_nothing_stays_here(place, monkeypatch, tmp_pat
 
 
 def test_a_store_that_does_not_answer_is_told_before_anything_is_solved(bucket):
-    with pytest.raises(DataError, match="nobucketofthisname"):
+    with pytest.raises(PlaceError, match="nobucketofthisname"):
         check_new_place("s3://nobucketofthisname/x.zarr")
     with pytest.raises(UsageError, match="gopher"):
         check_new_place("gopher://x/y.zarr")
-    with pytest.raises(DataError, match="does not exist"):
+    with pytest.raises(PlaceError, match="does not exist"):
         open_video(f"{bucket}/no.zarr")

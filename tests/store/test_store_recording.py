@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from store_helpers import CLOCK, Truth, check_rows, fill, make_spec
 
-from acquire.errors import DataError, UsageError
+from acquire.errors import DataError, PlaceError, StoreError, UsageError
 from acquire.lines import ARMS, LineFlag
 from acquire.store import FORMAT, Event, Gap, RecordingWriter, RunCondition, open_recording
 
@@ -298,7 +298,7 @@ def test_what_cannot_be_a_path_is_refused(tmp_path, name):
         (errno.EROFS, UsageError),
         (errno.EPERM, UsageError),
         (errno.ENOENT, UsageError),
-        (errno.ENOSPC, DataError),
+        (errno.ENOSPC, StoreError),
     ],
 )
 def test_a_place_that_takes_no_directory_is_not_a_disk_that_fails(path, monkeypatch, number, kind):
@@ -372,19 +372,18 @@ def damage_root(path, change):
 
 
 def test_what_is_not_a_recording_says_so(path, tmp_path):
-    with pytest.raises(DataError, match="does not exist"):
+    with pytest.raises(PlaceError, match="does not exist"):
         open_recording(path)
-    with pytest.raises(DataError, match="not a recording: it holds no"):
+    with pytest.raises(PlaceError, match="not a recording: it holds no"):
         open_recording(tmp_path)
     zarr.create_group(tmp_path / "other.zarr")
-    with pytest.raises(DataError, match=r"format None.*possible: 'acquire-recording/1'"):
+    with pytest.raises(PlaceError, match=r"format None.*possible: 'acquire-recording/1'"):
         open_recording(tmp_path / "other.zarr")
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: d["attributes"].update(format="acquire-recording/2"), "acquire-recording/2"),
         (lambda d: d["attributes"].pop("geometry"), "damaged"),
         (lambda d: d["attributes"].pop("cameras"), "damaged"),
         (lambda d: d["attributes"].pop("ledger"), "damaged"),
@@ -398,6 +397,22 @@ def test_damaged_metadata_is_told(path, change, message):
         seal(writer)
     damage_root(path, change)
     with pytest.raises(DataError, match=message):
+        open_recording(path)
+
+
+def test_a_newer_format_is_told(path):
+    with RecordingWriter.create(path, make_spec()) as writer:
+        seal(writer)
+    damage_root(path, lambda d: d["attributes"].update(format="acquire-recording/2"))
+    with pytest.raises(PlaceError, match=r"acquire-recording/2.*newer version"):
+        open_recording(path)
+
+
+def test_a_recording_that_lost_its_root_metadata_is_damaged_and_no_wrong_path(path):
+    with RecordingWriter.create(path, make_spec()) as writer:
+        seal(writer)
+    (path / "zarr.json").unlink()
+    with pytest.raises(DataError, match=r"root metadata, zarr\.json, is missing"):
         open_recording(path)
 
 

@@ -11,7 +11,7 @@ import pytest
 import zarr
 from store_helpers import Truth, check_rows, fill, make_spec
 
-from acquire.errors import DataError, StateError, UsageError
+from acquire.errors import DataError, PlaceError, StateError, UsageError
 from acquire.store import (
     RecordingWriter,
     Retention,
@@ -198,7 +198,7 @@ def test_one_process_copies_a_recording(path, tmp_path):
     with only_copy(path), pytest.raises(StateError, match="another process"):
         mirror(path, place)
     assert mirror(path, place).sealed
-    with pytest.raises(DataError, match="does not exist"):
+    with pytest.raises(PlaceError, match="does not exist"):
         mirror(tmp_path / "none.zarr", place)
 
 
@@ -253,13 +253,13 @@ def test_a_slow_store_has_time_unless_somebody_says_how_much(monkeypatch):
 
 
 def test_what_cannot_be_reached_is_told(bucket, path):
-    with pytest.raises(DataError, match="does not exist"):
+    with pytest.raises(PlaceError, match="does not exist"):
         open_recording(f"memory://{uuid.uuid4()}/no.zarr")
     with pytest.raises(UsageError, match="gopher"):
         open_recording("gopher://x/y.zarr")
-    with pytest.raises(DataError, match="does not exist"):
+    with pytest.raises(PlaceError, match="does not exist"):
         open_recording(f"{bucket}/no.zarr")
-    with pytest.raises(DataError, match="nobucketofthisname"):
+    with pytest.raises(PlaceError, match="nobucketofthisname"):
         mirror(write(path), "s3://nobucketofthisname/x.zarr")
     with pytest.raises(FileNotFoundError, match="nobucketofthisname"):
         RemoteSource("s3://nobucketofthisname").prove()

@@ -11,7 +11,7 @@ import zarr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from acquire.errors import DataError, UsageError
+from acquire.errors import PlaceError, UsageError
 from acquire.store import open_video, write_video
 
 TIME = np.int64(1_790_000_000_000_000_000)
@@ -106,10 +106,10 @@ def test_what_cannot_be_written_is_refused_untouched(tmp_path, wrong):
 
 
 def test_what_is_not_a_video_says_so(tmp_path):
-    with pytest.raises(DataError, match="does not exist"):
+    with pytest.raises(PlaceError, match="does not exist"):
         open_video(tmp_path / "v.zarr")
-    with pytest.raises(DataError, match="not a video"):
+    with pytest.raises(PlaceError, match="not a video"):
         open_video(tmp_path)
     zarr.create_group(tmp_path / "g.zarr")
-    with pytest.raises(DataError, match="not a video"):
+    with pytest.raises(PlaceError, match="not a video"):
         open_video(tmp_path / "g.zarr")

@@ -1,0 +1,77 @@
+"""What a disk or a remote store refuses, as the error that the user meets.
+
+::
+
+    no such path or bucket, no permission, no credentials   PlaceError, 2   another place, or other rights
+    the disk is full, the store or its network is away      StoreError, 5   later, or on another disk
+    the medium cannot give back what it holds               DataError, 6    a copy of the recording
+"""
+
+from __future__ import annotations
+
+import errno
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from acquire.errors import DataError, PlaceError, StoreError
+from acquire.store.remote import is_url
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from acquire.errors import AcquireError
+
+NOT_A_PLACE = (
+    errno.EACCES,
+    errno.EEXIST,
+    errno.EINVAL,
+    errno.EISDIR,
+    errno.ELOOP,
+    errno.ENAMETOOLONG,
+    errno.ENOENT,
+    errno.ENOTDIR,
+    errno.EPERM,
+    errno.EROFS,
+)
+"""What is wrong with a path, or with this user's rights there; all other reasons are the disk's."""
+
+_RIGHTS = "the credentials in the environment (for S3: AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION)"
+_NETWORK = "the network and the store's address (for S3: AWS_ENDPOINT, and AWS_ALLOW_HTTP=true for http://)"
+
+
+@contextmanager
+def refused(place: object, doing: str, hint: str = "") -> Iterator[None]:
+    """Turn an OSError of the block into the error that the user meets; see `refusal`."""
+    try:
+        yield
+    except OSError as error:
+        raise refusal(place, error, doing, hint) from error
+
+
+def refusal(place: object, error: OSError, doing: str, hint: str = "") -> AcquireError:
+    """The error for a place, a path or a URL, that cannot be ``doing``: read, written, copied.
+
+    ``hint`` is added to what there is to try.
+    """
+    text = f"{place} cannot be {doing}: {error.strerror or error}"
+    if is_url(str(place)):
+        return _far(text, error, hint)
+    if error.errno == errno.EIO and doing == "read":
+        return DataError(text, hint="a copy of the recording, and the kernel's log for errors of the disk")
+    return _near(text, error, hint)
+
+
+def _far(text: str, error: OSError, hint: str) -> AcquireError:
+    if isinstance(error, FileNotFoundError):
+        return PlaceError(text, hint="; ".join(filter(None, ("an existing bucket or directory", hint))))
+    if isinstance(error, PermissionError):
+        return PlaceError(text, hint="; ".join(filter(None, (_RIGHTS, hint))))
+    return StoreError(text, hint="; ".join(filter(None, (_NETWORK, hint))))
+
+
+def _near(text: str, error: OSError, hint: str) -> AcquireError:
+    if error.errno in NOT_A_PLACE:
+        return PlaceError(text, hint=hint or "another path, or the permissions of this one")
+    if error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}:
+        return StoreError(text, hint="free space there, or another disk")
+    return StoreError(text, hint=hint or "the kernel's log for errors of the disk")

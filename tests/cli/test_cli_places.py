@@ -1,0 +1,226 @@
+"""Exit code 6 says that data is lost or damaged and nothing else: not that a path or URL holds none."""
+
+from __future__ import annotations
+
+import os
+import socket
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zarr
+from s3_server import KEYS, S3Server
+
+from acquire.store import write_video
+from acquire.store.remote import WAYS_IN, RemoteSource
+
+Cli = Callable[..., Any]
+
+READERS = {
+    "info": ("info", "{place}"),
+    "verify": ("verify", "{place}"),
+    "cut": ("cut", "{place}", "--first-line", "1", "--lines", "1", "--out", "new.npz"),
+    "reconstruct": ("reconstruct", "{place}", "--out", "new.zarr"),
+    "auto": ("reconstruct", "{place}", "--auto"),
+    "tradeoff": ("tradeoff", "{place}", "--out", "new"),
+    "render": ("render", "{place}", "--out", "new.png"),
+}
+"""Commands that take a path or a URL."""
+CHANGERS = {
+    "replay": ("replay", "{place}", "--out", "new.zarr"),
+    "recover": ("recover", "{place}"),
+    "hold": ("hold", "{place}", "--first-line", "1", "--lines", "1"),
+    "upload": ("upload", "{place}", "memory://copies/new.zarr"),
+}
+"""Commands that take a path alone."""
+FILES = {
+    "simulate": ("simulate", "{place}", "--out", "new.zarr"),
+    "config": ("config", "check", "{place}"),
+    "serve": ("serve", "--config", "{place}"),
+    "bench": ("bench", "--config", "{place}"),
+    "devices": ("devices", "--config", "{place}"),
+    "demo": ("demo", "--config", "{place}", "--out", "new"),
+    "plan": ("reconstruct", "none.zarr", "--plan", "{place}", "--out", "new.zarr"),
+    "code": ("trigger", "load", "{place}"),
+    "ls": ("ls", "{place}"),
+}
+"""Commands that take another kind of file, or a directory."""
+NO_RECORDINGS = ("absent", "below a file", "file", "empty file", "directory", "group", "too long", "nul")
+NO_FILES = ("absent", "below a file", "file", "too long")
+
+
+@pytest.fixture
+def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """Paths that hold no recording, by what they are."""
+    monkeypatch.chdir(tmp_path)
+    there = tmp_path / "there"
+    (there / "directory").mkdir(parents=True)
+    (there / "file").write_text("root:x:0:0\n")
+    (there / "empty").touch()
+    zarr.create_group(there / "group", zarr_format=3)
+    return {
+        "absent": str(there / "absent.zarr"),
+        "below a file": str(there / "file" / "x.zarr"),
+        "file": str(there / "file"),
+        "empty file": str(there / "empty"),
+        "directory": str(there / "directory"),
+        "group": str(there / "group"),
+        "too long": str(there / ("long" * 100)),
+        "nul": str(there / "a") + "\udcff.zarr",
+    }
+
+
+def untouched(directory: Path) -> bool:
+    """Nothing new was made."""
+    return {path.name for path in directory.iterdir()} <= {"there"}
+
+
+@pytest.mark.parametrize("what", NO_RECORDINGS)
+@pytest.mark.parametrize("words", [*READERS.values(), *CHANGERS.values()], ids=[*READERS, *CHANGERS])
+def test_what_is_no_recording_is_a_wrong_path_and_no_damage(
+    cli: Cli, tmp_path: Path, places: dict[str, str], words: tuple[str, ...], what: str
+) -> None:
+    answer = cli(*(word.format(place=places[what]) for word in words))
+    assert answer.code == 2, answer.err
+    assert Path(places[what]).name.partition("\udcff")[0] in answer.err
+    assert "  try: " in answer.err or "  possible: " in answer.err
+    assert untouched(tmp_path)
+
+
+@pytest.mark.parametrize("what", NO_FILES)
+@pytest.mark.parametrize("words", FILES.values(), ids=FILES)
+def test_what_is_no_such_file_is_a_wrong_path(
+    cli: Cli, tmp_path: Path, places: dict[str, str], words: tuple[str, ...], what: str
+) -> None:
+    answer = cli(*(word.format(place=places[what]) for word in words))
+    assert answer.code == 2, answer.err
+    assert "Traceback" not in answer.err
+    assert untouched(tmp_path)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+@pytest.mark.parametrize("words", [*READERS.values(), *CHANGERS.values()], ids=[*READERS, *CHANGERS])
+def test_what_this_user_may_not_read_is_told_so(
+    cli: Cli, places: dict[str, str], words: tuple[str, ...]
+) -> None:
+    closed = Path(places["group"])
+    closed.chmod(0)
+    try:
+        answer = cli(*(word.format(place=closed) for word in words))
+    finally:
+        closed.chmod(0o700)
+    assert (answer.code, "Permission denied" in answer.err) == (2, True)
+
+
+def test_a_video_is_told_from_a_recording(cli: Cli, tmp_path: Path) -> None:
+    times = np.arange(2, dtype=np.int64)
+    write_video(tmp_path / "v.zarr", np.zeros((2, 4, 4), np.float32), times, 1.0, 1e4, {})
+    answer = cli("info", tmp_path / "v.zarr")
+    assert (answer.code, "is a video, but not a recording" in answer.err) == (2, True)
+    assert "try: acquire render" in answer.err
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[S3Server]:
+    """One for all tests here. A client keeps its event loop for the life of the process: it is made now."""
+    made = S3Server()
+    made.start()
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in made.environment.items():
+            patch.setenv(name, value)
+        made.create_bucket()
+        RemoteSource("s3://recordings").put("made", b"once")
+    try:
+        yield made
+    finally:
+        made.stop()
+
+
+def closed_port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
+@pytest.mark.parametrize("family", sorted(WAYS_IN))
+@pytest.mark.parametrize("words", READERS.values(), ids=READERS)
+def test_a_store_without_credentials_is_refused_without_asking_anybody(
+    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], family: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for name in {name for way in WAYS_IN[family] for name in way}:
+        monkeypatch.delenv(name, raising=False)
+
+    def asked(*_: object) -> None:
+        raise AssertionError("somebody was asked")
+
+    monkeypatch.setattr("fsspec.core.url_to_fs", asked)
+    answer = cli(*(word.format(place=f"{family}://bucket/x.zarr") for word in words))
+    assert answer.code == 2, answer.err
+    assert "the environment holds no credentials" in answer.err
+    assert f"  try: export {WAYS_IN[family][0][0]}" in answer.err
+
+
+@pytest.mark.parametrize("words", READERS.values(), ids=READERS)
+def test_a_bucket_or_a_name_that_is_not_there_is_a_wrong_url(
+    cli: Cli,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    server: S3Server,
+    words: tuple[str, ...],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name, value in server.environment.items():
+        monkeypatch.setenv(name, value)
+    for place in ("s3://recordings/none.zarr", "s3://nobucketofthisname/none.zarr"):
+        answer = cli(*(word.format(place=place) for word in words))
+        assert (answer.code, place in answer.err) == (2, True), answer.err
+    assert untouched(tmp_path)
+
+
+def test_what_an_upload_meets(
+    cli: Cli, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, server: S3Server
+) -> None:
+    """No rights and no bucket are the user's matter, a network that is away the host's: nothing is lost."""
+    from test_cli_recordings import write
+
+    recording = write(tmp_path / "one.zarr")
+    for name, value in server.environment.items():
+        monkeypatch.setenv(name, value)
+    server.denies = True
+    try:
+        denied = cli("upload", recording, "s3://recordings/one.zarr")
+    finally:
+        server.denies = False
+    assert denied.code == 2, denied.err
+    assert "AWS_ACCESS_KEY_ID" in denied.err
+    unknown = cli("upload", recording, "s3://nobucketofthisname/one.zarr")
+    assert unknown.code == 2, unknown.err
+    monkeypatch.setenv("AWS_ENDPOINT", f"http://127.0.0.1:{closed_port()}")
+    away = cli("upload", recording, "s3://away/one.zarr")
+    assert away.code == 5, away.err
+    assert "try: the network" in away.err
+    for name in KEYS:
+        monkeypatch.delenv(name)
+    without = cli("upload", recording, "s3://recordings/one.zarr")
+    assert (without.code, "holds no credentials" in without.err) == (2, True)
+
+
+@pytest.mark.parametrize("words", CHANGERS.values(), ids=CHANGERS)
+def test_a_command_that_changes_a_recording_in_place_takes_no_url(cli: Cli, words: tuple[str, ...]) -> None:
+    answer = cli(*(word.format(place="s3://bucket/x.zarr") for word in words))
+    assert (answer.code, "possible: a path on this machine" in answer.err) == (2, True)
+
+
+def test_a_package_that_is_not_installed_is_named_with_the_extra_that_brings_it(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def missing(_: object) -> None:
+        raise ModuleNotFoundError("No module named 'obstore'", name="obstore")
+
+    monkeypatch.setattr("acquire.store.open_recording", missing)
+    answer = cli("info", "s3://bucket/x.zarr")
+    assert (answer.code, "try: pip install 'tdi-acquire[remote]'" in answer.err) == (2, True)
