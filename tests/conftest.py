@@ -29,7 +29,7 @@ import zarr.storage
 from hypothesis import HealthCheck, settings
 from numcodecs import blosc
 
-from acquire.cores import usable_cores
+from acquire.cores import limit_blas, usable_cores
 from acquire.forward.kernels import transpose_frames
 
 pytest_plugins = ["left_out"]
@@ -52,6 +52,10 @@ MOST_WORKERS = 8
 CLEANING_UP_S = 120.0
 """What a test that failed may take to end: one that was late may hang there again."""
 
+# Threads of BLAS and OpenMP wait for one another in a spin: on two cores that others use too, small products
+# take 14 times the processor time. BLAS is loaded by now; child processes and OpenMP read the environment.
+limit_blas(int(os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")))
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 settings.register_profile("any speed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("any speed")
 

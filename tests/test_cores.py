@@ -19,10 +19,10 @@ def blas_threads() -> set[int]:
 
 def test_blas_is_limited_for_a_while() -> None:
     np.ones((2, 2)) @ np.ones((2, 2))
-    before = blas_threads()
-    with limit_blas(1):
-        assert blas_threads() == {1}
-    assert blas_threads() == before
+    with limit_blas(2):
+        with limit_blas(1):
+            assert blas_threads() == {1}
+        assert blas_threads() == {2}
 
 
 @pytest.mark.parametrize(
