@@ -101,7 +101,9 @@ class CameraConfig(FrozenModel):
         description="GenTL producer; absent: those of GENICAM_GENTL64_PATH. 'aravis': the camera's address",
     )
     settings: tuple[tuple[GentlModule, str, bool | int | float | str], ...] = Field(
-        default=(), description="[module, feature, value] in the order in which they are written"
+        default=(),
+        description="[module, feature, value] in the order in which they are written; 'aravis': module "
+        "'stream' has frame-retention, packet-timeout, packet-resend and other parameters of its stream",
     )
     buffer_s: float = Field(default=0.5, ge=0.2, le=60, description="lines that the driver can hold")
     first_column: int = Field(default=0, ge=0, description="layout 'compact': where the arm's image begins")

@@ -23,6 +23,8 @@ MODULES = ("remote", "interface", "device", "stream", "system")
 Kind = Literal["integer", "float", "enumeration", "boolean", "text", "command", "other"]
 Value = bool | int | float | str
 
+_LONG = 1e15
+"""Limits from here on are those of the type, not of the camera: not worth their digits."""
 FLOAT_TOLERANCE = 1e-3
 """Cameras round what they cannot have exactly; more than this is another value."""
 
@@ -141,7 +143,8 @@ def describe(node: Node) -> str:
 
 
 def _number(value: float) -> str:
-    return f"{value:.0f}" if value == round(value) else f"{value:g}"
+    whole = abs(value) < _LONG and value == round(value)
+    return f"{value:.0f}" if whole else f"{value:g}"
 
 
 def _check_range(setting: Setting, node: Node, value: float) -> None:

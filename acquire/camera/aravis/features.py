@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ctypes
+import sys
 from ctypes import byref, c_double, c_int64, c_uint, c_void_p
 from typing import TYPE_CHECKING, Any
 
 from acquire.camera.aravis.library import errors
+from acquire.errors import CameraError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -23,6 +25,8 @@ _KINDS: tuple[tuple[bytes, Kind], ...] = (
 )
 """GObject types and interfaces, the first that a node has counting: there are more classes of nodes than ways
 to read one, and some have several (an enumeration is also an integer)."""
+
+_MOST = sys.float_info.max
 
 
 class AravisFeatures:
@@ -94,7 +98,7 @@ class AravisNode:
 
     @property
     def writable(self) -> bool:
-        return self._available and self._access in (1, 2)
+        return self.kind != "other" and self._available and self._access in (1, 2)
 
     @property
     def _available(self) -> bool:
@@ -127,15 +131,27 @@ class AravisNode:
                 self._library.arv_device_execute_command(self._device, self._key, error)
 
     def limits(self) -> tuple[float, float, float]:
-        number = c_int64 if self.kind == "integer" else c_double
-        low, high, step = number(), number(), 0
-        with errors(self.name) as error:
-            bounds = getattr(self._library, f"arv_device_get_{self.kind}_feature_bounds")
-            bounds(self._device, self._key, byref(low), byref(high), error)
-        if self.kind == "integer":
+        """Nodes that compute need not have any: then all that the type can hold."""
+        whole = self.kind == "integer"
+        number = c_int64 if whole else c_double
+        low, high = number(), number()
+        try:
+            with errors(self.name) as error:
+                bounds = getattr(self._library, f"arv_device_get_{self.kind}_feature_bounds")
+                bounds(self._device, self._key, byref(low), byref(high), error)
+        except CameraError:
+            low, high = (
+                (c_int64(-(2**63)), c_int64(2**63 - 1)) if whole else (c_double(-_MOST), c_double(_MOST))
+            )
+        return low.value, high.value, self._step() if whole else 0
+
+    def _step(self) -> int:
+        try:
             with errors(self.name) as error:
                 step = self._library.arv_device_get_integer_feature_increment(self._device, self._key, error)
-        return low.value, high.value, step
+        except CameraError:
+            return 1
+        return int(step)
 
     def entries(self) -> list[str]:
         count = c_uint()

@@ -8,8 +8,10 @@ only with a stream: `StreamParameters` remembers what was written, and gives it 
 from __future__ import annotations
 
 import ctypes
+import math
 from ctypes import byref, c_double, c_int, c_uint, c_void_p
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -188,18 +190,30 @@ def _properties(library: Any, owner: int) -> dict[str, _Property]:
 def _describe(library: Any, at: int, spec: _ParamSpec, kind: Kind) -> _Property:
     """What is behind the common part of a GParamSpec depends on its type."""
     behind = at + ctypes.sizeof(_ParamSpec)
-    limits, entries = (0.0, 0.0), {}
+    entries: dict[str, int] = {}
+    limits = (0.0, 0.0)
     field = "v_int"
     if kind == "enumeration":
         known = _EnumClass.from_address(c_void_p.from_address(behind).value or 0)
-        entries = {known.values[k].nick.decode(): known.values[k].value for k in range(known.count)}
+        for k in range(known.count):
+            if known.values[k].value not in entries.values():  # else another name for the same
+                entries[known.values[k].nick.decode()] = known.values[k].value
     elif kind != "boolean":
         field, number = _NUMBERS[library.g_type_name(spec.value_type)]
         low, high = (number * 2).from_address(behind)
-        limits = (low, high)
+        limits = (low, min(high, _largest_socket())) if spec.name == b"socket-buffer-size" else (low, high)
     return _Property(spec.name.decode(), kind, spec.value_type, field, limits, entries)
 
 
+def _largest_socket() -> float:
+    """Bytes that the kernel gives a socket; it cuts more down without a word."""
+    try:
+        return float(_RMEM_MAX.read_text())
+    except (OSError, ValueError):
+        return math.inf
+
+
+_RMEM_MAX = Path("/proc/sys/net/core/rmem_max")
 _NUMBERS: dict[bytes, tuple[str, Any]] = {
     b"gint": ("v_int", c_int),
     b"guint": ("v_uint", c_uint),
