@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import os
+import stat
 import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
@@ -16,13 +17,14 @@ from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_v
 
 from acquire.codes import TAPS, Code, ConstantCode, PrbsCode, mix_seed
 from acquire.device_config import SEEING_CAMERAS, SIMULATED_CAMERAS, CamerasConfig, TriggerConfig
-from acquire.effect_config import FrozenModel
+from acquire.effect_config import MOST_SECONDS, SEED_END, FilePath, FrozenModel
 from acquire.errors import ConfigError
 from acquire.event_config import CheckConfig, EventsConfig
 from acquire.geometry import Geometry
 from acquire.plan_config import ReconstructionPlan
 from acquire.recording_config import USUAL_CHUNK_BYTES, RecordingConfig, usual_chunk_lines, usual_tag_chunks
 from acquire.scene_config import SceneConfig, SceneFile, VideoSceneConfig, anchored
+from acquire.text import shortened, shown
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -31,6 +33,10 @@ RING_RESERVE_SHARE = 4
 """Of the ring's slots, one part in so many stays free for the cameras while a recording takes the past."""
 EVENT_DELAY_S = 0.5
 """Between an event and the recording that it starts."""
+MOST_FILE_BYTES = 2**20
+"""Of a file of this kind; written by hand, they have some kilobytes."""
+MOST_LISTED = 20
+"""Things to mend that one error lists."""
 MAX_RING_BYTES = 4 * 2**30
 """Pixels that may wait in the ring of one arm."""
 
@@ -58,7 +64,9 @@ class PrbsConfig(FrozenModel):
 
     kind: Literal["prbs"] = "prbs"
     degree: int = Field(default=64, description="degree of the register: " + ", ".join(map(str, TAPS)))
-    seed: int = Field(default=1, ge=0, description="any number; the register's first state is mixed from it")
+    seed: int = Field(
+        default=1, ge=0, lt=SEED_END, description="any number; the register's first state is mixed from it"
+    )
     state: str | None = Field(
         default=None,
         pattern="^0x[0-9a-f]+$",
@@ -92,7 +100,10 @@ class StreamConfig(FrozenModel):
     block_lines: int = Field(default=256, ge=1, le=65536, description="lines per camera block and ring slot")
     ring_slots: int = Field(default=64, ge=2, le=2**16)
     ring_seconds: float | None = Field(
-        default=None, gt=0, description="of lines from the past that the ring holds, instead of ring_slots"
+        default=None,
+        gt=0,
+        le=MOST_SECONDS,
+        description="of lines from the past that the ring holds, instead of ring_slots",
     )
     reopen_s: float = Field(default=2.0, ge=0, le=600, description="wait for a camera that is gone")
     realtime: bool = Field(
@@ -105,7 +116,7 @@ class StreamConfig(FrozenModel):
 class ControlConfig(FrozenModel):
     """Where the daemon listens."""
 
-    socket: Path = Field(default_factory=default_socket)
+    socket: FilePath = Field(default_factory=default_socket)
 
 
 class SimulationConfig(FrozenModel):
@@ -117,7 +128,9 @@ class SimulationConfig(FrozenModel):
         "where no camera is simulated",
     )
     speed: float = Field(default=1.0, gt=0, le=1000, description="simulated seconds per second")
-    replay: Path | None = Field(default=None, description="a recording whose lines the cameras give instead")
+    replay: FilePath | None = Field(
+        default=None, description="a recording whose lines the cameras give instead"
+    )
     replay_loop: bool = Field(default=False, description="over and over")
     replay_hold_s: float = Field(default=0.0, ge=0, le=2.5, description="by which replayed lines come late")
 
@@ -130,7 +143,11 @@ def _prbs_unless_said(value: Any) -> Any:
 class RigConfig(FrozenModel):
     """A whole instrument: everything the daemon needs to know."""
 
-    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
+    name: str = Field(
+        pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$",
+        max_length=128,
+        description="recordings and the list of those to upload are named after it",
+    )
     geometry: GeometryConfig
     code: Annotated[
         PrbsConfig | ConstantCodeConfig, Field(discriminator="kind"), BeforeValidator(_prbs_unless_said)
@@ -292,9 +309,12 @@ def find(name: str | Path, beside: Path | None = None, kind: str = "") -> Path:
         if os.path.isfile(path):  # noqa: PTH113  # Path's raises for a name that no file can have
             return path
     have = ", ".join(sorted(p.stem for p in builtin_directory().glob(f"{kind}*.toml")))
-    why = "is a directory" if name and os.path.isdir(name) else "does not exist"  # noqa: PTH112
+    if name and os.path.isdir(name):  # noqa: PTH112
+        why = "is a directory"
+    else:
+        why = "is no regular file" if os.path.lexists(name) else "does not exist"
     what = f"{kind} file" if kind else "configuration file"
-    raise ConfigError(f"{what} {str(name)!r} {why}", possible=f"a path, or one of the built-in {have}")
+    raise ConfigError(f"{what} {shown(str(name))} {why}", possible=f"a path, or one of the built-in {have}")
 
 
 def load_rig(name: str | Path, overrides: Mapping[str, Any] | None = None) -> RigConfig:
@@ -328,9 +348,11 @@ def parse_settings(settings: Sequence[str]) -> dict[str, Any]:
         key, equals, value = setting.partition("=")
         try:
             overrides[key.strip()] = tomllib.loads(f"value = {value}")["value"]
-        except tomllib.TOMLDecodeError as error:
+        except (ValueError, RecursionError) as error:
             raise ConfigError(
-                f"setting {setting!r}: {error}" if equals else f"setting {setting!r} has no '='",
+                f"setting {shown(setting)}: {shortened(error)}"
+                if equals
+                else f"setting {shown(setting)} has no '='",
                 possible="KEY=VALUE with a TOML value: code.seed=7, name='lab', cameras.a.serial='12'",
             ) from error
     return overrides
@@ -364,22 +386,39 @@ def check_plan(table: dict[str, Any], origin: str | Path) -> ReconstructionPlan:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path} is not TOML: {error}") from error
+        text = _bytes(path).decode("utf-8-sig")  # editors of some systems begin a file with a mark
+        return tomllib.loads(text)
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path} is not TOML: byte {error.start} is not UTF-8") from error
+    except RecursionError as error:
+        raise ConfigError(f"{path} is not TOML: it is nested too deeply") from error
+    except ValueError as error:  # that of a number with thousands of digits, too
+        raise ConfigError(f"{path} is not TOML: {shortened(error, 400)}") from error
     except OSError as error:
         raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
 
 
 def _check_kind(table: dict[str, Any], wanted: str, path: Path) -> None:
     """Raise ConfigError for a file that shows that it describes something else than what is ``wanted``."""
-    shown = [kind for kind, keys in _MARKS.items() if keys & table.keys()]
-    if len(shown) == 1 and shown != [wanted]:
+    found = [kind for kind, keys in _MARKS.items() if keys & table.keys()]
+    if len(found) == 1 and found != [wanted]:
         raise ConfigError(
-            f"{path} describes a {shown[0]}, and a {wanted} was asked for",
+            f"{path} describes a {found[0]}, and a {wanted} was asked for",
             possible=f"a {wanted} file",
-            hint=_USES[shown[0]].format(path.stem if path.parent == builtin_directory() else path),
+            hint=_USES[found[0]].format(path.stem if path.parent == builtin_directory() else path),
         )
+
+
+def _bytes(path: Path) -> bytes:
+    """The file's; of a pipe, a device or something very long nothing is read, since it might never end."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    with os.fdopen(descriptor, "rb") as file:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise ConfigError(f"{path} is no regular file", possible="a TOML file")
+        text = file.read(MOST_FILE_BYTES + 1)
+    if len(text) > MOST_FILE_BYTES:
+        raise ConfigError(f"{path} is too long", possible=f"a TOML file of at most {MOST_FILE_BYTES} bytes")
+    return text
 
 
 def _set(table: dict[str, Any], dotted: str, value: Any) -> None:
@@ -400,9 +439,11 @@ def _validate(model: type[M], table: dict[str, Any], path: Path) -> M:
 
 def _explain(error: ValidationError, model: type[BaseModel], path: Path) -> str:
     lines = [f"{path}: {error.error_count()} thing(s) to mend"]
-    for item in error.errors():
+    found = error.errors()
+    for item in found[:MOST_LISTED]:
         keys, allowed = _locate(model, item["loc"])
-        key, why = ".".join(keys) or "(file)", item["msg"].removeprefix("Value error, ")
+        key = shortened(".".join(keys)) or "(file)"
+        why = shortened(item["msg"].removeprefix("Value error, "), 400)
         if item["type"] == "extra_forbidden":
             lines.append(f"  {key}: unknown key; allowed here: {', '.join(allowed)}")
         elif item["type"] == "missing":
@@ -410,7 +451,9 @@ def _explain(error: ValidationError, model: type[BaseModel], path: Path) -> str:
         elif isinstance(item["input"], dict):
             lines.append(f"  {key}: {why}")
         else:
-            lines.append(f"  {key} = {item['input']!r}: {why}")
+            lines.append(f"  {key} = {shown(item['input'])}: {why}")
+    if len(found) > MOST_LISTED:
+        lines.append(f"  and {len(found) - MOST_LISTED} more")
     return "\n".join(lines)
 
 

@@ -6,7 +6,7 @@ from typing import Literal, get_args
 
 from pydantic import Field, model_validator
 
-from acquire.effect_config import FrozenModel
+from acquire.effect_config import MOST_DN, FrozenModel
 
 PIXEL_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16}
 """SFNC PixelFormat → significant bits of an (unpacked) pixel."""
@@ -52,7 +52,7 @@ class TriggerConfig(FrozenModel):
 
     driver: Literal["simulated", "rtl", "serial", "usb"] = "simulated"
     url: str = Field(default="", description="driver 'serial': /dev/tty…, socket://host:port")
-    baud: int = Field(default=3_000_000, ge=9600, description="driver 'serial'")
+    baud: int = Field(default=3_000_000, ge=9600, le=10**9, description="driver 'serial'")
     flow_control: Literal["none", "rts-cts"] = Field(
         default="none", description="driver 'serial'; 'rts-cts' where the board wires both lines"
     )
@@ -73,7 +73,7 @@ class TriggerConfig(FrozenModel):
         default=0, ge=0, lt=2**32, description="of silence of the host after which a run ends; 0: never"
     )
     external_start: Literal["off", "rising", "falling"] = "off"
-    external_timeout_s: float = Field(default=10.0, gt=0, description="wait for the external start")
+    external_timeout_s: float = Field(default=10.0, gt=0, le=86400, description="wait for the external start")
     light: LightOutputConfig = LightOutputConfig()
     a: LineOutputConfig = LineOutputConfig()
     b: LineOutputConfig = LineOutputConfig()
@@ -106,14 +106,18 @@ class CameraConfig(FrozenModel):
         "'stream' has frame-retention, packet-timeout, packet-resend and other parameters of its stream",
     )
     buffer_s: float = Field(default=0.5, ge=0.2, le=60, description="lines that the driver can hold")
-    first_column: int = Field(default=0, ge=0, description="layout 'compact': where the arm's image begins")
+    first_column: int = Field(
+        default=0, ge=0, le=2**16, description="layout 'compact': where the arm's image begins"
+    )
     frame_id_bits: int = Field(default=0, ge=0, le=64, description="0: found when the ids wrap")
     frame_id_first: Literal[0, 1] | None = Field(
         default=None, description="of the first frame; absent: whichever comes first"
     )
     pixel_format: Literal["Mono8", "Mono10", "Mono12", "Mono16"] = "Mono12"
-    black_level_dn: float = Field(default=0.0, ge=0)
-    responsivity_dn: float = Field(default=1.0, gt=0, description="DN per unit of scene light and sub-step")
+    black_level_dn: float = Field(default=0.0, ge=0, le=MOST_DN, description="of a pixel without light")
+    responsivity_dn: float = Field(
+        default=1.0, gt=0, le=MOST_DN, description="DN per unit of scene light and sub-step"
+    )
 
     @property
     def bits(self) -> int:

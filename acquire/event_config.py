@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from acquire.effect_config import FrozenModel
+from acquire.effect_config import MOST_DN, FrozenModel, Seconds
 
 
 class EventsConfig(FrozenModel):
@@ -21,12 +21,14 @@ class EventsConfig(FrozenModel):
         description="'mark': acquire mark; 'input': an edge at the trigger's PPS input; 'threshold': level",
     )
     arm: Literal["a", "b"] = Field(default="a", description="'threshold': whose lines")
-    level_dn: float = Field(default=0.0, ge=0, description="'threshold': mean of the pixels")
-    hysteresis_dn: float = Field(default=0.0, ge=0, description="by which it must go back to count again")
+    level_dn: float = Field(default=0.0, ge=0, le=MOST_DN, description="'threshold': mean of the pixels")
+    hysteresis_dn: float = Field(
+        default=0.0, ge=0, le=MOST_DN, description="by which it must go back to count again"
+    )
     edge: Literal["rising", "falling"] = "rising"
     average_lines: int = Field(default=64, ge=1, le=65536, description="lines that the mean is taken over")
-    pre_s: float = Field(default=0.0, ge=0, description="recorded from before the event, as the ring has it")
-    post_s: float = Field(default=1.0, gt=0, description="recorded after the last event")
+    pre_s: Seconds = Field(default=0.0, description="recorded from before the event, as the ring has it")
+    post_s: Seconds = Field(default=1.0, gt=0, description="recorded after the last event")
     rearm: bool = Field(
         default=False,
         description="every event starts a recording, and the instrument stays armed for the next; "

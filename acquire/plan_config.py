@@ -22,7 +22,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from acquire.effect_config import FrozenModel
+from acquire.effect_config import MOST_LINES, FrozenModel, Seconds
 
 FADE_SUBSTEPS = 32
 """To either side of a seam: over this, one sub-segment becomes the next."""
@@ -32,11 +32,11 @@ class SegmentPlan(FrozenModel):
     """One sub-segment: how long it is, and its voxels."""
 
     name: str = ""
-    substeps: int | None = Field(default=None, ge=1)
-    lines: int | None = Field(default=None, ge=1)
-    seconds: float | None = Field(default=None, gt=0)
-    spatial_merge: int = Field(ge=1, description="N_m, side of a voxel in fine pixels")
-    temporal_merge: int = Field(ge=1, description="T_m, sub-steps of a voxel")
+    substeps: int | None = Field(default=None, ge=1, le=MOST_LINES)
+    lines: int | None = Field(default=None, ge=1, le=MOST_LINES)
+    seconds: Seconds | None = Field(default=None, gt=0)
+    spatial_merge: int = Field(ge=1, le=2**16, description="N_m, side of a voxel in fine pixels")
+    temporal_merge: int = Field(ge=1, le=2**40, description="T_m, sub-steps of a voxel")
     why: str = Field(default="", description="for people; `--auto` says here what it saw")
 
     @model_validator(mode="after")

@@ -8,8 +8,10 @@ from urllib.parse import urlsplit
 
 from pydantic import Field, field_validator
 
-from acquire.effect_config import FrozenModel
+from acquire.effect_config import FilePath, FrozenModel, Seconds
 
+MOST_GB = 1e9
+"""An exabyte."""
 USUAL_CHUNK_BYTES = 2 * 2**20
 """A cut reads whole chunks: small ones are quicker to cut, but there are more of them to be written."""
 USUAL_CHUNK_S = 0.1
@@ -36,20 +38,25 @@ def usual_tag_chunks(chunk_lines: int, shard_chunks: int, line_rate_hz: float, c
 class RetentionConfig(FrozenModel):
     """What of an endless recording is kept; the oldest lines go first, in whole files."""
 
-    max_gb: float | None = Field(default=None, gt=0, description="that one recording may take of the disk")
-    max_age_s: float | None = Field(default=None, gt=0, description="of lines behind the newest")
+    max_gb: float | None = Field(
+        default=None, gt=0, le=MOST_GB, description="that one recording may take of the disk"
+    )
+    max_age_s: Seconds | None = Field(default=None, gt=0, description="of lines behind the newest")
     hold_events: tuple[str, ...] = Field(default=("mark",), description="kinds of events that keep lines")
-    hold_before_s: float = Field(default=2.0, ge=0, description="kept before such an event")
-    hold_after_s: float = Field(default=2.0, ge=0, description="kept after it")
+    hold_before_s: Seconds = Field(default=2.0, description="kept before such an event")
+    hold_after_s: Seconds = Field(default=2.0, description="kept after it")
     segment_lines: int = Field(
-        default=512, ge=1, description="longest segment to be reconstructed; so much is kept around a hold"
+        default=512,
+        ge=1,
+        le=2**40,
+        description="longest segment to be reconstructed; so much is kept around a hold",
     )
 
 
 class RecordingConfig(FrozenModel):
     """How recordings are written."""
 
-    directory: Path = Path()
+    directory: FilePath = Field(default=Path(), description="where recordings without a path of their own go")
     chunk_lines: int | None = Field(
         default=None,
         ge=16,
@@ -69,6 +76,7 @@ class RecordingConfig(FrozenModel):
     reserve_gb: float = Field(
         default=0.25,
         ge=0,
+        le=MOST_GB,
         description="of the disk left free; a recording is sealed before that",
     )
     after: Literal["armed", "idle"] = Field(

@@ -17,7 +17,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, RootModel, model_validator
 
-from acquire.effect_config import EffectConfig, FrozenModel
+from acquire.effect_config import MOST_LINES, SEED_END, EffectConfig, FilePath, FrozenModel, Seconds
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
@@ -109,7 +109,7 @@ class SpriteConfig(FrozenModel):
 class WindowPhase(FrozenModel):
     """A stretch of time of a window: open, or a slit that slides along ``axis`` from ``begin`` to ``end``."""
 
-    duration_s: float = Field(gt=0)
+    duration_s: Seconds = Field(gt=0)
     axis: Literal["row", "column", "open"] = "open"
     begin: float = Field(default=0.0, ge=-1, le=2, description="middle of the slit")
     end: float = Field(default=1.0, ge=-1, le=2)
@@ -158,8 +158,8 @@ class OpticsConfig(FrozenModel):
     a: ArmOptics = ArmOptics()
     b: ArmOptics = ArmOptics(turn_deg=90)
     sensor_pixels: int = Field(default=256, ge=2, le=65536, description="compact: columns of the camera")
-    column_a: int = Field(default=0, ge=0, description="compact: first column of arm A")
-    column_b: int | None = Field(default=None, ge=0, description="compact: absent: half-way")
+    column_a: int = Field(default=0, ge=0, le=2**16, description="compact: first column of arm A")
+    column_b: int | None = Field(default=None, ge=0, le=2**16, description="compact: absent: half-way")
     raw_bits: int = Field(
         default=12, ge=1, le=16, description="emulated: of the lines before they are merged"
     )
@@ -171,10 +171,10 @@ class SceneBase(FrozenModel):
 
     title: str = ""
     rig: str = Field(default="rig-demo", description="the rig that `acquire simulate` takes for it")
-    lines: int = Field(default=33_334, ge=1, description="that `acquire simulate` writes")
+    lines: int = Field(default=33_334, ge=1, le=MOST_LINES, description="that `acquire simulate` writes")
     shutters: tuple[ShutterConfig, ...] = ()
     optics: OpticsConfig = OpticsConfig()
-    seed: int = Field(default=0, ge=0, description="of the effects' random streams")
+    seed: int = Field(default=0, ge=0, lt=SEED_END, description="of the effects' random streams")
     system_gain_dn_per_e: float = Field(
         default=0.1, gt=0, description="K of EMVA 1288, for effects that count electrons"
     )
@@ -241,7 +241,7 @@ class VideoSceneConfig(SceneBase):
     """A file of the user: a picture, a video, or an array (time, row, column) of 0 to 1 as .npy."""
 
     kind: Literal["video"]
-    path: Path = Field(description="relative to the scene file")
+    path: FilePath = Field(description="relative to the scene file")
     frame_rate_hz: float | None = Field(default=None, gt=0, description="absent: the file's own")
     fit: Literal["fill", "pad", "stretch"] = Field(default="fill", description="how it becomes square")
     between: Literal["hold", "blend"] = Field(default="blend", description="light between two frames")

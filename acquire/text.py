@@ -9,6 +9,7 @@ not UTF-8 cannot be encoded at all.
 from __future__ import annotations
 
 import re
+import reprlib
 
 _ALLOWED = " \u00a0\u202f"
 """Spaces that typography needs; every other separator and control character is escaped."""
@@ -35,3 +36,16 @@ def shortened(text: object, characters: int = 120) -> str:
     """``text``, visible, and at most so many characters of it, with a mark where it was cut."""
     shown = visible(text)
     return shown if len(shown) <= characters else f"{shown[: characters - 1]}…"
+
+
+_REPR = reprlib.Repr()
+_REPR.maxstring = _REPR.maxother = 100
+_REPR.maxlevel = 3
+
+
+def shown(value: object) -> str:
+    """A value as Python writes it, visible and short, however long or deeply nested it is."""
+    try:
+        return shortened(_REPR.repr(value))
+    except (ValueError, RecursionError):  # an integer of thousands of digits, or a list in a list in a list
+        return f"a {type(value).__name__} too large to be shown"

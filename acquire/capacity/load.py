@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from acquire.stream import CaptureStatus
 
 CLOCK_HZ = 90_000_000
-_PIXEL_FORMAT = {"uint8": "Mono8", "uint16": "Mono12"}
+_PIXEL_FORMAT: dict[str, Literal["Mono8", "Mono12"]] = {"uint8": "Mono8", "uint16": "Mono12"}
 _POLL_S = 0.05
 _GRACE_S = 30.0
 

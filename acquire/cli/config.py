@@ -28,7 +28,8 @@ def check(file: FileArgument, json: JsonFlag = False) -> None:
 
     Example: [bold]acquire config check rig-demo[/]
     """
-    from acquire.config import check_directory, load_rig, load_scene
+    from acquire.config import load_rig, load_scene
+    from acquire.daemon.host import check_host
     from acquire.daemon.uploads import check_upload
     from acquire.rig import check_rig
 
@@ -36,7 +37,7 @@ def check(file: FileArgument, json: JsonFlag = False) -> None:
     check_rig(rig)
     if rig.needs_scene:
         load_scene(rig.scene_file())
-    check_directory(rig)
+    check_host(rig)
     check_upload(rig)
     facts = _facts(rig)
     if json:

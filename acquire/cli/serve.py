@@ -36,7 +36,8 @@ def serve(
     """
     import threading
 
-    from acquire.config import check_directory, load_rig, parse_settings
+    from acquire.config import load_rig, parse_settings
+    from acquire.daemon.host import check_host
     from acquire.daemon.logs import write_log
     from acquire.daemon.server import serve as run_daemon
     from acquire.daemon.uploads import check_upload
@@ -45,7 +46,7 @@ def serve(
     if socket is not None:
         overrides["control.socket"] = str(socket.absolute())
     rig = load_rig(config, overrides)
-    check_directory(rig)
+    check_host(rig)
     check_upload(rig)
     write_log()
     if owned:

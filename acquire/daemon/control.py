@@ -28,7 +28,7 @@ from acquire.daemon.messages import (
 )
 from acquire.daemon.states import State
 from acquire.errors import AcquireError, UsageError
-from acquire.text import shortened
+from acquire.text import shortened, shown
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -160,7 +160,7 @@ def _add_errors(app: FastAPI) -> None:
 def _explain(item: dict[str, Any]) -> str:
     """What is wrong with a value; of a long one its beginning, since it comes from whoever asked."""
     key = ".".join(str(part) for part in item["loc"] if part != "body") or "request"
-    return f"{shortened(key)} = {shortened(repr(item.get('input')))}: {shortened(item['msg'], 400)}"
+    return f"{shortened(key)} = {shown(item.get('input'))}: {shortened(item['msg'], 400)}"
 
 
 def _answer(error: AcquireError) -> JSONResponse:

@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from acquire.scene_config import LedConfig
 
 
+_EDGE = 2
+"""Pixels by which a shape's smooth edge can reach over its square."""
+
+
 class LedScene(MaskScene):
     """LEDs behind masks, each with its own drive (Fig. 9).
 
@@ -29,18 +33,31 @@ class LedScene(MaskScene):
     def __init__(self, leds: tuple[LedConfig, ...], size: int, substep_s: float) -> None:
         self.leds = leds
         self.substep_s = substep_s
-        self.masks = np.stack([_mask(led, size) for led in leds])
+        self.masks = np.zeros((len(leds), size, size), np.float32)
+        for mask, led in zip(self.masks, leds, strict=True):
+            _draw(led, mask)
 
     def intensity(self, first: int, count: int, substep_s: float | None = None) -> NDArray[np.float64]:
         """(K, count): light of each LED, mean over each sub-step."""
         return np.stack([_light(led, first, count, substep_s or self.substep_s) for led in self.leds])
 
 
-def _mask(led: LedConfig, size: int) -> NDArray[np.float32]:
-    """(row, column): how far each pixel of the scene is covered by the LED's shape, 0 to 1."""
+def _draw(led: LedConfig, mask: NDArray[np.float32]) -> None:
+    """(row, column): how far each pixel of the scene is covered by the LED's shape, 0 to 1.
+
+    Only the square around the shape is computed: elsewhere memory is not even touched.
+    """
+    size = len(mask)
+    rows, columns = _extent(led.row, led.size, size), _extent(led.column, led.size, size)
     centre = (np.arange(size) + 0.5) / size
-    row, column = (centre - led.row) / led.size, (centre - led.column) / led.size
-    return coverage(led.shape, row[:, None], column[None, :], pixel=1 / (led.size * size))
+    row, column = (centre[rows] - led.row) / led.size, (centre[columns] - led.column) / led.size
+    mask[rows, columns] = coverage(led.shape, row[:, None], column[None, :], pixel=1 / (led.size * size))
+
+
+def _extent(centre: float, side: float, size: int) -> slice:
+    """Pixels along one axis that a shape may cover, its smooth edge included."""
+    first, last = (centre - side / 2) * size, (centre + side / 2) * size
+    return slice(max(0, int(first) - _EDGE), min(size, int(last) + 1 + _EDGE))
 
 
 def _light(led: LedConfig, first: int, count: int, substep_s: float) -> NDArray[np.float64]:

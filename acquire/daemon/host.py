@@ -1,0 +1,126 @@
+"""Whether this host has what a rig needs: a directory, room on its disk, and memory.
+
+What would fail at `start`, after the devices were armed, is refused before the daemon begins.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from acquire.clock import ClockFit
+from acquire.config import check_directory, load_scene
+from acquire.daemon.storage import storage_settings
+from acquire.errors import ConfigError, UsageError
+from acquire.lines import ARMS
+from acquire.scene_config import LedSceneConfig
+from acquire.store import RecordingSpec
+
+if TYPE_CHECKING:
+    from acquire.config import RigConfig
+
+MEMORY_PART = 0.8
+"""Of the host's memory; the rest is the system's and the programs'."""
+SIMULATING = 3
+"""Processes that hold a simulated scene: the daemon, to check it, and a camera for each arm."""
+SCENE_BYTES = 32
+"""Per fine pixel of a simulated scene in each of them, as measured; of four LEDs as well as of frames."""
+_CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
+
+
+def check_host(config: RigConfig) -> None:
+    """Raise ConfigError for what cannot be recorded here, with what could be."""
+    check_directory(config)
+    _check_disk(config)
+    _check_spec(config)
+    _check_memory(config)
+
+
+def _check_spec(config: RigConfig) -> None:
+    """The recording that `start` would make, but for what only the devices know."""
+    cameras = {
+        arm: config.cameras.arm(arm).model_dump(include={"black_level_dn", "responsivity_dn"})
+        | {"white_dn": config.cameras.arm(arm).white_dn}
+        for arm in ARMS
+    }
+    codec = config.recording.codec
+    try:
+        RecordingSpec(
+            run_id="check",
+            stages=config.geometry.stages,
+            substeps=config.geometry.substeps,
+            pixels=config.geometry.stages,
+            dtype=config.cameras.a.dtype,
+            first_line=0,
+            clock=ClockFit(config.trigger.clock_hz, 0, 0),
+            code=config.code.build().to_attrs(),
+            substep_ticks=config.trigger.substep_ticks,
+            trigger={},
+            cameras=cameras,
+            config=config.model_dump(mode="json"),
+            codec="none" if codec == "auto" else codec,
+            **storage_settings(config),
+        )
+    except UsageError as error:
+        raise ConfigError(
+            f"[recording]: {error.message}", possible=error.possible, hint=error.hint
+        ) from error
+
+
+def _check_disk(config: RigConfig) -> None:
+    recording = config.recording
+    total_gb = shutil.disk_usage(recording.directory).total / 1e9
+    if recording.reserve_gb >= total_gb:
+        raise ConfigError(
+            f"recording.reserve_gb = {recording.reserve_gb:g}: the disk of {recording.directory.absolute()} "
+            f"has {total_gb:.3g} GB in all",
+            possible=f"below {total_gb:.3g}",
+        )
+    retention = recording.retention
+    line_bytes = config.geometry.stages * np.dtype(config.cameras.a.dtype).itemsize
+    shard_gb = len(ARMS) * config.chunk_lines * recording.shard_chunks * line_bytes / 1e9
+    if retention is not None and retention.max_gb is not None and retention.max_gb < shard_gb:
+        raise ConfigError(
+            f"recording.retention.max_gb = {retention.max_gb:g} is less than one file of each arm",
+            possible=f"{shard_gb:.3g} or more",
+            hint="a smaller recording.shard_chunks makes smaller files",
+        )
+
+
+def _check_memory(config: RigConfig) -> None:
+    line_bytes = config.geometry.stages * np.dtype(config.cameras.a.dtype).itemsize
+    rings = len(ARMS) * config.ring_slots * config.stream.block_lines * line_bytes
+    scene = SIMULATING * _scene_bytes(config)
+    most = int(MEMORY_PART * memory_bytes())
+    if rings + scene > most:
+        raise ConfigError(
+            f"geometry.stages = {config.geometry.stages}: the rings need {rings / 1e9:.3g} GB of memory and "
+            f"the simulated scene {scene / 1e9:.3g} GB, {(rings + scene) / 1e9:.3g} GB in all",
+            possible=f"up to {most / 1e9:.3g} GB on this host",
+            hint="fewer geometry.stages, or a smaller stream.ring_seconds or ring_slots",
+        )
+
+
+def _scene_bytes(config: RigConfig) -> int:
+    """In one process; 0 where no camera computes what it sees."""
+    if not config.needs_scene:
+        return 0
+    scene = load_scene(config.scene_file())
+    size = config.geometry.stages * config.geometry.substeps
+    if scene.optics.layout == "interline":
+        size *= scene.optics.baseline_factor
+    masks = len(scene.leds) if isinstance(scene, LedSceneConfig) else 4
+    return size * size * max(SCENE_BYTES, SCENE_BYTES // 4 * masks)
+
+
+def memory_bytes() -> int:
+    """Of this host, or what its control group leaves of it."""
+    host = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    with contextlib.suppress(OSError, ValueError):  # no control group, or "max"
+        return min(host, int(_CGROUP_LIMIT.read_text(encoding="ascii")))
+    return host

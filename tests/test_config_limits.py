@@ -1,0 +1,139 @@
+"""Rig files that no hand wrote, and values that no host can honour, are refused in a sentence at check."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from acquire.config import MOST_FILE_BYTES, RigConfig, builtin_directory, load_plan, load_rig, load_scene
+from acquire.daemon import host
+from acquire.daemon.host import check_host
+from acquire.errors import ConfigError
+
+DEEP = "x = " + "[" * 20_000
+DIGITS = "9" * 10_000
+SENTENCE_CHARACTERS = 6000
+"""Of the longest refusal."""
+
+
+@pytest.fixture
+def rig_text() -> str:
+    return (builtin_directory() / "rig-demo.toml").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("load", [load_rig, load_scene, load_plan])
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (DEEP.encode(), "nested too deeply"),
+        (b"x = " + b"[" * 500 + b"]" * 500, "x"),
+        (f"x = {DIGITS}".encode(), "not TOML"),
+        (b"x = 0x" + b"f" * 40_000, "x"),
+        (b"\xff\xfex = 1", "byte 0 is not UTF-8"),
+        (b"x = 1\0", "not TOML"),
+        (b"#" * (MOST_FILE_BYTES + 1), "too long"),
+        (b"a = 1\n" + b"\n".join(b"k%d = 1" % i for i in range(5000)), "mend"),
+        (b'x = "' + b"y" * 50_000 + b'"', "x"),
+        (b'"' + b"y" * 50_000 + b'" = 1', "mend"),
+    ],
+)
+def test_files_that_no_hand_wrote(
+    load: Callable[[Path], object], tmp_path: Path, content: bytes, words: str
+) -> None:
+    file = tmp_path / "x.toml"
+    file.write_bytes(content)
+    with pytest.raises(ConfigError) as caught:
+        load(file)
+    assert words in str(caught.value)
+    assert len(str(caught.value)) < SENTENCE_CHARACTERS
+
+
+def test_what_is_no_file_is_not_read(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe.toml")
+    for odd in (tmp_path / "pipe.toml", Path("/dev/zero"), Path("/dev/null")):
+        with pytest.raises(ConfigError, match="no regular file"):
+            load_rig(odd)
+
+
+def test_a_mark_of_the_editor_s_before_the_text_is_none_of_it(tmp_path: Path, rig_text: str) -> None:
+    file = tmp_path / "rig.toml"
+    file.write_text("\ufeff" + rig_text, encoding="utf-8")
+    assert load_rig(file) == load_rig("rig-demo")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("geometry.stages", True),
+        ("geometry.stages", "64"),
+        ("geometry.stages", 64.0),
+        ("geometry.substeps", True),
+        ("code.seed", True),
+        ("code.seed", 1 << 40_000),
+        ("trigger.substep_ticks", True),
+        ("simulation.speed", True),
+        ("recording.commit_s", False),
+        ("events.sources", "mark"),
+        ("cameras.a.settings", [["remote", "Gain", [1]]]),
+        ("name", "x" * 300),
+        ("name", "a/b"),
+        ("name", "a\n"),
+        ("cameras.a.serial", "x" * 5000),
+        ("events.post_s", -1.0),
+        ("events.post_s", 1e300),
+        ("stream.ring_seconds", 1e12),
+        ("stream.reopen_s", float("nan")),
+        ("trigger.external_timeout_s", 1e12),
+        ("recording.reserve_gb", 1e12),
+        ("recording.reserve_gb", float("inf")),
+        ("recording.retention.hold_before_s", 1e12),
+        ("cameras.a.black_level_dn", 1e300),
+    ],
+    ids=lambda value: value if isinstance(value, str) and len(value) < 50 else type(value).__name__,
+)
+def test_values_that_are_none_name_their_key(key: str, value: object) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_rig("rig-demo", {key: value})
+    assert key in str(caught.value)
+    assert len(str(caught.value)) < 500
+
+
+def test_every_number_has_its_limits() -> None:
+    """A number without an upper limit fails somewhere behind, where nobody can say which key it was."""
+    open_ended: list[str] = []
+    for name, model in RigConfig.model_json_schema()["$defs"].items():
+        for key, found in model["properties"].items():
+            for kind in found.get("anyOf", [found]):
+                bounded = {"maximum", "exclusiveMaximum", "enum", "const"} & set(kind)
+                if kind.get("type") in ("integer", "number") and not bounded:
+                    open_ended.append(f"{name}.{key}")
+    assert open_ended == ["PrbsConfig.degree"]  # one of a list
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"recording.reserve_gb": 1e8}, "recording.reserve_gb = 1e+08: the disk of"),
+        ({"recording.retention.max_gb": 1e-12}, "less than one file of each arm; possible:"),
+        ({"recording.chunk_lines": 2**20, "geometry.stages": 4096}, "chunk_lines = 1048576; possible: 1 to"),
+    ],
+)
+def test_what_would_fail_at_start_is_refused_at_check(
+    tmp_path: Path, changes: dict[str, object], words: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        check_host(load_rig("rig-demo", {"recording.directory": str(tmp_path)} | changes))
+    assert words in str(caught.value)
+
+
+def test_memory_is_compared_with_the_host_s(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    changes = {"recording.directory": str(tmp_path), "geometry.stages": 4096, "stream.ring_seconds": 1.0}
+    monkeypatch.setattr(host, "memory_bytes", lambda: 64 * 10**9)
+    check_host(load_rig("rig-demo", changes))
+    monkeypatch.setattr(host, "memory_bytes", lambda: 8 * 10**9)
+    with pytest.raises(ConfigError, match=r"geometry.stages = 4096: .* possible: up to 6.4 GB on this host"):
+        check_host(load_rig("rig-demo", changes))
+    assert 2**28 < host.memory_bytes() < 2**60
