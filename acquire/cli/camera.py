@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import threading
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table
-from acquire.errors import UsageError
+from acquire.errors import TriggerError, UsageError
 
 if TYPE_CHECKING:
     from acquire.camera.base import CameraOpener
@@ -23,6 +25,7 @@ ConfigOption = Annotated[
 ]
 SerialArgument = Annotated[str, typer.Argument(help="Serial number: acquire devices lists them.")]
 OPEN_S = 60.0
+_LISTEN_S = 0.2
 
 
 def register(app: typer.Typer) -> None:
@@ -98,6 +101,8 @@ class _Bench:
 
         self._config: RigConfig | None = load_rig(config) if config else None
         self._rig: Rig | None = None
+        self._ending = threading.Event()
+        self._listener = threading.Thread(target=self._listen, name="acquire-snapshot-trigger", daemon=True)
 
     @property
     def line_rate_hz(self) -> float:
@@ -121,6 +126,14 @@ class _Bench:
 
             self._rig.trigger.prepare(trigger_run(self._config, "snapshot"))
             self._rig.trigger.start()
+            self._listener.start()
+
+    def _listen(self) -> None:
+        """Take the trigger's tags, which keeps its watchdog quiet. A dead link is the camera's silence."""
+        assert self._rig is not None
+        with suppress(TriggerError):
+            while not self._ending.wait(_LISTEN_S):
+                self._rig.trigger.tags(_LISTEN_S)
 
     def __enter__(self) -> _Bench:
         if self._config is not None:
@@ -130,6 +143,9 @@ class _Bench:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._ending.set()
+        if self._listener.ident is not None:
+            self._listener.join(OPEN_S)
         if self._rig is not None:
             self._rig.close()
 

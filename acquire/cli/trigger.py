@@ -109,6 +109,9 @@ def arm(
 ) -> None:
     """Configure the device as the rig file says and arm it; it stays so when the command ends.
 
+    A run without a host ends after [bold]trigger.watchdog_s[/] (10 s), light off: `monitor` keeps it going,
+    and 0 makes it go on alone.
+
     Example: [bold]acquire trigger arm --url /dev/ttyUSB0 --set trigger.substep_ticks=50 --start[/]
     """
     from dataclasses import replace
@@ -132,6 +135,7 @@ def arm(
         fit = driver.start() if start else None
         facts = {"run_id": run.run_id, **facts_of(driver.device().status())}
         facts["utc_ns_at_tick_0"] = fit and fit.utc_ns_at_tick_0
+        facts["watchdog_s"] = rig.trigger.watchdog_s
     if json:
         print_json(facts)
         return

@@ -88,7 +88,7 @@ class PulseTrain:
     ``run`` counts the trains of a wire from 1; ``start_ns`` is CLOCK_MONOTONIC; ``line_period_ns`` is
     simulated time; ``code`` is what `acquire.codes.code_from_attrs` reads; ``stopped_after`` is the
     number of pulses after which the train ended, None while it lasts; ``budget`` is the number that it
-    never exceeds, None where only a stop ends it.
+    does not exceed unless more are allowed, None where only a stop ends it.
     """
 
     run: int
@@ -187,6 +187,21 @@ class Wire:
                 return latest.issued
             ended = self._write(sequence, lambda now_ns: replace(train, stopped_after=train.issued(now_ns)))
             return ended.stopped_after or 0
+
+    def allow(self, pulses: int) -> int:
+        """Let the train issue ``pulses`` pulses and no more, unless more are allowed later.
+
+        Returns the number it will issue: at least one, and those issued so far.
+        """
+        with self._writing:
+            sequence, latest = self._observe()
+            train = latest.train
+            if train is None or train.stopped_after is not None:
+                return latest.issued
+            allowed = self._write(
+                sequence, lambda now_ns: replace(train, budget=max(1, pulses, train.issued(now_ns)))
+            )
+            return allowed.budget or 0
 
     def look(self) -> Reading:
         """The latest train and the pulses it has issued at this moment."""

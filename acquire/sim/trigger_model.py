@@ -14,6 +14,7 @@ codes; with a code memory the wire carries the pulses of a dark run.
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import deque
 from fractions import Fraction
@@ -22,7 +23,14 @@ from typing import TYPE_CHECKING
 from acquire.clock import NS_PER_S
 from acquire.sim.arming import Refusal, check_configuration
 from acquire.sim.trigger_code import light_attrs, prbs_state
-from acquire.sim.trigger_registers import START_LATENCY, TAG_ROOM, RegisterBank, constants
+from acquire.sim.trigger_registers import (
+    BARK_CLOCKS,
+    RUN_CLOCKS,
+    START_LATENCY,
+    TAG_ROOM,
+    RegisterBank,
+    constants,
+)
 from acquire.sim.trigger_run import Run
 from acquire.trigger import registers as r
 from acquire.trigger.frames import (
@@ -70,7 +78,6 @@ class TriggerModel:
         self._tags: deque[bytes] = deque()
         self._run = Run()
         self._zero = (wire.clock.monotonic_ns(), 0, Fraction(1))
-        self._heard_tick = 0
         self._pps: tuple[int, int] = (0, 0)
         self._clock_losses = 0
         self._locked = True
@@ -145,7 +152,7 @@ class TriggerModel:
             self._locked = not lost
             self._clock_losses += lost
             if lost:
-                self._end_after_this_line(EndReason.CLOCK_LOST)
+                self._end(EndReason.CLOCK_LOST)
 
     # Requests.
 
@@ -163,11 +170,11 @@ class TriggerModel:
             raise Refusal(ErrorCode.BAD_VERSION, 0)
         if frame.type == FrameType.READ:
             address, count = parse_read(frame.payload)
-            self._heard_tick = self._tick()
+            self._hear(self._tick())
             return FrameType.DATA, write_payload(address, self.registers.read(address, count))
         if frame.type == FrameType.WRITE:
             address, words = parse_write(frame.payload)
-            self._heard_tick = self._tick()
+            self._hear(self._tick())
             for i, word in enumerate(words):
                 self.registers.write(address + i, word)
             return FrameType.ACK, frame.payload[:2] + bytes([len(words)])
@@ -204,7 +211,7 @@ class TriggerModel:
         self._tags.clear()
         line_clocks = self.registers.field(r.LINE, "substeps") * self.registers.get(r.SUBSTEP_CLOCKS)
         budget = self.registers.get(r.LINE_BUDGET) or None
-        self._run = Run(number, State.ARMED, line_clocks=line_clocks, limit=budget)
+        self._run = Run(number, State.ARMED, line_clocks=line_clocks, budget=budget)
 
     def _start(self, number: int) -> None:
         run = self._run
@@ -218,11 +225,7 @@ class TriggerModel:
     def _stop(self, number: int) -> None:
         if number not in (0, self._run.number):
             raise Refusal(ErrorCode.WRONG_RUN, r.COMMAND.address)
-        if self._run.state == State.ARMED:
-            self._run.limit = 0
-            self._finish(EndReason.STOPPED, self._tick())
-        else:
-            self._end_after_this_line(EndReason.STOPPED)
+        self._end(EndReason.STOPPED)
 
     def _check_code(self, number: int) -> None:
         del number
@@ -244,39 +247,73 @@ class TriggerModel:
     def _begin(self, external: bool) -> None:
         run, clock = self._run, self._wire.clock
         now_ns, now_tick = clock.monotonic_ns(), self._tick()
-        latency = START_LATENCY + self.registers.field(r.LED, "lead")
+        latency = START_LATENCY + self._lead()
         run.start_tick, run.state, run.external = now_tick + latency, State.RUNNING, external
         rate = self._clock_hz * self._speed / NS_PER_S
         start_ns = now_ns + -(-latency * rate.denominator // rate.numerator)
         self._zero = (start_ns, run.start_tick, self._speed)
+        self._hear(run.start_tick - self._lead() - RUN_CLOCKS)
         period_ns = Fraction(run.line_clocks * NS_PER_S, self._clock_hz)
-        self._wire.start(period_ns, self._speed, light_attrs(self.registers.get), start_ns, run.limit)
-        self._heard_tick = now_tick
+        attrs = light_attrs(self.registers.get)
+        self._wire.start(period_ns, self._speed, attrs, start_ns, self._lines_allowed())
+
+    def _hear(self, tick: int) -> None:
+        """The host lived at ``tick``: that is what it may be silent from.
+
+        A host lives in its own time: simulated time that runs faster does not make it silent any sooner.
+        """
+        run, period = self._run, self.registers.get(r.WATCHDOG)
+        if run.state != State.RUNNING or not period:
+            return
+        run.bark_tick = tick + math.ceil(period * self._speed) + BARK_CLOCKS
+        if self._wire.look().running:
+            self._wire.allow(self._lines_allowed() or 0)
+
+    def _lines_allowed(self) -> int | None:
+        """Lines that the run has if nothing is heard of the host any more; None: no end."""
+        run = self._run
+        if run.bark_tick is None:
+            return run.budget
+        settled = self._lead() + 1  # clocks ahead of a line: whether it comes
+        silent = max(1, -(-(run.bark_tick + settled - run.start_tick) // run.line_clocks))
+        return silent if run.budget is None else min(silent, run.budget)
+
+    def _lead(self) -> int:
+        return self.registers.field(r.LED, "lead")
 
     def _advance(self) -> None:
         """Let everything happen that is due by now."""
         run = self._run
         if run.state not in (State.RUNNING, State.STOPPING):
             return
-        self._bark()
+        tick = self._tick()  # before the look: what is over by then has issued all its lines
         lines = self._wire.look().issued
-        tick = self._tick()
         self._tell_lines(run.lines, lines)
         run.lines = lines
+        self._expire(tick)
         if run.limit is not None and tick >= (end := run.start_tick + run.limit * run.line_clocks):
-            self._finish(EndReason.LINE_BUDGET if run.reason == EndReason.NONE else run.reason, end)
+            self._finish(run.reason, end)
 
-    def _bark(self) -> None:
-        """The watchdog; it bites at the first look after its time."""
-        patience = self.registers.get(r.WATCHDOG)
-        if patience and self._tick() >= self._heard_tick + patience:
-            self._end_after_this_line(EndReason.WATCHDOG)
+    def _expire(self, tick: int) -> None:
+        """The last line of the budget begins, or the watchdog barks, whichever comes first."""
+        run = self._run
+        ends = [(run.bark_tick, EndReason.WATCHDOG)] if run.bark_tick is not None else []
+        if run.budget is not None:
+            ends.append((run.start_tick + (run.budget - 1) * run.line_clocks, EndReason.LINE_BUDGET))
+        if run.state == State.RUNNING and ends:
+            first_tick, reason = min(ends, key=lambda end: end[0])
+            if tick >= first_tick:
+                run.state, run.reason, run.limit = State.STOPPING, reason, self._lines_allowed()
 
-    def _end_after_this_line(self, reason: EndReason) -> None:
-        """What the wire has issued is the truth: cameras may have seen it."""
-        if self._run.state == State.RUNNING:
-            self._run.state, self._run.reason = State.STOPPING, reason
-            self._run.limit = self._wire.stop()
+    def _end(self, reason: EndReason) -> None:
+        """At once where no line has begun; else after the line that runs, which cameras may have seen."""
+        run = self._run
+        if run.state == State.ARMED:
+            run.limit = 0
+            self._finish(reason, self._tick())
+        elif run.state == State.RUNNING:
+            run.state, run.reason = State.STOPPING, reason
+            run.limit = self._wire.allow(0)
 
     def _finish(self, reason: EndReason, tick: int) -> None:
         run = self._run

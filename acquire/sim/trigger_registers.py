@@ -16,6 +16,10 @@ CODE_BITS = 1 << 19
 TAG_ROOM = 1 << 15
 RX_BYTES = 2048
 START_LATENCY = 6
+RUN_CLOCKS = 2
+"""From the clock that starts a run to line 0, less LED.lead: the run's first clock is one later."""
+BARK_CLOCKS = 2
+"""From the last silent clock that the watchdog allows to its bark."""
 SUBSTEP_MIN = 5
 SUBSTEP_MAX_LOG2 = 24
 LEAD_MARGIN = 1

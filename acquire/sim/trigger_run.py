@@ -24,5 +24,9 @@ class Run:
     gap: bool = False
     """Tags have been lost since the last one that was not."""
     peak: int = 0
+    budget: int | None = None
+    """Lines after which it ends in any case."""
+    bark_tick: int | None = None
+    """When the watchdog ends it, should nothing be heard of the host until then."""
     limit: int | None = None
-    """Lines after which it ends."""
+    """Lines after which it ends: settled."""

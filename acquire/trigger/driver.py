@@ -9,6 +9,13 @@
 Nothing is opened before it is needed. A link that dies raises TriggerError at once in whoever waits, and in
 every later call but three: `prepare` and `stop` connect again by themselves, since the light may still
 flash out there; `reopen` does so and says what became of the run.
+
+The device's watchdog (``trigger.watchdog_s``) watches every run from its first clock. Requests keep it quiet:
+`start` makes them until line 0 has begun, and `tags` whenever they are due, so it is whoever takes the tags
+that keeps the light on. A host that hangs, dies or is unplugged falls silent, and so does one that has called
+`release`: the run ends after ``watchdog_s`` and the line that runs then, with the reason WATCHDOG. `stop` and
+`close` end it at once. An armed run whose host has gone stays armed, and dark; should an external edge start
+it, the watchdog ends it.
 """
 
 from __future__ import annotations
@@ -38,7 +45,9 @@ if TYPE_CHECKING:
 
 _DRIFT = 1e-4
 """How far an ordinary oscillator may be off: the uncertainty that grows with the age of a comparison."""
-_SIGNS_OF_LIFE_PER_WATCHDOG = 4
+_SIGNS_OF_LIFE_PER_WATCHDOG = 8
+_SIGN_OF_LIFE_S = 0.5
+"""At least as often as this: a simulated device's time may pass faster than the host's."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,9 +268,9 @@ class TriggerDriver:
 
     def _show_life(self, device: Device) -> float:
         """Keep the watchdog quiet while somebody asks for tags; for how long it is now."""
-        patience_s = self._config.watchdog_ticks / self._config.clock_hz / _SIGNS_OF_LIFE_PER_WATCHDOG
-        if not patience_s:
+        if not self._config.watchdog_s:
             return float("inf")
+        patience_s = min(self._config.watchdog_s / _SIGNS_OF_LIFE_PER_WATCHDOG, _SIGN_OF_LIFE_S)
         if time.monotonic() > self._sign_of_life_s + patience_s:
             device.read(r.STATUS)
             self._sign_of_life_s = time.monotonic()

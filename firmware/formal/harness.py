@@ -58,6 +58,7 @@ class Harness:
         self.claims: list[str] = []
         self.covers: list[str] = []
         self._names: set[str] = set()
+        self._facts = 0
 
     def assume(self, condition: ValueLike) -> None:
         self.m.d.comb += Assume(condition)
@@ -70,6 +71,12 @@ class Harness:
         self._take(name)
         self.m.d.comb += Assert(~Value.cast(when).any() | Value.cast(then).any(), name)
 
+    def fact(self, name: str, when: ValueLike, then: ValueLike) -> None:
+        """What another proof has shown, under assumptions that hold here as well."""
+        self._take(name)
+        self._facts += 1
+        self.assume(~Value.cast(when).any() | Value.cast(then).any())
+
     def cover(self, name: str, condition: ValueLike) -> None:
         self._take(name)
         self.covers.append(name)
@@ -78,7 +85,7 @@ class Harness:
     def proof(self, name: str, inputs: list[Signal], cover_depth: int, depth: int = 1) -> Proof:
         text = rtlil.convert(self.m, ports=[self._sync.clk, *inputs])
         text = _CHECK.sub(lambda found: f"cell $check \\check.{found[2]}\n{found[1]}", text)
-        lemmas = len(self._names) - len(self.claims) - len(self.covers)
+        lemmas = len(self._names) - len(self.claims) - len(self.covers) - self._facts
         return Proof(name, text, tuple(self.claims), lemmas, tuple(self.covers), cover_depth, depth)
 
     def _take(self, name: str) -> None:

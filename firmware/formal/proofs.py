@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from firmware.formal.frames import frames_proof
 from firmware.formal.pulses import pulses_proof
 from firmware.formal.requests import requests_proof
 from firmware.formal.runs import runs_proof
@@ -12,6 +13,7 @@ from firmware.formal.tags import tags_proof
 from firmware.formal.timing import timing_proof
 from firmware.formal.transfer import transfer_proof
 from firmware.formal.wiring import wiring_proof
+from firmware.formal.witnesses import witnesses_proof
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -26,5 +28,7 @@ PROOFS: dict[str, Callable[[], Proof]] = {
     "requests": requests_proof,
     "runs": runs_proof,
     "tags": tags_proof,
+    "frames": frames_proof,
+    "witnesses": witnesses_proof,
     "wiring": wiring_proof,
 }

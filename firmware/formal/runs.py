@@ -1,11 +1,12 @@
 r"""Runs begin when they shall, end when they must, and the state that the host reads is the truth.
 
-`Commands` and `Timing` as they are joined in `firmware.top`; commands, edges, a watchdog that barks and a
-clock that is lost come at any time, all at once if they like::
+`Commands`, `Timing`, `Watchdog` and `Light` as they are joined in `firmware.top`; commands, edges, signs of
+life of the host and the loss of the clock come at any time, all at once if they like::
 
     edge or START, armed   ──▶ line 0 exactly START_CLOCKS + lead clocks later
-    STOP, watchdog, clock  ──▶ one line more at most, then dark
+    STOP, silence, clock   ──▶ one line more at most, then dark
     state ENDED            ◀─▶ nothing runs, and a tag LAST has been asked for, once
+    WATCHDOG silent clocks ──▶ the run is over two lines later, whoever started it: see `silence`
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ from typing import Any
 
 from amaranth.hdl import Cat, Mux, Signal
 
-from acquire.trigger.registers import Command, EndReason, State, TagFlag
+from acquire.trigger.registers import Command, EndReason, ErrorCode, State, TagFlag
 from firmware.commands import SETTLE_CLOCKS, Commands
 from firmware.formal.harness import Harness, Proof, opened
 from firmware.formal.settings import SETTLED
+from firmware.formal.silence import silence_and_dark
 from firmware.formal.timing import Observer, assume_settings, timing_facts
 from firmware.timing import Timing
 
@@ -34,6 +36,7 @@ class Story:
         self.since_arm, self.since_command, self.commanded = Signal(4), Signal(4), Signal()
         m.d.sync += self.commanded.eq(self.commanded | commands.execute)
         self.must_end = Signal()
+        self.other_end = ~commands.clock_locked | commands.watchdog
         m.d.comb += self.ended_told.eq((commands.last & int(TagFlag.LAST)) != 0)
         m.d.sync += [
             self.was.eq(commands.state),
@@ -71,8 +74,9 @@ def runs_proof() -> Proof:
     _lemmas(harness, commands, timing, seen, story)
     _pipeline(harness, commands, seen, story, within)
     free = ["execute", "command", "run", "config_error", "config_address", "length_good", "busy", "edge"]
-    inputs = [getattr(commands, name) for name in [*free, "watchdog", "clock_locked"]]
+    inputs = [getattr(commands, name) for name in [*free, "clock_locked"]]
     inputs += [timing.substep_clocks, timing.substeps, timing.lead, timing.lines]
+    inputs += silence_and_dark(harness, commands, timing, seen, inside["leaving"])
     return harness.proof("runs", inputs, cover_depth=24)
 
 
@@ -114,6 +118,25 @@ def _claims(harness: Harness, commands: Commands, timing: Timing, story: Story) 
         timing.stop,
     )
     claim("watchdog_ends_the_run", active & commands.watchdog & timing.running, timing.stop)
+    meant = commands.run == commands.current  # all 64 bits
+    asked_start, asked_stop = (
+        story.answered & (story.asked_command == command) for command in (Command.START, Command.STOP)
+    )
+    wrong = commands.error == ErrorCode.WRONG_RUN
+    claim("only_the_run_that_is_named_starts", timing.start & ~commands.edge, meant)
+    claim("a_start_of_another_is_refused", asked_start & ~meant & (story.was != State.IDLE), wrong)
+    claim("a_stop_of_another_is_refused", asked_stop & ~meant & (commands.run != 0), wrong)
+    claim("any_run_can_be_stopped", asked_stop & (meant | (commands.run == 0)), commands.error == 0)
+    claim(
+        "a_refused_stop_stops_nothing",
+        stop_asked & timing.stop & ~story.other_end,
+        meant | (commands.run == 0),
+    )
+    claim("the_id_armed_is_the_one_named", armed & (story.was != State.ARMED), meant)
+    free = ~active & ~armed & ~commands.busy & (commands.config_error == 0) & (commands.run != 0)
+    arm_asked = story.asked & (commands.command == Command.ARM)
+    claim("a_new_id_is_armed", arm_asked & free & ~meant, commands.arm)
+    claim("an_old_id_is_not", arm_asked & meant, ~commands.arm)
     claim("every_command_is_answered", story.answered, commands.done)
     claim("no_answer_unasked", commands.done, story.answered)
     harness.cover("stopped_while_running", (state == State.ENDED) & (commands.reason == EndReason.STOPPED))
@@ -151,7 +174,9 @@ def _pipeline(
     lemma("settled", armed & (settling == 0), story.since_arm > SETTLE_CLOCKS)
     lemma("commanded_before_armed", armed, story.since_arm + 1 >= story.since_command)
     lemma("settled_when_commanded", armed & story.asked, story.since_arm > SETTLE_CLOCKS)
-    lemma("named_is_decoded", story.asked, within["named"] == (commands.run != 0))
+    named = commands.run != 0
+    lemma("named_is_decoded", story.asked, within["named"] == named)
+    lemma("same_is_decoded", story.asked, within["same"] == ((commands.run == commands.current) & named))
     lemma("pending_is_asked", 1, within["pending"] == story.asked)
     lemma("done_is_answered", 1, commands.done == story.answered)
     lemma("begun_is_was_running", 1, within["begun"] == seen.was_running)

@@ -126,9 +126,16 @@ def _line_claims(harness: Harness, tagger: Tagger, lines: Lines, inside: dict[st
     run = entry.word_select(0, SEQUENCE_BITS)
     number, rest = entry[SEQUENCE_BITS + 32 :][:48], entry[SEQUENCE_BITS + 80 :]
     content = (number == lines.number) & (rest[:64] == lines.code_index) & (rest[64:112] == lines.time)
+    of_line = (number == lines.number) & (rest[:64] == lines.code_index)
     harness.claim("every_due_line_makes_a_tag", lines.was_due, ready & entry[FLAGS][0])
     harness.claim("no_line_tag_but_a_due_line_s", ready & entry[FLAGS][0], lines.was_due)
     harness.claim("the_tag_is_of_its_line", lines.was_due, content & (run == tagger.count[:SEQUENCE_BITS]))
+    now, event = Signal(48), ready & ~entry[FLAGS][0]
+    harness.m.d.sync += now.eq(tagger.now)
+    harness.claim("an_event_s_tag_has_its_time", event, rest[64:112] == now)
+    harness.claim("an_event_is_of_the_latest_line", event & lines.begun, of_line)
+    kept = (inside["line_number"] == lines.number) & (inside["code_index"] == lines.code_index)
+    harness.lemma("the_latest_line_is_kept", lines.begun, kept)
     harness.lemma("due_is_due", 1, inside["due"] == lines.due)
     harness.lemma("begun_is_begun", 1, inside["begun"] == lines.begun)
     harness.lemma("none_ahead_of_the_first", ~lines.begun, inside["ahead"] == 0)

@@ -26,6 +26,8 @@ from firmware.timing import CLOCK_BITS, LEAD_BITS, START_CLOCKS, SUBSTEP_CLOCKS_
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    Claim = Callable[[str, Value, Value], None]
+
 LINE_CLOCK_BITS = CLOCK_BITS + 3
 
 
@@ -84,7 +86,7 @@ def timing_proof() -> Proof:
     seen = Observer(harness, timing)
     harness.assume(seen.lines < (1 << 48) - 3)
     _claims(harness.claim, timing, seen)
-    _lemmas(harness, timing, seen, inside)
+    _lemmas(harness.lemma, timing, seen, inside)
     harness.cover("third_line", timing.line & (seen.lines == 2) & (timing.substeps == 2))
     harness.cover("stopped_in_the_second_line", ~timing.running & seen.stopped & (seen.lines == 2))
     harness.cover("budget_of_two_used_up", ~timing.running & seen.was_running & (timing.lines == 2))
@@ -93,11 +95,11 @@ def timing_proof() -> Proof:
 
 
 def timing_facts(harness: Harness, timing: Timing, inside: dict[str, Signal]) -> Observer:
-    """All of this as lemmas of a proof about something larger."""
+    """All of this as facts for a proof about something larger, whose settings hold still as they do here."""
     seen = Observer(harness, timing)
     harness.assume(seen.lines < (1 << 48) - 3)
-    _claims(harness.lemma, timing, seen)
-    _lemmas(harness, timing, seen, inside)
+    _claims(harness.fact, timing, seen)
+    _lemmas(harness.fact, timing, seen, inside)
     return seen
 
 
@@ -113,7 +115,7 @@ def assume_settings(harness: Harness, timing: Timing, hold: Value) -> None:
     harness.assume(timing.lead < timing.substep_clocks)
 
 
-def _claims(claim: Callable[[str, Value, Value], None], timing: Timing, seen: Observer) -> None:
+def _claims(claim: Claim, timing: Timing, seen: Observer) -> None:
     period = timing.substep_clocks
     whole_line = times(period, timing.substeps, 6)
     later = seen.started & timing.substep
@@ -155,9 +157,8 @@ def _claims(claim: Callable[[str, Value, Value], None], timing: Timing, seen: Ob
     )
 
 
-def _lemmas(harness: Harness, timing: Timing, seen: Observer, inside: dict[str, Signal]) -> None:
+def _lemmas(lemma: Claim, timing: Timing, seen: Observer, inside: dict[str, Signal]) -> None:
     """How the registers inside go with what was seen, clock by clock."""
-    lemma = harness.lemma
     left, leading = inside["left"], inside["leading"]
     counting, waiting = timing.running & ~leading, timing.running & leading
     lemma("started_once_counting", counting, seen.started | timing.line)
@@ -193,12 +194,12 @@ def _lemmas(harness: Harness, timing: Timing, seen: Observer, inside: dict[str, 
         counting,
         timing.code_index == times(timing.line_number, timing.substeps, 6) + timing.place,
     )
-    _light_lemmas(harness, timing, seen, inside)
-    _end_lemmas(harness, timing, seen, inside)
+    _light_lemmas(lemma, timing, seen, inside)
+    _end_lemmas(lemma, timing, seen, inside)
 
 
-def _light_lemmas(harness: Harness, timing: Timing, seen: Observer, inside: dict[str, Signal]) -> None:
-    lemma, left, leading, leaving = harness.lemma, inside["left"], inside["leading"], inside["leaving"]
+def _light_lemmas(lemma: Claim, timing: Timing, seen: Observer, inside: dict[str, Signal]) -> None:
+    left, leading, leaving = inside["left"], inside["leading"], inside["leaving"]
     waits = seen.lit_ahead & ~timing.substep
     lemma("only_in_a_run", ~timing.running, ~seen.lit_ahead)
     lemma("ahead_goes_with_left", waits, seen.ahead == left + 1)
@@ -214,8 +215,8 @@ def _light_lemmas(harness: Harness, timing: Timing, seen: Observer, inside: dict
     lemma("dark_from_lead_on", leaving & timing.running, left < timing.lead)
 
 
-def _end_lemmas(harness: Harness, timing: Timing, seen: Observer, inside: dict[str, Signal]) -> None:
-    lemma, left, leading, leaving = harness.lemma, inside["left"], inside["leading"], inside["leaving"]
+def _end_lemmas(lemma: Claim, timing: Timing, seen: Observer, inside: dict[str, Signal]) -> None:
+    left, leading, leaving = inside["left"], inside["leading"], inside["leaving"]
     counting, last_place = timing.running & ~leading, timing.place + 1 == timing.substeps
     lemma("stop_is_kept", timing.running, inside["stopping"] == seen.stopped)
     lemma("at_most_one_line_more", timing.running & seen.stopped, seen.lines_after_stop + timing.line <= 1)

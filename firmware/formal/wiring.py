@@ -22,8 +22,11 @@ from firmware.top import PIN_CLOCKS, Build, SyncTrigger
 
 if TYPE_CHECKING:
     from firmware.pulse import Pulse
+    from firmware.watchdog import Watchdog
 
 FREE = ("Host", "CodeSource", "Deframer", "Framer", "UartReceiver", "UartTransmitter")
+
+STROBE_COUNTERS = ("SEEN", "MISSED", "UNEXPECTED")
 
 DEPTH = LATENCY + 3
 """Clocks until every pipeline holds what the last clocks have put into it."""
@@ -39,6 +42,8 @@ def wiring_proof() -> Proof:
     parts = local["m"].submodules
     _settings(harness, trigger, parts)
     _commands(harness, trigger)
+    _watchdog(harness, trigger, parts.watchdog)
+    _witnesses(harness, trigger, parts)
     _pins(harness, trigger)
     _light(harness, trigger, light)
     _tags(harness, trigger)
@@ -99,6 +104,52 @@ def _commands(harness: Harness, trigger: SyncTrigger) -> None:
     harness.m.d.sync += [pin.eq(Cat(trigger.external_arm, pin)), before.eq(level)]
     enabled = file.field(r.EXTERNAL_ARM, "enable")
     _equal(harness, "the_edge_is_the_pin_s", commands.edge, level & ~before & enabled)
+
+
+def _watchdog(harness: Harness, trigger: SyncTrigger, watchdog: Watchdog) -> None:
+    given = Cat(watchdog.enable, watchdog.feed, watchdog.period)
+    wanted = Cat(trigger.timing.running, trigger.host.heard, trigger.file.value(r.WATCHDOG))
+    _equal(harness, "it_watches_the_run_and_the_host", given, wanted)
+    _equal(harness, "its_bark_is_heard", trigger.commands.watchdog, watchdog.bark)
+
+
+def _witnesses(harness: Harness, trigger: SyncTrigger, parts: Any) -> None:
+    """Strobes and seconds are those of their pins, and are told where the host looks for them."""
+    file, m, stamp = trigger.file, harness.m, trigger.timestamp
+    for arm in "ab":
+        check, letter = getattr(trigger, f"camera_{arm}"), arm.upper()
+        edge = _edge(harness, getattr(trigger, f"strobe_{arm}"))
+        given = Cat(check.strobe, check.pulse, check.enable, check.clear)
+        pulse = getattr(parts, f"pulse_{arm}").begin
+        enabled = file.field(getattr(r, f"TRIGGER_{letter}"), "strobe")
+        _equal(
+            harness, f"strobes_{arm}_are_the_pin_s", given, Cat(edge, pulse, enabled, trigger.commands.arm)
+        )
+        counters = Cat(*(file.value(getattr(r, f"STROBE_{letter}_{name}")) for name in STROBE_COUNTERS))
+        _equal(harness, f"strobes_{arm}_are_told", counters, Cat(check.seen, check.missed, check.unexpected))
+    _equal(harness, "seconds_are_the_pin_s", stamp.edge, _edge(harness, trigger.pps))
+    told = Cat(file.value(r.TIME), file.value(r.PPS_TIME), file.value(r.PPS_COUNT))
+    _equal(harness, "seconds_are_told", told, Cat(stamp.now, stamp.pps_time, stamp.pps_count))
+    armed, line_0, now, before = Signal(), Signal(), Signal(48), Signal(48)
+    start_time = file.value(r.START_TIME)
+    m.d.sync += [armed.eq(trigger.commands.arm), now.eq(stamp.now), before.eq(start_time)]
+    m.d.sync += line_0.eq(trigger.timing.line & (trigger.timing.line_number == 0))
+    wanted = Mux(armed, 0, Mux(line_0, now, before))
+    harness.claim("start_time_is_that_of_line_0", ~_first_clock(harness), start_time == wanted)
+
+
+def _first_clock(harness: Harness) -> Value:
+    """The first clock: nothing is known of the one before."""
+    later = Signal()
+    harness.m.d.sync += later.eq(1)
+    return ~later
+
+
+def _edge(harness: Harness, pin: Signal) -> Value:
+    """Whether the pin rose LATENCY clocks ago."""
+    levels = Signal(LATENCY + 1)
+    harness.m.d.sync += levels.eq(Cat(pin, levels))
+    return levels[-2] & ~levels[-1]
 
 
 def _pins(harness: Harness, trigger: SyncTrigger) -> None:

@@ -42,9 +42,10 @@ def test_a_run_by_hand(port: str) -> None:
     where = ("--url", port, "--json")
     facts = json.loads(acquire("info", *where))
     assert (facts["board"], facts["state"], facts["substeps"]) == ("model", "IDLE", [1, 2, 3, 6])
-    armed = json.loads(acquire("arm", *where, "--run-id", "mine"))
+    alone = ("--set", "trigger.watchdog_s=0", "--run-id", "mine")  # the next command may take its time
+    armed = json.loads(acquire("arm", *where, *alone))
     assert (armed["state"], armed["lines"], armed["utc_ns_at_tick_0"]) == ("ARMED", 0, None)
-    started = json.loads(acquire("arm", *where, "--run-id", "mine", "--start"))
+    started = json.loads(acquire("arm", *where, *alone, "--start"))
     assert started["state"] == "RUNNING"
     assert started["utc_ns_at_tick_0"] > 1e18
     tags = [json.loads(line) for line in acquire("monitor", *where, "--tags", "5").splitlines()]
@@ -56,8 +57,23 @@ def test_a_run_by_hand(port: str) -> None:
     assert "no run is armed" in acquire("monitor", "--url", port, code=5)
 
 
+def test_a_run_that_the_host_leaves_alone_ends(port: str) -> None:
+    started = json.loads(
+        acquire("arm", "--url", port, "--json", "--start", "--set", "trigger.watchdog_s=1e-3")
+    )
+    assert started["watchdog_s"] == 1e-3
+    facts = json.loads(acquire("info", "--url", port, "--json"))
+    assert (facts["state"], facts["end_reason"]) == ("ENDED", "WATCHDOG")
+    assert facts["lines"] >= 1e-3 / 30e-6
+
+
 def test_a_run_is_monitored_to_its_end() -> None:
-    settings = {"line_budget": "5000", "tag_every_lines": "1000", "external_start": "'rising'"}
+    settings = {
+        "line_budget": "5000",
+        "watchdog_s": "0",
+        "tag_every_lines": "1000",
+        "external_start": "'rising'",
+    }
     with wired_model() as model, closing(SocketTwin(model)) as twin:
         changes = [word for key, value in settings.items() for word in ("--set", f"trigger.{key}={value}")]
         acquire("arm", "--url", twin.url, *changes)

@@ -104,7 +104,7 @@ def test_a_run_goes_on_without_its_host_and_is_found_again(cable, driver) -> Non
 
 
 def test_a_run_that_ended_meanwhile_says_why(cable) -> None:
-    driver = cable.driver(watchdog_ticks=CLOCK_HZ // 20)
+    driver = cable.driver(watchdog_s=0.05)
     lose_it(cable, driver)
     cable.plug()
     while cable.model.registers.read(r.STATUS.address, 1)[0] & 7 != State.ENDED:

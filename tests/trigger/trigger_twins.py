@@ -44,7 +44,7 @@ class Bench:
     connect: Callable[[], Transport]
     unplug: Callable[[], None]
     external_edge: Callable[[], None] | None = None
-    watchdog_ticks: int = CLOCK_HZ // 5
+    watchdog_s: float = 0.2
     """Enough for a host that lives, and soon over."""
     drivers: list[TriggerDriver] = field(default_factory=list)
 
@@ -149,7 +149,7 @@ def gateware_behind_pty() -> Iterator[Bench]:
         twin = PtyTwin(device)
         try:
             edge = partial(device.set, "external_arm", True)
-            yield Bench(lambda: SerialTransport(twin.path, 3_000_000), twin.close, edge, CLOCK_HZ // 50)
+            yield Bench(lambda: SerialTransport(twin.path, 3_000_000), twin.close, edge, 0.02)
         finally:
             twin.close()
 

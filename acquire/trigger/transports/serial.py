@@ -82,7 +82,10 @@ class SerialTransport:
             raise self._gone(error) from error
 
     def close(self) -> None:
+        remote = getattr(self._port, "_socket", None)
         self._port.close()
+        if remote is not None:
+            remote.close()  # pyserial leaves it open if the other end has gone
         self._lock.release()
 
     def _gone(self, error: OSError) -> TriggerError:
