@@ -13,7 +13,15 @@ from acquire.errors import DataError, UsageError
 
 if TYPE_CHECKING:
     from acquire.daemon.client import Client
-    from acquire.daemon.messages import CheckStatus, LastRecording, Status, UploadStatus
+    from acquire.daemon.messages import (
+        ArmStatus,
+        CheckStatus,
+        DiskStatus,
+        LastRecording,
+        Status,
+        TriggerStatus,
+        UploadStatus,
+    )
 
 SocketOption = Annotated[
     Path | None, typer.Option("--socket", envvar="ACQUIRE_SOCKET", help="The daemon's control socket.")
@@ -22,7 +30,7 @@ SEALED_WORD = "sealed"
 """For ``status --wait``: any state in which no recording is under way."""
 DAMAGED = ("INCOMPLETE", "ABORTED", None)
 """Conditions of a recording that lost something."""
-RECOVERIES = UPLOADS = 3
+RECOVERIES = UPLOADS = TROUBLES = 3
 """Recordings not sealed, or on their way to a store, of which the status tells in words; --json has more."""
 
 
@@ -169,7 +177,10 @@ def _show(status: Status, json: bool) -> None:
             "last": _last(status.last),
             "not sealed": _recoveries(status),
             "uploads": _uploads(status),
+            "disk": _disk(status.disk),
+            "trigger": _trigger(status.trigger),
             "sustains": _capacity(status),
+            "troubles": _troubles(status),
             "possible": ", ".join(status.possible),
         }
     )
@@ -222,6 +233,12 @@ def _uploads(status: Status) -> str | None:
     return "; ".join([*shown, *map(_upload, found[-UPLOADS:])]) or None
 
 
+def _troubles(status: Status) -> str | None:
+    """Failures in what nobody asked for; the daemon's log has more of them."""
+    shown = [f"{one.text} ({one.times} times)" for one in status.troubles[-TROUBLES:]]
+    return "; ".join(shown) or None
+
+
 def _upload(one: UploadStatus) -> str:
     waiting = f", {one.waiting_lines} more here" if one.waiting_lines else ""
     why = f": {one.error}" if one.error else ""
@@ -230,19 +247,55 @@ def _upload(one: UploadStatus) -> str:
 
 
 def _show_arms(status: Status) -> None:
-    columns = (
-        *("arm", "rate", "delivered", "preroll", "recorded", "missing", "lost", "ring", "peak", "drops"),
-        *("code", "ledger"),
-    )
-    rows = []
-    for name, arm in status.arms.items():
-        lost = ", ".join(f"{cause} {lines}" for cause, lines in arm.lost.items() if lines) or "0"
-        counts = (arm.delivered, arm.preroll, arm.recorded, arm.missing)
-        ring = (f"{arm.ring.fill}/{arm.ring.slots}", arm.ring.peak, arm.ring.drops)
-        account = "-" if arm.ledger is None else "balances" if arm.ledger.balanced else "DOES NOT BALANCE"
-        rows.append((name, quantity(arm.rate_hz, "Hz"), *counts, lost, *ring, _check(arm.check), account))
+    """A column for each arm: as narrow as a terminal can be."""
+    columns = [_arm(arm) for arm in status.arms.values()]
     say()
-    print_table(columns, rows)
+    print_table(("arm", *status.arms), [(name, *(column[name] for column in columns)) for name in columns[0]])
+
+
+def _arm(arm: ArmStatus) -> dict[str, str]:
+    ring, ledger = arm.ring, arm.ledger
+    return {
+        "rate": quantity(arm.rate_hz, "Hz"),
+        "delivered": str(arm.delivered),
+        "preroll": str(arm.preroll),
+        "recorded": str(arm.recorded),
+        "missing": str(arm.missing),
+        "lost": ", ".join(f"{cause} {lines}" for cause, lines in arm.lost.items() if lines) or "0",
+        "saturated": f"{arm.saturated} ({arm.saturated_part:.1%} now)",
+        "ring": f"{ring.fill} of {ring.slots}, peak {ring.peak}",
+        "drops": str(ring.drops),
+        "code": _check(arm.check),
+        "clock": f"{arm.drift_ppb / 1000:+.3f} ppm" if arm.drift_ppb else "-",
+        "ledger": "-" if ledger is None else "balances" if ledger.balanced else "DOES NOT BALANCE",
+    }
+
+
+def _trigger(trigger: TriggerStatus | None) -> str | None:
+    if trigger is None:
+        return None
+    answers = "answers" if trigger.answers else f"SILENT for {trigger.silent_s:.0f} s"
+    clock = f"clock {quantity(trigger.clock_hz, 'Hz')}, UTC known to {trigger.uncertainty_ns / 1000:.3g} us"
+    return f"{answers}, {trigger.pulses} lines, {clock}"
+
+
+def _disk(disk: DiskStatus | None) -> str | None:
+    """How long recordings can go on."""
+    if disk is None:
+        return None
+    rate = quantity(disk.bytes_per_s, "B/s")
+    return (
+        f"{disk.directory}, {quantity(disk.free_bytes, 'B')} free, "
+        f"full in {_long(disk.seconds_to_full)} at {rate}"
+    )
+
+
+def _long(seconds: float) -> str:
+    """A time that is looked at, not calculated with."""
+    for unit, length_s in (("days", 86400), ("h", 3600), ("min", 60)):
+        if seconds >= 2 * length_s:
+            return f"{seconds / length_s:.3g} {unit}"
+    return f"{seconds:.0f} s"
 
 
 def _check(check: CheckStatus | None) -> str:

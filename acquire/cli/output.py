@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import sys
+import textwrap
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -45,11 +47,31 @@ def json_text(value: Any, indent: int | None = None) -> str:
 
 
 def print_facts(facts: Mapping[str, Any]) -> None:
-    """``name  value`` per line, aligned; None is left out, several values stand side by side."""
+    """``name  value`` per line, aligned; None is left out, several values stand side by side.
+
+    On a terminal what is longer than its line goes on below itself, by whole words; for other programs a
+    fact stays on one line.
+    """
     shown = {name: value for name, value in facts.items() if value is not None}
     width = max(map(len, shown), default=0)
+    columns = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
     for name, value in shown.items():
-        say(f"{name:<{width}}  {_words(value)}")
+        for line in _wrapped(f"{name:<{width}}  {visible(_words(value))}", width + 2, columns):
+            say(line)
+
+
+def _wrapped(text: str, indent: int, columns: int) -> list[str]:
+    if len(text) <= columns:
+        return [text]
+    return textwrap.wrap(
+        text,
+        max(columns, 2 * indent),
+        subsequent_indent=" " * indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+        drop_whitespace=True,
+        replace_whitespace=False,
+    )
 
 
 def _words(value: Any) -> str:

@@ -160,7 +160,12 @@ class ArmStatus(_Message):
     lost: dict[str, int] = Field(description="cause → lines")
     recorded: int = Field(description="rows of the latest recording")
     missing: int = Field(description="those of them that hold no line")
-    rate_hz: float = Field(description="lines per second over the last seconds")
+    rate_hz: float = Field(description="lines per second over the last five seconds")
+    saturated: int = Field(default=0, description="lines with a saturated pixel, of those delivered")
+    saturated_part: float = Field(default=0.0, description="of the lines of the last five seconds, 0 to 1")
+    drift_ppb: int = Field(
+        default=0, description="by which the camera's clock is faster than the trigger's, if it tells time"
+    )
     ring: RingStatus
     ledger: LedgerStatus | None = None
     check: CheckStatus | None = Field(default=None, description="null: the rig does not check")
@@ -224,6 +229,29 @@ class CapacityStatus(_Message):
     warning: Text | None = None
 
 
+class TriggerStatus(_Message):
+    """The instrument's clock, since it was armed."""
+
+    clock_hz: int
+    uncertainty_ns: int = Field(description="of its relation to UTC")
+    pulses: int = Field(description="lines that it has begun")
+    silent_s: float = Field(description="since it last sent a tag or an answer")
+    answers: bool = Field(description="it was not silent for longer than it should be")
+
+
+class DiskStatus(_Message):
+    """Room for recordings that have no path of their own."""
+
+    directory: Place
+    free_bytes: int
+    reserve_bytes: int = Field(description="of it, that no recording takes")
+    bytes_per_s: float = Field(
+        description="at which it fills, over the last minute of a recording; else what the cameras would "
+        "give, not compressed"
+    )
+    seconds_to_full: float = Field(description="at that rate, to the reserve")
+
+
 class TroubleStatus(_Message):
     """A failure that nobody foresaw, in something that nobody asked for; the service goes on."""
 
@@ -248,6 +276,8 @@ class Status(_Message):
     arms: dict[str, ArmStatus]
     last: LastRecording | None
     fault: Text | None
+    trigger: TriggerStatus | None = Field(default=None, description="null: not armed")
+    disk: DiskStatus | None = Field(default=None, description="null: it has not been seen yet")
     capacity: CapacityStatus | None = None
     processes: dict[str, int] = Field(default={}, description="of the run: name → process number")
     recoveries: list[RecoveryStatus] = Field(

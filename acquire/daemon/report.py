@@ -6,38 +6,70 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING
 
-from acquire.daemon.messages import ArmStatus, CheckStatus, LedgerStatus, RingStatus
+from acquire.daemon.messages import ArmStatus, CheckStatus, LedgerStatus, RingStatus, TriggerStatus
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from acquire.stream import CaptureStatus
 
 RATE_WINDOW_S = 5.0
-"""Cameras deliver blocks: over a few of them, arms that are equally fast seem to differ."""
+LOOK_EVERY_S = 0.1
+ANSWER_S = 5.0
+"""A trigger that is silent for longer does not answer: it is asked every second."""
 
 
 class Rates:
-    """Lines per second of each arm over the last seconds, from the count at each look."""
+    """Lines per second of each arm over the last seconds, and the part of them that is saturated.
 
-    def __init__(self) -> None:
-        self._looks: deque[tuple[float, dict[str, int]]] = deque(maxlen=256)
+    Lines come in blocks: a rate is taken from one change of the count to another, so that neither the size
+    of a block nor the moment of a look makes two arms differ.
+    """
 
-    def look(self, delivered: dict[str, int]) -> None:
-        now = time.monotonic()
-        self._looks.append((now, delivered))
-        while self._looks[0][0] < now - RATE_WINDOW_S and len(self._looks) > 2:
-            self._looks.popleft()
+    def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._now_s = now_s
+        self._looked_s = -LOOK_EVERY_S
+        self._changes: dict[str, deque[tuple[float, int, int]]] = {}
+
+    def look(self, seen: CaptureStatus) -> None:
+        now_s = self._now_s()
+        if now_s - self._looked_s < LOOK_EVERY_S:
+            return
+        self._looked_s = now_s
+        for arm, counts in seen.lines.items():
+            changes = self._changes.setdefault(arm, deque())
+            if not changes or counts["delivered"] != changes[-1][1]:
+                changes.append((now_s, counts["delivered"], counts.get("saturated", 0)))
+            while len(changes) > 2 and changes[1][0] <= now_s - RATE_WINDOW_S:
+                changes.popleft()
 
     def of(self, arm: str) -> float:
-        """0 before the second look."""
-        if len(self._looks) < 2:
+        """0 before the second change, and where nothing came for the length of the window."""
+        changes = self._changes.get(arm)
+        if changes is None or len(changes) < 2:
             return 0.0
-        (t0, first), (t1, last) = self._looks[0], self._looks[-1]
-        return (last[arm] - first[arm]) / (t1 - t0) if t1 > t0 else 0.0
+        (first_s, first, _), (last_s, last, _) = changes[0], changes[-1]
+        usual_s = (last_s - first_s) / (len(changes) - 1)
+        quiet_s = self._looked_s - last_s
+        if quiet_s >= RATE_WINDOW_S:
+            return 0.0
+        over_s = last_s - first_s + (quiet_s if quiet_s > 2 * usual_s else 0.0)
+        return (last - first) / over_s
+
+    def saturated_part(self, arm: str) -> float:
+        """Of the lines that came in the window, 0 to 1."""
+        changes = self._changes.get(arm)
+        if changes is None or len(changes) < 2:
+            return 0.0
+        (_, first, white), (_, last, whites) = changes[0], changes[-1]
+        return min(1.0, (whites - white) / (last - first))
 
 
-def delivered_lines(seen: CaptureStatus) -> dict[str, int]:
-    """Arm → lines that its camera delivered since it was armed."""
-    return {arm: counts["delivered"] for arm, counts in seen.lines.items()}
+def trigger_status(seen: CaptureStatus) -> TriggerStatus | None:
+    """What the status says of the trigger."""
+    if not seen.trigger:
+        return None
+    return TriggerStatus.model_validate({**seen.trigger, "answers": seen.trigger["silent_s"] < ANSWER_S})
 
 
 def arm_statuses(seen: CaptureStatus, rates: Rates) -> dict[str, ArmStatus]:
@@ -47,16 +79,25 @@ def arm_statuses(seen: CaptureStatus, rates: Rates) -> dict[str, ArmStatus]:
             delivered=counts["delivered"],
             preroll=counts["preroll"],
             discarded=counts["discarded"],
-            lost={str(cause): lines for cause, lines in counts["lost"].items()},
+            lost=_lost(seen, arm),
             recorded=counts["recorded"],
             missing=counts["missing"],
             rate_hz=rates.of(arm),
+            saturated=counts.get("saturated", 0),
+            saturated_part=rates.saturated_part(arm),
+            drift_ppb=counts.get("clock", {}).get("drift_ppb", 0),
             ring=_ring(seen.ring[arm]),
             ledger=LedgerStatus(**seen.accounts[arm].to_dict()) if arm in seen.accounts else None,
             check=CheckStatus(**counts["check"]) if counts.get("check") else None,
         )
         for arm, counts in seen.lines.items()
     }
+
+
+def _lost(seen: CaptureStatus, arm: str) -> dict[str, int]:
+    """The ledger's losses, once there is a ledger: it alone knows what never came."""
+    counted = {str(cause): lines for cause, lines in seen.lines[arm]["lost"].items()}
+    return counted | (seen.accounts[arm].lost if arm in seen.accounts else {})
 
 
 def _ring(counts: dict[str, int]) -> RingStatus:

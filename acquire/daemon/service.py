@@ -16,10 +16,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from acquire import __version__
+from acquire.daemon.disk_watch import disk_watch
 from acquire.daemon.events import StandingOrder, budget_lines, window_of
 from acquire.daemon.messages import ArmRequest, LastRecording, Status, fault_error
 from acquire.daemon.plan import default_path
-from acquire.daemon.report import Rates, arm_statuses, delivered_lines
+from acquire.daemon.report import Rates, arm_statuses, trigger_status
 from acquire.daemon.salvage import Salvage
 from acquire.daemon.states import Event, State, after, commands
 from acquire.daemon.take import Take
@@ -93,6 +94,7 @@ class Service:
         self._run: Run | None = None
         self._seen = CaptureStatus()
         self._rates = Rates()
+        self._disk = disk_watch(config)
         self._order = StandingOrder(config)
         self._take: Take | None = None
         self._last: LastRecording | None = None
@@ -104,7 +106,8 @@ class Service:
     def status(self) -> Status:
         """What was published last; never waits."""
         uptime_s = round(time.monotonic() - self._born, 3)
-        return self._status.model_copy(update={"uptime_s": uptime_s, "troubles": self.troubles.statuses})
+        told = {"uptime_s": uptime_s, "troubles": self.troubles.statuses, "disk": self._disk.status}
+        return self._status.model_copy(update=told)
 
     @property
     def patience_s(self) -> float:
@@ -180,6 +183,7 @@ class Service:
                 look()
             except Exception as error:  # noqa: BLE001 - told in the status; the capture comes first
                 self.troubles.note(name, error)
+        self._disk.look(recording=self._state is State.RECORDING)
         if self._run is None:
             return
         try:
@@ -220,6 +224,7 @@ class Service:
                 self._recovered(self._salvage.wait(RECOVERY_S))
                 self._salvage.close()
                 self._uploads.close()
+                self._disk.close()
 
     def _stop(self, reason: str) -> None:
         assert self._run is not None
@@ -252,7 +257,7 @@ class Service:
         self._salvage.add(self._seen.orphans)
         if self._seen.path is not None:
             self._uploads.add(Path(self._seen.path))
-        self._rates.look(delivered_lines(self._seen))
+        self._rates.look(self._seen)
         return self._seen
 
     def _begin(
@@ -404,6 +409,7 @@ class Service:
             run_id=None if self._run is None else self._run.run_id,
             recording=None if self._take is None else self._take.status(self._seen),
             arms=arm_statuses(self._seen, self._rates),
+            trigger=None if self._run is None else trigger_status(self._seen),
             last=self._last,
             fault=self._fault,
             capacity=self._capacity,

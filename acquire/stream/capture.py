@@ -302,6 +302,12 @@ class Capture:
             fault=supervisor.fault,
             pids={name: pid for name, pid in self.pids.items() if pid is not None},
             orphans=supervisor.orphans,
+            trigger={
+                "clock_hz": self.clock.clock_hz,
+                "uncertainty_ns": self.clock.uncertainty_ns,
+                "pulses": max(supervisor.pulses, self._counters[TRIGGER]["pulses"]),
+                "silent_s": supervisor.trigger_silent_s,
+            },
         )
         if began is None:
             return status
@@ -386,6 +392,7 @@ class Capture:
             "check": self._check(arm),
             "recorded": recorded[f"rows_{arm}"] if began else 0,
             "missing": recorded[f"missing_{arm}"] if began else 0,
+            "saturated": grabbed["saturated"],
             "reopened": grabbed["reopened"],
             "clock": {name: grabbed[name] for name in ("stamp_line", "stamp_ns", "drift_ppb")},
         }

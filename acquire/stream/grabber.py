@@ -36,11 +36,11 @@ if TYPE_CHECKING:
 CAMERA_CAUSES = (Cause.CAMERA, *(Cause(cause) for cause in LossCause))
 COUNTERS = (
     "delivered", "preroll", *CAMERA_CAUSES, Cause.GRABBER_LOST,
-    "next_line", "reopened", "stamp_line", "stamp_ns", "drift_ppb",
+    "next_line", "reopened", "stamp_line", "stamp_ns", "drift_ppb", "saturated",
 )  # fmt: skip
 """Lines since arm: delivered by the camera (preroll included), discarded as preroll, lost by cause; the line
 that comes next. How often the camera was opened again; a line and its time by the camera's clock, and how
-much faster that runs than the trigger's.
+much faster that runs than the trigger's. Lines with a saturated pixel.
 """
 
 _BLOCK_WAIT_S = 0.05
@@ -280,4 +280,5 @@ class Intake:
         if pixels.max() >= self._plan.white_dn:
             white = pixels.max(axis=1) >= self._plan.white_dn
             slot.flags[:count][white] |= np.uint16(LineFlag.SATURATED)
+            self._counters.add("saturated", int(np.count_nonzero(white)))
         self._ring.commit(first_line, count, self._losses.take())

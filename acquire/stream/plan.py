@@ -136,15 +136,17 @@ class CaptureStatus:
     recorded_lines, committed_lines : rows that both arms have; rows that a reader finds
     ring : arm → slots, fill, peak, drops (blocks), dropped_lines, all since arm
     lines : arm → delivered, preroll, discarded (taken from the ring, but in no recording), and lost by
-        cause, since arm; and of the latest recording ``recorded`` rows, of which ``missing``. After
-        `close`: delivered = preroll + lost["ring_full"] + discarded + recorded − missing. Also how often
-        the camera was ``reopened``, and its ``clock``: the latest stamp (line, its time by the camera) and
-        how much faster it runs than the trigger's, in parts per billion; all 0 where it tells no time. The
-        ``check`` of the code, where it is made: verdict, shift, and the line after the last looked at
+        cause, since arm, and ``saturated`` in a pixel at least; and of the latest recording ``recorded``
+        rows, of which ``missing``. After `close`: delivered = preroll + lost["ring_full"] + discarded +
+        recorded − missing. Also how often the camera was ``reopened``, and its ``clock``: the latest stamp
+        (line, its time by the camera) and how much faster it runs than the trigger's, in parts per billion;
+        all 0 where it tells no time. The ``check`` of the code, where it is made: verdict, shift, and the
+        line after the last looked at
     accounts : arm → what became of every pulse since arm
     fault : what failed first, or None
     pids : process numbers: of the recorder, and of each grabber
     orphans : recordings that their recorder did not live to seal: to be recovered
+    trigger : clock_hz, uncertainty_ns of its relation to UTC, pulses, and silent_s since it last answered
     """
 
     recording: bool = False
@@ -163,3 +165,4 @@ class CaptureStatus:
     ledger: dict[str, Any] = field(default_factory=dict)
     accounts: dict[str, ArmLedger] = field(default_factory=dict)
     orphans: tuple[Orphan, ...] = ()
+    trigger: dict[str, float] = field(default_factory=dict)

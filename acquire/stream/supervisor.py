@@ -86,6 +86,7 @@ class Supervisor:
         self._newest_pulse: int | None = None
         self._refused: Refused | None = None
         self._trigger_lost = False
+        self._trigger_told_s = time.monotonic()
         self._events: deque[Note] = deque(maxlen=_MOST_EVENTS)
         self._dead: set[str] = set()
         self._orphans: list[Orphan] = []
@@ -123,7 +124,13 @@ class Supervisor:
         """Issued by the trigger, as far as its tags tell."""
         return 0 if self._newest_pulse is None else self._newest_pulse + 1
 
+    @property
+    def trigger_silent_s(self) -> float:
+        """Since the trigger last told anything: a tag, or the answer to a question."""
+        return time.monotonic() - self._trigger_told_s
+
     def start(self) -> None:
+        self._trigger_told_s = time.monotonic()
         self._thread.start()
 
     def end(self) -> None:
@@ -210,6 +217,7 @@ class Supervisor:
             return []
         if tags:
             self._newest_pulse = tags[-1].line
+            self._trigger_told_s = time.monotonic()
         for event in self._trigger.events():
             self.happened(Note(event.line, event.kind, f"tick {event.tick}"))
         rows = self._tags.shape.rows
@@ -226,6 +234,8 @@ class Supervisor:
             counts = self._trigger.statistics()
             for name in TRIGGER_COUNTERS:
                 self._counters[TRIGGER][name] = int(counts.get(name, 0))
+            if "link_lost" not in counts:
+                self._trigger_told_s = time.monotonic()
 
     def _pass_on(self, tags: list[LineTag]) -> None:
         """To the recorder; should it be too late to take them, later tags confirm the same lines."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import sys
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -9,9 +11,18 @@ from typing import Any
 
 import pytest
 
-from acquire.cli import control
+from acquire.cli import control, main
 from acquire.cli.durations import seconds
-from acquire.daemon.messages import ArmStatus, LastRecording, RecordingStatus, RingStatus, Status
+from acquire.daemon.messages import (
+    ArmStatus,
+    DiskStatus,
+    LastRecording,
+    RecordingStatus,
+    RingStatus,
+    Status,
+    TriggerStatus,
+    TroubleStatus,
+)
 from acquire.daemon.states import State, commands
 
 Cli = Callable[..., Any]
@@ -91,8 +102,12 @@ def test_status_in_words(cli: Cli, answering: Callable[[Status], FakeClient]) ->
     assert "recording since 2025-01-02 03:04:05 UTC" in out
     assert "/d/x.zarr, 500 of 900 lines from line 40 on, 256 readable" in out
     assert "process 42" in out
-    arm = out.splitlines()[-1].split()
-    assert arm == ["a", "33.3", "kHz", "1000", "65", "500", "1", "camera", "2", "3/64", "9", "0", "-", "-"]
+    arm = {name: words for name, *words in (line.split() for line in out.rpartition("\n\n")[2].splitlines())}
+    assert arm["arm"] == ["a"]
+    assert arm["rate"] == ["33.3", "kHz"]
+    assert (arm["delivered"], arm["preroll"], arm["recorded"]) == (["1000"], ["65"], ["500"])
+    assert (arm["missing"], arm["lost"], arm["drops"]) == (["1"], ["camera", "2"], ["0"])
+    assert (arm["ring"], arm["ledger"]) == (["3", "of", "64,", "peak", "9"], ["-"])
 
 
 def test_status_as_json_is_the_message(cli: Cli, answering: Callable[[Status], FakeClient]) -> None:
@@ -149,3 +164,48 @@ def test_what_is_no_duration_is_refused(cli: Cli, text: str) -> None:
     answer = cli("start", f"--pre={text}")
     assert answer.code == 2
     assert "is no duration: 2s, 500ms" in " ".join(answer.err.split())
+
+
+class Terminal(io.StringIO):
+    """stdout of a person."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("columns", [60, 80, 120, 200])
+def test_status_fits_the_terminal(
+    answering: Callable[[Status], FakeClient], monkeypatch: pytest.MonkeyPatch, columns: int
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(columns))
+    monkeypatch.setattr(sys, "argv", ["acquire", "status"])
+    monkeypatch.setattr(sys, "stdout", terminal := Terminal())
+    now = RecordingStatus(
+        path=Path("/data/2025/recordings/run-of-the-valve-7.zarr"),
+        first_line=40,
+        budget_lines=900_000,
+        recorded_lines=500_000,
+        committed_lines=256,
+    )
+    disk = DiskStatus(
+        directory=Path("/data/2025/recordings"),
+        free_bytes=10**12,
+        reserve_bytes=10**8,
+        bytes_per_s=1e9,
+        seconds_to_full=1000.0,
+    )
+    trigger = TriggerStatus(
+        clock_hz=90_000_000, uncertainty_ns=1200, pulses=123_456, silent_s=7.5, answers=False
+    )
+    trouble = TroubleStatus(text="uploads: ValueError: \x1b[31m", times=3, last=datetime.now(UTC))
+    answer = status(State.RECORDING, recording=now, disk=disk, trigger=trigger, troubles=[trouble])
+    answering(answer.model_copy(update={"arms": {"a": answer.arms["a"], "b": answer.arms["a"]}}))
+    main()
+    lines = terminal.getvalue().splitlines()
+    assert max(map(len, lines)) <= columns
+    words = " ".join(" ".join(lines).split())
+    assert "run-of-the-valve-7.zarr, 500000 of 900000 lines from line 40 on, 256 readable" in words
+    assert "/data/2025/recordings, 1e+03 GB free, full in 16.7 min at 1 GB/s" in words
+    assert "SILENT for 8 s, 123456 lines, clock 90 MHz, UTC known to 1.2 us" in words
+    assert "uploads: ValueError: \\x1b[31m (3 times)" in words
+    assert ["rate", "33.3", "kHz", "33.3", "kHz"] in [line.split() for line in lines]

@@ -54,6 +54,13 @@ def test_two_hundred_connections_keep_nobody_from_the_status(daemon: Daemon) -> 
         before = client.status().arms["a"].delivered
         until(lambda: client.status().arms["a"].delivered > before, "lines while connections are held")
         assert psutil.Process(daemon.process.pid).num_fds() < 128
+        until(lambda: client.status().disk is not None, "the disk")
+        now = client.status()
+        assert now.trigger is not None
+        assert now.trigger.answers
+        assert now.trigger.clock_hz == 90_000_000
+        assert now.disk is not None
+        assert now.disk.directory == daemon.home
         ended = client.stop().last
     assert ended is not None
     assert (ended.condition, ended.end_reason) == ("GOOD", "stopped")
