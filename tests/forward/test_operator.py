@@ -105,7 +105,8 @@ def test_norm_bound_is_above_the_norm_and_tight(case: tuple[Geometry, int, int, 
     E[0] = 1
     op = DualArm(g, E, N_m, T_m, np.float64)
     norm = np.linalg.norm(explicit_eq4(E, g, N_m, T_m), 2)
-    assert norm <= op.norm_bound(steps=5)
+    rounding = 1 + 1e-9
+    assert norm <= op.norm_bound(steps=5) * rounding
     assert op.norm_bound(steps=400) <= 1.05 * norm
 
 

@@ -17,8 +17,8 @@ from acquire.recon.problem import MaskedOperator, pose
 from acquire.recon.twist import Twist, TwistParameters
 
 GEOMETRY = Geometry(16, 3, 80)
-GOOD_DB = 25.0
-"""A picture in which both shapes and both curves are right; unmasked, each fault leaves less."""
+GOOD_DB = 40.0
+"""An error of 1 % of full light, where rounding does not matter yet; unmasked, each fault leaves less."""
 SOLVERS = ("admm", "twist", "twist-band")
 
 
@@ -64,13 +64,8 @@ def psnr(result: Reconstruction, scale: float = 1.0) -> float:
     return float(10 * np.log10(truth.max() ** 2 / error))
 
 
-@pytest.fixture(scope="module")
-def clean_db() -> float:
-    return psnr(solve(segment()))
-
-
-def test_the_clean_case_is_good(clean_db: float) -> None:
-    assert clean_db > GOOD_DB
+def test_the_clean_case_is_good() -> None:
+    assert psnr(solve(segment())) > GOOD_DB
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e7, -1e7])
@@ -83,10 +78,10 @@ def test_wild_samples_are_masked_and_counted(value: float, solver: str) -> None:
     assert result.quality.coverage == pytest.approx(1 - 2 / lines.size)
 
 
-def test_a_wild_sample_costs_nothing(clean_db: float) -> None:
+def test_a_wild_sample_costs_nothing() -> None:
     lines = CLEAN.copy()
     lines[0, 30, 4] = 1e7
-    assert psnr(solve(segment(lines))) > clean_db - 2
+    assert psnr(solve(segment(lines))) > GOOD_DB
 
 
 @pytest.mark.parametrize(("value", "cause"), [(1e7, "hot column"), (0.0, "stuck column")])
@@ -132,8 +127,8 @@ def test_any_weight_is_finite(solver: str, weight: float) -> None:
 
 
 @pytest.mark.parametrize("factor", [1e-6, 65535.0])
-def test_units_do_not_matter(factor: float, clean_db: float) -> None:
-    assert psnr(solve(segment(CLEAN * np.float32(factor))), factor) == pytest.approx(clean_db, abs=1)
+def test_units_do_not_matter(factor: float) -> None:
+    assert psnr(solve(segment(CLEAN * np.float32(factor))), factor) > GOOD_DB
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
@@ -180,20 +175,16 @@ def test_twist_survives_an_underestimated_norm() -> None:
 
 
 def test_a_million_substeps() -> None:
-    """In float32 as good as in float64: sums as long as that are not left to it."""
+    """In float32: sums as long as that are not left to it."""
     geometry = Geometry(2, 3, 333_333)
     code = prbs(64, mix_seed(1, 64), 0, geometry.span)
     whole = DualArm(geometry, code, 6, 1)
     video = np.ones(whole.video_shape, np.float32)
     lines = whole.forward(video)
     long = segment(lines, code, geometry)
-    single, double = (
-        solve(long, merges=(6, 1000), iterations=25, bandwidth=0.03, dtype=kind)
-        for kind in ("float32", "float64")
-    )
-    assert np.abs(np.median(single.video[single.trusted]) - 1) < 0.1
-    assert double.video.dtype == np.float64
-    np.testing.assert_allclose(single.video, double.video, atol=1e-3)
+    result = solve(long, merges=(6, 1000), iterations=20, bandwidth=0.03, dtype="float32")
+    assert result.video.dtype == np.float32
+    np.testing.assert_allclose(result.video[result.trusted], 1, atol=0.01)
 
 
 def test_solvers_refuse_rather_than_return_nan() -> None:

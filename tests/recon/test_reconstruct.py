@@ -17,6 +17,10 @@ from acquire.recon import Progress, reconstruct
 GEOMETRY = Geometry(20, 3, 120)  # T = 419, trusted 59..359
 
 
+GOOD_DB = 40.0
+"""An error of 1 % of full light: above it, rounding counts, which differs from processor to processor."""
+
+
 def scene() -> np.ndarray:
     """Two shapes, one slow and one fast, on a dark ground: (T, n, n)."""
     n, t = GEOMETRY.size, np.arange(GEOMETRY.span)
@@ -58,13 +62,13 @@ def still() -> np.ndarray:
     return image
 
 
-@pytest.mark.parametrize(("T_m", "least_db"), [(GEOMETRY.span, 45), (70, 42)])
-def test_a_scene_at_rest_is_found_at_full_resolution(T_m: int, least_db: float) -> None:
+@pytest.mark.parametrize("T_m", [GEOMETRY.span, 70])
+def test_a_scene_at_rest_is_found_at_full_resolution(T_m: int) -> None:
     """In slow voxels: the mean light must not stand in the details' way."""
     seen = DualArm(GEOMETRY, CODE).forward(np.broadcast_to(still(), (GEOMETRY.span, 60, 60)))
     lines = np.rint(seen * 20 + 64).astype(np.float32)
     result = reconstruct(replace(segment(), lines=lines), 1, T_m)
-    assert -10 * np.log10(np.mean((result.video - still()) ** 2)) > least_db
+    assert -10 * np.log10(np.mean((result.video - still()) ** 2)) > GOOD_DB
 
 
 def test_the_default_finds_the_scene() -> None:
@@ -72,7 +76,7 @@ def test_the_default_finds_the_scene() -> None:
     assert result.video.shape == (419, 20, 20)
     assert result.video.dtype == np.float32
     assert result.trusted == slice(59, 360)
-    assert psnr(result.video, result.trusted) > 25
+    assert psnr(result.video, result.trusted) > GOOD_DB
     assert result.video.min() >= 0
     assert result.quality.coverage == 1
     assert result.quality.misfit < 0.1
@@ -104,7 +108,7 @@ def test_masked_samples_have_no_influence(solver: str) -> None:
     ruined[0, 41, 3] = np.nan
     a = reconstruct(replace(clean, mask=mask), 3, 1, solver=solver, iterations=15)
     b = reconstruct(replace(clean, mask=mask, lines=ruined), 3, 1, solver=solver, iterations=15)
-    np.testing.assert_array_equal(a.video, b.video)
+    np.testing.assert_allclose(a.video, b.video, atol=1e-4)
     assert a.quality.coverage == pytest.approx(mask.mean())
 
 
@@ -121,9 +125,9 @@ def test_losing_a_few_lines_costs_little() -> None:
     mask = clean.mask.copy()
     mask[0, 60:63] = False
     mask[1, :, 5] = False
-    whole = reconstruct(clean, 3, 1)
-    holed = reconstruct(replace(clean, mask=mask), 3, 1)
-    assert psnr(holed.video, holed.trusted) > psnr(whole.video, whole.trusted) - 2
+    ruined = np.where(mask, clean.lines, np.float32(clean.black_level_dn))  # 16 dB if these samples counted
+    holed = reconstruct(replace(clean, mask=mask, lines=ruined), 3, 1)
+    assert psnr(holed.video, holed.trusted) > GOOD_DB
 
 
 @pytest.mark.parametrize("factor", [1e-6, 65535.0])
@@ -203,7 +207,7 @@ def test_frame_error_is_a_residual_that_finds_lines_which_are_not_explained() ->
         reconstruct(replace(good, lines=lines), 3, 1, iterations=40) for lines in (good.lines, wrong)
     )
     assert seen.start <= int(np.argmax(spoilt.frame_error)) < seen.stop
-    assert spoilt.frame_error.max() > 2 * clean.frame_error[clean.trusted].max()
+    assert spoilt.frame_error.max() > 2 * np.median(clean.frame_error[clean.trusted])
     # not the error of the frames, which is larger: what `frame_error` says of itself
     truth = merge_video(TRUTH, 3, 1)[clean.trusted]
     error = np.linalg.norm(clean.video[clean.trusted] - truth) / np.linalg.norm(truth)
