@@ -124,7 +124,7 @@ def print_warning(text: str) -> None:
 
 def quantity(value: float, unit: str) -> str:
     """``value`` with three significant digits and a metric prefix: 33.3 kHz, 1.2 MB."""
-    for factor, prefix in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+    for factor, prefix in ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")):
         if abs(value) >= factor:
             return f"{value / factor:.3g} {prefix}{unit}"
     return f"{value:.3g} {unit}"

@@ -169,6 +169,9 @@ def _live(pipe: Connection[Any, Any], name: str, target: Callable[..., None], *a
     mailbox = Mailbox(pipe)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, mailbox.terminate)
+    # Locks that libraries make, as blosc's does, have a name in /dev/shm where children are spawned, which a
+    # kill of the whole group would leave there for ever; one made for forked children loses it at once.
+    multiprocessing.set_start_method("fork", force=True)
     gc.freeze()  # what was imported never dies: no collection needs to look at it again
     try:
         target(mailbox, *args)

@@ -205,7 +205,7 @@ def test_status_fits_the_terminal(
     assert max(map(len, lines)) <= columns
     words = " ".join(" ".join(lines).split())
     assert "run-of-the-valve-7.zarr, 500000 of 900000 lines from line 40 on, 256 readable" in words
-    assert "/data/2025/recordings, 1e+03 GB free, full in 16.7 min at 1 GB/s" in words
+    assert "/data/2025/recordings, 1 TB free, full in 16.7 min at 1 GB/s" in words
     assert "SILENT for 8 s, 123456 lines, clock 90 MHz, UTC known to 1.2 us" in words
     assert "uploads: ValueError: \\x1b[31m (3 times)" in words
     assert ["rate", "33.3", "kHz", "33.3", "kHz"] in [line.split() for line in lines]
