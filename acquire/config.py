@@ -132,7 +132,9 @@ class SimulationConfig(FrozenModel):
         default=None, description="a recording whose lines the cameras give instead"
     )
     replay_loop: bool = Field(default=False, description="over and over")
-    replay_hold_s: float = Field(default=0.0, ge=0, le=2.5, description="by which replayed lines come late")
+    replay_gate: FilePath | None = Field(
+        default=None, description="a file; before it exists, no replayed line comes"
+    )
 
 
 def _prbs_unless_said(value: Any) -> Any:

@@ -4,23 +4,29 @@ from __future__ import annotations
 
 import shutil
 import tempfile
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from acquire.cli.output import JsonFlag, print_facts, print_json
-from acquire.cli.recordings import RecordingArgument
-from acquire.errors import DataError, UsageError
+from acquire.cli.progress import stage_progress
+from acquire.cli.recordings import PlaceArgument
+from acquire.errors import AcquireError, DataError, UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from acquire.store.compare import Difference
     from acquire.store.reader import Recording
 
-HOLD_S = 2.0
-"""Between arming and the first replayed line: time to start the recording that is to hold all of them."""
-SPEEDS = (32.0, 16.0, 8.0, 4.0, 2.0, 1.0)
-"""Tried one after the other by ``--speed 0`` until no line is lost."""
-COMPARED_LINES = 65_536
+FASTEST = 32.0
+"""What ``--speed 0`` begins with: a trigger of some MHz keeps a process busy with nothing but its tags."""
+SLOWER, TRIES = 4.0, 4
+"""Where lines of a recording that no ring can hold are lost: by how much slower it is tried, how often."""
+LONGEST_SOCKET = 90
+"""Bytes of a socket's path that every system takes."""
 
 
 def register(app: typer.Typer) -> None:
@@ -28,7 +34,7 @@ def register(app: typer.Typer) -> None:
 
 
 def replay(
-    recording: RecordingArgument,
+    recording: PlaceArgument,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Record it again; else a daemon waits for commands.")
     ] = None,
@@ -37,77 +43,168 @@ def replay(
     ] = 1.0,
     loop: Annotated[bool, typer.Option(help="Over and over, for a daemon under load.")] = False,
     socket: Annotated[
-        Path | None, typer.Option(envvar="ACQUIRE_SOCKET", help="Control socket; else the recording's.")
+        Path | None,
+        typer.Option(envvar="ACQUIRE_SOCKET", help="Control socket, without --out; else the user's."),
     ] = None,
     json: JsonFlag = False,
 ) -> None:
     """Feed a recording through the simulated devices into a daemon; the lines come out identical.
 
-    With --out the daemon lives for one recording, which is compared with the first. Without it, it runs until
-    Ctrl-C and is armed and started like any other.
+    With --out the daemon lives for one recording, on a socket of its own, and every array of that recording
+    is compared with the first: exit code 0 where all are equal, 6 where one differs, 2 where the recording
+    cannot be replayed. Gaps stay gaps, and flags come back as they were recorded: the light's code is not
+    judged anew, since when a verdict comes depends on the load. A recording that is too large for the memory
+    is tried again more slowly when lines are lost.
+
+    Without --out the daemon runs until Ctrl-C and is armed and started like any other.
 
     Example: [bold]acquire replay run.zarr --out again.zarr --speed 0[/]
     """
-    from acquire.store import open_recording
     from acquire.store.files import check_new_path
 
     if not 0 <= speed <= 1000:
-        raise UsageError(f"replay at speed {speed:g}", possible="0 for as fast as it goes, or up to 1000")
-    stored = open_recording(recording)
-    if not stored.lines:
-        raise UsageError(f"replay of {recording}: it holds no lines")
-    if out is None:
-        _serve(stored, speed or SPEEDS[-1], loop, socket)
-        return
-    if loop:
-        raise UsageError("replay --loop --out: it would never end", possible="one of them")
-    check_new_path(out)
-    used = next(pace for pace in _paces(speed) if _record(stored, out, pace, last=pace == _paces(speed)[-1]))
-    facts = {"path": str(out), "lines": stored.lines, "speed": used, **compare(stored, open_recording(out))}
-    if json:
-        print_json(facts)
-    else:
-        print_facts(facts)
-    if not facts["identical"]:
-        raise DataError(f"{out} differs from {recording}", hint="acquire info, a slower --speed")
+        raise UsageError(
+            f"--speed {speed:g} is out of range", possible="0 for as fast as it goes, or up to 1000"
+        )
+    if out is not None:
+        if loop:
+            raise UsageError("--loop with --out would never end", possible="one of them")
+        check_new_path(out)
+    with _at_hand(recording) as stored:
+        if out is None:
+            _serve(stored, speed or 1.0, loop, socket)
+            return
+        used, differences = _until_nothing_is_lost(stored, out, speed or FASTEST)
+        facts = {
+            "path": str(out),
+            "lines": stored.lines,
+            "speed": used,
+            "identical": not differences,
+            "differences": [one.to_dict() for one in differences],
+        }
+        if json:
+            print_json(facts)
+        else:
+            print_facts(facts | {"differences": "; ".join(map(str, differences)) or None})
+    if differences:
+        arrays = ", ".join(one.array for one in differences)
+        raise DataError(f"{out} differs from {recording} in {arrays}", hint=f"acquire info {out}")
 
 
-def compare(stored: Recording, again: Recording) -> dict[str, Any]:
-    """Whether rows of the new recording are those of the first, line by line."""
-    different = abs(stored.lines - again.lines)
-    shift = again.first_line
-    for arm in ("a", "b"):
-        for start in range(0, again.lines, COMPARED_LINES):
-            stop = min(start + COMPARED_LINES, again.lines)
-            for name in ("lines", "code"):
-                old = stored.camera(arm).read(name, start + shift, stop + shift)
-                new = again.camera(arm).read(name, start, stop)
-                different += int((old != new).reshape(len(old), -1).any(axis=1).sum())
-    return {"identical": not different, "different_rows": different}
+@contextmanager
+def _at_hand(place: str) -> Iterator[Recording]:
+    """The recording, fetched to this machine where it is far away: cameras cannot wait for a network."""
+    from acquire.store import open_recording
+    from acquire.store.remote import RemoteSource
+
+    place = place.removeprefix("file://")
+    with ExitStack() as held:
+        stored = open_recording(place)
+        if not stored.lines:
+            raise UsageError(f"{place} cannot be replayed: it holds no lines")
+        if stored.state != "sealed":
+            raise UsageError(
+                f"{place} cannot be replayed: it is not sealed",
+                hint=f"acquire stop where it is being written, or acquire recover {place}",
+            )
+        if isinstance(stored.source, RemoteSource):
+            directory = Path(held.enter_context(tempfile.TemporaryDirectory(prefix="acquire-")))
+            stored = open_recording(_fetched(stored.source, directory / place.rpartition("/")[2]))
+        yield stored
 
 
-def _paces(speed: float) -> tuple[float, ...]:
-    return (speed,) if speed else SPEEDS
+def _fetched(source: Any, path: Path) -> Path:
+    """A copy of all parts of a recording below ``path``."""
+    from acquire.store.refusals import refused
+
+    with refused(source, "read"):
+        sizes = source.sizes()
+    room, size = shutil.disk_usage(path.parent).free, sum(sizes.values())
+    if size > room:
+        raise UsageError(
+            f"{source} cannot be fetched: it has {size} bytes, and {path.parent} has room for {room}",
+            hint="TMPDIR on a larger disk",
+        )
+    done = 0
+    with stage_progress(f"fetching {path.name}") as advance:
+        for key, part_size in sizes.items():
+            target = path / key
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with refused(source, "read"):
+                data = source.read(key)
+            target.write_bytes(data)
+            done += part_size
+            advance(done, size)
+    return path
 
 
-def replay_settings(stored: Recording, speed: float, *, loop: bool, hold_s: float) -> dict[str, Any]:
-    """The recording's own rig as a table, with cameras that replay it and the code of its rows."""
-    from acquire.sim.replay import replay_code
+def _until_nothing_is_lost(stored: Recording, out: Path, speed: float) -> tuple[float, list[Difference]]:
+    """The speed at which nothing was lost, and what differs; slower and slower where lines are lost."""
+    from acquire.store import open_recording
+    from acquire.store.compare import compare
 
-    table: dict[str, Any] = {key: value for key, value in stored.attrs["config"].items() if key != "code"}
-    code = replay_code(stored).to_attrs()
-    if code["kind"] == "prbs":
-        table["code"] = {"kind": "prbs", "degree": code["degree"], "state": code["seed"]}
-    else:
-        table["code"] = {"kind": "constant", "value": code["value"]}
-    table["trigger"] = {**table["trigger"], "driver": "simulated"}
-    table["simulation"] = {
-        "speed": speed,
-        "replay": str(stored.path.resolve()),
-        "replay_loop": loop,
-        "replay_hold_s": hold_s,
-    }
-    return table
+    for number in range(TRIES):
+        pace, last = speed / SLOWER**number, number == TRIES - 1
+        fault = _record(stored, out, pace)
+        if fault is None:
+            with stage_progress(f"comparing {out.name}") as advance:
+                return pace, compare(stored, open_recording(out), advance)
+        if last:
+            break
+        shutil.rmtree(out, ignore_errors=True)  # made by `_record`, of a name that was free
+    raise AcquireError(
+        f"the replay to {out} lost lines at every speed that was tried, down to {pace:g}: {fault}",
+        hint="fewer other processes on this host, or more memory, so that the ring can hold the recording",
+    )
+
+
+def _record(stored: Recording, out: Path, speed: float) -> str | None:
+    """One attempt; what was lost on the way, None where nothing was."""
+    from acquire.cli.demo_capture import await_daemon, daemon_process, follow
+    from acquire.cli.replay_rig import replay_rig
+    from acquire.daemon.client import Client
+
+    with ExitStack() as held:
+        directory = held.enter_context(_private_directory())
+        gate, socket, log = (directory / name for name in ("gate", "c.sock", "daemon.log"))
+        table = replay_rig(stored, speed, directory, replay_gate=str(gate))
+        table["check"] = {"enable": False}  # flags are replayed, and when a verdict comes depends on the load
+        table["recording"]["after"] = "idle"
+        options = [f"--config={_rig_file(directory, table)}", f"--socket={socket}"]
+        process = held.enter_context(daemon_process(options, log))
+        client = held.enter_context(Client(socket))
+        advance = held.enter_context(stage_progress(f"replaying {out.name}"))
+        await_daemon(client, process, log)
+        client.arm(force=True)  # the ring holds what the disk does not take in time
+        client.start(out.absolute(), lines=stored.lines)
+        gate.touch()
+        status = follow(client, stored.lines, advance)
+    if status.fault:
+        return status.fault
+    last = status.last
+    if last is None or last.lines < stored.lines:
+        return "none was made" if last is None else f"it ended after {last.lines} lines: {last.end_reason}"
+    return "the rings were full" if any(_lost_more(stored, out)) else None
+
+
+def _lost_more(stored: Recording, out: Path) -> Iterator[bool]:
+    """Whether more lines of an arm are missing than there were."""
+    from acquire.store import open_recording
+
+    again = open_recording(out)
+    for arm in again.arms:
+        before = sum(map(len, stored.lost_rows(arm))) + sum(map(len, stored.dropped_rows()))
+        yield sum(map(len, again.lost_rows(arm))) > before
+
+
+@contextmanager
+def _private_directory() -> Iterator[Path]:
+    """A directory of our own for socket, rig and log, with a path that is short enough for a socket."""
+    with ExitStack() as held:
+        name = held.enter_context(tempfile.TemporaryDirectory(prefix="acquire-"))
+        if len(f"{name}/c.sock".encode()) > LONGEST_SOCKET:
+            name = held.enter_context(tempfile.TemporaryDirectory(prefix="acquire-", dir="/tmp"))
+        yield Path(name)
 
 
 def _rig_file(directory: Path, table: dict[str, Any]) -> Path:
@@ -120,39 +217,9 @@ def _rig_file(directory: Path, table: dict[str, Any]) -> Path:
 
 def _serve(stored: Recording, speed: float, loop: bool, socket: Path | None) -> None:
     """The daemon in this process, until it is told to end."""
+    from acquire.cli.replay_rig import replay_rig
     from acquire.cli.serve import serve
 
-    with tempfile.TemporaryDirectory(prefix="acquire-") as directory:
-        table = replay_settings(stored, speed, loop=loop, hold_s=0.0)
-        table["recording"] = {**table["recording"], "directory": str(Path.cwd())}
-        serve(str(_rig_file(Path(directory), table)), socket, None)
-
-
-def _record(stored: Recording, out: Path, speed: float, *, last: bool) -> bool:
-    """One attempt; False when lines were lost and a slower one is left."""
-    from acquire.cli.demo_capture import await_daemon, daemon_process, follow
-    from acquire.cli.progress import stage_progress
-    from acquire.daemon.client import Client
-
-    with (
-        tempfile.TemporaryDirectory(prefix="acquire-") as name,
-        stage_progress(f"replaying {out.name}") as advance,
-    ):
-        directory = Path(name)
-        table = replay_settings(stored, speed, loop=False, hold_s=HOLD_S)
-        table["recording"] = {**table["recording"], "directory": str(directory)}
-        table["control"] = {"socket": str(directory / "c.sock")}
-        config, log = _rig_file(directory, table), directory / "daemon.log"
-        with daemon_process([f"--config={config}"], log) as process, Client(directory / "c.sock") as client:
-            await_daemon(client, process, log)
-            client.arm()
-            client.start(out, lines=stored.lines)
-            status = follow(client, stored.lines, advance)
-    condition = status.last.condition if status.last else "none"
-    lost = len(stored.gaps) == 0 and condition != "GOOD"
-    if lost and not last:
-        shutil.rmtree(out)
-        return False
-    if status.fault:
-        raise DataError(f"replay to {out}: {status.fault}", hint="a slower --speed")
-    return True
+    with _private_directory() as directory:
+        table = replay_rig(stored, speed, Path.cwd(), replay_loop=loop)
+        serve(str(_rig_file(directory, table)), socket, None)

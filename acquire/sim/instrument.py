@@ -80,7 +80,7 @@ class SimulatedDevices:
             arm,
             self.config.stream.block_lines,
             simulation.replay_loop,
-            simulation.replay_hold_s,
+            simulation.replay_gate,
         )
 
     def _sensor(self, arm: str) -> CameraOpener:

@@ -1,8 +1,13 @@
 """Simulated cameras that give a stored stream again: real lines for tests, loads and demonstrations.
 
 Line ℓ of the new run is row ℓ of the recording, and its code is the stored one from there on: a register's
-state can be taken at any index (`replay_code`). Lines that were missing are missing again. Endlessly repeated
-rows meet a code that is not theirs: from the second round on they are flagged as such.
+state can be taken at any index (`replay_code`). Lines that were missing are missing again, and what else a
+line was flagged with is replayed with it, as a property of the stored line. Endlessly repeated rows meet a
+code that is not theirs: from the second round on they are flagged as such.
+
+With a ``gate``, a file, no line comes before that file exists: who waits for a recording to begin makes it
+then, however long that takes on a busy host. After the last row come dark lines, which end a recording whose
+own last lines are missing.
 """
 
 from __future__ import annotations
@@ -21,6 +26,7 @@ from acquire.errors import CameraError, UsageError
 from acquire.geometry import Geometry
 from acquire.lines import LineFlag
 from acquire.store import open_recording
+from acquire.store.present import flags_of, present_values
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -34,8 +40,6 @@ if TYPE_CHECKING:
     from acquire.store.reader import Recording
 
 _PAGE_LINES = 4096
-_KEPT_FLAGS = np.uint16(LineFlag.INCOMPLETE)
-"""What was seen of a line by its camera; all else is found again."""
 _NAP_S = 0.001
 _CATCH_UP = Fraction(5, 4)
 """Lines per pulse of a camera that is behind."""
@@ -50,7 +54,9 @@ def replay_code(recording: Recording) -> Code:
     if isinstance(code, ConstantCode):
         return code
     raise UsageError(
-        f"replay of a code of kind {recording.attrs['code']['kind']!r}", possible="prbs, constant"
+        f"{recording} cannot be replayed: its code is of kind {recording.attrs['code']['kind']!r}, and a "
+        "simulated trigger generates its code",
+        possible="recordings with codes of kind prbs or constant",
     )
 
 
@@ -65,7 +71,7 @@ def describe_replay(path: Path) -> dict[str, Any]:
 class ReplayCameraOpener:
     """Opens one arm of a recording as a camera. Picklable.
 
-    Its lines come ``hold_s`` after their pulses, so that a recording can be started before the first.
+    No line comes before the file ``gate`` exists, so that a recording can be started before the first.
     """
 
     wire: Wire
@@ -73,7 +79,7 @@ class ReplayCameraOpener:
     arm: str
     block_lines: int
     loop: bool = False
-    hold_s: float = 0.0
+    gate: Path | None = None
 
     def __call__(self) -> Camera:
         return ReplayCamera(self)
@@ -90,6 +96,8 @@ class ReplayCamera:
         geometry = self._recording.geometry_for(1)
         self._depth_lines = Geometry(geometry.stages, geometry.substeps, 1).depth_lines
         self._rows = self._recording.lines
+        self._open = opener.gate is None
+        self._tail_lines = 0 if opener.gate is None else opener.block_lines
         self._run: int | None = None
         self._delivered = self._lost = 0
         self._not_before_ns = 0
@@ -155,17 +163,27 @@ class ReplayCamera:
         return count
 
     def _due(self) -> int:
-        """Lines whose pulses came ``hold_s`` ago or earlier, and which are not delivered."""
+        """Lines whose pulses have come, and which are not delivered; none while the gate is closed."""
         reading = self._wire.look()
-        if reading.train is None or reading.run != self._run:
+        if reading.train is None or reading.run != self._run or not self._is_open():
             return 0
-        issued = reading.train.issued(self._wire.clock.monotonic_ns() - int(self._opener.hold_s * 1e9))
-        last = issued if self._opener.loop else min(issued, self._rows + self._depth_lines)
+        issued = reading.train.issued(self._wire.clock.monotonic_ns())
+        last = issued if self._opener.loop else min(issued, self._last)
         return last - self._delivered
+
+    def _is_open(self) -> bool:
+        gate = self._opener.gate
+        self._open = self._open or gate is None or gate.exists()
+        return self._open
+
+    @property
+    def _last(self) -> int:
+        """Lines in all, unless they are repeated: what comes before line 0, the rows, and the dark tail."""
+        return self._depth_lines + self._rows + self._tail_lines
 
     def _ended(self) -> bool:
         reading = self._wire.look()
-        finished = not self._opener.loop and self._delivered + self._due() >= self._rows + self._depth_lines
+        finished = not self._opener.loop and self._delivered + self._due() >= self._last
         return finished or reading.stopped
 
     def _blocks(self, count: int) -> Iterator[CameraBlock]:
@@ -176,6 +194,8 @@ class ReplayCamera:
             line = at - self._depth_lines
             if line < 0:
                 pixels, flags = self._dark(min(-line, self._delivered - at))
+            elif line >= self._rows and not self._opener.loop:
+                pixels, flags = self._dark(self._delivered - at)
             else:
                 pixels, flags = self._stored(line, self._delivered - at)
             missing = (flags & LineFlag.MISSING) != 0
@@ -188,8 +208,8 @@ class ReplayCamera:
             at += len(flags)
 
     def _dark(self, count: int) -> tuple[NDArray[Any], NDArray[np.uint16]]:
-        """What comes before line 0: preroll, which nobody keeps."""
-        pixels = np.zeros((count, self._stream.lines.shape[1]), self._stream.lines.dtype)
+        """What comes before line 0, and after the last: nobody keeps it."""
+        pixels = np.zeros((count, self._stream.pixels), self._stream.dtype)
         return pixels, np.zeros(count, np.uint16)
 
     def _stored(self, line: int, count: int) -> tuple[NDArray[Any], NDArray[np.uint16]]:
@@ -198,11 +218,9 @@ class ReplayCamera:
         page, skip = divmod(row, _PAGE_LINES)
         if self._page is None or self._page[0] != page:
             start, stop = page * _PAGE_LINES, min((page + 1) * _PAGE_LINES, self._rows)
-            pixels = self._stream.read("lines", start, stop).astype(
-                self._stream.lines.dtype.newbyteorder("=")
-            )
-            flags = self._stream.read("flags", start, stop)
-            self._page = (page, pixels, flags & (_KEPT_FLAGS | np.uint16(LineFlag.MISSING)))
+            flags = flags_of(self._recording, self._opener.arm, start, stop)
+            pixels = present_values(self._recording, self._opener.arm, "lines", start, flags)
+            self._page = (page, pixels.astype(self._stream.dtype.newbyteorder("=")), flags)
         _, pixels, flags = self._page
         part = slice(skip, skip + count)
         again = np.uint16(LineFlag.CODE_UNVERIFIED if turn else 0)

@@ -38,14 +38,16 @@ def play(stored, pulses, **changes):
     clock = ManualClock()
     wire = Wire(clock)
     try:
+        gate = changes.get("gate")
         camera = ReplayCameraOpener(wire, stored.path, "b", 64, **changes)()
         camera.arm()
         period = stored.line_period_ns
         wire.start(Fraction(period), Fraction(1), CODE.to_attrs())
         clock.now_ns += int((pulses - 1) * period) + 1
         held = camera.next_block(0.0)
-        clock.now_ns += int(changes.get("hold_s", 0) * 1e9)
-        if not changes.get("hold_s"):
+        if gate is not None:
+            gate.touch()
+        else:
             wire.stop()
         blocks: list[CameraBlock] = [held] if held else []
         while (block := camera.next_block(0.1)) is not None:
@@ -92,10 +94,12 @@ def test_a_replay_ends_or_begins_again_with_flags(stored):
             np.testing.assert_array_equal(pixels, lines[number % LINES][0])
 
 
-def test_held_lines_come_late(stored):
-    blocks, _, held = play(stored, 200, hold_s=0.5)
+def test_no_line_comes_before_the_gate_opens_and_dark_ones_come_after_the_last(stored, tmp_path):
+    blocks, _, held = play(stored, LINES + DEPTH + 64, gate=tmp_path / "gate")
     assert held is None
-    assert sum(len(block.flags) for block in blocks) > 100
+    assert blocks[0].first_line == 0
+    assert blocks[-1].first_line + len(blocks[-1].flags) == DEPTH + LINES + 64
+    assert not blocks[-1].pixels[-64:].any()
 
 
 def test_the_code_of_a_replay_is_the_stored_one_from_its_first_line_on(stored):

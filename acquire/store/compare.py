@@ -1,0 +1,180 @@
+"""Two recordings of the same lines, array by array: where they first differ, and in how many rows.
+
+A recording that was made from another one numbers its lines anew, from 0 on, and has a clock of its own. So
+what is compared is what the lines themselves determine:
+
+=============  ==========================================================================================
+lines, code    equal
+flags          equal; both missing is equal, whatever else is flagged
+code_index     equal once either is counted from the recording's line 0
+tick           equal up to one offset, the same for all rows of both arms
+time           as far off the recording's own clock at its tick, to the nanosecond, in both
+gaps           the same rows of the same arm; their causes may differ
+=============  ==========================================================================================
+
+Rows that are missing in either are compared by their flags and gaps alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.lines import ARMS
+from acquire.store.present import MISSING, flags_of, present_values
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from numpy.typing import NDArray
+
+    from acquire.store.reader import Recording
+
+BLOCK_ROWS = 16_384
+COLUMNS = ("lines", "code", "flags", "code_index", "tick", "time")
+ROWS = "number of rows"
+Block = dict[str, "NDArray[Any]"]
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """Where an array of the second recording first differs from the first one's, and in how many rows."""
+
+    array: str
+    rows: int
+    row: int
+    first: str
+    second: str
+
+    def __str__(self) -> str:
+        if self.array == ROWS:
+            return f"the recording has {self.first} rows, and the copy {self.second}"
+        return (
+            f"{self.array} differs in {self.rows} rows, first in row {self.row}: {self.first}, "
+            f"and {self.second} in the copy"
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def compare(
+    first: Recording, second: Recording, progress: Callable[[int, int], object] | None = None
+) -> list[Difference]:
+    """Every array of ``second`` against that of ``first``, whose row ``second.first_line`` is its row 0.
+
+    Raises DataError where one of them cannot be read.
+    """
+    shift = second.first_line
+    asked, have = first.lines - shift, second.lines
+    count = Difference(ROWS, abs(asked - have), min(asked, have), str(asked), str(have))
+    found = [] if asked == have else [count]
+    rows = max(0, min(asked, have))
+    by_array: dict[str, Difference] = {}
+    ticks = _Offset()
+    for start in range(0, rows, BLOCK_ROWS):
+        stop = min(start + BLOCK_ROWS, rows)
+        for arm in ARMS:
+            old, new = _read(first, arm, start + shift, stop + shift), _read(second, arm, start, stop)
+            _count_from_zero(first, second, old, new, ticks)
+            for difference in _of_block(arm, start, old, new):
+                _add(by_array, difference)
+        if progress is not None:
+            progress(stop, rows)
+    return [*found, *by_array.values(), *_of_gaps(first, second, shift, rows)]
+
+
+class _Offset:
+    """Between the two clocks: found at the first row that both have, and the same from there on."""
+
+    def __init__(self) -> None:
+        self.ticks: int | None = None
+
+
+def _read(recording: Recording, arm: str, start: int, stop: int) -> Block:
+    flags = flags_of(recording, arm, start, stop)
+    values = {name: present_values(recording, arm, name, start, flags) for name in COLUMNS if name != "flags"}
+    return {"flags": flags, **values}
+
+
+def _count_from_zero(first: Recording, second: Recording, old: Block, new: Block, offset: _Offset) -> None:
+    """Bring numbers and clocks of both to the same beginning, where rows are there in both."""
+    both = ((old["flags"] | new["flags"]) & MISSING) == 0
+    for recording, block in ((first, old), (second, new)):
+        # int64 throughout: differences of recorded numbers may be negative where something is wrong
+        block["time"] = block["time"] - recording.clock.time_ns(block["tick"])
+        begin = 0 if recording is second else first.substeps * first.first_line
+        block["code_index"] = block["code_index"].astype(np.int64) - begin
+        block["tick"] = block["tick"].astype(np.int64)
+    if offset.ticks is None and both.any():
+        row = int(both.argmax())
+        offset.ticks = int(new["tick"][row] - old["tick"][row])
+    new["tick"] = new["tick"] - (offset.ticks or 0)
+    for block in (old, new):
+        for name in COLUMNS:
+            if name != "flags":
+                block[name][~both] = 0
+    neither = (old["flags"] & new["flags"] & MISSING) != 0
+    old["flags"][neither] = new["flags"][neither] = MISSING
+
+
+def _of_block(arm: str, start: int, old: Block, new: Block) -> Iterator[Difference]:
+    for name in COLUMNS:
+        differs = (old[name] != new[name]).reshape(len(old[name]), -1).any(axis=1)
+        if differs.any():
+            row = int(differs.argmax())
+            yield Difference(
+                f"{arm}/{name}",
+                int(differs.sum()),
+                start + row,
+                _shown(old[name][row]),
+                _shown(new[name][row]),
+            )
+
+
+def _shown(value: Any) -> str:
+    """A value; of a line, its first pixels."""
+    if np.ndim(value) == 0:
+        return str(value)
+    return f"[{' '.join(map(str, value[:4]))}{' …' if len(value) > 4 else ''}]"
+
+
+def _add(found: dict[str, Difference], new: Difference) -> None:
+    before = found.get(new.array)
+    rows = new.rows + (0 if before is None else before.rows)
+    found[new.array] = Difference(
+        new.array,
+        rows,
+        *((new.row, new.first, new.second) if before is None else (before.row, before.first, before.second)),
+    )
+
+
+def _of_gaps(first: Recording, second: Recording, shift: int, rows: int) -> Iterator[Difference]:
+    """Listed gaps; those that found no room in the table are in the flags alone."""
+    if first.gaps_not_listed or second.gaps_not_listed:
+        return
+    for arm in ARMS:
+        old = _edges([*first.lost_rows(arm), *first.dropped_rows()], shift, rows)
+        new = _edges(second.lost_rows(arm), 0, rows)
+        differing = np.setxor1d(old, new)
+        if len(differing):
+            row = int(differing[0])
+            words = ("lost", "not lost") if np.searchsorted(old, row, "right") % 2 else ("not lost", "lost")
+            count = int((differing[1::2] - differing[::2]).sum())
+            yield Difference(f"gaps of arm {arm}", count, row, *words)
+
+
+def _edges(stretches: list[range], shift: int, rows: int) -> NDArray[np.int64]:
+    """Where stretches of lost rows begin and end, in turn; those that touch or overlap are one."""
+    edges: list[int] = []
+    for lost in sorted(stretches, key=lambda lost: lost.start):
+        begin, end = (min(max(0, row - shift), rows) for row in (lost.start, lost.stop))
+        if begin >= end:
+            continue
+        if edges and begin <= edges[-1]:
+            edges[-1] = max(edges[-1], end)
+        else:
+            edges += [begin, end]
+    return np.array(edges, np.int64)
