@@ -110,7 +110,7 @@ def test_real_devices_need_no_scene_and_nothing_that_makes_one(tmp_path):
         "print([name for name in sys.modules if name.startswith('acquire.sim')])\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True
     )
     facts, modules = done.stdout.splitlines()
     assert facts == "['a', 'b'] {'simulated': False} dual"

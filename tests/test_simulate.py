@@ -138,7 +138,7 @@ def acquire(*words):
         [sys.executable, "-m", "acquire", "simulate", *map(str, words)],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=300,
         check=False,
     )
 

@@ -25,7 +25,7 @@ from acquire.errors import CameraError
 from acquire.sim.gentl.models import CameraModel
 from acquire.sim.gige.camera import GigeCamera, Transmission
 
-WAIT_S = 60.0
+WAIT_S = 300.0
 WIDTH = 48
 _numbers = itertools.count()
 
@@ -105,7 +105,7 @@ def open_in_time(opener: Callable[[], AravisCamera]) -> AravisCamera:
 @contextmanager
 def aravis_camera(log: Path, lost_per_thousand: int = 0) -> Iterator[str]:
     """Serial number of Aravis' own camera, whose port others may have; ``log`` is what it sends and drops."""
-    serial, deadline = f"GV-{os.getpid()}", time.monotonic() + 90
+    serial, deadline = f"GV-{os.getpid()}", time.monotonic() + 300
     command = [
         FAKE_GIGE,
         "-i",

@@ -45,7 +45,7 @@ def of_host(producers: str) -> list[dict[str, str]]:
     """``acquire devices`` as a process: libusb, Aravis and producers keep what they opened until its end."""
     command = [sys.executable, "-m", "acquire", "devices", "--json"]
     environment = os.environ | {"GENICAM_GENTL64_PATH": producers}
-    done = subprocess.run(command, env=environment, capture_output=True, timeout=60, check=True)
+    done = subprocess.run(command, env=environment, capture_output=True, timeout=300, check=True)
     return json.loads(done.stdout)
 
 

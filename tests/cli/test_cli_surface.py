@@ -97,7 +97,7 @@ def test_help_loads_nothing_heavy(words: list[str]) -> None:
         f"finally:\n    print('loaded:', sorted({HEAVY!r} & set(sys.modules)))"
     )
     ended = subprocess.run(
-        [sys.executable, "-c", code, *words], check=True, capture_output=True, text=True, timeout=60
+        [sys.executable, "-c", code, *words], check=True, capture_output=True, text=True, timeout=300
     )
     assert ended.stdout.splitlines()[-1] == "loaded: []"
 
@@ -113,7 +113,7 @@ def test_status_loads_no_recording_or_mathematics(tmp_path: Path) -> None:
         check=True,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=300,
     )
     assert ended.stdout.strip() == "[]"
 
@@ -132,7 +132,7 @@ def test_a_full_disk_behind_stdout_ends_in_words() -> None:
             stdout=full,
             stderr=subprocess.PIPE,
             text=True,
-            timeout=60,
+            timeout=300,
             check=False,
         )
     assert ended.returncode == 5

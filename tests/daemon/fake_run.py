@@ -68,7 +68,7 @@ class FakeRun:
         )
 
     def arm(self) -> None:
-        assert self.may_arm.wait(10)
+        assert self.may_arm.wait(300)
         self._call("arm")
         self.seen = CALM
 

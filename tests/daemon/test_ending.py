@@ -30,7 +30,7 @@ def test_a_thread_that_hangs_is_named_and_left(tmp_path: Path, end: str, code: i
         check=False,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=300,
     )
     assert ended.returncode == code, ended.stderr
     assert "thread reader at" in ended.stderr
@@ -49,6 +49,6 @@ def test_nothing_is_forced_where_all_threads_end() -> None:
         check=False,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=300,
     )
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, "0\n", "")

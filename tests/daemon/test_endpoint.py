@@ -53,7 +53,7 @@ def test_left_behind_by_a_killed_process(path: Path) -> None:
         "import os, signal, sys, pathlib; from acquire.daemon.endpoint import Endpoint;"
         "e = Endpoint(pathlib.Path(sys.argv[1])); os.kill(os.getpid(), signal.SIGKILL)"
     )
-    ended = subprocess.run([sys.executable, "-c", code, str(path)], check=False, timeout=30)
+    ended = subprocess.run([sys.executable, "-c", code, str(path)], check=False, timeout=300)
     assert ended.returncode == -9
     assert path.exists()
     endpoint = Endpoint(path)

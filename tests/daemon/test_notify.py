@@ -20,7 +20,7 @@ def test_delivered(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, abstract: bo
     name = f"@{tmp_path}" if abstract else str(tmp_path / "n")
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
         receiver.bind(name.replace("@", "\0"))
-        receiver.settimeout(5)
+        receiver.settimeout(300)
         monkeypatch.setenv("NOTIFY_SOCKET", name)
         assert notify("READY=1")
         assert receiver.recv(100) == b"READY=1"

@@ -26,7 +26,7 @@ def impostor(path: Path) -> Iterator[socket.socket]:
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(str(path))
         listener.listen(4)
-        listener.settimeout(10)
+        listener.settimeout(300)
         yield listener
 
 

@@ -109,7 +109,7 @@ class Disk:
         self.watch = DiskWatch(Path("/d"), 1000, 100.0, self._free_bytes, self.clock)
 
     def _free_bytes(self, _: Path) -> int:
-        assert self.answers.wait(30)
+        assert self.answers.wait(300)
         if self.gone:
             raise OSError(5, "Input/output error")
         return self.free

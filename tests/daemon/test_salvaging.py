@@ -19,7 +19,7 @@ from acquire.store.files import locked
 from acquire.stream import Orphan
 
 SPEC = recording_spec(Load(8, "uint16", 1000.0), ClockFit(90_000_000, 0, 0))
-WAIT_S = 60.0
+WAIT_S = 300.0
 
 
 @pytest.fixture

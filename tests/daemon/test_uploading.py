@@ -29,7 +29,7 @@ CLOCK = ClockFit(90_000_000, 0, 0)
 SHARD_LINES = 16
 LOAD = Load(8, "uint16", 1000.0, chunk_lines=SHARD_LINES, shard_chunks=1)
 SPEC = recording_spec(LOAD, CLOCK)
-WAIT_S = 60.0
+WAIT_S = 300.0
 
 
 class Place:

@@ -28,7 +28,7 @@ OBEY_PERMISSIONS = (
     "os.execv(sys.argv[1], sys.argv[1:])",
 )
 """Runs a command without what lets root write to any directory: tests may run as root."""
-END_S = 30.0
+END_S = 300.0
 
 RIG = """
 name = "small"
@@ -85,7 +85,7 @@ def acquire(*words: object, socket: Path | None = None, cwd: Path | None = None)
         check=False,
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=300,
         env=environment,
         cwd=cwd,
     )
@@ -164,5 +164,5 @@ def write_rig(home: Path) -> Path:
 
 def until_gone(processes: list[psutil.Process]) -> None:
     """Fail unless the processes end by themselves in bounded time."""
-    _, alive = psutil.wait_procs(processes, timeout=20)
+    _, alive = psutil.wait_procs(processes, timeout=300)
     assert not alive

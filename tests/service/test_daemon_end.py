@@ -39,7 +39,7 @@ def record(daemon: Daemon, committed_lines: int = 300) -> Path:
     with daemon.client() as client:
         client.arm()
         client.start(path)
-        deadline = time.monotonic() + 30
+        deadline = time.monotonic() + 300
         while (now := client.status().recording) is None or now.committed_lines < committed_lines:
             assert time.monotonic() < deadline
             time.sleep(0.02)
@@ -93,7 +93,7 @@ def test_killed_while_recording(start: Start) -> None:
     path = record(daemon)
     children = daemon.children()
     daemon.process.kill()
-    daemon.process.wait(30)
+    daemon.process.wait(300)
     until_gone(children)
     check_contiguous(open_recording(path), 300)
     assert daemon.socket.exists()
@@ -163,7 +163,7 @@ def test_systemd_is_told(start: Start, tmp_path_factory: pytest.TempPathFactory)
     name = tmp_path_factory.mktemp("n") / "n"
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
         receiver.bind(str(name))
-        receiver.settimeout(30)
+        receiver.settimeout(300)
         daemon = start(NOTIFY_SOCKET=str(name))
         assert receiver.recv(100) == b"READY=1"
         assert receiver.recv(100) == b"WATCHDOG=1"

@@ -67,7 +67,7 @@ def test_a_recording_goes_on_in_a_segment(daemon: Daemon) -> None:
     for resume in ((), ("--resume",)):
         begun = daemon("start", "days.zarr", "--lines", 300, *resume, "--json")
         assert begun.code == 0, begun.err
-        assert daemon("status", "--wait", "sealed", "--timeout", 30).code == 0
+        assert daemon("status", "--wait", "sealed", "--timeout", 300).code == 0
     assert begun.json["recording"]["path"] == str(daemon.home / "days-2.zarr")
     first = open_recording(daemon.home / "days.zarr")
     (second,) = first.segments
@@ -88,7 +88,7 @@ def test_line_budget(daemon: Daemon) -> None:
     with daemon.client() as client:
         client.arm()
     assert daemon("start", "budget.zarr", "--lines", 700).code == 0
-    status = daemon("status", "--wait", "sealed", "--timeout", 30, "--json").json
+    status = daemon("status", "--wait", "sealed", "--timeout", 300, "--json").json
     assert status["last"] == {
         "path": str(daemon.home / "budget.zarr"),
         "lines": 700,

@@ -37,7 +37,7 @@ def hold(daemon: Daemon, count: int, stack: contextlib.ExitStack) -> None:
     """Connections that stay, half of them with the beginning of a request."""
     for number in range(count):
         connection = stack.enter_context(socket.socket(socket.AF_UNIX))
-        connection.settimeout(30)
+        connection.settimeout(300)
         connection.connect(str(daemon.socket))
         with contextlib.suppress(OSError):  # the daemon was quicker to close it
             connection.sendall(HALF_SENT if number % 2 else IDLE)

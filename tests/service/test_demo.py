@@ -23,7 +23,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
     out = tmp_path_factory.mktemp("demo") / "run"
     command = ["demo", f"--out={out}", f"--seed={SEED}", f"--lines={LINES}", "--twist-budget=2", "--json"]
     done = subprocess.run(
-        [sys.executable, "-m", "acquire", *command], capture_output=True, text=True, timeout=110, check=False
+        [sys.executable, "-m", "acquire", *command], capture_output=True, text=True, timeout=300, check=False
     )
     assert done.returncode == 0, done.stderr
     return out, json.loads(done.stdout)
@@ -122,7 +122,7 @@ def test_a_directory_that_exists_is_refused_and_untouched(demo: tuple[Path, dict
         [sys.executable, "-m", "acquire", "demo", f"--out={out}"],
         capture_output=True,
         text=True,
-        timeout=30,
+        timeout=300,
         check=False,
     )
     assert again.returncode == 2

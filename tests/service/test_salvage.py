@@ -78,7 +78,7 @@ def kill_all(daemon: Daemon) -> None:
         process.suspend()  # so that none of them notices that another has gone
     for process in family:
         process.kill()
-    daemon.process.wait(30)
+    daemon.process.wait(300)
     until_gone(family[1:])
 
 
@@ -132,7 +132,7 @@ def test_what_another_process_writes_is_left_to_it(start: Start, tmp_path: Path)
             killed = subprocess.Popen([*command[:2], str(dead), *command[3:]], stdout=subprocess.DEVNULL)
             until(lambda: dead.exists() and (dead / "zarr.json").exists())
             killed.kill()
-            killed.wait(30)
+            killed.wait(300)
             shutil.copytree(dead, far)
             root = (far / "zarr.json").read_text()
             (far / "zarr.json").write_text(root.replace('"host":{"name":"', '"host":{"name":"far-'))

@@ -119,7 +119,7 @@ def naive_lines(scene: Scene, code: Code, stages: int, substeps: int, arm: str, 
     return Y
 
 
-def read_lines(camera: Camera, lines: int, timeout_s: float = 20.0) -> list[np.ndarray]:
+def read_lines(camera: Camera, lines: int, timeout_s: float = 300.0) -> list[np.ndarray]:
     """Blocks until ``lines`` lines have come."""
     blocks, have = [], 0
     while have < lines:

@@ -217,12 +217,12 @@ def spawned(target, *openers):
             children.append((child, ours))
         yield [link for _, link in children]
         for child, _ in children:
-            child.join(20)
+            child.join(300)
             assert child.exitcode == 0
     finally:
         for child, link in children:
             child.kill()
-            child.join(10)
+            child.join(300)
             link.close()
 
 

@@ -19,7 +19,7 @@ from writer_process import SPEC
 from acquire.store import open_recording, recover, verify
 
 SCRIPT = Path(__file__).with_name("writer_process.py")
-WAIT_S = 60.0
+WAIT_S = 300.0
 
 
 @contextmanager

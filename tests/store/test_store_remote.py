@@ -112,7 +112,7 @@ def test_a_growing_recording_is_followed_to_its_end(path, place):
         follower.start()
         fill(writer, 30)
         writer.seal(RunCondition.GOOD, "done", {})
-    follower.join(60)
+    follower.join(300)
     assert (seen[0].lines, seen[0].sealed) == (230, True)
     assert verify(place).intact
 

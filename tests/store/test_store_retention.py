@@ -124,7 +124,7 @@ def test_holds_and_drops_race_in_threads(path):
     begun = threading.Event()
 
     def holder():
-        begun.wait(30)
+        begun.wait(300)
         for line in range(1000, 1000 + 30 * SHARD, 3 * SHARD):
             try:
                 accepted.append(hold(path, line, 4))
@@ -138,12 +138,12 @@ def test_holds_and_drops_race_in_threads(path):
         with RecordingWriter.create(path, spec_of(policy)) as writer:
             begun.set()
             grow(writer, 30 * SHARD, step=64)
-            thread.join(60)
+            thread.join(300)
             for held in accepted:
                 assert open_recording(path).cut(held.first_line, held.count).mask.all()
     finally:
         begun.set()
-        thread.join(60)
+        thread.join(300)
 
 
 class SmallDisk(Disk):

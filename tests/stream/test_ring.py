@@ -217,15 +217,15 @@ def test_a_slot_overwritten_while_it_is_read_is_refused(ring: Ring) -> None:
 def test_a_wait_is_bounded_and_ends_with_a_commit(ring: Ring) -> None:
     begun = time.monotonic()
     assert ring.acquire(0.05) is None
-    assert 0.05 <= time.monotonic() - begun < 2
+    assert 0.05 <= time.monotonic() - begun < 60
     ring.claim()
     later = threading.Timer(0.05, ring.commit, (7, 2))
     later.start()
-    block = ring.acquire(10)
+    block = ring.acquire(600)
     later.join()
     assert block is not None
     assert block.first_line == 7
-    assert time.monotonic() - begun < 5
+    assert time.monotonic() - begun < 300
 
 
 def test_doorbell_rings_until_hushed(ring: Ring) -> None:
@@ -353,11 +353,11 @@ class Players:
     def kill(self, name: str) -> None:
         process = self.processes.pop(name)
         process.kill()
-        process.join(10)
+        process.join(300)
         process.close()
 
     def until_more(self, name: str, more: int) -> None:
-        target, deadline = self.counts[name] + more, time.monotonic() + 60
+        target, deadline = self.counts[name] + more, time.monotonic() + 300
         while self.counts[name] < target:
             assert time.monotonic() < deadline, f"{name} stands at {self.counts[name]}"
             time.sleep(0.001)
@@ -392,7 +392,7 @@ def test_whoever_is_killed_the_others_go_on_and_a_successor_continues(players: P
         assert players.ring.head > before
     for name in ("producer", "observer"):
         players.kill(name)
-    deadline = time.monotonic() + 30
+    deadline = time.monotonic() + 300
     while players.ring.fill and time.monotonic() < deadline:
         time.sleep(0.001)
     players.kill("reader")

@@ -39,7 +39,7 @@ from acquire.trigger.driver import TriggerDriver
 
 LOAD = Load(256, "uint16", 20_000.0, substeps=2, stages=8, block_lines=128, ring_slots=256, chunk_lines=256)
 """20 MB/s from both arms, chunks of 128 KiB, a ring of 1.6 s."""
-WAIT_S = 60.0
+WAIT_S = 300.0
 
 
 @contextlib.contextmanager

@@ -23,7 +23,7 @@ from acquire.store import open_recording
 from acquire.store.recover import recover
 from acquire.stream import Orphan
 
-WAIT_S = 60.0
+WAIT_S = 300.0
 RIG = """
 name = "pattern"
 [geometry]

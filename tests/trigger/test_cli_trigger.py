@@ -31,7 +31,7 @@ def acquire(*arguments: str, code: int = 0) -> str:
         [sys.executable, "-m", "acquire", "trigger", *arguments],
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=300,
         check=False,
     )
     assert done.returncode == code, done.stdout + done.stderr
@@ -80,12 +80,12 @@ def test_a_run_is_monitored_to_its_end() -> None:
         heard = model.frames_heard
         command = [sys.executable, "-m", "acquire", "trigger", "monitor", "--url", twin.url, "--json"]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as monitor:
-            deadline = time.monotonic() + 30
+            deadline = time.monotonic() + 300
             while model.frames_heard < heard + 3:
                 assert time.monotonic() < deadline
                 time.sleep(0.01)
             model.external_edge()
-            tags = [json.loads(line) for line in monitor.communicate(timeout=30)[0].splitlines()]
+            tags = [json.loads(line) for line in monitor.communicate(timeout=300)[0].splitlines()]
         assert monitor.returncode == 0
     assert [(tag["line"], tag["flags"]) for tag in tags] == [
         (0, "LINE+FIRST+EXTERNAL"),

@@ -67,7 +67,7 @@ def test_an_echo_is_no_trigger() -> None:
     begun = time.monotonic()
     with pytest.raises(TriggerError, match=r"loop://: no answer to READ .*try: is it the trigger's port"):
         driver.identify()
-    assert time.monotonic() - begun < 4
+    assert time.monotonic() - begun < 60
 
 
 def _hold(path, link) -> None:
@@ -88,7 +88,7 @@ def test_a_port_has_one_user_and_the_second_hears_who_the_first_is(tmp_path) -> 
     with pytest.raises(TriggerError, match=rf"{path} is in use by process {child.pid} \(.*python"):
         PortLock(path)
     child.kill()
-    child.join(10)
+    child.join(300)
     PortLock(path).release()
     ours.close()
     theirs.close()
@@ -127,7 +127,7 @@ def test_tags_that_nobody_takes_are_lost_by_the_device_and_counted(monkeypatch) 
         while driver.statistics()["tags_missing"] < 100:
             tags += driver.tags(0.1)
         lines = driver.stop()
-        deadline = time.monotonic() + 20
+        deadline = time.monotonic() + 300
         while (now := driver.statistics())["tags"] + now["tag_lost"] < lines + 1:
             assert time.monotonic() < deadline, now
             tags += driver.tags(0.1)
@@ -178,7 +178,7 @@ def test_a_full_terminal_makes_the_device_wait_and_loses_nothing() -> None:
     said = talker.rest
     twin = PtyTwin(talker)
     slave = os.open(twin.path, os.O_RDONLY | os.O_NOCTTY | os.O_NONBLOCK)
-    waiting, deadline = -1, time.monotonic() + 10
+    waiting, deadline = -1, time.monotonic() + 300
     while (now := _waiting(slave)) != waiting or not now:  # until nothing more fits
         assert time.monotonic() < deadline
         waiting = now

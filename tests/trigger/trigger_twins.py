@@ -106,7 +106,7 @@ class SocketTwin:
 
     def close(self) -> None:
         self._ending.set()
-        self._thread.join(5)
+        self._thread.join(300)
         self._server.close()
 
     def _live(self) -> None:

@@ -7,7 +7,6 @@ import re
 from collections import Counter
 from typing import TYPE_CHECKING
 
-import pytest
 from amaranth.back import rtlil
 from amaranth.hdl import Fragment
 
@@ -17,7 +16,6 @@ from firmware.build import main, synthesize
 if TYPE_CHECKING:
     from pathlib import Path
 
-pytestmark = pytest.mark.timeout(300)
 """Yosys compiles itself when it runs for the first time."""
 
 LOGIC_CELLS, BLOCK_RAMS = 24288, 56

@@ -8,7 +8,6 @@ from firmware.formal.engine import prove
 from firmware.formal.mutants import MUTANTS, Mutant, broken_by
 from firmware.formal.proofs import PROOFS
 
-pytestmark = pytest.mark.timeout(300)
 """Yosys compiles itself when it runs for the first time."""
 
 
