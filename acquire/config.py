@@ -106,6 +106,12 @@ class StreamConfig(FrozenModel):
         description="of lines from the past that the ring holds, instead of ring_slots",
     )
     reopen_s: float = Field(default=2.0, ge=0, le=600, description="wait for a camera that is gone")
+    stall_s: float = Field(
+        default=3.0,
+        gt=0,
+        le=600,
+        description="an arm that is silent for longer has stalled, unless its camera is waited for longer",
+    )
     realtime: bool = Field(
         default=False,
         description="grabbers before everything else on the host, where its user may (RLIMIT_RTPRIO); "

@@ -84,12 +84,26 @@ class RecordingConfig(FrozenModel):
         description="the state that a recording's end leads to: 'armed', where the rings go on holding the "
         "latest lines for the next recording, or 'idle'",
     )
+    on_disk_trouble: Literal["continue", "stop"] = Field(
+        default="continue",
+        description="a disk that pauses is waited for as long as the rings hold the lines "
+        "(stream.ring_seconds); then the recording is sealed, and goes on in a further segment when the disk "
+        "is back, or stops there",
+    )
+    patience_s: float | None = Field(
+        default=None,
+        ge=1,
+        le=1e6,
+        description="a disk that does not answer for longer is a fault, and a recorder that shows no life "
+        "for another reason is replaced; absent: the disk is waited for, the recorder gets three times what "
+        "the rings hold",
+    )
     seal_timeout_s: float = Field(
         default=60.0,
         gt=0,
         le=3600,
-        description="longest time in which nothing more of an ending recording reaches the disk; "
-        "beyond it, a fault",
+        description="longest time in which nothing more of an ending recording reaches the disk, though "
+        "nobody waits for the disk; beyond it, a fault",
     )
     retention: RetentionConfig | None = Field(default=None, description="absent: all is kept")
     upload_to: str | None = Field(

@@ -16,6 +16,7 @@ from shutil import which
 from typing import Any
 
 import pytest
+from frozen_disk import can_freeze
 from throttle import can_throttle
 from umockdev_here import missing as missing_for_umockdev
 
@@ -60,6 +61,7 @@ NEEDS = {
     "needs_compiler": "builds the simulated GenTL producer",
     "needs_dask": "spreads work over a Dask cluster",
     "needs_gpu": "computes on CUDA",
+    "needs_freeze": "freezes a file system of its own",
     "needs_mount": "fills a small file system of its own",
     "needs_throttle": "has the kernel slow a disk down for a process",
     "needs_umockdev": "runs libusb on a made-up bus",
@@ -80,6 +82,7 @@ def find_missing() -> dict[str, str]:
         "needs_compiler": not (compiler() and _HAVE_GENICAM) and "a C compiler and the genicam package",
         "needs_dask": importlib.util.find_spec("distributed") is None and "dask.distributed",
         "needs_gpu": not _have_gpu() and "CuPy and a GPU",
+        "needs_freeze": not can_freeze() and "the right to mount a file system and to freeze it",
         "needs_mount": not _can_mount() and "the right to mount a small file system",
         "needs_throttle": not can_throttle(Path(tempfile.gettempdir())) and "the right to slow a disk down",
         "needs_umockdev": missing_for_umockdev(),

@@ -170,6 +170,7 @@ def _show(status: Status, json: bool) -> None:
         {
             "state": f"{status.state} since {status.since:%Y-%m-%d %H:%M:%S} UTC",
             "busy": status.busy,
+            "waiting": status.waiting,
             "fault": status.fault,
             "rig": f"{status.name} (process {status.pid}, up {status.uptime_s:.0f} s)",
             "run": status.run_id,

@@ -275,6 +275,9 @@ class Status(_Message):
     recording: RecordingStatus | None
     arms: dict[str, ArmStatus]
     last: LastRecording | None
+    waiting: Text | None = Field(
+        default=None, description="what takes longer than it should, and how long that can be borne, in words"
+    )
     fault: Text | None
     trigger: TriggerStatus | None = Field(default=None, description="null: not armed")
     disk: DiskStatus | None = Field(default=None, description="null: it has not been seen yet")

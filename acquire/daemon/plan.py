@@ -25,10 +25,6 @@ if TYPE_CHECKING:
     from acquire.stream import CaptureStatus, Window
 
 
-STALL_S = 3.0
-"""An arm that is silent for so long has stalled, unless its camera is waited for longer."""
-
-
 class Run:
     """One run of a rig: armed once, records at most once, closed once."""
 
@@ -141,11 +137,13 @@ def capture_plan(config: RigConfig, rig: Rig, run_id: str) -> CapturePlan:
         watch=watch_plan(config),
         white_dn=config.cameras.a.white_dn,
         openers=rig.openers(),
-        stall_timeout_s=max(STALL_S, config.stream.reopen_s + 1.0),
+        stall_timeout_s=max(config.stream.stall_s, config.stream.reopen_s + 1.0),
         reopen_timeout_s=config.stream.reopen_s,
         columns=config.columns,
         realtime=config.stream.realtime,
         line_period_ns=1e9 / config.line_rate_hz / config.simulation.speed,
+        patience_s=config.recording.patience_s,
+        goes_on=config.recording.on_disk_trouble == "continue",
     )
 
 

@@ -209,7 +209,7 @@ class Service:
         try:
             if self._state is State.RECORDING:
                 self._stop("signal")
-            while self._state is State.DRAINING:
+            while self._state is State.DRAINING and not self._waits_too_long():
                 self.supervise()
                 if self._state is State.DRAINING:
                     self._hurried.wait(POLL_S)
@@ -225,6 +225,14 @@ class Service:
                 self._salvage.close()
                 self._uploads.close()
                 self._disk.close()
+
+    def _idles(self, take: Take) -> bool:
+        """Nothing more of the recording has reached the disk for as long as is allowed."""
+        return take.idle_s(self._seen) > self._config.recording.seal_timeout_s
+
+    def _waits_too_long(self) -> bool:
+        """A disk that does not answer must not keep the daemon from ending; the next one recovers."""
+        return self._take is not None and bool(self._seen.waiting) and self._idles(self._take)
 
     def _stop(self, reason: str) -> None:
         assert self._run is not None
@@ -245,20 +253,30 @@ class Service:
         if self._state is not State.DRAINING:
             return
         assert self._take is not None
-        limit_s = self._config.recording.seal_timeout_s
         if seen.done or self.hurried:
             self._finish(self._take)
-        elif self._take.idle_s(seen) > limit_s:
+        elif self._idles(self._take) and not seen.waiting:  # a disk may take its time
+            limit_s = self._config.recording.seal_timeout_s
             self._fail(f"the recording was not sealed: nothing more of it reached the disk for {limit_s:g} s")
 
     def _poll(self) -> CaptureStatus:
         assert self._run is not None
-        self._seen = self._run.poll()
+        before, self._seen = self._seen, self._run.poll()
+        self._tell_waiting(before)
         self._salvage.add(self._seen.orphans)
         if self._seen.path is not None:
             self._uploads.add(Path(self._seen.path))
         self._rates.look(self._seen)
         return self._seen
+
+    def _tell_waiting(self, before: CaptureStatus) -> None:
+        """In the log: when waiting begins and ends, and where a recording goes on."""
+        if self._seen.waiting and not before.waiting:
+            log.warning("%s", self._seen.waiting)
+        elif before.waiting and not self._seen.waiting:
+            log.warning("over: %s", before.waiting)
+        if self._seen.recording and before.recording and before.path != self._seen.path:
+            log.warning("%s goes on in %s", before.path, self._seen.path)
 
     def _begin(
         self,
@@ -411,6 +429,7 @@ class Service:
             arms=arm_statuses(self._seen, self._rates),
             trigger=None if self._run is None else trigger_status(self._seen),
             last=self._last,
+            waiting=self._seen.waiting or None,
             fault=self._fault,
             capacity=self._capacity,
             processes={} if self._run is None else self._seen.pids,

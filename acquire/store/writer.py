@@ -149,9 +149,13 @@ class RecordingWriter:
                 if self.spec.continues is not None and self.spec.continues.listed:
                     list_segment(self.path, self.spec.continues, self._disk)
         except (DataError, StateError):
-            self.close()
-            self._disk.remove_tree(self.path)
+            self.abandon()
             raise
+
+    def abandon(self) -> None:
+        """Give up what was prepared, before `begin`: nothing is left behind."""
+        self.close()
+        self._disk.remove_tree(self.path)
 
     def _create_parts(self) -> None:
         with self._failing("creating the recording"):

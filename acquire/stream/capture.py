@@ -21,7 +21,7 @@ from acquire.lines import ARMS
 from acquire.stream import grabber, recorder, watcher
 from acquire.stream.ledger import Counted, account
 from acquire.stream.losses import Cause
-from acquire.stream.messages import Begin, Extend, Interrupt, Note, Quit, Ready, RunStarted
+from acquire.stream.messages import Begin, Interrupt, Note, Quit, Ready, RunStarted
 from acquire.stream.plan import CaptureStatus
 from acquire.stream.process import Worker
 from acquire.stream.ring import Ring, RingShape
@@ -43,6 +43,8 @@ if TYPE_CHECKING:
     from acquire.trigger.base import Trigger
 
 _TAG_RING = RingShape(slots=64, rows=256, width=3, dtype="uint64")
+TOLD_S = 1.0
+"""What is waited for longer than this is told."""
 _UNDO_S = 1.0
 _LEAST_END_S = 1.0
 
@@ -129,8 +131,7 @@ class Capture:
 
     def extend(self, line: int) -> None:
         """Let the recording under way not end before ``line``, unless it is ending already."""
-        self._running("extend")
-        self._workers[RECORDER].post(Extend(line))
+        self._running("extend").extend(line)
 
     def stop(self, reason: str = "stopped") -> None:
         """End the recording at the newest line; `poll` tells when it is sealed. Idempotent."""
@@ -138,7 +139,7 @@ class Capture:
         if supervisor.began is None:
             raise StateError("stop: nothing has been recorded", possible="start")
         if supervisor.recording:
-            supervisor.end_recording(reason)
+            supervisor.end_recording(reason, max(ring.newest_line for ring in self._rings.values()))
 
     def poll(self) -> CaptureStatus:
         """What is seen at this moment; after `close`, what was seen last."""
@@ -194,9 +195,7 @@ class Capture:
             self._workers,
             self._tags,
             self._counters,
-            self._plan.stall_timeout_s,
-            self._plan.margin_lines,
-            self._plan.grabbers,
+            self._plan,
             Succession(
                 {RECORDER: self._next_recorder, WATCHER: self._new_watcher}
                 | {name: partial(self._next_grabber, name) for name in self._plan.grabbers}
@@ -231,6 +230,7 @@ class Capture:
             plan.max_skew_lines,
             plan.realtime,
             plan.disk,
+            plan.goes_on,
         )
         return Worker(
             RECORDER, recorder.record, what, self._rings, self._tags, self._counters[RECORDER], self._others()
@@ -299,6 +299,7 @@ class Capture:
             accounts={arm: self._account(arm, supervisor) for arm in ARMS},
             ring={arm: self._ring_counts(arm) for arm in ARMS},
             lines={arm: self._line_counts(arm, began=began is not None) for arm in ARMS},
+            waiting=self._waiting(supervisor),
             fault=supervisor.fault,
             pids={name: pid for name, pid in self.pids.items() if pid is not None},
             orphans=supervisor.orphans,
@@ -324,6 +325,27 @@ class Capture:
             end_reason=sealed.end_reason if sealed else None,
             ledger=sealed.ledger if sealed else {},
         )
+
+    def _waiting(self, supervisor: Supervisor) -> str:
+        """What takes longer than it should, and how long that can be borne."""
+        if supervisor.silent_s > TOLD_S:
+            who = "disk has not answered" if supervisor.waits_for_disk else "recorder has shown no life"
+            room = f"; {self._room()}" if supervisor.recording else ""
+            return f"the {who} for {supervisor.silent_s:.0f} s{room}"
+        since_ns = self._counters[RECORDER]["store_since_ns"]
+        if since_ns and (store_s := time.monotonic() - since_ns / 1e9) > TOLD_S:
+            return f"the disk has been at work for {store_s:.0f} s to create or seal a recording"
+        if why := supervisor.resuming:
+            return f"the recording goes on in a further segment when the disk lets it: {why}"
+        return ""
+
+    def _room(self) -> str:
+        """How long the rings can still take what comes."""
+        rings, period_ns = self._rings.values(), self._plan.line_period_ns
+        if any(ring.fill == ring.shape.slots for ring in rings):
+            return "the rings are full: what comes now belongs to no recording"
+        lines = min(ring.room_lines for ring in rings)
+        return f"the rings hold {lines * period_ns / 1e9:.0f} s more" if period_ns else f"{lines} lines more"
 
     def _ring_counts(self, arm: str) -> dict[str, int]:
         counts = asdict(self._rings[arm].statistics())

@@ -2,7 +2,7 @@
 
 ::
 
-    owner ──▶ recorder      RunStarted, Begin, Note, Extend, End, Interrupt, Quit
+    owner ──▶ recorder      RunStarted, Begin, Cancel, Note, Extend, End, Interrupt, Quit
     recorder ──▶ owner      Ready, Began | Refused, Sealed
     owner ──▶ grabber       Quit
     grabber ──▶ owner       Ready
@@ -52,12 +52,21 @@ class RunStarted:
 
 @dataclass(frozen=True, slots=True)
 class Begin:
-    """Write a recording of the lines in ``window`` to ``path``, ``lines`` of them or until told to end."""
+    """Write a recording of the lines in ``window`` to ``path``, ``lines`` of them or until told to end.
+
+    Not past ``end_line``, wherever it begins.
+    """
 
     path: Path
     spec: RecordingSpec
     lines: int | None
     window: Window = NOW
+    end_line: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Cancel:
+    """Do not begin what was asked for last: the disk took too long; one that has begun ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,9 +111,10 @@ class Refused:
 
 @dataclass(frozen=True, slots=True)
 class End:
-    """End the recording at the newest line, for ``reason``."""
+    """End the recording at ``line``, or at the newest one, for ``reason``."""
 
     reason: str
+    line: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,12 +128,16 @@ class Interrupt:
 
 @dataclass(frozen=True, slots=True)
 class Sealed:
-    """The recording is over and closed; not ``on_disk``, where that failed: somebody must recover it."""
+    """The recording is over and closed; not ``on_disk``, where that failed: somebody must recover it.
+
+    ``end_line`` is the line after its last one where the disk was too slow for more: it may go on.
+    """
 
     condition: RunCondition
     end_reason: str
     ledger: dict[str, Any]
     on_disk: bool = True
+    end_line: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

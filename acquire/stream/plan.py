@@ -28,6 +28,9 @@ MAX_SUBSTEPS = 8
 TAG_DELAY_S = 0.5
 """How late a tag may come."""
 
+PATIENT_RINGS = 3
+"""A recorder is given up once lines of so many rings have come since its last sign of life."""
+
 SKEW_RINGS = 32
 """An arm that lags behind the other by the lines of so many rings is taken for stalled."""
 
@@ -44,7 +47,11 @@ class CapturePlan:
     white_dn : a pixel that has this value is saturated
     openers : arm → how its camera is opened, in the grabber's process
     stall_timeout_s : an arm that delivers nothing for so long ends the recording; while nothing is
-        recorded it is a fault, as is a recorder that shows no life for so long
+        recorded it is a fault
+    patience_s : a recorder that waits for the disk for longer is a fault, and one that shows no life for
+        another reason is replaced; None: the disk as long as it takes, the recorder for `PATIENT_RINGS` times
+        what the rings hold, and for ``stall_timeout_s`` at least
+    goes_on : a recording that ended since the disk was too slow goes on in a further segment
     tag_wait_s : how long lines wait for the tag that confirms them before they are flagged
     reopen_timeout_s : how long a camera that is gone is waited for; less than ``stall_timeout_s``, or the
         arm counts as stalled first
@@ -74,6 +81,8 @@ class CapturePlan:
     ring_reserve: int = 2
     watch: WatchPlan | None = None
     disk: Disk = DISK
+    patience_s: float | None = None
+    goes_on: bool = False
 
     def __post_init__(self) -> None:
         if tuple(sorted(self.openers)) != ARMS:
@@ -101,6 +110,18 @@ class CapturePlan:
         return RingShape(
             self.ring_slots, self.block_lines, self.pixels, self.dtype, OBSERVERS, self.ring_reserve
         )
+
+    @property
+    def ring_s(self) -> float:
+        """Seconds of lines that a ring holds at most; 0 where time is not told."""
+        return self.ring_slots * self.block_lines * self.line_period_ns / 1e9
+
+    @property
+    def hung_after_s(self) -> float:
+        """A recorder that shows no life for so long, and does not wait for the disk, is replaced."""
+        if self.patience_s is not None:
+            return self.patience_s
+        return max(self.stall_timeout_s, PATIENT_RINGS * self.ring_s)
 
     @property
     def grabbers(self) -> dict[str, tuple[str, ...]]:
@@ -143,6 +164,7 @@ class CaptureStatus:
         all 0 where it tells no time. The ``check`` of the code, where it is made: verdict, shift, and the
         line after the last looked at
     accounts : arm → what became of every pulse since arm
+    waiting : what is being waited for that takes longer than it should, in words; "" for nothing
     fault : what failed first, or None
     pids : process numbers: of the recorder, and of each grabber
     orphans : recordings that their recorder did not live to seal: to be recovered
@@ -158,6 +180,7 @@ class CaptureStatus:
     committed_lines: int = 0
     ring: dict[str, dict[str, int]] = field(default_factory=dict)
     lines: dict[str, dict[str, Any]] = field(default_factory=dict)
+    waiting: str = ""
     fault: str | None = None
     pids: dict[str, int] = field(default_factory=dict)
     condition: RunCondition | None = None

@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import multiprocessing
+import multiprocessing.process
 import os
 import pickle
 import select
@@ -16,6 +17,8 @@ import signal
 import sys
 import threading
 import time
+from collections import deque
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from acquire.errors import AcquireError, DeviceError
@@ -27,6 +30,7 @@ if TYPE_CHECKING:
     from types import FrameType
 
 _KILL_WAIT_S = 5.0
+_FLUSH_S = 0.1
 _IMPORTANT = -15
 """Niceness; threads that are started later have it as well."""
 
@@ -78,7 +82,10 @@ class Worker:
         context = multiprocessing.get_context("spawn")
         self.name = name
         self._sending = threading.Lock()
+        self._outbox: deque[object] = deque()
         self.pipe, theirs = context.Pipe()
+        self._has_room = select.poll()
+        self._has_room.register(self.pipe, select.POLLOUT)
         self._process = context.Process(
             target=_live, args=(theirs, name, target, *args), name=f"acquire-{name}", daemon=True
         )
@@ -99,10 +106,43 @@ class Worker:
             return None
         return f"killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
 
+    @property
+    def is_stopped(self) -> bool:
+        """A signal keeps the process from running, until another lets it go on."""
+        try:
+            state = Path(f"/proc/{self.pid}/stat").read_text(encoding="utf-8", errors="replace")
+        except OSError:
+            return False  # it has ended
+        return state.rpartition(") ")[2][:1] in ("T", "t")
+
     def post(self, message: object) -> None:
-        """Tell the child; in vain when it is dead, which `death` tells."""
-        with self._sending, contextlib.suppress(BrokenPipeError, ConnectionResetError):
-            self.pipe.send(message)
+        """Tell the child; in vain when it is dead, which `death` tells.
+
+        Never waits for a child that does not listen: what its pipe does not take is sent by a later `post` or
+        `flush`, in order.
+        """
+        self._outbox.append(message)
+        self.flush()
+
+    def flush(self) -> None:
+        """Send what the pipe takes by now of what was posted."""
+        with self._sending:
+            if self.pipe.closed:
+                self._outbox.clear()
+            try:
+                while self._outbox and self._has_room.poll(0):
+                    self.pipe.send(self._outbox.popleft())
+            except (BrokenPipeError, ConnectionResetError):
+                self._outbox.clear()
+
+    @property
+    def unsent(self) -> int:
+        """Messages that were posted, and that the pipe has not taken yet."""
+        return len(self._outbox)
+
+    def kill(self) -> None:
+        """End the process by force; it dies when the system lets it, which may take a disk's answer."""
+        self._process.kill()
 
     def message(self, timeout_s: float = 0.0) -> object | None:
         """The child's next message, or None when there is none."""
@@ -132,12 +172,21 @@ class Worker:
         if self.pipe.closed:
             return
         self.post(Quit())
-        self._process.join(max(0.0, deadline - time.monotonic()))
+        while self._process.exitcode is None and (left_s := deadline - time.monotonic()) > 0:
+            self.flush()
+            self._process.join(min(left_s, _FLUSH_S) if self._outbox else left_s)
         forced = self._process.exitcode is None
         if forced:
             self._process.kill()
             self._process.join(_KILL_WAIT_S)
         self.pipe.close()
+        if self._process.exitcode is None:
+            # Python would wait for it without a limit when this process ends.
+            multiprocessing.process._children.discard(self._process)  # type: ignore[attr-defined]
+            raise DeviceError(
+                f"{self.name}: the process was killed, and has not ended within {_KILL_WAIT_S:g} s",
+                hint="it waits for a disk or device that does not answer, and ends when that does",
+            )
         self._process.close()
         if forced:
             raise DeviceError(f"{self.name}: the process did not end when told to, and was killed")

@@ -23,7 +23,7 @@ from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -37,6 +37,7 @@ from acquire.stream.losses import Cause
 from acquire.stream.messages import (
     Began,
     Begin,
+    Cancel,
     End,
     Extend,
     Interrupt,
@@ -47,13 +48,13 @@ from acquire.stream.messages import (
 )
 from acquire.stream.process import OwnerGone, become_important
 from acquire.stream.session import OPEN_END, Session
-from acquire.stream.stalls import Arm, Backlog, Lent, find_stall
+from acquire.stream.stalls import HELD_UP_S, Arm, Backlog, HoldUps, Lent, find_stall
 from acquire.stream.tagger import Tagger
 from acquire.stream.window import Span, hold, span
 from acquire.stream.witness import Witness
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from acquire.stream.messages import Sealed
     from acquire.stream.process import Mailbox
@@ -64,14 +65,18 @@ if TYPE_CHECKING:
 COUNTERS = (
     *("recorded", "committed", "draining", "rows_a", "rows_b", "missing_a", "missing_b"),
     *("discarded_a", "discarded_b", "stored_a", "stored_b", "turns", "awaited_a", "awaited_b"),
-    *("unsaved_a", "unsaved_b", "overrun_a", "overrun_b", "overrun_to_a", "overrun_to_b", "writing"),
+    *("unsaved_a", "unsaved_b", "overrun_a", "overrun_b", "overrun_to_a", "overrun_to_b"),
+    *("disk_since_ns", "store_since_ns"),
 )
 """Of the latest recording: rows in both arms, rows that a reader finds, whether its last line is known; per
 arm the rows written and those of them that are missing. Since armed: per arm the lines taken from its ring
 that no recording holds, those that one does, and those that a disk which failed did not keep; those that
 found their ring full and are a gap in a recording, and the line after the last of these; turns of the loop,
-which stand still when it hangs, and whether it was writing lines then. The owner alone counts how often it
-has seen that an arm's next grabber is only starting: its silence means nothing then."""
+which stand still when it hangs or waits for the disk. Since when, by the monotonic clock, the loop waits for
+the disk, and the thread that creates and seals recordings is at work; 0 while they do not. The owner alone
+counts how often it has seen that an arm's next grabber is only starting: its silence means nothing then."""
+
+T = TypeVar("T")
 
 _WAIT_S = 0.02
 _COMMIT_INTERVAL_S = 0.1
@@ -97,6 +102,7 @@ class RecorderPlan:
     max_skew_lines: int
     realtime: bool = False
     disk: Disk = DISK
+    goes_on: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +112,7 @@ class Opening:
     begin: Begin
     span: Span | None
     writer: Future[RecordingWriter]
+    cancelled: bool = False
 
 
 def record(
@@ -159,6 +166,8 @@ class Recorder:
         self._owner = True
         self._busy = False
         self._commit_s = 0.0
+        self._hold_ups = HoldUps()
+        self._cut_short = False
         self._waited_in_vain_for = -1
         shape = rings[ARMS[0]].shape
         self._blank = np.zeros((shape.rows, shape.width), shape.dtype)
@@ -211,12 +220,16 @@ class Recorder:
                 self._line_rate_hz = clock.clock_hz / self._plan.run.line_period_ticks
             case Begin():
                 self._begin(message)
+            case Cancel() if self._opening is not None:
+                self._opening = replace(self._opening, span=None, cancelled=True)
+            case Cancel() if self._session is not None:
+                self._session.end(self._common_line(), "cancelled", RunCondition.INTERRUPTED)
             case Note():
                 self._note(message)
             case Extend(line) if self._session is not None:
                 self._session.extend(line)
-            case End(reason) if self._session is not None:
-                self._session.end(self._newest_line(), reason)
+            case End(reason, line) if self._session is not None:
+                self._session.end(self._newest_line() if line is None else line, reason)
             case Interrupt(reason, lost, cause):
                 self._interrupt(reason, dict.fromkeys(lost, cause))
 
@@ -230,7 +243,9 @@ class Recorder:
         except UsageError as error:
             self._mailbox.post(Refused(error))
             return
-        writer = self._disk.submit(RecordingWriter.prepare, begin.path, begin.spec, self._plan.disk)
+        writer = self._disk.submit(
+            self._in_store, RecordingWriter.prepare, begin.path, begin.spec, self._plan.disk
+        )
         self._opening = Opening(begin, span, writer)
 
     def _hold(self, begin: Begin) -> Span:
@@ -289,11 +304,14 @@ class Recorder:
             for name, lines in session.left_out.items():
                 # Of a block that was taken in part, all lines are counted as discarded.
                 self._forget(name, lines, session.end_line, "unsaved" if lines > 0 else "discarded")
-            self._mailbox.post(sealed.result())
+            ended = sealed.result()
+            if self._cut_short and ended.on_disk:
+                ended = replace(ended, end_line=session.end_line)
+            self._mailbox.post(ended)
 
     def _is_ready_for(self, opening: Opening) -> bool:
         """What waits goes first: a recording must not begin with rings that are about to overflow."""
-        if opening.span is not None or opening.writer.exception() is not None:
+        if opening.span is not None or opening.cancelled or opening.writer.exception() is not None:
             return True
         return all(2 * arm.ring.fill < arm.ring.shape.slots for arm in self._arms.values())
 
@@ -313,13 +331,16 @@ class Recorder:
         first_line = self._next_line() if opening.span is None else opening.span.first_line
         try:
             writer = opening.writer.result()
-            writer.begin(first_line)
+            self._check_wanted(opening, writer, first_line)
+            with self._at_disk():
+                writer.begin(first_line)
         except AcquireError as error:
-            self._mailbox.post(Refused(error))
+            self._refuse(opening, error)
             return
         except (OSError, ValueError, MemoryError) as error:
-            self._mailbox.post(Refused(DataError(f"the recording cannot be created: {error!r}")))
+            self._refuse(opening, DataError(f"the recording cannot be created: {error!r}"))
             return
+        self._cut_short = False
         self._session = self._new_session(writer, opening, first_line)
         for arm in self._arms.values():
             arm.revive(time.monotonic())
@@ -331,12 +352,27 @@ class Recorder:
         if self._trouble is not None:
             self._interrupt(*self._trouble)
 
+    def _refuse(self, opening: Opening, error: AcquireError) -> None:
+        if not opening.cancelled:  # else nobody waits for the answer
+            self._mailbox.post(Refused(error))
+
+    def _check_wanted(self, opening: Opening, writer: RecordingWriter, first_line: int) -> None:
+        """Raises UsageError for a recording that nobody wants any more, once nothing of it is left."""
+        end_line = opening.begin.end_line
+        if not opening.cancelled and (end_line is None or first_line < end_line):
+            return
+        with self._at_disk():
+            writer.abandon()
+        raise UsageError(f"start: line {first_line} is past the recording's end; nothing was recorded")
+
     def _new_session(self, writer: RecordingWriter, opening: Opening, first_line: int) -> Session:
         assert self._tagger is not None
         lines, at = opening.begin.lines, first_line
         if opening.span is not None:
             at = opening.span.at
             lines = None if opening.span.end_line is None else opening.span.end_line - first_line
+        elif opening.begin.end_line is not None:
+            lines = opening.begin.end_line - first_line
         session = Session(writer, self._tagger, self._blank, first_line, lines)
         self._witness.begin()
         session.doubted = self._witness.doubted()
@@ -365,9 +401,8 @@ class Recorder:
             except (AcquireError, OSError) as another:
                 error = error or another
         self._session = None
-        self._counters["writing"] = 0
         self._publish(session)
-        self._closing = session, self._disk.submit(session.close, error)
+        self._closing = session, self._disk.submit(self._in_store, session.close, error)
 
     # ---- tags and lines
 
@@ -396,6 +431,7 @@ class Recorder:
         """Let go of the arm's last block and take the next, if there is one that may go."""
         self._release(name, arm)
         self._listen_to(name, arm)
+        self._hold_ups.look()
         if self._opening is not None and self._opening.span is not None:
             return False  # it waits for the recording
         block = arm.ring.acquire()
@@ -419,9 +455,11 @@ class Recorder:
         """
         assert arm.lent is not None
         if (line := session.overrun(name, block)) is not None:
-            session.cut(line, f"too slow to write: the ring of arm {name} was full at line {line}")
+            self._cut_short = True
+            full = f"the ring of arm {name} was full at line {line}"
+            session.cut(line, f"too slow to write: {full}{self._held_up}")
         self._count_overrun(name, block, session)
-        with self._counting():
+        with self._at_disk():
             written = session.take(name, block, hurry=arm.ring.fill > _CALM_BLOCKS)
         if written:
             end_line = session.books[name].next_line
@@ -429,8 +467,11 @@ class Recorder:
         fill, slots = arm.ring.fill, arm.ring.shape.slots
         if arm.backlog.grows(fill, slots) and not session.ending:
             # Before the slot is released: nothing has been lost as long as the ring is not overtaken.
-            reason = f"too slow to write: {fill} of {slots} ring slots of arm {name} wait for disk or codec"
+            self._cut_short = True
+            waiting = f"{fill} of {slots} ring slots of arm {name} wait for disk or codec"
+            reason = f"too slow to write: {waiting}{self._held_up}"
             session.end(self._common_line(), reason, RunCondition.INTERRUPTED)
+        self._hold_ups.took(block.time_ns / 1e9)
 
     def _count_overrun(self, name: str, block: RingBlock, session: Session) -> None:
         """Lines that found the ring full are lost where a recording lists them; each once."""
@@ -448,18 +489,34 @@ class Recorder:
             return
         try:
             if self._session is not None:
-                with self._counting():
+                with self._at_disk():
                     self._session.give_back(name)
         finally:
             self._count(name, lent.first_line, lent.end_line)
             arm.ring.release()
 
+    @property
+    def _held_up(self) -> str:
+        """For an end reason."""
+        longest_s = self._hold_ups.longest_s
+        return f", after {longest_s:.1f} s without an answer of the disk" if longest_s >= 1 else ""
+
     @contextmanager
-    def _counting(self) -> Iterator[None]:
-        """Lines are being written: it may take its time."""
-        self._counters["writing"] = 1
-        yield
-        self._counters["writing"] = 0
+    def _at_disk(self) -> Iterator[None]:
+        """The loop waits for the disk, which may take its time."""
+        self._counters["disk_since_ns"] = time.monotonic_ns()
+        try:
+            yield
+        finally:
+            self._counters["disk_since_ns"] = 0
+
+    def _in_store(self, work: Callable[..., T], *args: Any) -> T:
+        """In the other thread: do what is told when it begins and ends."""
+        self._counters["store_since_ns"] = time.monotonic_ns()
+        try:
+            return work(*args)
+        finally:
+            self._counters["store_since_ns"] = 0
 
     def _may_go(self, ring: Ring, block: RingBlock) -> bool:
         """Nothing is gained by letting the block wait any longer for its tag."""
@@ -469,8 +526,10 @@ class Recorder:
 
     def _tags_overdue(self, confirmed_end: int, ring: Ring, block: RingBlock) -> bool:
         """The block has waited long enough; those after it do not wait at all until a tag comes again."""
-        waited_ns = time.monotonic_ns() - block.time_ns
-        if waited_ns > self._plan.tag_wait_s * 1e9 or 2 * ring.fill > ring.shape.slots:
+        now_s = time.monotonic()
+        waited_s = now_s - max(block.time_ns / 1e9, self._hold_ups.over_s)
+        is_pressing = 2 * ring.fill > ring.shape.slots and now_s > self._hold_ups.over_s + HELD_UP_S
+        if waited_s > self._plan.tag_wait_s or is_pressing:
             self._waited_in_vain_for = confirmed_end
         return self._waited_in_vain_for == confirmed_end
 
@@ -497,7 +556,8 @@ class Recorder:
     def _commit_now_and_then(self, session: Session) -> None:
         begun = time.monotonic()
         if begun >= self._commit_s:
-            session.commit()
+            with self._at_disk():
+                session.commit()
             ended = time.monotonic()
             self._commit_s = ended + max(_COMMIT_INTERVAL_S, (_COMMIT_SHARE - 1) * (ended - begun))
 
@@ -506,7 +566,7 @@ class Recorder:
         rows = {name: book.next_line - session.first_line for name, book in session.books.items()}
         counters["recorded"] = min(rows.values())
         counters["committed"] = session.committed_lines
-        counters["draining"] = session.ending
+        counters["draining"] = session.ending and not (self._cut_short and self._plan.goes_on)
         for name, book in session.books.items():
             counters[f"rows_{name}"] = rows[name]
             counters[f"missing_{name}"] = book.missing.total()

@@ -258,6 +258,13 @@ class Ring:
         return int(min(self._control[_HEAD] - tail, self.shape.slots))
 
     @property
+    def room_lines(self) -> int:
+        """Lines that find a free slot, if blocks stay as they were on the whole."""
+        head = int(self._control[_HEAD])
+        rows = self.committed_lines / head if head else self.shape.rows
+        return int((self.shape.slots - self.fill) * rows)
+
+    @property
     def newest_line(self) -> int:
         """The line after the last committed one; 0 before the first."""
         return int(self._control[_NEWEST])

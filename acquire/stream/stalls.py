@@ -25,6 +25,8 @@ NEARLY_FULL = 0.9
 PATIENCE_SHARE = 8
 """A ring that is more than half full says nothing before one part in so many of its slots was emptied: it may
 have leapt there in a pause."""
+HELD_UP_S = 0.25
+"""More than a busy host keeps a process waiting: what others said meanwhile has still to be heard."""
 _LONGEST_LOOK_S = 0.5
 _EXCESS_S = 1.0
 
@@ -63,6 +65,30 @@ class Backlog:
         if not self._caught_up or self._taken <= max(1, slots // PATIENCE_SHARE):
             return False
         return fill >= max(self._first_fill, NEARLY_FULL * slots)
+
+
+class HoldUps:
+    """When a loop was held up last, and for how long."""
+
+    def __init__(self) -> None:
+        self._seen_s = time.monotonic()
+        self.over_s = 0.0
+        """When the last hold-up was over."""
+        self.longest_s = 0.0
+        """Of those that may have to do with the lines which are taken now."""
+
+    def look(self) -> None:
+        """To be called between any two things that may take time."""
+        now_s = time.monotonic()
+        held_s, self._seen_s = now_s - self._seen_s, now_s
+        if held_s > HELD_UP_S:
+            self.over_s = now_s
+            self.longest_s = max(self.longest_s, held_s)
+
+    def took(self, come_s: float) -> None:
+        """Lines were taken that had come at this moment: those that came in hold-ups before are done with."""
+        if come_s > self.over_s:
+            self.longest_s = 0.0
 
 
 @dataclass(frozen=True, slots=True)

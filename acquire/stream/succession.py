@@ -7,6 +7,8 @@
     recorder killed  ─▶ another begins a recording beside the one that was cut off, from the first line on
                         that this one's last commit does not cover; what the ring does not hold any more
                         is a gap, `Cause.RECORDER_LOST`; the one that was cut off is an `Orphan`
+    disk too slow    ─▶ the recording ends, sealed, and the same recorder begins another beside it as soon as
+                        the disk lets it; what came between is an outage, and part of neither
 
 A process that ended with a word of its own (an error of its camera, a full disk) has said why it cannot go
 on; nobody takes its place.
@@ -14,6 +16,7 @@ on; nobody takes its place.
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -32,6 +35,9 @@ if TYPE_CHECKING:
 
 MOST = 5
 """Successors of one process in a run: what dies more often has a reason."""
+_SHORT_S = 60.0
+"""A segment that lasts for less says that the disk still has trouble."""
+_LONGEST_WAIT_S = 60.0
 READY_S = 20.0
 """How long a successor may take until it is ready."""
 
@@ -42,6 +48,41 @@ class Orphan:
 
     path: Path
     why: str
+
+
+class Resumption:
+    """When a recording that the disk has ended goes on in a further segment.
+
+    At once, and ever later where the disk takes no segment for long: a disk that is too slow for good must
+    not be filled with short ones.
+    """
+
+    def __init__(self) -> None:
+        self._failures = 0
+        self._began_s = -math.inf
+        self._due_s: float | None = None
+        self.why = ""
+        """Why the recording has not gone on yet; "" where it has."""
+
+    def began(self, now_s: float) -> None:
+        """The recording goes on."""
+        self._began_s = now_s
+        self._due_s, self.why = None, ""
+
+    def ended(self, now_s: float, why: str) -> None:
+        """A segment ended, or could not begin."""
+        self.why = why
+        self._failures = 0 if now_s - self._began_s > _SHORT_S else self._failures + 1
+        self._began_s = now_s
+        wait_s = 2.0 ** (self._failures - 2) if self._failures > 1 else 0.0
+        self._due_s = now_s + min(wait_s, _LONGEST_WAIT_S)
+
+    def is_due(self, now_s: float) -> bool:
+        """It is to be tried now; said once."""
+        if self._due_s is None or now_s < self._due_s:
+            return False
+        self._due_s = None
+        return True
 
 
 @dataclass(slots=True)
@@ -105,8 +146,23 @@ def continuation(begin: Begin, began: Began, committed_lines: int, why: str) -> 
     return replace(begin, path=path, spec=replace(spec, continues=follows), lines=None, window=window)
 
 
+def resumed(begin: Begin, began: Began, end_line: int, why: str) -> Begin | None:
+    """What has a recorder go on with a recording that it sealed after ``end_line`` lines, if that has an end
+    to come: from the next line on, up to the same end.
+    """
+    if began.end_line is not None and began.end_line <= end_line:
+        return None
+    spec, before = begin.spec, begin.spec.continues
+    first, number = (begin.path.name, 2) if before is None else (before.first, before.number + 1)
+    follows = Continuation(first, number, end_line, readout_ns(spec, end_line), why)
+    window = Window(kind="resumed", text=f"goes on from {begin.path.name}: {why}")
+    path = free_name(begin.path.with_name(first))
+    spec = replace(spec, continues=follows)
+    return replace(begin, path=path, spec=spec, lines=None, window=window, end_line=began.end_line)
+
+
 def once_more(following: Begin) -> Begin:
-    """A continuation for another recorder, since the one it was for was killed before it had begun."""
+    """A continuation that is tried again, since it could not begin."""
     assert following.spec.continues is not None
     return replace(following, path=free_name(following.path.with_name(following.spec.continues.first)))
 

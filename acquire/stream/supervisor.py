@@ -8,21 +8,42 @@ import contextlib
 import threading
 import time
 from collections import deque
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from acquire.errors import AcquireError, DeviceError, TriggerError
 from acquire.lines import ARMS
-from acquire.stream.messages import Began, Checked, End, Failed, Interrupt, Note, Ready, Refused, Sealed
+from acquire.stream.messages import (
+    Began,
+    Cancel,
+    Checked,
+    End,
+    Extend,
+    Failed,
+    Interrupt,
+    Note,
+    Ready,
+    Refused,
+    Sealed,
+)
 from acquire.stream.stalls import Excess, Heartbeat
-from acquire.stream.succession import Orphan, Succession, continuation, obituary, once_more
+from acquire.stream.succession import (
+    Orphan,
+    Resumption,
+    Succession,
+    continuation,
+    obituary,
+    once_more,
+    resumed,
+)
 from acquire.stream.tagger import tag_rows
 from acquire.stream.witness import TRIGGER, TRIGGER_COUNTERS, WATCHER
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from pathlib import Path
 
     from acquire.stream.messages import Begin
+    from acquire.stream.plan import CapturePlan
     from acquire.stream.process import Worker
     from acquire.stream.ring import Ring
     from acquire.stream.shared import Counters
@@ -43,7 +64,7 @@ _ASK_EVERY_S = 1.0
 class Supervisor:
     """Owns the thread. What it learnt can be read at any time: `began`, `sealed`, `fault`.
 
-    With ``margin_lines`` it holds the cameras' count of lines against the trigger's (`stalls.Excess`).
+    Where time is told, it holds the cameras' count of lines against the trigger's (`stalls.Excess`).
 
     Attributes
     ----------
@@ -59,9 +80,7 @@ class Supervisor:
         workers: dict[str, Worker],
         tags: Ring,
         counters: dict[str, Counters],
-        stall_timeout_s: float,
-        margin_lines: int | None = None,
-        grabbers: Mapping[str, tuple[str, ...]] | None = None,
+        plan: CapturePlan,
         succession: Succession | None = None,
     ) -> None:
         self.began: Began | None = None
@@ -71,15 +90,15 @@ class Supervisor:
         self._trigger = trigger
         self._workers = workers
         self._succession = succession or Succession({})
-        self._counters = counters
         self._asked: Begin | None = None
         self._begin: Begin | None = None
         self._end_reason: str | None = None
         self._tags = tags
-        self._stall_timeout_s = stall_timeout_s
+        self._plan = plan
         self._loop = Heartbeat(counters[RECORDER], "turns")
         self._cameras = {arm: Heartbeat(counters[arm], "delivered") for arm in ARMS}
-        self._arms_of = grabbers or {arm: (arm,) for arm in ARMS}
+        self._arms_of = plan.grabbers
+        margin_lines = plan.margin_lines
         self._excess = {arm: Excess(counters[arm], margin_lines) for arm in ARMS if margin_lines is not None}
         self._counters = counters
         self._ask_s = 0.0
@@ -92,6 +111,9 @@ class Supervisor:
         self._orphans: list[Orphan] = []
         self._kept: dict[str, deque[tuple[int, int]]] = {arm: deque(maxlen=_MOST_KEPT) for arm in ARMS}
         self._going_on = False
+        self._resumption = Resumption()
+        self._cut_short: Sealed | None = None
+        self._hung: str | None = None
         self._last_words: dict[str, str] = {}
         self._news = threading.Condition()
         self._ending = threading.Event()
@@ -101,6 +123,16 @@ class Supervisor:
     def recording(self) -> bool:
         """A recording is open, as far as the living can tell."""
         return self.began is not None and self.sealed is None and RECORDER not in self._dead
+
+    @property
+    def silent_s(self) -> float:
+        """How long the recorder has shown no life."""
+        return self._loop.still_s
+
+    @property
+    def resuming(self) -> str:
+        """Why a recording that the disk ended has not gone on yet, in words; "" where it has."""
+        return self._resumption.why
 
     @property
     def dead(self) -> frozenset[str]:
@@ -153,7 +185,8 @@ class Supervisor:
     def begin(self, message: Begin) -> None:
         """Have the recorder begin; returns when it has. Raises what it refuses with."""
         with self._news:
-            self.began = self.sealed = self._refused = self._begin = self._end_reason = None
+            self.began = self.sealed = self._refused = self._begin = self._end_reason = self._cut_short = None
+            self._resumption = Resumption()
             self._asked = message
             self._workers[RECORDER].post(message)
             self._news.wait_for(lambda: self.began or self._refused or self.fault, _ANSWER_S)
@@ -163,19 +196,41 @@ class Supervisor:
                 return
             if self._refused is not None:
                 raise self._refused.error
+            if self.fault is None:
+                self._end_reason = "cancelled"  # should it begin all the same
+                self._workers[RECORDER].post(Cancel())
         if self.fault is None:
-            self._fail(f"recorder: no answer within {_ANSWER_S:g} s")
+            raise DeviceError(
+                f"start: the recorder has not begun within {_ANSWER_S:g} s: {self._excuse()}",
+                possible="nothing was recorded",
+                hint="start again once the disk answers",
+            )
         raise DeviceError(f"start: {self.fault}")
 
-    def end_recording(self, reason: str) -> None:
-        """Have the recording end at the newest line; a recorder that is only starting will hear of it."""
-        self._end_reason = reason
-        self._workers[RECORDER].post(End(reason))
+    def end_recording(self, reason: str, line: int) -> None:
+        """Have the recording end at ``line``; a recorder that is only starting will hear of it."""
+        with self._news:
+            self._end_reason = reason
+            self._stay_ended()
+        self._workers[RECORDER].post(End(reason, line))
+
+    def extend(self, line: int) -> None:
+        """Let the recording not end before ``line``, unless it is ending already."""
+        with self._news:
+            if self.began is not None and self.began.end_line is not None:
+                self.began = replace(self.began, end_line=max(line, self.began.end_line))
+                if self._cut_short is not None and self._begin is not None:
+                    self._begin = replace(self._begin, end_line=self.began.end_line)
+        self._workers[RECORDER].post(Extend(line))
 
     def happened(self, note: Note) -> None:
-        """Tell the recorder, and whoever asks with `take_events`."""
+        """Tell the recorder, and whoever asks with `take_events`.
+
+        A recorder that does not listen hears of the first of them only.
+        """
         self._events.append(note)
-        self._workers[RECORDER].post(note)
+        if self._workers[RECORDER].unsent < _MOST_EVENTS:
+            self._workers[RECORDER].post(note)
 
     def take_events(self) -> list[Note]:
         """What happened since the last call; the latest, if it was too much."""
@@ -200,6 +255,8 @@ class Supervisor:
         self._ask_trigger(begun)
         for name, worker in self._workers.items():
             self._hear(name, worker)
+            worker.flush()
+        self._resume_when_due()
         if self.fault is None:
             self._watch(time.monotonic())
         if not tags:  # a trigger that does not wait by itself must not make this loop spin
@@ -247,12 +304,10 @@ class Supervisor:
         self._tags.commit(0, len(tags))
 
     def _watch(self, now_s: float) -> None:
-        """A recorder that hangs is a fault. So is a silent arm; in a recording, the recorder judges it."""
-        limit_s = self._stall_timeout_s
+        """A silent arm is a fault; in a recording, the recorder judges it."""
+        limit_s = self._plan.stall_timeout_s
         self._bear_with_successors()
-        if self._loop.look(now_s) > limit_s:
-            doing = ", while it writes to the disk" if self._counters[RECORDER]["writing"] else ""
-            self._fail(f"{self._workers[RECORDER].name}: no sign of life for {limit_s:g} s{doing}")
+        self._watch_recorder(now_s)
         self._watch_counts(now_s)
         if self.recording:
             for camera in self._cameras.values():
@@ -262,6 +317,28 @@ class Supervisor:
             # Arms that fall silent together do so to within a block: half the limit tells both from one.
             arms = " and ".join(arm for arm in ARMS if silent_s[arm] > limit_s / 2)
             self._fail(f"arm {arms}: no line for {limit_s:g} s")
+
+    def _watch_recorder(self, now_s: float) -> None:
+        """One that hangs is replaced. A disk is waited for: the rings keep what comes meanwhile."""
+        silent_s, patience_s = self._loop.look(now_s), self._plan.patience_s
+        if self._hung is not None:
+            if silent_s > 2 * self._plan.hung_after_s:
+                self._fail(f"{self._hung}; it was killed, and has not ended")
+        elif self.waits_for_disk:
+            if patience_s is not None and silent_s > patience_s:
+                self._fail(f"the disk has not answered for {patience_s:g} s")
+        elif silent_s > self._plan.hung_after_s:
+            self._hung = f"{self._workers[RECORDER].name}: no sign of life for {self._plan.hung_after_s:g} s"
+            self._workers[RECORDER].kill()
+
+    def _excuse(self) -> str:
+        waits = self._counters[RECORDER]["disk_since_ns"] or self._counters[RECORDER]["store_since_ns"]
+        return "it waits for the disk" if waits else f"no sign of life for {self.silent_s:.1f} s"
+
+    @property
+    def waits_for_disk(self) -> bool:
+        """The recorder's loop does; not one that was stopped by a signal while it did."""
+        return bool(self._counters[RECORDER]["disk_since_ns"]) and not self._workers[RECORDER].is_stopped
 
     def _bear_with_successors(self) -> None:
         for name in self._workers:
@@ -284,6 +361,8 @@ class Supervisor:
 
     def _hear(self, name: str, worker: Worker) -> None:
         death = worker.death  # looked at before the messages: what a process said last counts
+        if death and name == RECORDER and self._hung is not None:
+            death = f"{death} after {self._hung.partition(': ')[2]}"
         while (message := worker.message()) is not None:
             self._note(name, message)
         if death and name not in self._dead:
@@ -310,6 +389,7 @@ class Supervisor:
             return False
         self._workers[name] = successor
         worker.end(time.monotonic())
+        self._hung = None
         for arm in self._arms_of.get(name, ()):
             self._cameras[arm].revive()
         self._loop.revive()
@@ -324,7 +404,7 @@ class Supervisor:
 
     def _go_on(self, begin: Begin, began: Began, death: str) -> Begin:
         """With the recording of a recorder that was killed, beside it."""
-        if self._going_on:  # and the counters may be neither's
+        if self._going_on or self._cut_short is not None:  # and the counters may be neither's
             following = once_more(begin)
         else:
             following = continuation(begin, began, self._counters[RECORDER]["committed"], death)
@@ -341,14 +421,13 @@ class Supervisor:
                 case Ready():
                     self._succession.ready(name)
                 case Began():
-                    self.began, self._going_on = message, False
+                    self.began, self._going_on, self._cut_short = message, False, None
+                    self._resumption.began(time.monotonic())
+                    self.path = self._begin.path if self._begin else self.path
                     if self._end_reason is not None:
                         self._workers[RECORDER].post(End(self._end_reason))
-                case Refused(error) if self._begin is not None:
-                    self._last_words[name] = f"the recording cannot go on: {error}"
-                    self.fault = self.fault or f"{self._workers[name].name}: {self._last_words[name]}"
-                case Refused():
-                    self._refused = message
+                case Refused(error):
+                    self._take_refusal(name, message, error)
                 case Sealed():
                     self._take_end(message)
                 case Note():
@@ -360,18 +439,57 @@ class Supervisor:
                     self._last_words[name] = str(error).removeprefix(f"{self._workers[name].name}: ")
             self._news.notify_all()
 
+    def _take_refusal(self, name: str, refused: Refused, error: AcquireError) -> None:
+        """Of a first recording, or of one that goes on after a disk's trouble or a recorder's death."""
+        if self._cut_short is not None:
+            self._resumption.ended(time.monotonic(), error.message)
+        elif self._begin is None:
+            self._refused = refused
+        else:
+            self._last_words[name] = f"the recording cannot go on: {error}"
+            self.fault = self.fault or f"{self._workers[name].name}: {self._last_words[name]}"
+
     def _take_end(self, sealed: Sealed) -> None:
-        if self.began is not None:
-            first = self.began.first_line
-            for arm, ranges in self._kept.items():
-                ranges.append((first, first + self._counters[RECORDER][f"rows_{arm}"]))
-        self.sealed = sealed
+        self._note_kept()
         if not sealed.on_disk and self.path is not None:
             self._orphans.append(Orphan(self.path, sealed.end_reason))
+        begin, began, is_over = self._begin, self.began, self._end_reason or self.fault
+        following = None
+        if self._plan.goes_on and sealed.end_line is not None and begin and began and not is_over:
+            following = resumed(begin, began, sealed.end_line, sealed.end_reason)
+        if following is None:
+            self.sealed = sealed
+            return
+        self._begin, self._cut_short = following, sealed
+        self._resumption.ended(time.monotonic(), sealed.end_reason)
+
+    def _note_kept(self) -> None:
+        if self.began is None:
+            return
+        first = self.began.first_line
+        for arm, ranges in self._kept.items():
+            ranges.append((first, first + self._counters[RECORDER][f"rows_{arm}"]))
+
+    def _resume_when_due(self) -> None:
+        """Have a recording that the disk ended go on in a further segment."""
+        with self._news:
+            if self._begin is None or not self._resumption.is_due(time.monotonic()):
+                return
+            self._begin = once_more(self._begin)
+        self._workers[RECORDER].post(self._begin)
+
+    def _stay_ended(self) -> None:
+        """Nobody wants the further segment any more that has not begun yet."""
+        if self._cut_short is not None:
+            self.sealed, self._cut_short = self._cut_short, None
+            self._resumption = Resumption()
+            self._workers[RECORDER].post(Cancel())
+            self._news.notify_all()
 
     def _fail(self, text: str, name: str | None = None) -> None:
         """Keep the first fault, and have the recording sealed if the recorder lives."""
         with self._news:
             self.fault = self.fault or text
+            self._stay_ended()
             self._news.notify_all()
         self._workers[RECORDER].post(Interrupt(text, self._arms_of.get(name or "", ())))

@@ -123,26 +123,19 @@ def test_killed_processes_are_replaced(start: Start) -> None:
     assert open_recording(path).lines >= 300
 
 
-@pytest.mark.parametrize("recording", [False, True])
-def test_a_process_that_hangs_is_a_fault(start: Start, recording: bool) -> None:
-    """A camera while armed, the recorder while recording: told, ended by force, and the daemon goes on."""
+def test_a_camera_that_hangs_is_a_fault(start: Start) -> None:
+    """Told, ended by force, and the daemon goes on."""
     daemon = start()
-    if recording:
-        path = record(daemon)
     with daemon.client() as client:
-        if not recording:
-            client.arm()
+        client.arm()
         workers = daemon.workers()
-        (workers[0] if recording else workers[-1]).suspend()
+        workers[-1].suspend()
         status = client.wait({State.FAULTED}, 60)
-        told = "recorder: no sign of life for 3 s" if recording else "arm b: no line for 3 s"
-        assert str(status.fault).startswith(told)
+        assert str(status.fault).startswith("arm b: no line for 3 s")
         until_gone(workers)
         client.disarm()
         client.arm()
         client.disarm()
-    if recording:
-        assert open_recording(path).lines >= 300
 
 
 def test_a_disk_that_ends_the_recording_is_a_fault(start: Start) -> None:

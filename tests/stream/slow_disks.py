@@ -79,3 +79,55 @@ class FailingFile(ShardFile):
         if offset + size > self._disk.after_bytes:
             self._disk.fail()
         super().write_pages(parts, offset)
+
+
+@dataclass(frozen=True)
+class PausingDisk(Disk):
+    """Does not answer what is asked ``at`` some of its operations, as long as the file ``gate`` exists."""
+
+    gate: Path
+    at: str
+
+    @property
+    def held(self) -> Path:
+        """Exists once something has been held up: who waits is in another process."""
+        return self.gate.with_name("held")
+
+    def create(self, path: Path, *, direct: bool) -> ShardFile:
+        self.pause("create")
+        return PausingFile(path, direct=direct, disk=self)
+
+    def make_directory(self, path: Path, *, parents: bool = False) -> None:
+        self.pause("make")
+        super().make_directory(path, parents=parents)
+
+    def rename(self, source: Path, target: Path) -> None:
+        self.pause("commit")
+        super().rename(source, target)
+
+    def sync_tree(self, path: Path) -> None:
+        self.pause("seal")
+        super().sync_tree(path)
+
+    def remove(self, path: Path) -> None:
+        self.pause("delete")
+        super().remove(path)
+
+    def pause(self, operation: str) -> None:
+        while operation == self.at and self.gate.exists():
+            self.held.touch()
+            time.sleep(0.005)
+
+
+class PausingFile(ShardFile):
+    def __init__(self, path: Path, *, direct: bool, disk: PausingDisk) -> None:
+        super().__init__(path, direct=direct)
+        self._disk = disk
+
+    def write_pages(self, parts: Sequence[Any], offset: int) -> None:
+        self._disk.pause("pages")
+        super().write_pages(parts, offset)
+
+    def sync(self) -> None:
+        self._disk.pause("sync")
+        super().sync()

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -43,13 +44,13 @@ WAIT_S = 300.0
 
 
 @contextlib.contextmanager
-def capturing(disk: Disk, load: Load = LOAD) -> Iterator[Capture]:
+def capturing(disk: Disk, load: Load = LOAD, **changes: Any) -> Iterator[Capture]:
     wire = Wire()
     model = TriggerModel(wire, CLOCK_HZ, load.speed)
     trigger = TriggerDriver(partial(TwinTransport, model), TriggerConfig(tag_every_lines=load.block_lines))
-    capture = Capture(replace(capture_plan(load, wire), realtime=False, disk=disk), trigger)
+    capture = Capture(replace(capture_plan(load, wire), realtime=False, disk=disk, **changes), trigger)
     try:
-        capture.arm()
+        capture.arm(2 * WAIT_S)
         yield capture
     finally:
         capture.close()

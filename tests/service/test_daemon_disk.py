@@ -1,0 +1,176 @@
+"""A daemon whose disk or recorder pauses: waited out, told, and gone on after, without anybody's help."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import frozen_disk
+import numpy as np
+import pytest
+from live_daemon import SUBSTEPS, Daemon, until_gone
+from waiting import until
+
+from acquire.daemon.client import Client
+from acquire.daemon.messages import Status
+from acquire.daemon.states import State
+from acquire.errors import DataError
+from acquire.store import Recording, open_recording, verify
+
+LONG_RING = "stream.ring_slots=4096"
+"""26 s of lines: a busy host is slow to come back."""
+SHORT_RING = "stream.ring_slots=256"
+"""1.6 s of lines."""
+SMALL_DISK = "recording.reserve_gb=0.01"
+
+
+@contextmanager
+def recording(home: Path, path: Path, *settings: str) -> Iterator[tuple[Daemon, Client]]:
+    """A daemon that records to ``path``, some lines of which are committed."""
+    daemon = Daemon(home, *settings)
+    try:
+        with daemon.client() as client:
+            client.arm()
+            client.start(path)
+            until(lambda: committed(client.status()) > 300, "committed lines")
+            yield daemon, client
+    finally:
+        daemon.close()
+
+
+def committed(status: Status) -> int:
+    return 0 if status.recording is None else status.recording.committed_lines
+
+
+def waits(client: Client, text: str) -> Callable[[], bool]:
+    """What is waited for is told; meanwhile nothing is given up."""
+
+    def told() -> bool:
+        status = client.status()
+        assert (status.state, status.fault) == (State.RECORDING, None)
+        return text in (status.waiting or "")
+
+    return told
+
+
+def ended(client: Client) -> Status:
+    """The recording is sealed, and the devices are released."""
+    client.stop()
+    if client.status().state is State.ARMED:
+        client.disarm()
+    return client.wait({State.IDLE}, 60)
+
+
+def check_whole(recording: Recording) -> None:
+    assert recording.state == "sealed"
+    assert not recording.gaps
+    assert verify(recording.path).intact
+    index = np.arange(recording.lines, dtype=np.uint64) + np.uint64(recording.first_line)
+    for arm in "ab":
+        camera = recording.camera(arm)
+        assert np.array_equal(camera.code_index[:], np.uint64(SUBSTEPS) * index)
+        assert not camera.flags[:].any()
+
+
+def check_books(status: Status, *recordings: Recording) -> None:
+    for arm in status.arms.values():
+        assert arm.ledger is not None
+        assert arm.ledger.balanced
+        assert sum(arm.lost.values()) == sum(arm.ledger.lost.values()) == 0
+        assert arm.ledger.stored == sum(recording.lines for recording in recordings)
+
+
+def test_a_recorder_that_pauses_for_seconds_is_waited_for(tmp_path: Path) -> None:
+    path = tmp_path / "x.zarr"
+    with recording(tmp_path, path, LONG_RING) as (daemon, client):
+        pid = client.status().processes["recorder"]
+        os.kill(pid, signal.SIGSTOP)
+        until(waits(client, "for 5 s; the rings hold "), "the words")
+        assert "waiting" in daemon("status").out
+        os.kill(pid, signal.SIGCONT)
+        until(lambda: client.status().waiting is None, "the end of the pause")
+        status = ended(client)
+    assert status.last is not None
+    assert (status.last.path, status.last.condition, status.last.end_reason) == (path, "GOOD", "stopped")
+    found = open_recording(path)
+    check_whole(found)
+    check_books(status, found)
+
+
+def test_a_recorder_that_pauses_for_long_costs_no_recorded_line(tmp_path: Path) -> None:
+    """The recording ends where the rings were full, and goes on in a segment beside it."""
+    path = tmp_path / "x.zarr"
+    with recording(tmp_path, path, SHORT_RING) as (_, client):
+        pid = client.status().processes["recorder"]
+        os.kill(pid, signal.SIGSTOP)
+        until(waits(client, "the rings are full"), "full rings")
+        os.kill(pid, signal.SIGCONT)
+        until(lambda: (now := client.status().recording) is not None and now.path != path, "a segment")
+        until(lambda: committed(client.status()) > 300, "committed lines")
+        status = ended(client)
+    assert status.fault is None
+    first = open_recording(path)
+    parts = [first, *first.segments]  # a busy host may fill a ring this short more than once
+    assert len(parts) > 1
+    for part in parts:
+        check_whole(part)
+    check_books(status, *parts)
+
+
+@pytest.mark.needs_freeze
+def test_a_disk_that_freezes_is_waited_for_and_the_recording_goes_on(tmp_path: Path) -> None:
+    """Frozen once for as long as the rings hold, then for longer."""
+    with frozen_disk.mounted(tmp_path) as disk:
+        path, second = disk.path / "x.zarr", disk.path / "x-2.zarr"
+        with recording(tmp_path, path, SMALL_DISK) as (_, client):
+            for text in ("the disk has not answered for 2 s; the rings hold ", "the rings are full"):
+                disk.freeze()
+                until(waits(client, text), "the words")
+                disk.thaw()
+                until(lambda: client.status().waiting is None, "the end of the pause")
+            until(lambda: (now := client.status().recording) is not None and now.path == second, "a segment")
+            until(lambda: committed(client.status()) > 300, "committed lines")
+            status = ended(client)
+        one, two = open_recording(path), open_recording(second)
+        for found in (one, two):
+            check_whole(found)
+        assert (one.attrs["run_condition"], two.attrs["run_condition"]) == ("INTERRUPTED", "GOOD")
+        assert [segment.path for segment in one.segments] == [second]
+        assert one.lines > 60_000  # both pauses are in it, as far as the rings held them
+        check_books(status, one, two)
+
+
+@pytest.mark.needs_freeze
+def test_a_daemon_ends_although_its_disk_does_not_answer(tmp_path: Path) -> None:
+    """In bounded time; what it left is recovered by the next one, once the disk answers."""
+    with frozen_disk.mounted(tmp_path) as disk:
+        path = disk.path / "x.zarr"
+        home, again = tmp_path / "1", tmp_path / "2"
+        home.mkdir()
+        again.mkdir()
+        with recording(home, path, SMALL_DISK, "recording.seal_timeout_s=2") as (daemon, client):
+            disk.freeze()
+            until(waits(client, "the disk has not answered"), "the words")
+            acknowledged = committed(client.status())
+            children = daemon.children()
+            daemon.process.send_signal(signal.SIGTERM)
+            daemon.process.wait(90)
+            disk.thaw()
+            until_gone(children)
+        other = Daemon(again, SMALL_DISK, f"recording.directory='{disk.path}'")
+        try:
+            until(lambda: state_of(path) == "sealed", "the recovery")
+        finally:
+            other.close()
+        assert open_recording(path).lines >= acknowledged
+
+
+def state_of(path: Path) -> str:
+    """Of a recording that somebody may be writing."""
+    try:
+        return str(open_recording(path).state)
+    except DataError:
+        return ""
