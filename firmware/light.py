@@ -35,7 +35,7 @@ class Light(wiring.Component):
 
     def elaborate(self, platform: object) -> Elaboratable:
         m = Module()
-        clock, shown = Signal(24), Signal()
+        clock, shown, glows = Signal(24), Signal(), Signal()
         with m.If(self.advance):
             m.d.sync += [self.lit.eq(self.code_bit & ~self.ending), clock.eq(0)]
         with m.Else():
@@ -44,6 +44,7 @@ class Light(wiring.Component):
         gate = ~self.scene_enable | self.scene_gate
         m.d.sync += [
             shown.eq(self.lit & window & self.enable),
-            self.led.eq((shown & gate) ^ self.inverted),
+            glows.eq(shown & gate),
         ]
+        m.d.comb += self.led.eq(glows ^ self.inverted)  # dark from power-up on, whichever level that is
         return m

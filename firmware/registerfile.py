@@ -18,7 +18,7 @@ from amaranth.lib.wiring import In, Out
 
 from acquire.trigger import registers as r
 
-ADDRESS_BITS = (max(register.address + register.words for register in r.REGISTERS) - 1).bit_length()
+ADDRESS_BITS = (r.MAP_END - 1).bit_length()
 READ_LATENCY = 2
 GROUP = 8
 """Words that the first stage of the read multiplexer chooses from."""
@@ -36,11 +36,14 @@ class RegisterFile(wiring.Component):
     write: In(1)
     write_data: In(32)
 
-    def __init__(self, constants: dict[r.Register, int]) -> None:
+    def __init__(self, constants: dict[r.Register, int], resets: dict[r.Register, int]) -> None:
+        """``resets``: values at power-up of a board that needs others than the definition's."""
         super().__init__()
         self._constants = constants
         self._values = {
-            register.name: Signal(register.width, name=register.name.lower(), init=register.reset)
+            register.name: Signal(
+                register.width, name=register.name.lower(), init=resets.get(register, register.reset)
+            )
             for register in r.REGISTERS
             if register.access not in {"constant", "command"}
         }

@@ -59,6 +59,8 @@ class Build:
     code_words: int = WORDS
     tags: int = 1024
     rx_bytes: int = 2048
+    light_low: bool = False
+    """The light is lit by a low level: the output is high from the first clock on."""
 
     @property
     def divisor(self) -> int:
@@ -89,10 +91,15 @@ class Build:
                 pps=1,
                 scene_gate=1,
                 external_arm=1,
+                light_low=self.light_low,
                 start_latency=START_LATENCY,
             ),
             r.QUEUES: r.QUEUES.pack(tags=self.tags, rx_bytes=self.rx_bytes),
         }
+
+    def resets(self) -> dict[r.Register, int]:
+        """Registers that this build resets to another value than the definition's."""
+        return {r.LED: r.LED.pack(invert=1)} if self.light_low else {}
 
 
 class SyncTrigger(wiring.Component):
@@ -138,7 +145,7 @@ class SyncTrigger(wiring.Component):
 
     def _parts(self, m: Module) -> None:
         build = self.build
-        self.file = m.submodules.registers = RegisterFile(build.constants())
+        self.file = m.submodules.registers = RegisterFile(build.constants(), build.resets())
         self.host = m.submodules.host = Host(build.code_words)
         self.code = m.submodules.code = CodeSource(self.file, build.code_words)
         self.checks = m.submodules.checks = Checks(self.file, 32 * build.code_words)

@@ -25,7 +25,6 @@ SUBSTEP_MAX_LOG2 = 24
 LEAD_MARGIN = 1
 INPUTS = ("pps", "external_arm")
 _SUBSTEPS = (1, 2, 3, 6)
-_END = r.REGISTERS[-1].address + r.REGISTERS[-1].words
 _REGISTER_AT = {register.address + i: register for register in r.REGISTERS for i in range(register.words)}
 
 
@@ -78,7 +77,12 @@ class RegisterBank:
         self.code_checked = False
 
     def read(self, address: int, count: int) -> list[int]:
-        """Words, all of one moment; Refusal where there are none."""
+        """Words, all of one moment; Refusal, about the first of them, where there are not so many."""
+        in_code = address >= r.CODE_MEMORY
+        if address + count > (r.CODE_MEMORY + len(self._memory) // 4 if in_code else r.MAP_END):
+            raise Refusal(ErrorCode.BAD_ADDRESS, address)
+        if in_code:
+            self._demand_rest(address)
         for register, value in self._status.items():
             if register.address < address + count and register.address + register.words > address:
                 self.put(register, value())
@@ -88,8 +92,6 @@ class RegisterBank:
         at = (address - r.CODE_MEMORY) * 4
         if 0 <= at < len(self._memory):
             return int.from_bytes(self._memory[at : at + 4], "little")
-        if not 0 <= address < _END:
-            raise Refusal(ErrorCode.BAD_ADDRESS, address)
         return self._words.get(address, 0)
 
     def write(self, address: int, word: int) -> None:
@@ -102,7 +104,7 @@ class RegisterBank:
             return
         register = _REGISTER_AT.get(address)
         if register is None:
-            if word or not 0 <= address < _END:
+            if word or not 0 <= address < r.MAP_END:
                 raise Refusal(ErrorCode.BAD_ADDRESS, address)
             return
         self._write_register(register, address, word)

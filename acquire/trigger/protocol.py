@@ -37,39 +37,55 @@ class State(IntEnum):
     """STATUS.state."""
 
     IDLE = 0
+    """No run has been armed since power-up."""
     ARMED = 1
+    """Waits for START or the external edge; dark."""
     RUNNING = 2
+    """Lines are done, or the first is about to begin."""
     STOPPING = 3
     """The last line runs."""
     ENDED = 4
+    """The run is over and the light off; STATUS.end_reason says why."""
 
 
 class EndReason(IntEnum):
     """STATUS.end_reason."""
 
     NONE = 0
+    """No run has ended since the latest ARM."""
     STOPPED = 1
+    """By STOP."""
     LINE_BUDGET = 2
+    """LINE_BUDGET lines are done."""
     WATCHDOG = 3
+    """No valid request for WATCHDOG clocks."""
     CLOCK_LOST = 4
+    """The PLL lost its reference."""
 
 
 class ErrorCode(IntEnum):
     """Why a request was refused (NAK). From 32 on: why a configuration cannot be armed."""
 
     BAD_VERSION = 1
+    """A frame of another protocol version; the answer is a frame of the device's."""
     BAD_TYPE = 2
+    """Neither READ nor WRITE."""
     BAD_LENGTH = 3
+    """The payload is not as its type has it, or asks for 0 or too many words."""
     BAD_ADDRESS = 4
+    """Beyond the map or the code memory; or a word other than 0 for an address without a register."""
     READ_ONLY = 5
+    """A WRITE to a register of access constant or read."""
     BUSY = 6
     """A configuration, code word, check or test while a run is armed or running; or another run's ARM."""
     BAD_COMMAND = 7
+    """No such command."""
     WRONG_RUN = 8
     """START or STOP of a run that is not the current one."""
     RUN_OVER = 9
     """ARM of the run that has just ended: a run id is used once."""
     NOT_ARMED = 10
+    """START before any run was armed."""
     BAD_RUN_ID = 11
     """ARM with run id 0."""
 
@@ -80,10 +96,11 @@ class ErrorCode(IntEnum):
     BAD_PHASES = 34
     """The 6/S sub-phases of PHASE_CLOCKS do not fit into a sub-step."""
     BAD_SOURCE = 35
+    """CODE_SOURCE.kind is no Source."""
     BAD_SEED = 36
     """PRBS with mask or seed 0."""
     BAD_CODE_LENGTH = 37
-    """CODE_LENGTH is 0 or more than CODE_BITS."""
+    """CODE_LENGTH is 0 or more than CODE_BITS: at ARM with source MEMORY, at CHECK_CODE with any."""
     CODE_UNCHECKED = 38
     """Code words, or CODE_LENGTH, were written after the last CHECK_CODE."""
     BAD_WINDOW = 39
@@ -93,35 +110,44 @@ class ErrorCode(IntEnum):
     BAD_TRIGGER_A = 41
     """Width 0, or delay + width >= the distance of A's pulses."""
     BAD_TRIGGER_B = 42
+    """The same of B."""
     BAD_MIN_PERIOD = 43
     """Pulses would be closer than CAMERA_MIN_PERIOD."""
     BAD_TAG_INTERVAL = 44
+    """TAG_INTERVAL is 0."""
     CLOCK_UNLOCKED = 45
+    """The PLL is not locked; the address is that of STATUS."""
 
 
 class Source(IntEnum):
     """CODE_SOURCE.kind."""
 
     CONSTANT = 0
+    """CODE_SOURCE.value in every sub-step."""
     PRBS = 1
+    """The shift register of PRBS_MASK and PRBS_SEED."""
     MEMORY = 2
+    """The code memory's first CODE_LENGTH bits, again and again."""
 
 
 class LineMode(IntEnum):
     """LINE.mode: when trigger outputs A and B pulse."""
 
     PER_LINE = 0
+    """Once, at the start of each line."""
     PER_SUBSTEP = 1
     """A camera line per sub-step, as the paper's setup emulates S = 3."""
 
 
 class Board(IntEnum):
-    """FIRMWARE.board."""
+    """VERSION.board."""
 
     NONE = 0
     """Gateware in a simulator."""
     ULX3S = 1
+    """Radiona ULX3S, ECP5-25F."""
     XC4VSX55 = 2
+    """Virtex-4 SX55."""
     MODEL = 255
     """The behavioural model."""
 
@@ -130,11 +156,17 @@ class FrameType(IntEnum):
     """Type byte of a frame; answers and tags have bit 7 set."""
 
     READ = 0x01
+    """To the device: read words."""
     WRITE = 0x02
+    """To the device: write words."""
     DATA = 0x81
+    """Answer to READ."""
     ACK = 0x82
+    """Answer to WRITE: done."""
     NAK = 0x83
+    """Answer to either: refused."""
     TAG = 0x90
+    """From the device, unasked: a line or an event of the run."""
 
 
 class TagFlag(IntFlag):
@@ -147,12 +179,13 @@ class TagFlag(IntFlag):
     LAST = 1 << 2
     """The run has ended; ``line`` is the last one. (No line was started: line = 0 and NO_LINES.)"""
     NO_LINES = 1 << 3
+    """With LAST: the run ended before its first line."""
     EXTERNAL = 1 << 4
     """With FIRST: the external edge started the run."""
     BUDGET = 1 << 5
     """With LAST: the line budget is used up."""
     WATCHDOG = 1 << 6
-    """With LAST: the host was silent for too long."""
+    """With LAST: no valid request for WATCHDOG clocks."""
     CLOCK_LOST = 1 << 7
     """With LAST: the reference clock was lost."""
     PPS = 1 << 8
@@ -160,9 +193,11 @@ class TagFlag(IntFlag):
     MISSED_A = 1 << 9
     """The first missed strobe of camera A in this run."""
     MISSED_B = 1 << 10
+    """The same of B."""
     UNEXPECTED_A = 1 << 11
     """The first unexpected strobe of camera A in this run."""
     UNEXPECTED_B = 1 << 12
+    """The same of B."""
     TAGS_LOST = 1 << 13
     """Tags before this one found the FIFO full; TAG_LOST has their number."""
 
@@ -171,7 +206,8 @@ class TagRecord(NamedTuple):
     """What a tag's payload says. ``run`` is the low half of the run id.
 
     Without LINE in ``flags`` it tells of an event: ``line`` and ``code_index`` are those of the latest
-    line, ``timestamp`` is the event's, at most 15 clocks late.
+    line, ``timestamp`` is the event's, at most 15 clocks late, or that of the clock in which a full queue
+    had room for it.
     """
 
     run: int

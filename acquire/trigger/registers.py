@@ -44,6 +44,8 @@ from acquire.trigger.protocol import (
 DEVICE_ID = int.from_bytes(b"TDIT", "little")
 CODE_MEMORY = 0x8000
 """First address of the code memory."""
+MAP_END = 0x80
+"""First address beyond the map: words below it read as 0 where no register is."""
 
 # Who answers, and what it can do.
 
@@ -55,13 +57,13 @@ VERSION = Register(
     32,
     "What the device was built from.",
     (
-        Field("protocol", 0, 8, "PROTOCOL_VERSION"),
-        Field("firmware_minor", 8, 8),
-        Field("firmware_major", 16, 8),
+        Field("protocol", 0, 8, "version of the protocol"),
+        Field("firmware_minor", 8, 8, "version of the gateware, behind the point"),
+        Field("firmware_major", 16, 8, "before the point"),
         Field("board", 24, 8, "see Board"),
     ),
 )
-MAP = Register("MAP", 0x02, "constant", 32, "CRC-32 of this register map: both sides need the same.")
+MAP = Register("MAP", 0x02, "constant", 32, "CRC-32 of this register map: both sides have the same.")
 SERIAL = Register("SERIAL", 0x03, "constant", 64, "Serial number.")
 CLOCK_HZ = Register("CLOCK_HZ", 0x05, "constant", 32, "Frequency of the clock.")
 CODE_BITS = Register("CODE_BITS", 0x06, "constant", 32, "Size of the code memory in bits.")
@@ -90,6 +92,7 @@ CAPABILITIES = Register(
         Field("pps", 10, 1, "pulse-per-second input"),
         Field("scene_gate", 11, 1, "external scene gate input"),
         Field("external_arm", 12, 1, "external arm input"),
+        Field("light_low", 13, 1, "built for a light that a low level lights: LED resets with invert set"),
         Field("start_latency", 16, 16, "clocks from START, or the external edge, to line 0, less LED.lead"),
     ),
 )
@@ -164,7 +167,14 @@ STROBE_B_MISSED = Register("STROBE_B_MISSED", 0x24, "read", 32, "As for A.")
 STROBE_B_UNEXPECTED = Register("STROBE_B_UNEXPECTED", 0x25, "read", 32, "As for A.")
 PPS_TIME = Register("PPS_TIME", 0x26, "read", 48, "TIME at the latest pulse-per-second edge.")
 PPS_COUNT = Register("PPS_COUNT", 0x28, "read", 32, "Pulse-per-second edges since power-up.")
-CODE_CRC = Register("CODE_CRC", 0x29, "read", 32, "CRC-32 (zlib) of the code memory's bytes; see CHECK_CODE.")
+CODE_CRC = Register(
+    "CODE_CRC",
+    0x29,
+    "read",
+    32,
+    "CRC-32 of the words of the code memory that hold CODE_LENGTH bits, made by CHECK_CODE. Each word counts "
+    "whole, as four bytes, the low one first.",
+)
 SELF_TEST = Register(
     "SELF_TEST",
     0x2A,
@@ -228,7 +238,7 @@ LED = Register(
     32,
     "The light: code bit AND window AND scene gate.",
     (
-        Field("enable", 0),
+        Field("enable", 0, 1, "0: dark"),
         Field("gate_enable", 1, 1, "AND the scene gate input"),
         Field("invert", 2, 1, "output low while lit"),
         Field("lead", 8, 8, "clocks by which the light precedes its sub-step"),
@@ -237,7 +247,7 @@ LED = Register(
 WINDOW_OPEN = Register("WINDOW_OPEN", 0x54, "config", 24, "Clock of the sub-step from which light may be.")
 WINDOW_CLOSE = Register("WINDOW_CLOSE", 0x55, "config", 24, "Clock from which it is not.", reset=900)
 _TRIGGER_FIELDS = (
-    Field("enable", 0),
+    Field("enable", 0, 1, "0: no pulses"),
     Field("invert", 1, 1, "output low during the pulse"),
     Field("direction", 2, 1, "level of the camera's direction output"),
     Field("strobe", 3, 1, "the camera answers every pulse with a strobe: count those it misses"),
@@ -267,7 +277,7 @@ EXTERNAL_ARM = Register(
     "config",
     32,
     "Start of an armed run by an input.",
-    (Field("enable", 0), Field("invert", 1, 1, "falling edge")),
+    (Field("enable", 0, 1, "1: wait for an edge"), Field("invert", 1, 1, "1: for a falling one")),
 )
 
 REGISTERS: tuple[Register, ...] = tuple(

@@ -7,7 +7,7 @@ had, what to try.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from acquire.trigger.base import TriggerRun
 
 _DEFAULT_WIDTH = 90
+_TWINS = (r.Board.NONE, r.Board.MODEL)
+"""Their light is simulated."""
 _TAG_FRAME_BYTES = r.TAG_BYTES + 10
 """On the wire: header, CRC, COBS and delimiter."""
 _TAGS_SHARE = 0.5
@@ -61,6 +63,8 @@ class Capabilities:
     tag_room: int
     rx_bytes: int
     inputs: tuple[str, ...]
+    light_active: Literal["high", "low", "any"]
+    """Level for which the output is dark from power-up on; any where no light is connected."""
 
     @classmethod
     def read(cls, values: Mapping[r.Register, int]) -> Capabilities:
@@ -82,6 +86,7 @@ class Capabilities:
             tag_room=queues["tags"],
             rx_bytes=queues["rx_bytes"],
             inputs=tuple(name for name in ("strobes", "pps", "scene_gate", "external_arm") if can[name]),
+            light_active="any" if version["board"] in _TWINS else "low" if can["light_low"] else "high",
         )
 
 
@@ -99,6 +104,7 @@ GATEWARE = Capabilities(
     tag_room=1024,
     rx_bytes=2048,
     inputs=("strobes", "pps", "scene_gate", "external_arm"),
+    light_active="any",
 )
 """The most that a device of this program's firmware can do: what is known before one is asked."""
 
@@ -219,6 +225,12 @@ def _light(light: LightOutputConfig, substep_ticks: int, device: Capabilities) -
             f"light from tick {light.open_ticks} to {closes} of a sub-step",
             possible=f"within 0 to {substep_ticks}",
             hint="change trigger.light.open_ticks and close_ticks",
+        )
+    if device.light_active not in {"any", light.active}:
+        raise TriggerError(
+            f"a light that is lit by a {light.active} level",
+            possible=f"{device.light_active}, as this board was built: else it is lit from power-up on",
+            hint=f"trigger.light.active, or firmware.build with --light-active {light.active}",
         )
     most = substep_ticks - device.lead_margin_ticks
     if light.lead_ticks > most:

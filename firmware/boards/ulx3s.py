@@ -1,4 +1,4 @@
-"""Radiona ULX3S with an ECP5-25F: 25 MHz × 18 / 5 = 90 MHz exactly, the FTDI's UART, GPIO pins."""
+"""Radiona ULX3S with an ECP5-25F: 25 MHz · 18 / 5 = 90 MHz exactly, the FTDI's UART, GPIO pins."""
 
 from amaranth.hdl import ClockDomain, Elaboratable, Instance, Module, Signal
 
@@ -62,22 +62,31 @@ class Ulx3s(Elaboratable):
 
 
 def _pll(reference: Signal, clock: Signal, locked: Signal) -> Instance:
-    """25 MHz / 5 · 18 = 90 MHz; the oscillator runs at 90 MHz · 7 = 630 MHz."""
+    """The oscillator runs at 25 MHz · 18 = 450 MHz, a fifth of which is 90 MHz.
+
+    Its eighteenth is compared with the reference itself, at 25 MHz: the maker wants 10 MHz or more there, and
+    400 to 800 MHz of the oscillator.
+    """
+    feedback = Signal()
     return Instance(
         "EHXPLLL",
-        p_CLKI_DIV=5,
-        p_CLKFB_DIV=18,
-        p_CLKOP_DIV=7,
-        p_CLKOP_CPHASE=3,
+        p_CLKI_DIV=1,
+        p_CLKFB_DIV=1,
+        p_CLKOP_DIV=5,
+        p_CLKOP_CPHASE=2,
         p_CLKOP_FPHASE=0,
         p_CLKOP_ENABLE="ENABLED",
-        p_FEEDBK_PATH="CLKOP",
+        p_CLKOS_DIV=18,
+        p_CLKOS_CPHASE=2,
+        p_CLKOS_FPHASE=0,
+        p_CLKOS_ENABLE="ENABLED",
+        p_FEEDBK_PATH="CLKOS",
         p_PLLRST_ENA="DISABLED",
         p_STDBY_ENABLE="DISABLED",
         p_INTFB_WAKE="DISABLED",
         p_DPHASE_SOURCE="DISABLED",
         i_CLKI=reference,
-        i_CLKFB=clock,
+        i_CLKFB=feedback,
         i_RST=0,
         i_STDBY=0,
         i_PHASESEL0=0,
@@ -88,19 +97,24 @@ def _pll(reference: Signal, clock: Signal, locked: Signal) -> Instance:
         i_PLLWAKESYNC=0,
         i_ENCLKOP=0,
         o_CLKOP=clock,
+        o_CLKOS=feedback,
         o_LOCK=locked,
     )
 
 
-def constraints(sites: dict[str, str]) -> str:
+def constraints(sites: dict[str, str], light_low: bool = False) -> str:
     """The pins and the reference as nextpnr reads them (LPF)."""
     lines = [f'FREQUENCY PORT "reference" {REFERENCE_HZ / 1e6:g} MHZ;']
     for name, site in sites.items():
-        pull = (
-            " PULLMODE=NONE"
-            if name in (*OUTPUTS, "reference") or "[" in name or "usb" in name
-            else " PULLMODE=DOWN"
-        )
-        pull = " PULLMODE=UP" if name == "rx" else pull
+        pull = f" PULLMODE={pull_of(name, light_low)}"
         lines += [f'LOCATE COMP "{name}" SITE "{site}";', f'IOBUF PORT "{name}" IO_TYPE=LVCMOS33{pull};']
     return "\n".join(lines) + "\n"
+
+
+def pull_of(port: str, light_low: bool) -> str:
+    """Which way a pin goes that nothing drives: inputs to rest, light and triggers to off."""
+    if port == "rx" or (port == "led" and light_low):
+        return "UP"
+    if port in INPUTS or port in {"led", "trigger_a", "trigger_b"}:
+        return "DOWN"
+    return "NONE"

@@ -7,6 +7,7 @@
                              └▶ 12 MHz  usb       everything else of USB
 """
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 from amaranth.hdl import ClockDomain, Elaboratable, Instance, IOPort, Module, Signal
@@ -21,11 +22,11 @@ PINS = {**ulx3s.PINS, "usb_dp": "D15", "usb_dn": "E15", "usb_pullup": "B12"}
 class Ulx3sUsb(Ulx3s):
     sites = PINS
 
-    def __init__(self) -> None:
+    def __init__(self, light_low: bool = False) -> None:
         self.lines = {name: SimpleNamespace(i=Signal(), o=Signal(), oe=Signal()) for name in ("d_p", "d_n")}
         self.pullup = Signal(name="usb_pullup")
         bus = SimpleNamespace(**self.lines, pullup=SimpleNamespace(o=self.pullup))
-        super().__init__(UsbSyncTrigger(ulx3s.BUILD, bus))
+        super().__init__(UsbSyncTrigger(replace(ulx3s.BUILD, light_low=light_low), bus))
         self.pads = {"d_p": IOPort(1, name="usb_dp"), "d_n": IOPort(1, name="usb_dn")}
 
     @property

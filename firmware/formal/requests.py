@@ -28,7 +28,7 @@ def requests_proof() -> Proof:
     harness, host = Harness(), Host(Build().code_words)
     m, claim = harness.m, harness.claim
     m.submodules.host, _ = opened(host)
-    m.submodules.file = file = RegisterFile(Build().constants())
+    m.submodules.file = file = RegisterFile(Build().constants(), {})
     m.d.comb += [
         file.address.eq(host.address),
         host.known.eq(file.known),

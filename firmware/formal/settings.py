@@ -28,7 +28,7 @@ CODE_BITS = 32 * Build().code_words
 
 def settings_proof() -> Proof:
     harness = Harness()
-    file = RegisterFile(Build().constants())
+    file = RegisterFile(Build().constants(), {})
     checks = Checks(file, CODE_BITS)
     opened(file)  # its registers take any value here, whatever has been written
     harness.m.submodules.checks = checks

@@ -72,14 +72,14 @@ def _dark(harness: Harness, timing: Timing, leaving: Signal) -> list[Signal]:
     m, light = harness.m, Light()
     m.submodules.light, inside = opened(light)
     m.d.comb += [light.advance.eq(timing.advance), light.ending.eq(timing.ending)]
-    idle, inverted = Signal(PIN_CLOCKS), Signal()  # the latest clock in bit 0
-    m.d.sync += [idle.eq(Cat(~timing.running, idle)), inverted.eq(light.inverted)]
-    dark = light.led == inverted
+    idle = Signal(PIN_CLOCKS, init=-1)  # the latest clock in bit 0; none has run before power-up
+    m.d.sync += idle.eq(Cat(~timing.running, idle))
+    dark = light.led == light.inverted
     harness.claim("no_light_without_a_run", idle.all(), dark)
     harness.lemma("unlit_without_a_run", ~timing.running, ~light.lit)
     harness.lemma("unlit_in_the_last_substep", timing.running & leaving, ~light.lit)
     harness.lemma("nothing_shown", idle[0], ~inside["shown"])
-    harness.cover("lit", light.led & ~inverted & timing.running)
+    harness.cover("lit", ~dark & timing.running)
     return [
         *(light.code_bit, light.enable, light.inverted, light.window_open, light.window_close),
         *(light.scene_enable, light.scene_gate),

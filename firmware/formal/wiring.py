@@ -162,7 +162,7 @@ def _pins(harness: Harness, trigger: SyncTrigger) -> None:
 def _light(harness: Harness, trigger: SyncTrigger, inside: dict[str, Any]) -> None:
     """The pin shows the code bit of its sub-step, within the window, while the gate is open."""
     file, timing, m = trigger.file, trigger.timing, harness.m
-    bit, clock, shown, led = Signal(), Signal(24), Signal(), Signal()
+    bit, clock, shown, glows = Signal(), Signal(24), Signal(), Signal()
     with m.If(timing.advance):
         m.d.sync += [bit.eq(trigger.code.bit & ~timing.ending), clock.eq(0)]
     with m.Else():
@@ -170,9 +170,10 @@ def _light(harness: Harness, trigger: SyncTrigger, inside: dict[str, Any]) -> No
     window = (clock >= file.value(r.WINDOW_OPEN)) & (clock < file.value(r.WINDOW_CLOSE))
     gate = ~file.field(r.LED, "gate_enable") | trigger.scene.level
     m.d.sync += shown.eq(bit & window & file.field(r.LED, "enable"))
-    m.d.sync += led.eq((shown & gate) ^ file.field(r.LED, "invert"))
+    m.d.sync += glows.eq(shown & gate)
     harness.lemma("light_counts", 1, (inside["clock"] == clock) & (trigger.light.lit == bit))
-    _equal(harness, "light_is_code_and_window_and_gate", trigger.led, led)
+    wanted = glows ^ file.field(r.LED, "invert")
+    _equal(harness, "light_is_code_and_window_and_gate", trigger.led, wanted)
     _equal(harness, "code_goes_on_with_the_light", trigger.code.step, timing.advance)
     _equal(harness, "code_begins_anew_at_arm", trigger.code.load, trigger.commands.arm)
 

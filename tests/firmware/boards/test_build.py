@@ -46,7 +46,13 @@ def test_the_ulx3s_netlist_fits_a_quarter_of_the_device_and_can_be_made_again(tm
     assert not [kind for kind in cells if kind.startswith("$_")], "something was not mapped"
     assert cells["LUT4"] + 2 * cells["CCU2C"] <= LOGIC_CELLS // 4
     assert cells["DP16KD"] <= BLOCK_RAMS
-    assert cells["EHXPLLL"] == 1
+    (pll,) = (cell["parameters"] for cell in netlist["cells"].values() if cell["type"] == "EHXPLLL")
+    divide = {name.removesuffix("_DIV"): int(pll[name], 2) for name in pll if name.endswith("_DIV")}
+    compared_mhz = 25 / divide["CLKI"]
+    oscillator_mhz = compared_mhz * divide["CLKFB"] * divide[pll["FEEDBK_PATH"]]
+    assert 10 <= compared_mhz <= 400, "the maker's limits of the phase detector"
+    assert 400 <= oscillator_mhz <= 800, "and of the oscillator"
+    assert oscillator_mhz / divide["CLKOP"] == 90
 
 
 def test_one_command_writes_what_the_vendor_s_tools_need(tmp_path: Path) -> None:
