@@ -16,8 +16,6 @@ from firmware.build import main, synthesize
 if TYPE_CHECKING:
     from pathlib import Path
 
-"""Yosys compiles itself when it runs for the first time."""
-
 LOGIC_CELLS, BLOCK_RAMS = 24288, 56
 """Of an ECP5-25F."""
 

@@ -8,8 +8,6 @@ from firmware.formal.engine import prove
 from firmware.formal.mutants import MUTANTS, Mutant, broken_by
 from firmware.formal.proofs import PROOFS
 
-"""Yosys compiles itself when it runs for the first time."""
-
 
 @pytest.mark.parametrize("name", PROOFS)
 def test_is_proved_and_says_something(name: str) -> None:
