@@ -40,7 +40,7 @@ POOL_THREADS = re.compile(r"asyncio_\d+|zarr|fsspec|pydevd|AnyIO worker thread")
 KEPT_FILES = re.compile(r"/mpl-data/fonts/")
 """Files that libraries keep open for reuse."""
 
-LOOK_AGAIN_S = 0.02
+FIRST_PAUSE_S = 0.01
 
 Found = dict[str, str]
 """Key of a thing that exists → how to name it to the reader."""
@@ -61,7 +61,7 @@ settings.load_profile("any speed")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addini("leak_grace_s", "seconds that a test's leftovers may take to go", default="60")
+    parser.addini("leak_grace_s", "seconds that a test's leftovers may take to go", default="30")
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -113,12 +113,13 @@ def _nothing_left(request: pytest.FixtureRequest, _made_once: None) -> Iterator[
 
 def leftovers(before: Found, grace_s: float) -> Found:
     """What exists now and did not before, once ``grace_s`` has not made it go."""
-    deadline = time.monotonic() + grace_s
+    deadline, pause_s = time.monotonic() + grace_s, FIRST_PAUSE_S
     while left := {key: name for key, name in existing().items() if key not in before}:
         if time.monotonic() > deadline:
             return left
         gc.collect()
-        time.sleep(LOOK_AGAIN_S)
+        time.sleep(pause_s)
+        pause_s = min(2 * pause_s, grace_s / 4)
     return {}
 
 
