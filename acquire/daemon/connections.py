@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 MOST_CONNECTIONS = 32
 AT_ONCE = 16
 """Connections that one turn of the event loop takes."""
-WAITING = 128
+WAITING = 1024
 """Connections that wait in the system, at no cost to us, until they are taken."""
 REQUEST_S = 10.0
 """From a connection, or the first byte of a further request on it, to the last byte of the request."""

@@ -16,7 +16,7 @@ from acquire.text import visible
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-REPEATS = 30
+REPEATS = 10
 """Entries of one kind that are written within `WINDOW_S`."""
 WINDOW_S = 60.0
 MOST_KINDS = 256
