@@ -34,13 +34,14 @@ def serve(
 
     Example: [bold]acquire serve --config rig-demo[/]
     """
+    import logging
     import threading
 
     from acquire.config import load_rig, parse_settings
     from acquire.daemon.host import check_host
-    from acquire.daemon.logs import write_log
     from acquire.daemon.server import serve as run_daemon
     from acquire.daemon.uploads import check_upload
+    from acquire.logs import write_log
 
     overrides = parse_settings(settings or [])
     if socket is not None:
@@ -48,7 +49,8 @@ def serve(
     rig = load_rig(config, overrides)
     check_host(rig)
     check_upload(rig)
-    write_log()
+    write_log(logging.INFO)
+    logging.getLogger("uvicorn").setLevel(logging.WARNING)
     if owned:
         threading.Thread(target=_end_with_owner, name="acquire-owner", daemon=True).start()
     raise typer.Exit(run_daemon(rig))

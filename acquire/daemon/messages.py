@@ -24,6 +24,8 @@ def _on_the_wire(text: object) -> str:
 Text = Annotated[str, PlainSerializer(_on_the_wire, return_type=str, when_used="json")]
 """Whatever is in it, such as the name of a file that is not UTF-8: in JSON it is readable, and harmless."""
 Place = Annotated[Path, PlainSerializer(_on_the_wire, return_type=str, when_used="json")]
+LONGEST_NAME = 200
+"""Bytes of a recording's name: what lies beside it, such as a further segment, has a longer one."""
 LONGEST_MARK = 400
 """Characters."""
 
@@ -102,6 +104,8 @@ class StartRequest(_Message):
         text = str(path)
         if "\0" in text or text != text.encode(errors="replace").decode():
             raise ValueError(f"path {text!r} is not UTF-8, or has a NUL")
+        if path is not None and len(path.name.encode()) > LONGEST_NAME:
+            raise ValueError(f"path ends in a name that is too long: at most {LONGEST_NAME} bytes")
         return path
 
 

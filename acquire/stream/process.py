@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import logging
 import multiprocessing
 import multiprocessing.process
 import os
@@ -22,6 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from acquire.errors import AcquireError, DeviceError
+from acquire.logs import write_log
 from acquire.stream.messages import Failed, Quit
 
 if TYPE_CHECKING:
@@ -221,6 +223,7 @@ def _live(pipe: Connection[Any, Any], name: str, target: Callable[..., None], *a
     # Locks that libraries make, as blosc's does, have a name in /dev/shm where children are spawned, which a
     # kill of the whole group would leave there for ever; one made for forked children loses it at once.
     multiprocessing.set_start_method("fork", force=True)
+    write_log(logging.WARNING)
     gc.freeze()  # what was imported never dies: no collection needs to look at it again
     try:
         target(mailbox, *args)

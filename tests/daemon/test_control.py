@@ -157,6 +157,16 @@ def test_paths_that_cannot_be_are_refused_before_they_are_sent(
     assert str(caught.value).encode()  # can be printed
 
 
+@pytest.mark.parametrize("name", ["x" * 300 + ".zarr", "µ" * 150 + ".zarr"])
+def test_names_that_no_file_system_takes_are_refused(
+    daemon: Client, run: FakeRun, tmp_path: Path, name: str
+) -> None:
+    daemon.arm()
+    with pytest.raises(UsageError, match="at most 200 bytes"):
+        daemon.start(tmp_path / name)
+    assert run.names == ["arm"]
+
+
 def test_status_is_answered_while_arming(daemon: Client, run: FakeRun) -> None:
     run.may_arm.clear()
     arming = threading.Thread(target=daemon.arm)

@@ -1,4 +1,4 @@
-"""The daemon's log: one line per entry, whatever foreign text is in it, and a bounded number of lines.
+"""The log of the daemon and its processes: one line per entry, whatever is in it, and not too many of them.
 
 An entry that repeats, as of a connection that cannot be accepted, is written some times a minute; how often
 it came besides is told once the minute is over. So the log can neither be forged nor fill the disk.
@@ -76,13 +76,12 @@ class Bounded(logging.Filter):
                 self._tell(f"{count.seen - REPEATS} more entries like this one were not written: {kind[2]}")
 
 
-def write_log() -> None:
-    """Log to stderr from now on, in this process."""
+def write_log(level: int) -> None:
+    """Log to stderr from now on, in this process, what is at least of this level."""
     handler = logging.StreamHandler()
     handler.setFormatter(OneLine())
     handler.addFilter(Bounded(lambda text: handler.emit(_entry(text))))
-    logging.basicConfig(level=logging.INFO, handlers=[handler])
-    logging.getLogger("uvicorn").setLevel(logging.WARNING)
+    logging.basicConfig(level=level, handlers=[handler])
 
 
 def _entry(text: str) -> logging.LogRecord:

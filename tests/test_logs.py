@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 
-from acquire.daemon.logs import MOST_CHARACTERS, REPEATS, WINDOW_S, Bounded, OneLine
+from acquire.logs import MOST_CHARACTERS, REPEATS, WINDOW_S, Bounded, OneLine
 
 
 def record(text: str, *words: object, level: int = logging.INFO) -> logging.LogRecord:
