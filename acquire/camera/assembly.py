@@ -201,8 +201,6 @@ class Assembly:
             self._owed = losses + self._owed
             return None
         flag = LineFlag(0) if frame.complete and not place.doubtful else LineFlag.INCOMPLETE
-        self._statistics["lines"] += count
-        self._statistics["lost"] += sum(loss.count for loss in losses)
         return CameraBlock(
             place.first_line,
             reader.lines(frame.memory, count),
@@ -210,6 +208,11 @@ class Assembly:
             losses,
             frame.facts.time_ns,
         )
+
+    def count(self, block: CameraBlock) -> None:
+        """The block is being delivered."""
+        self._statistics["lines"] += len(block.flags)
+        self._statistics["lost"] += sum(loss.count for loss in block.losses)
 
     def statistics(self) -> dict[str, int]:
         return dict(self._statistics)

@@ -151,6 +151,8 @@ class HarvestersCamera:
             return None
         block, buffer = self._ready.popleft()
         self._held[block] = buffer
+        assert self._assembly is not None
+        self._assembly.count(block)
         return block
 
     def _await_buffer(self, timeout_s: float) -> Any:

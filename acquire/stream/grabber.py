@@ -198,6 +198,8 @@ class Intake:
             block = replace(block, pixels=block.pixels[:, slice(*self._plan.columns)])
         self._check(block)
         if self._away:
+            if block.time_ns is None and block.flags.all():
+                return  # an incomplete frame has no time, and the next one may have
             self._come_back(block)
             block = replace(block, losses=())
         first = block.first_line + self._shift

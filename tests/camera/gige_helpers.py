@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import random
 import re
 import subprocess
 import threading
@@ -56,6 +57,17 @@ class PacedSensor:
 
     def times_ns(self, first_line: int, count: int) -> np.ndarray:
         return 1_000_000_000 + np.arange(first_line, first_line + count) * 50_000
+
+
+@dataclass(frozen=True)
+class BadLink:
+    """Loses a ``share`` of the packets; for a camera in a process of its own."""
+
+    share: float
+
+    def __call__(self, frame: int, packets: list[bytes]) -> list[bytes]:
+        chance = random.Random(frame)
+        return [packet for packet in packets if chance.random() >= self.share]
 
 
 @contextmanager

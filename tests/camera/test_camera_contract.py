@@ -5,10 +5,8 @@ Aravis and GigE Vision.
 from __future__ import annotations
 
 import itertools
-import os
 import pickle
 import signal
-import subprocess
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -18,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from left_out import FAKE_GIGE
+from gige_helpers import aravis_camera
 
 from acquire.camera.aravis import FAKE, AravisOpener
 from acquire.camera.base import Camera, CameraBlock
@@ -140,20 +138,10 @@ def aravis_stand(serial: str, interface: str = "") -> Iterator[Stand]:
     yield Stand(opener, nothing, nothing, None, opener, serial)
 
 
-def gige_stand() -> Iterator[Stand]:
-    """Aravis' GigE Vision camera: packets over the loopback interface, whose port other tests may have."""
-    serial, deadline = f"GV-{os.getpid()}", time.monotonic() + 300
-    while True:
-        command = [FAKE_GIGE, "-i", "127.0.0.1", "-s", serial]
-        with subprocess.Popen(command, stdout=subprocess.DEVNULL) as server:
-            try:
-                server.wait(1.0)
-            except subprocess.TimeoutExpired:
-                yield from aravis_stand(serial)
-                return
-            finally:
-                server.kill()
-        assert time.monotonic() < deadline
+def gige_stand(log: Path) -> Iterator[Stand]:
+    """Aravis' GigE Vision camera: packets over the loopback interface."""
+    with aravis_camera(log) as serial:
+        yield from aravis_stand(serial)
 
 
 @pytest.fixture(
@@ -167,14 +155,14 @@ def gige_stand() -> Iterator[Stand]:
         pytest.param("Aravis' GigE camera", marks=pytest.mark.needs_gige_camera),
     ],
 )
-def stand(request: pytest.FixtureRequest) -> Iterator[Stand]:
+def stand(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Stand]:
     makers = {
         "in process": lambda: simulated_stand("in process"),
         "our producer": lambda: simulated_stand("gentl"),
         "foreign producer": foreign_stand,
         "our GigE camera": lambda: simulated_stand("gige"),
         "Aravis' fake camera": lambda: aravis_stand("1", FAKE),
-        "Aravis' GigE camera": gige_stand,
+        "Aravis' GigE camera": lambda: gige_stand(tmp_path_factory.mktemp("aravis") / "log"),
     }
     yield from makers[request.param]()
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gige_helpers import BadLink
 from waiting import until
 
 from acquire.config import RigConfig, load_rig
@@ -19,6 +20,7 @@ from acquire.daemon.plan import Run
 from acquire.errors import ConfigError
 from acquire.lines import LineFlag
 from acquire.rig import Rig
+from acquire.sim.gige.camera import Transmission
 from acquire.sim.lines import StreamingArm
 from acquire.store import Recording, RunCondition, open_recording
 
@@ -52,8 +54,10 @@ def record(
     lines: int,
     happen: Callable[[Rig, Run], None] = lambda rig, run: None,
     stamps: bool = True,
+    prepare: Callable[[Rig], None] = lambda rig: None,
 ) -> tuple[Recording, Any]:
     with Rig(config) as rig:
+        prepare(rig)
         run = Run(config, rig)
         try:
             run.arm()
@@ -93,21 +97,58 @@ def test_what_is_recorded_through_the_producer_is_eq1(tmp_path: Path) -> None:
         assert camera["clock"]["stamp_ns"] > 0
 
 
-@pytest.mark.needs_aravis
-def test_what_is_recorded_through_gige_vision_is_eq1(tmp_path: Path) -> None:
+def gige_config(**changes: Any) -> RigConfig:
     settings = [
         ["remote", "Width", STAGES],
         ["remote", "PixelFormat", "Mono12"],
         ["remote", "Height", 100],
+        ["stream", "packet-resend", "never"],
     ]
-    given = dict(SMALL)
-    given |= {f"cameras.{arm}.settings": settings for arm in "ab"}
-    config = load_rig("rig-demo-gige", given)
+    given = SMALL | {f"cameras.{arm}.settings": settings for arm in "ab"}
+    return load_rig("rig-demo-gige", given | changes)
+
+
+@pytest.mark.needs_aravis
+def test_what_is_recorded_through_gige_vision_is_eq1(tmp_path: Path) -> None:
+    config = gige_config()
     recording, status = record(config, tmp_path / "r.zarr", 20_000)
     assert status.condition is RunCondition.GOOD
     for arm in "ab":
         assert not check_lines(config, recording, arm).any()
-        assert recording.attrs["cameras"][arm]["identity"]["serial"] == f"SIM-{arm.upper()}"
+        camera = recording.attrs["cameras"][arm]
+        assert camera["identity"]["serial"] == f"SIM-{arm.upper()}"
+        assert (camera["packet-resend"], camera["frame-retention"]) == ("never", 100_000)
+
+
+@pytest.mark.needs_aravis
+def test_over_a_bad_link_every_line_is_eq1_flagged_or_lost_also_after_the_camera_was_away(
+    tmp_path: Path,
+) -> None:
+    config = gige_config(**{"stream.reopen_s": 30.0})
+
+    def prepare(rig: Rig) -> None:
+        rig.simulated._gige.transmission = Transmission(link=BadLink(0.05), resends=False)
+
+    def happen(rig: Rig, run: Run) -> None:
+        until(lambda: run.poll().recorded_lines > 10_000, "lines")
+        gige = rig.simulated._gige
+        gige._servers.pop("a").end(time.monotonic() + 20)
+        until(lambda: run.poll().lines["a"]["reopened"] or _reopen(gige, rig), "the camera")
+
+    def _reopen(gige: Any, rig: Rig) -> bool:
+        gige.opener("a", rig.simulated._sensor)
+        return False
+
+    recording, status = record(config, tmp_path / "r.zarr", 60_000, happen, prepare=prepare)
+    assert status.end_reason == "line budget reached"
+    for arm in "ab":
+        flags = check_lines(config, recording, arm)
+        missing = int((flags & LineFlag.MISSING != 0).sum())
+        gaps = [gap for gap in recording.gaps if gap.arm == arm]
+        assert missing == sum(gap.count for gap in gaps)
+        assert {gap.cause for gap in gaps} <= {"id_gap", "incomplete", "device_lost"}
+        assert ("device_lost" in {gap.cause for gap in gaps}) == (arm == "a")
+        assert (flags & LineFlag.INCOMPLETE != 0).sum() > 1000
 
 
 @pytest.mark.parametrize("rig", ["rig-demo", pytest.param("rig-demo-gentl", marks=needs_compiler)])

@@ -19,6 +19,7 @@ from acquire.camera.assembly import (
     STATISTICS,
     Assembly,
     Frame,
+    FrameFormat,
     MissedTriggers,
     buffer_count,
     check_format,
@@ -31,6 +32,8 @@ from acquire.camera.settings import apply_settings
 from acquire.errors import CameraError, CameraLostError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from acquire.camera.settings import Features
     from acquire.camera.spec import GenicamSpec
 
@@ -79,7 +82,7 @@ class AravisCamera:
             _check_identity(self._identity, spec)
             self._parameters = StreamParameters(library, self._device, self._prepare, self._drop)
             apply_settings(spec.settings, self.features())
-            check_format(frame_format({"remote": self._features}), spec)
+            check_format(self._format(), spec)
         except BaseException:
             self.close()
             raise
@@ -94,10 +97,13 @@ class AravisCamera:
         """Of the camera itself, and the parameters of Aravis' stream."""
         return {"remote": self._features, "stream": self._parameters}
 
+    def _format(self) -> FrameFormat:
+        return frame_format({"remote": self._features})
+
     def _prepare(self) -> int:
         """The stream of the next acquisition: its socket is new, and gets no packet of an earlier one."""
         if self._stream is None:
-            found = frame_format({"remote": self._features})
+            found = self._format()
             with errors(f"stream of camera {self._spec.serial}") as error:
                 self._stream = self._library.arv_camera_create_stream(self._camera, None, None, error)
             assert self._stream is not None
@@ -111,7 +117,7 @@ class AravisCamera:
 
     def arm(self) -> None:
         self.disarm()
-        library, found = self._library, frame_format({"remote": self._features})
+        library, found = self._library, self._format()
         self._missed = MissedTriggers(self.features())
         what = f"arm camera {self._spec.serial}"
         with errors(what) as error:
@@ -160,53 +166,80 @@ class AravisCamera:
             return None
         block, buffer = self._ready.popleft()
         self._held[block] = buffer
+        assert self._assembly is not None
+        self._assembly.count(block)
         return block
 
     def _fetch(self, timeout_s: float) -> None:
-        """Put the next filled buffer in its place among the frames."""
-        library = self._library
-        assert self._stream is not None
-        assert self._assembly is not None
-        buffer = library.arv_stream_timeout_pop_buffer(self._stream, round(timeout_s * 1e6))
-        if not buffer:
+        """Put the buffers that have been filled in their places among the frames."""
+        buffers = list(self._pop(timeout_s))
+        if not buffers:
             self._ask_alive()
             return
         self._heard_s = time.monotonic()
-        status = library.arv_buffer_get_status(buffer)
-        if status == _ABORTED:
-            self._give(self._stream, buffer)
-            return
-        self._taken.add(buffer)
-        blocks, free = self._assembly.take(self._frame(buffer, status == _SUCCESS))
-        self._ready += blocks
-        for idle in free:
-            self._taken.remove(idle)
-            self._give(self._stream, idle)
+        assert self._stream is not None
+        assert self._assembly is not None
+        missed, underruns = self._missed_triggers(), self._starved_frames()
+        for buffer in buffers:
+            if self._library.arv_buffer_get_status(buffer) == _ABORTED:
+                self._give(self._stream, buffer)
+                continue
+            self._taken.add(buffer)
+            blocks, free = self._assembly.take(self._frame(buffer, underruns, missed))
+            self._ready += blocks
+            for idle in free:
+                self._taken.remove(idle)
+                self._give(self._stream, idle)
 
-    def _frame(self, buffer: int, success: bool) -> Frame:
+    def _pop(self, timeout_s: float) -> Iterator[int]:
+        """The next filled buffer, and those that wait already: a counter of the camera is read over the
+        network, once for all of them.
+        """
+        buffer = self._library.arv_stream_timeout_pop_buffer(self._stream, round(timeout_s * 1e6))
+        while buffer:
+            yield buffer
+            buffer = self._library.arv_stream_try_pop_buffer(self._stream)
+
+    def _missed_triggers(self) -> int:
+        try:
+            return self._missed.count()
+        except CameraError as error:
+            raise CameraLostError(f"camera {self._spec.serial} is gone: {error.message}") from error
+
+    def _starved_frames(self) -> int:
+        counts = c_uint64(), c_uint64(), c_uint64()
+        self._library.arv_stream_get_statistics(self._stream, *map(byref, counts))
+        return math.ceil(counts[2].value / self._packets)
+
+    def _frame(self, buffer: int, underruns: int, missed: int) -> Frame:
         library, size = self._library, c_size_t()
         address = library.arv_buffer_get_data(buffer, byref(size))
         memory = np.ctypeslib.as_array((ctypes.c_uint8 * self._payload).from_address(address))
-        counts = c_uint64(), c_uint64(), c_uint64()
-        library.arv_stream_get_statistics(self._stream, *map(byref, counts))
         frame_id = library.arv_buffer_get_frame_id(buffer)
-        complete = success and frame_id != _NO_ID
+        complete = library.arv_buffer_get_status(buffer) == _SUCCESS and frame_id != _NO_ID
         facts = FrameFacts(
             None if frame_id == _NO_ID else frame_id,
-            math.ceil(counts[2].value / self._packets),
-            self._missed.count(),
+            underruns,
+            missed,
             library.arv_buffer_get_timestamp(buffer) or None,
         )
         # Aravis does not say how much of an incomplete frame has come.
         return Frame(buffer, memory, size.value if complete else self._payload, facts, complete)
 
     def _ask_alive(self) -> None:
-        if time.monotonic() - self._heard_s > _ALIVE_S:
-            self._heard_s = time.monotonic()
-            try:
-                frame_format({"remote": self._features})
-            except CameraError as error:
-                raise CameraLostError(f"camera {self._spec.serial} is gone: {error.message}") from error
+        """A camera that was away for a moment answers, but obeys its host no more and sends nothing."""
+        if time.monotonic() - self._heard_s < _ALIVE_S:
+            return
+        self._heard_s = time.monotonic()
+        try:
+            self._format()
+        except CameraError as error:
+            raise CameraLostError(f"camera {self._spec.serial} is gone: {error.message}") from error
+        library = self._library
+        if library.arv_camera_is_gv_device(self._camera) and not library.arv_gv_device_is_controller(
+            self._device
+        ):
+            raise CameraLostError(f"camera {self._spec.serial} is gone: it has started anew")
 
     def release(self, block: CameraBlock) -> None:
         buffer = self._held.pop(block, None)

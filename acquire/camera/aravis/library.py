@@ -60,6 +60,7 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_gc_category_get_features": (c_void_p, (c_void_p,)),
     "arv_stream_push_buffer": (None, (c_void_p, c_void_p)),
     "arv_stream_timeout_pop_buffer": (c_void_p, (c_void_p, c_uint64)),
+    "arv_stream_try_pop_buffer": (c_void_p, (c_void_p,)),
     "arv_stream_get_statistics": (
         None,
         (c_void_p, POINTER(c_uint64), POINTER(c_uint64), POINTER(c_uint64)),
@@ -73,6 +74,7 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_buffer_set_timestamp": (None, (c_void_p, c_uint64)),
     "arv_camera_is_gv_device": (c_bool, (c_void_p,)),
     "arv_camera_is_uv_device": (c_bool, (c_void_p,)),
+    "arv_gv_device_is_controller": (c_bool, (c_void_p,)),
     "arv_camera_gv_get_packet_size": (c_uint, (c_void_p, c_void_p)),
     "g_type_name_from_instance": (c_char_p, (c_void_p,)),
     "g_type_name": (c_char_p, (c_size_t,)),

@@ -10,7 +10,7 @@ from acquire.camera.aravis import AravisOpener, load
 from acquire.camera.spec import spec_of
 from acquire.lines import ARMS
 from acquire.sim.gentl.arms import model_of
-from acquire.sim.gige.camera import serve
+from acquire.sim.gige.camera import Transmission, serve
 from acquire.stream.messages import Ready
 from acquire.stream.process import Worker
 
@@ -28,6 +28,7 @@ class GigeArms:
     """Openers of the arms whose driver is "gige-simulated"; touches nothing until one is asked for."""
 
     def __init__(self, config: RigConfig) -> None:
+        self.transmission = Transmission()
         self._config = config
         self._servers: dict[str, Worker] = {}
 
@@ -38,7 +39,8 @@ class GigeArms:
         """
         load()
         if arm not in self._servers:
-            server = Worker(f"camera {arm}", serve, model_of(self._config, arm), sensor(arm), address_of(arm))
+            how = (model_of(self._config, arm), sensor(arm), address_of(arm), self.transmission)
+            server = Worker(f"camera {arm}", serve, *how)
             self._servers[arm] = server
             server.expect(Ready, time.monotonic() + _START_S)
         return AravisOpener(spec_of(self._config, arm, address_of(arm)))

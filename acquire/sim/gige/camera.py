@@ -93,6 +93,7 @@ class GigeCamera:
         self._control = [_bound(address, shared=False), _bound("255.255.255.255", shared=True)]
         self._lines = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._lines.bind((address, 0))
+        self._answered: tuple[Any, protocol.Request | None, bytes | None] = (None, None, None)
         self._acquiring = False
         self._frames = 0
         self._sent: deque[tuple[int, list[bytes]]] = deque(maxlen=_KEPT_FRAMES)
@@ -104,19 +105,22 @@ class GigeCamera:
         for control in ready:
             self._answer(control)
         if self._acquiring and (block := self._sensor.next_block(_BLOCK_WAIT_S)) is not None:
-            time_ns = int(self._sensor.times_ns(block.first_line, 1)[0])
-            self._waiting.append((time_ns, np.array(block.pixels)))
+            self._waiting.append((block.first_line, np.array(block.pixels)))
             self._send_whole_frames()
 
     def _answer(self, control: socket.socket) -> None:
         packet, sender = control.recvfrom(2048)
         request = protocol.parse(packet)
-        if request is not None and request.command == protocol.Command.RESEND:
+        if request is None:
+            return
+        if request.command == protocol.Command.RESEND:
             self._send_again(*protocol.parse_resend(request))
             return
-        reply = self._registers.handle(request) if request is not None else None
-        if reply is not None:
+        if (sender, request) != self._answered[:2]:  # else the host has not seen the answer in time
+            self._answered = (sender, request, self._registers.handle(request))
             self._obey()  # the host may start the trigger once it has the answer
+        reply = self._answered[2]
+        if reply is not None:
             self._control[0].sendto(reply, sender)
 
     def _obey(self) -> None:
@@ -141,11 +145,11 @@ class GigeCamera:
     def _send_whole_frames(self) -> None:
         height = self._register("Height")
         while sum(len(lines) for _, lines in self._waiting) >= height:
-            time_ns = self._waiting[0][0]
+            first_line = self._waiting[0][0]
             lines = np.concatenate([lines for _, lines in self._waiting])
-            self._send(time_ns, lines[:height])
+            self._send(int(self._sensor.times_ns(first_line, 1)[0]), lines[:height])
             rest = lines[height:]
-            self._waiting = [(time_ns, rest)] if len(rest) else []
+            self._waiting = [(first_line + height, rest)] if len(rest) else []
 
     def _send(self, time_ns: int, lines: NDArray[Any]) -> None:
         code = self._register("PixelFormat")
