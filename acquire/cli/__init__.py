@@ -33,6 +33,7 @@ from acquire.cli import (
     tradeoff,
     trigger,
 )
+from acquire.cli.interrupts import interrupts_answered
 from acquire.cli.output import json_asked, print_error, say
 from acquire.cli.usage import not_installed, run
 from acquire.errors import EXIT_INTERRUPTED, AcquireError, DeviceError, UsageError
@@ -78,7 +79,8 @@ for module in MODULES:
 def main() -> int:
     """Entry point; the exit code is `acquire.errors`'."""
     try:
-        return run(app)
+        with interrupts_answered():
+            return run(app)
     except AcquireError as error:
         return _failed(error)
     except ModuleNotFoundError as error:

@@ -8,9 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, quantity, say
-from acquire.errors import DataError, UsageError
+from acquire.cli.progress import stage_progress
+from acquire.errors import DeviceError, UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from acquire.capacity.load import Load
     from acquire.capacity.parts import Parts
     from acquire.capacity.search import Trial
@@ -40,7 +43,7 @@ def bench(
     """Search the highest line rate without a loss.
 
     Cameras show stored lines, everything else is as in a run. Every run has processes, rings and a
-    recording of its own, which is removed again. Exit code 6 where no rate that is tried can be held.
+    recording of its own, which is removed again. Exit code 5 where no rate that is tried can be held.
 
     Example: [bold]acquire bench --config rig-vt-4k5c-h100 --out /data[/]
     """
@@ -51,22 +54,29 @@ def bench(
     from acquire.daemon.storage import choose_for
 
     if not 0.1 <= seconds <= 600:
-        raise UsageError(f"bench --seconds {seconds:g}", possible="0.1 to 600")
+        raise UsageError(f"--seconds {seconds:g} is out of range", possible="0.1 to 600")
     rig = load_rig(config, parse_settings(settings or []))
     directory = (out or rig.recording.directory).absolute()
     chosen = choose_for(rig, directory=directory).codec if rig.recording.codec == "auto" else None
     load = Load.of(rig, chosen)
-    parts = measure_parts(load, directory)
+    with stage_progress("measuring ring, codec and disk"):
+        parts = measure_parts(load, directory)
     if not json:
         _show_parts(load, parts, directory)
-    trials = search_rate(load, directory, parts.line_rate_hz, seconds, None if json else _tell, runs)
+    with stage_progress(f"recording at most {runs} times") as advance:
+        told = _Told(advance, runs, aloud=not json)
+        trials = search_rate(load, directory, parts.line_rate_hz, seconds, told, runs)
     found = best(trials)
     if json:
         print_json(_facts(load, parts, trials, found))
     elif found is not None:
         _show(load, trials, found)
     if found is None:
-        raise DataError("no line rate that was tried could be held", hint="another disk, or a longer ring")
+        slowest = min(trial.line_rate_hz for trial in trials)
+        raise DeviceError(
+            f"this host held none of the line rates that were tried, down to {quantity(slowest, 'Hz')}",
+            hint="another disk (--out), recording.codec, a longer ring (stream.ring_slots), or an idle host",
+        )
 
 
 def _show_parts(load: Load, parts: Parts, directory: Path) -> None:
@@ -80,8 +90,18 @@ def _show_parts(load: Load, parts: Parts, directory: Path) -> None:
     )
 
 
-def _tell(trial: Trial) -> None:
-    say(f"  {quantity(trial.line_rate_hz, 'Hz')}: {'held' if trial.held else 'not held'}", err=True)
+class _Told:
+    """Told of each trial as it ends."""
+
+    def __init__(self, advance: Callable[[int, int], None], runs: int, *, aloud: bool) -> None:
+        self._advance, self._runs, self._aloud = advance, runs, aloud
+        self._done = 0
+
+    def __call__(self, trial: Trial) -> None:
+        self._done += 1
+        self._advance(self._done, self._runs)
+        if self._aloud:
+            say(f"  {quantity(trial.line_rate_hz, 'Hz')}: {'held' if trial.held else 'not held'}", err=True)
 
 
 def _show(load: Load, trials: list[Trial], found: Trial) -> None:

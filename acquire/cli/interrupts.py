@@ -1,28 +1,81 @@
-"""Ctrl-C in commands whose work so far is worth keeping."""
+"""Ctrl-C is answered at once, in words: the first one ends in good order, the second one ends now."""
 
 from __future__ import annotations
 
+import multiprocessing
+import os
 import signal
 import threading
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from acquire.cli.output import note
+from acquire.errors import EXIT_INTERRUPTED
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+END_NOW = "acquire-end-now"
+GRACE_S = 3.0
+"""After the second Ctrl-C, for what is half-made to be removed."""
+
 
 @contextmanager
-def first_interrupt_asks() -> Iterator[threading.Event]:
-    """The first Ctrl-C sets the event, by which the work ends with the best so far; the second breaks off."""
+def first_interrupt_asks(finishing: str) -> Iterator[threading.Event]:
+    """The first Ctrl-C sets the event, by which the work ends with the best so far; the second ends now.
+
+    ``finishing`` says what is still done after the first: "finishing what is being solved".
+    """
     asked = threading.Event()
 
     def interrupted(_number: int, _frame: object) -> None:
         if asked.is_set():
-            raise KeyboardInterrupt
+            _end_now()
         asked.set()
+        note(f"{finishing}; Ctrl-C once more to end now")
 
-    before = signal.signal(signal.SIGINT, interrupted)
-    try:
+    with _handled_by(interrupted):
         yield asked
+
+
+@contextmanager
+def interrupts_answered() -> Iterator[None]:
+    """The first Ctrl-C raises KeyboardInterrupt and says so, since to end in good order may take its time."""
+    asked = threading.Event()
+
+    def interrupted(_number: int, _frame: object) -> None:
+        if asked.is_set():
+            _end_now()
+        asked.set()
+        note("interrupted, ending; Ctrl-C once more to end now")
+        raise KeyboardInterrupt
+
+    try:
+        with _handled_by(interrupted):
+            yield
+    finally:  # all is removed by now
+        for thread in threading.enumerate():
+            if isinstance(thread, threading.Timer) and thread.name == END_NOW:
+                thread.cancel()
+
+
+@contextmanager
+def _handled_by(handler: signal._HANDLER) -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():
+        yield  # a caller in a thread has its own ways to end this
+        return
+    before = signal.signal(signal.SIGINT, handler)
+    try:
+        yield
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def _end_now() -> None:
+    """End our processes, and this one: by an exception, so that what is half-made is removed, or without."""
+    for child in multiprocessing.active_children():
+        child.kill()
+    timer = threading.Timer(GRACE_S, os._exit, (EXIT_INTERRUPTED,))
+    timer.name, timer.daemon = END_NOW, True
+    timer.start()
+    raise KeyboardInterrupt

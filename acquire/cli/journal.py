@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from acquire.cli.output import say
+from acquire.cli.progress import stage_progress
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -30,7 +31,8 @@ class Journal:
 
         note: dict[str, str] = {}
         started = time.perf_counter()
-        yield note
+        with stage_progress(name):
+            yield note
         seconds = time.perf_counter() - started
         self.stages.append(Stage(name, seconds, note.get("detail", "")))
         detail = f"  {note['detail']}" if "detail" in note else ""

@@ -122,6 +122,16 @@ def print_warning(text: str) -> None:
     say(f"acquire: warning: {text}", err=True)
 
 
+def note(text: str) -> None:
+    """What happens meanwhile; on stderr."""
+    say(f"acquire: {text}", err=True)
+
+
+def note_json(facts: Any) -> None:
+    """The same for programs: one line of JSON on stderr."""
+    typer.echo(json_text(facts), err=True)
+
+
 def quantity(value: float, unit: str) -> str:
     """``value`` with three significant digits and a metric prefix: 33.3 kHz, 1.2 MB."""
     for factor, prefix in ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k")):

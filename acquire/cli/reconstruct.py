@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from acquire.store import Recording
 
 
-PROGRESS_STEPS = 1000
+QUICKER = "--from and --to (a part), --preview (seconds), --preset fast, --budget SECONDS, or larger voxels"
 
 
 def register(app: typer.Typer) -> None:
@@ -151,14 +151,10 @@ def _run(
     tasks = len(request.stretches)
     at_once = workers or (None if options.device == "cpu" else 1)  # one process fills a GPU
     with (
-        first_interrupt_asks() as interrupted,
-        stage_progress(f"reconstructing {PurePosixPath(out).name}") as advance,
+        first_interrupt_asks("finishing the sub-segments under way, as far as they came") as interrupted,
+        stage_progress(f"reconstructing {PurePosixPath(out).name}", QUICKER) as advance,
     ):
-        watcher = Watcher(
-            tasks,
-            lambda done, of: advance(round(PROGRESS_STEPS * done), PROGRESS_STEPS * of),
-            interrupted.is_set,
-        )
+        watcher = Watcher(tasks, advance, interrupted.is_set)
         with open_pool(tasks, at_once, cluster, watcher) as pool:
             return combine(recording, request, out, options, pool, watcher)
 
@@ -186,12 +182,14 @@ def _readable(outcome: Outcome) -> dict[str, Any]:
     first, end = facts["trusted"]
     quality, prediction = facts["quality"], facts["quality"]["prediction"]
     done, of = len(facts["segments"]), facts["segments_asked"]
+    trusted = sum(part["trusted"] for part in facts["segments"])
+    nothing = "every frame is sampled in part" if trusted else "no sub-segment was solved to its end"
     return {
         "video": f"{outcome.path}, {' × '.join(map(str, outcome.shape))} (time, row, column)",
-        "interrupted": f"holds {done} of {of} sub-segments, the last as far as it came"
+        "interrupted": f"holds {done} of {of} sub-segments, {done - trusted} of them broken off"
         if outcome.interrupted
         else None,
-        "trusted": f"frames {first} to {end - 1}" if end > first else "none: every frame is sampled in part",
+        "trusted": f"frames {first} to {end - 1}" if end > first else f"none: {nothing}",
         "solver": f"{facts['solver']}, {_iterations(facts)}, {facts['seconds']:.1f} s",
         "misfit": f"{quality['misfit']:.2%} of the samples' RMS",
         "prediction": None if prediction is None else f"{prediction:.2%} at samples kept from the solver",
@@ -214,10 +212,13 @@ def _print_segments(segments: list[dict[str, Any]]) -> None:
             part["iterations"],
             f"{part['seconds']:.1f}",
             f"{part['quality']['misfit']:.2%}",
+            "yes" if part["trusted"] else "no",
         )
         for number, part in enumerate(segments, 1)
     ]
-    print_table(("segment", "voxels", "sub-steps kept", "lines", "iterations", "seconds", "misfit"), rows)
+    print_table(
+        ("segment", "voxels", "sub-steps kept", "lines", "iterations", "seconds", "misfit", "trusted"), rows
+    )
 
 
 def _print_plan(plan: ReconstructionPlan) -> None:

@@ -172,7 +172,7 @@ def _plan(recording: Recording, selection: Selection, asked: Asked) -> Reconstru
     if asked.auto:
         from acquire.reconstruct.propose import propose
 
-        with stage_progress("looking for what changes") as advance:
+        with stage_progress("looking for what changes", "--from and --to, for a part") as advance:
             return propose(recording, selection, whole=asked.ends == "whole", progress=advance)
     if asked.plan is not None:
         return load_plan(asked.plan)

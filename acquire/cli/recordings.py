@@ -94,7 +94,7 @@ def verify(recording: PlaceArgument, json: JsonFlag = False) -> None:
     """
     from acquire.store import verify as verify_recording
 
-    with stage_progress("verifying") as progress:
+    with stage_progress(f"verifying {recording}") as progress:
         found = verify_recording(recording, progress)
     if json:
         print_json(found.to_dict())
@@ -113,7 +113,7 @@ def recover(recording: RecordingArgument, json: JsonFlag = False) -> None:
     """
     from acquire.store import recover as recover_recording
 
-    with stage_progress("recovering") as progress:
+    with stage_progress(f"recovering {recording}") as progress:
         done = recover_recording(recording, progress=progress)
     if json:
         print_json(done.to_dict())
@@ -170,7 +170,8 @@ def upload(
         if not json:
             say(f"{url}: {done.lines} lines, {quantity(done.bytes, 'B')} copied", err=True)
 
-    done = mirror(recording, url, follow=follow, report=report)
+    with stage_progress(f"copying {recording.name}") as progress:
+        done = mirror(recording, url, follow=follow, report=report, progress=progress)
     if json:
         print_json(done.to_dict())
     else:
@@ -193,8 +194,9 @@ def cut(
     from acquire.store.files import check_new_path
 
     check_new_path(out)
-    segment = open_recording(recording).cut(first_line, lines)
-    size = _save(segment, out)
+    with stage_progress(f"cutting {lines} lines"):
+        segment = open_recording(recording).cut(first_line, lines)
+        size = _save(segment, out)
     facts = {"path": str(out), "first_line": first_line, "lines": lines, "bytes": size}
     if json:
         print_json(facts)

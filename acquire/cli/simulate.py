@@ -62,7 +62,10 @@ def simulate(
         with stage_progress(f"simulating {out.name}") as advance:
             done = run(rig, shown, out, count, advance)
         facts = {**asdict(done), "path": str(done.path), "speed": done.speed}
-    found = study(bench_of(rig, shown), rig.code.build()) if explain or (advice and shown.effects) else None
+    found = None
+    if explain or (advice and shown.effects):
+        with stage_progress("leaving out one effect after the other"):
+            found = study(bench_of(rig, shown), rig.code.build())
     if json:
         print_json({**facts, "study": found and asdict(found)})
         return

@@ -7,6 +7,8 @@ from collections import deque
 from concurrent.futures import CancelledError, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, replace
+from itertools import groupby
+from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -83,6 +85,7 @@ def combine(
     tasks = [Task(place, segment, grid, options) for segment in segments]
     times, anchor = Times.of(recording), _anchor(recording, request)
     stitcher = Stitcher(grid)
+    solved: list[SubSegment] = []
     done: list[dict[str, Any]] = []
     with VideoWriter(
         out,
@@ -98,13 +101,15 @@ def combine(
             if len(video):
                 begins = grid.edges(slice(writer.frames, writer.frames + len(video)))[:-1]
                 writer.append(video, times.utc_ns(begins, anchor), error)
+            solved.append(task.segment)
             done.append(part.facts)  # not the part: memory must not grow with the stream
         if not done:
             raise KeyboardInterrupt  # there is nothing to keep
         facts = describe_parts(recording, request, done, options)
         facts["state"] = "interrupted" if watcher.stopped else "complete"
         facts["seconds"] = round(time.monotonic() - began, 3)
-        facts["trusted"] = _trusted_frames(request, writer.frames)
+        whole = _whole_stretch([(each, part["trusted"]) for each, part in zip(solved, done, strict=True)])
+        facts["trusted"] = _trusted_frames(request, writer.frames, whole)
         writer.finish(facts)
     return Outcome(out, (writer.frames, grid.side, grid.side), watcher.stopped, facts)
 
@@ -205,10 +210,26 @@ def _rms(values: Sequence[float | None]) -> float | None:
     return float(np.sqrt(np.mean(np.square(known)))) if known else None
 
 
-def _trusted_frames(request: Request, frames: int) -> list[int]:
-    """First frame that is sampled in full, and the one after the last."""
+def _whole_stretch(segments: Sequence[tuple[SubSegment, bool]]) -> tuple[int, int]:
+    """The longest run of sub-segments that are trusted, in sub-steps, without what fades into others."""
+    runs = [[each for each, _ in run] for trusted, run in groupby(segments, itemgetter(1)) if trusted]
+    first, last = segments[0][0], segments[-1][0]
+    found = [
+        (
+            run[0].begin + (0 if run[0] is first else run[0].fade_in),
+            run[-1].end - (0 if run[-1] is last else run[-1].fade_out),
+        )
+        for run in runs
+    ]
+    return max(found, key=lambda edges: edges[1] - edges[0], default=(first.begin, first.begin))
+
+
+def _trusted_frames(request: Request, frames: int, whole: tuple[int, int]) -> list[int]:
+    """First frame that is sampled in full, of a trusted sub-segment, and the one after the last."""
     T_m, begin = request.grid.voxels.temporal_merge, request.grid.begin
-    low, high = (edge - begin for edge in request.trusted)
-    stop = -(-high // T_m) if request.trusted[1] >= request.grid.end else high // T_m
+    low, high = (
+        edge - begin for edge in (max(request.trusted[0], whole[0]), min(request.trusted[1], whole[1]))
+    )
+    stop = -(-high // T_m) if begin + high >= request.grid.end else high // T_m
     first = min(frames, -(-low // T_m))
     return [first, max(first, min(frames, stop))]

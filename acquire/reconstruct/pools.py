@@ -169,6 +169,10 @@ def open_pool(
     )
     try:
         yield Processes(executor, count, shared)
+    except KeyboardInterrupt:  # nobody waits for what is being solved
+        for child in multiprocessing.active_children():
+            child.kill()
+        raise
     finally:
         shared.stop.set()
         executor.shutdown(cancel_futures=True)

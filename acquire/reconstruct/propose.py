@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from itertools import groupby
+from collections import deque
+from itertools import groupby, pairwise
 from typing import TYPE_CHECKING
 
 from acquire.plan_config import ReconstructionPlan, SegmentPlan
-from acquire.recon.auto import Tempo, tempo
+from acquire.recon.auto import TEMPORAL_MERGES, Tempo, tempo
 from acquire.recon.segments import Stretch, Voxels, split
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from acquire.reconstruct.select import Selection
     from acquire.store import Recording
@@ -19,6 +20,12 @@ LOOKED_AT = 4
 """Length of a stretch that is judged by itself, in n; a change is located no better than that."""
 LONGEST = 12
 """Sub-segments are no longer than this, in n."""
+PLACES = 9
+"""Stretches that are looked at first, evenly spaced; between two that differ more, until the change is found.
+
+A look takes as long as a short reconstruction. What changes and changes back between two places that are
+alike is not seen: a shorter selection is looked at throughout.
+"""
 
 
 def propose(
@@ -33,18 +40,51 @@ def propose(
     size = stream.geometry(1).size
     begin, end = selection.extent(Voxels(1, 1), Voxels(1, 1), whole=whole)
     stretches = split(begin, end, Voxels(1, 1), LOOKED_AT * size)
-    found = []
-    for number, stretch in enumerate(stretches):
+
+    def look(number: int) -> Tempo:
         # lines that see nothing else: what the neighbours do is judged with them
+        stretch = stretches[number]
         inner = stream.sub_segment(Stretch(stretch.begin, stretch.end, Voxels(1, size)))
-        heard = tempo(recording.cut(inner.first_line, inner.lines))
-        found.append((stretch, heard))
-        if progress is not None:
-            progress(number + 1, len(stretches))
+        return tempo(recording.cut(inner.first_line, inner.lines))
+
+    found = list(zip(stretches, _tempos(len(stretches), look, progress), strict=True))
     groups = [list(group) for _, group in groupby(found, key=lambda each: each[1].voxels)]
     parts = [part for group in groups for part in _parts(group, LONGEST // LOOKED_AT)]
     last = parts.pop().model_copy(update={"substeps": None})
     return ReconstructionPlan(ends="whole" if whole else "trusted", segments=(*parts, last))
+
+
+def _tempos(
+    count: int, look: Callable[[int], Tempo], progress: Callable[[int, int], object] | None
+) -> list[Tempo]:
+    """Of every stretch: looked at, or between two that were looked at and are in the same voxels."""
+    places = sorted({round(i * (count - 1) / max(1, PLACES - 1)) for i in range(PLACES)})
+    known: dict[int, Tempo] = {}
+    waiting = deque(places)
+    while waiting:
+        place = waiting.popleft()
+        known[place] = look(place)
+        if not waiting:
+            waiting.extend(_between(known))
+        if progress is not None:
+            progress(len(known), len(known) + len(waiting))
+    return [known[max(place for place in known if place <= number)] for number in range(count)]
+
+
+def _between(known: Mapping[int, Tempo]) -> list[int]:
+    """The middle between neighbours that differ and have something between them."""
+    return [
+        (one + other) // 2
+        for one, other in pairwise(sorted(known))
+        if other - one > 1 and not _alike(known[one].voxels, known[other].voxels)
+    ]
+
+
+def _alike(one: Voxels, other: Voxels) -> bool:
+    """Stills are as long as what was looked at, which differs by a line or two."""
+    slow = max(TEMPORAL_MERGES)
+    lengths = {min(voxels.temporal_merge, slow + 1) for voxels in (one, other)}
+    return one.spatial_merge == other.spatial_merge and len(lengths) == 1
 
 
 def _parts(found: list[tuple[Stretch, Tempo]], most: int) -> list[SegmentPlan]:

@@ -8,13 +8,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from acquire.recon import reconstruct
+from acquire.recon.judge import POOR_MISFIT
 from acquire.store import open_recording
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.arrays import Dtype
-    from acquire.recon import Preset, Progress, Solver
+    from acquire.recon import Preset, Progress, Reconstruction, Solver
     from acquire.recon.segments import Grid, SubSegment
 
 
@@ -85,6 +86,7 @@ def solve(task: Task, watch: Watch) -> Part:
     )
     watch.advance(1 - result.iterations / result.iterations_asked)
     substeps = lines.geometry.substeps
+    why = _why_not_trusted(result, segment)
     return Part(
         video=task.grid.resample(result.video, segment, substeps),
         error=task.grid.resample_time(result.frame_error, segment, substeps),
@@ -100,10 +102,24 @@ def solve(task: Task, watch: Watch) -> Part:
             "ended": result.ended,
             "seconds": round(result.seconds, 3),
             "masked": result.masked,
-            "warnings": list(result.warnings),
+            "trusted": why is None,
+            "warnings": [*([] if why is None else [why]), *result.warnings],
             "parameters": result.parameters,
             "quality": {name: _json(value) for name, value in asdict(result.quality).items()},
         },
+    )
+
+
+def _why_not_trusted(result: Reconstruction, segment: SubSegment) -> str | None:
+    """Why nothing of it may be believed: it was broken off, or had too little time to explain its lines."""
+    missed = float(np.nanmax([result.quality.misfit, result.quality.prediction]))
+    if result.ended != "stopped" and (result.ended != "budget" or missed <= POOR_MISFIT):
+        return None
+    why = "broken off" if result.ended == "stopped" else "ended by its budget"
+    last = segment.first_line + segment.lines - 1
+    return (
+        f"the sub-segment of lines {segment.first_line} to {last} was {why} after {result.iterations} of "
+        f"{result.iterations_asked} iterations and misses its lines by {missed:.0%}: it is not trusted"
     )
 
 

@@ -73,6 +73,7 @@ def mirror(
     follow: bool = False,
     idle_s: float = 60.0,
     report: Callable[[Mirrored], None] = lambda _: None,
+    progress: Callable[[int, int], object] = lambda _done, _total: None,
 ) -> Mirrored:
     """Copy the recording at ``path`` to ``url``; with ``follow`` until it is sealed.
 
@@ -82,11 +83,28 @@ def mirror(
     """
     open_recording(path)  # which says what else it may be
     with only_copy(path):
-        return _mirror(Mirror(path, url), path, follow, idle_s, report)
+        return _mirror(_Steps(Mirror(path, url), progress), path, follow, idle_s, report)
+
+
+class _Steps:
+    """A copy, file by file: after each, ``progress`` is told lines that are there, and how many there are."""
+
+    def __init__(self, copying: Mirror, progress: Callable[[int, int], object]) -> None:
+        self._copying, self._progress = copying, progress
+        self.target = copying.target
+
+    def step(self) -> Mirrored:
+        """All that is new; see `Mirror.step`."""
+        done = self._copying.step(most_shards=1)
+        before = -1
+        while not done.sealed and done.shards != before:
+            self._progress(done.lines, done.lines + done.waiting_lines)
+            before, done = done.shards, self._copying.step(most_shards=1)
+        return done
 
 
 def _mirror(
-    copying: Mirror, path: Path, follow: bool, idle_s: float, report: Callable[[Mirrored], None]
+    copying: _Steps, path: Path, follow: bool, idle_s: float, report: Callable[[Mirrored], None]
 ) -> Mirrored:
     done = copying.step()
     moved = time.monotonic()

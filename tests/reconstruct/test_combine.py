@@ -14,6 +14,7 @@ import pytest
 
 from acquire.errors import UsageError
 from acquire.plan_config import ReconstructionPlan
+from acquire.recon.judge import POOR_MISFIT
 from acquire.recon.segments import Voxels
 from acquire.reconstruct import (
     Options,
@@ -142,6 +143,13 @@ def test_what_was_solved_before_a_stop_is_kept_and_marked(recording_path, reques
     assert outcome.interrupted
     assert video.attrs["provenance"]["state"] == "interrupted"
     assert 0 < video.video.shape[0] < request_of_three.grid.frames
+    segments = video.attrs["provenance"]["segments"]
+    assert [part["trusted"] for part in segments] == [part["ended"] != "stopped" for part in segments]
+    assert not segments[-1]["trusted"]
+    assert "was broken off after" in segments[-1]["warnings"][0]
+    begin = segments[-1]["begin_substep"] - request_of_three.grid.begin
+    first, end = video.attrs["provenance"]["trusted"]
+    assert first <= end <= begin // request_of_three.grid.voxels.temporal_merge
     assert len(video.time_ns) == video.video.shape[0] == len(video.quality)
 
 
@@ -150,6 +158,17 @@ def test_a_budget_is_shared(recording_path, request_of_three, tmp_path):
     outcome = run(recording_path, request_of_three, tmp_path / "v.zarr", options)
     assert all(part["iterations"] < 100_000 for part in outcome.provenance["segments"])
     assert not outcome.interrupted
+
+
+def test_what_had_too_little_time_to_explain_its_lines_is_not_trusted(
+    recording_path, request_of_three, tmp_path
+):
+    options = Options(solver="twist", iterations=100_000, budget_s=0.05)
+    facts = run(recording_path, request_of_three, tmp_path / "v.zarr", options).provenance
+    poor = [part["quality"]["misfit"] > POOR_MISFIT for part in facts["segments"]]
+    assert poor == [not part["trusted"] for part in facts["segments"]]
+    assert any(poor)
+    assert facts["trusted"][1] - facts["trusted"][0] < request_of_three.grid.frames
 
 
 def test_a_failing_sub_segment_leaves_nothing(recording_path, request_of_three, tmp_path):
@@ -178,6 +197,8 @@ def test_ctrl_c_keeps_the_best_so_far(recording_path, tmp_path):
     facts = json.loads(out)
     assert facts["state"] == "interrupted"
     assert facts["segments"][0]["iterations"] < 1_000_000
+    assert facts["trusted"] == [0, 0]
+    assert b"Ctrl-C once more to end now" in error
     assert open_video(tmp_path / "v.zarr").attrs["provenance"]["state"] == "interrupted"
     assert [path.name for path in tmp_path.iterdir()] == ["v.zarr"]
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from acquire.recon.auto import Tempo
+from acquire.recon.segments import Voxels
 from acquire.reconstruct import by_lines
-from acquire.reconstruct.propose import propose
+from acquire.reconstruct.propose import PLACES, _alike, _tempos, propose
 from acquire.scene_config import ConstantDrive, LedConfig, LedSceneConfig, SineDrive
 from acquire.simulate import simulate
 from acquire.store import open_recording
@@ -30,3 +32,24 @@ def test_a_scene_that_flickers_gets_short_frames(rig, tmp_path):
     plan = propose(recording, by_lines(recording))
     assert max(part.temporal_merge for part in plan.segments) <= 16
     assert plan.segments[-1].is_open
+
+
+def test_a_long_recording_is_looked_at_in_some_places_and_where_it_changes():
+    still, fast = (Tempo(voxels, ((0, 0.1),)) for voxels in (Voxels(1, 770), Voxels(3, 4)))
+    looked, told = [], []
+
+    def look(number):
+        looked.append(number)
+        return fast if 70 <= number < 101 else still
+
+    found = _tempos(130, look, lambda done, of: told.append((done, of)))
+    assert found == [still] * 70 + [fast] * 31 + [still] * 29
+    assert len(looked) == len(set(looked)) <= PLACES + 2 * 4
+    assert told[-1] == (len(looked), len(looked))
+    assert _tempos(3, lambda _: still, None) == [still] * 3
+
+
+def test_stills_of_other_lengths_are_alike():
+    assert len(_tempos(50, lambda number: Tempo(Voxels(1, 770 + number % 3), ((0, 0.1),)), None)) == 50
+    assert not _alike(Voxels(1, 770), Voxels(1, 64))
+    assert _alike(Voxels(1, 770), Voxels(1, 767))

@@ -1,0 +1,143 @@
+"""How far long work is, and that Ctrl-C is answered: on a terminal, in a pipe, as JSON."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+
+import pytest
+
+from acquire.cli import progress as module
+from acquire.cli.interrupts import END_NOW, first_interrupt_asks, interrupts_answered
+from acquire.cli.progress import Progress, span
+
+LIMIT_S = 30.0
+
+
+@pytest.fixture
+def heard(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[[int], list[str]]:
+    """Waits for so many more lines on stderr; lines come as fast as they can."""
+    monkeypatch.setattr(module, "FIRST_S", 0.0)
+    monkeypatch.setattr(module, "EVERY_S", 0.01)
+
+    def lines(count: int) -> list[str]:
+        said, deadline = "", time.monotonic() + LIMIT_S
+        while said.count("\n") < count:
+            assert time.monotonic() < deadline, said
+            said += capsys.readouterr().err
+            time.sleep(0.005)
+        return said.splitlines()
+
+    return lines
+
+
+def test_a_pipe_gets_lines_with_share_and_time_left(heard: Callable[[int], list[str]]) -> None:
+    with Progress("verifying run.zarr") as progress:
+        assert heard(1)[0] == "acquire: verifying run.zarr, 0 s"
+        progress._began_s -= 100
+        progress.advance(25, 100)
+        assert (
+            heard(3)[-1] == "acquire: verifying run.zarr: 25 of 100 (25%), 1 min 40 s, about 5 min 0 s left"
+        )
+        progress.advance(2.25, 9)
+        assert "2.2 of 9 (25%)" in heard(3)[-1]
+    assert not [thread for thread in threading.enumerate() if thread.name == "acquire-progress"]
+
+
+def test_work_of_a_moment_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    with Progress("looking") as progress:
+        progress.advance(1, 2)
+    assert capsys.readouterr().err == ""
+
+
+def test_programs_get_json(heard: Callable[[int], list[str]], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["acquire", "verify", "--json"])
+    with Progress("verifying") as progress:
+        progress._began_s -= 10
+        progress.advance(1, 2)
+        facts = json.loads(heard(2)[-1])["progress"]
+    assert (facts["what"], facts["done"], facts["total"]) == ("verifying", 1, 2)
+    assert facts["left_s"] == pytest.approx(10, rel=0.5)
+
+
+def test_work_within_work_is_shown_in_its_place(heard: Callable[[int], list[str]]) -> None:
+    with Progress("the demo"):
+        heard(1)
+        with Progress("recording"):
+            assert "the demo" not in heard(3)[-1]
+        assert heard(3)[-1].startswith("acquire: the demo, ")
+
+
+def test_what_will_take_long_says_so_once_with_what_is_quicker(capsys: pytest.CaptureFixture[str]) -> None:
+    with Progress("reconstructing", "--preview") as progress:
+        progress._began_s -= 10
+        progress.advance(1, 1000)
+        progress.advance(2, 1000)
+    said = capsys.readouterr().err.splitlines()
+    assert said == ["acquire: reconstructing will take about 2 h 46 min; in less time: --preview"]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "words"), [(0.4, "0 s"), (59, "59 s"), (61, "1 min 1 s"), (7320, "2 h 2 min")]
+)
+def test_durations_are_told_in_words(seconds: float, words: str) -> None:
+    assert span(seconds) == words
+
+
+def test_a_terminal_gets_a_bar() -> None:
+    code = "from acquire.cli.progress import Progress\nwith Progress('verifying') as p: p.advance(30, 40)"
+    parent, child = pty.openpty()
+    try:
+        subprocess.run(
+            [sys.executable, "-c", code],
+            stderr=child,
+            stdout=subprocess.DEVNULL,
+            env=os.environ | {"TERM": "xterm"},
+            check=True,
+            timeout=60,
+        )
+        said = os.read(parent, 65536).decode()
+    finally:
+        os.close(parent)
+        os.close(child)
+    assert "verifying" in said
+    assert "30 of 40" in said
+
+
+def test_ctrl_c_is_answered_before_anything_ends(capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted() -> None:
+        with interrupts_answered():
+            try:
+                signal.raise_signal(signal.SIGINT)
+            finally:  # before whatever takes its time to end
+                said.append(capsys.readouterr().err)
+
+    said: list[str] = []
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert said == ["acquire: interrupted, ending; Ctrl-C once more to end now\n"]
+
+
+def test_the_first_ctrl_c_finishes_and_the_second_ends(capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted_twice() -> None:
+        with interrupts_answered(), first_interrupt_asks("finishing the segment") as asked:
+            signal.raise_signal(signal.SIGINT)
+            assert asked.is_set()
+            said.append(capsys.readouterr().err)
+            signal.raise_signal(signal.SIGINT)
+
+    said: list[str] = []
+    with pytest.raises(KeyboardInterrupt):
+        interrupted_twice()
+    assert said == ["acquire: finishing the segment; Ctrl-C once more to end now\n"]
+    for thread in threading.enumerate():
+        if thread.name == END_NOW:
+            thread.join(LIMIT_S)
+            assert not thread.is_alive()
