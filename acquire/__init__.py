@@ -18,7 +18,7 @@ The layers, top to bottom; imports point downwards only (checked by the tests)::
     config        lines              what a rig is · what travels from camera to disk
     codes  geometry  clock           the code, the shear, the time: plain arithmetic
     arrays  cores                    whose arrays are computed with, and on how many cores
-    logs                             one line per entry
+    logs  reading                    one line per entry · files that anybody may have put there
     errors  text                     failures that a user can meet, with exit codes · foreign text
 
 Equation numbers in docstrings refer to Li, Wang and Liu, "TDI-based continuous window compressed

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 from acquire.daemon.messages import ErrorMessage, UploadStatus
 from acquire.errors import AcquireError, PlaceError, UsageError
 from acquire.store import open_recording
+from acquire.store.attributes import segment_of
 from acquire.store.mirror import LOOK_S, Mirror, only_copy
 from acquire.store.opening import read_root
 from acquire.store.refusals import refusal
@@ -206,8 +207,8 @@ class Copier:
 
     def _renew_first(self, path: Path) -> None:
         """The first recording of a run lists its segments, this one by now."""
-        segment = read_root(LocalSource(path))["attributes"].get("segment")
-        if segment is not None and (first := path.with_name(str(segment["of"]))).exists():
+        segment = segment_of(read_root(LocalSource(path))["attributes"])
+        if segment is not None and (first := path.with_name(segment[0])).exists():
             self.add(first, ours=False)
             self._mailbox.post(self._jobs[first].said)
 

@@ -198,8 +198,9 @@ class RecoveryStatus(_Message):
     """A recording that its recorder did not seal, and what the daemon made of it."""
 
     path: Place
-    state: Literal["waiting", "recovered", "left", "failed"] = Field(
-        description="waiting for its turn or a lock; sealed; not to be touched by this daemon; could not be"
+    state: Literal["waiting", "recovered", "left", "failed", "gone"] = Field(
+        description="waiting for its turn or a lock; sealed; not to be touched by this daemon, or not a "
+        "recording at all; could not be; not there, or nothing was ever recorded to it"
     )
     lines: int | None = Field(default=None, description="of each arm that a reader finds")
     condition: Text | None = Field(default=None, description="what the lines are worth, once it is recovered")

@@ -3,10 +3,12 @@
 ::
 
     a recorder was killed (`CaptureStatus.orphans`) ─┐
-    found open when the daemon started ──────────────┴▶ Salvage ─▶ process: recover, one by one ─▶ status
+    found open when the daemon started ──────────────┼▶ Salvage ─▶ process: recover, one by one ─▶ status
+    an earlier daemon recorded it (`Journal`) ───────┘
 
 What another process still writes is left to it: the lock of its directory tells. So is what another machine
-wrote, and what lies where there are no locks. The process ends at once when a run is armed, unless it is
+wrote, what lies where there are no locks, what holds links, and what is no recording: it is named in the
+status and in the log, once, and not touched. The process ends at once when a run is armed, unless it is
 after what that run itself has left; a recovery that was cut off begins anew afterwards.
 """
 
@@ -14,20 +16,15 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from acquire.daemon.journal import Journal
 from acquire.daemon.messages import RecoveryStatus
-from acquire.errors import AcquireError, DataError, DeviceError, PlaceError, StateError
-from acquire.store import FORMAT, Circumstances, recover
-from acquire.store.files import DISK, locked
-from acquire.store.host import has_run_on, is_here
-from acquire.store.opening import read_root
-from acquire.store.source import LocalSource
-from acquire.stream import Orphan
+from acquire.daemon.recoverer import RECOVERED, Found, Task, hindrance, salvage, search
+from acquire.errors import DeviceError
 from acquire.stream.messages import Failed
 from acquire.stream.process import Worker
 
@@ -35,44 +32,39 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
-    from acquire.stream.process import Mailbox
+    from acquire.stream import Orphan
 
 AGAIN_S = 5.0
 """Between two looks at a recording that another process holds."""
 MOST_TRIES = 6
 MOST_LISTED = 32
 """Recordings of which the status tells, the latest: more than one run can leave."""
-RECOVERED = "recovered: "
-"""How the end reason begins of a recording that was recovered."""
-_NICE = 10
+MOST_ODD = 8
+"""Entries of the directory that are no recordings, of which the status tells."""
 _END_S = 5.0
 _POLL_S = 0.02
 
 log = logging.getLogger("acquire.daemon")
 
 
-@dataclass(frozen=True, slots=True)
-class Task:
-    """One recording to be recovered. ``ours``: this daemon's run has left it, ``why``."""
-
-    path: Path
-    why: str = ""
-    ours: bool = False
-    tries: int = 0
-    not_before_s: float = 0.0
-
-
 class Salvage:
-    """What is to be recovered, and what became of it. For one thread; only `wait` and `close` wait."""
+    """What is to be recovered, and what became of it. For one thread; only `wait` and `close` wait.
 
-    def __init__(self, directory: Path) -> None:
-        """``directory`` is searched for recordings that were left open, once `search` is called."""
+    Parameters
+    ----------
+    directory : searched for recordings that were left open, once `search` is called
+    journal : file that names what is being recorded, wherever that is
+    """
+
+    def __init__(self, directory: Path, journal: Path | None = None) -> None:
         self._directory = directory
+        self._journal = Journal(journal, "not_sealed", "not sealed")
+        self._not_sealed: dict[Path, None] = {}
         self._tasks: dict[Path, Task] = {}
         self._found: dict[Path, RecoveryStatus] = {}
         self._worker: Worker | None = None
         self._under_way: Task | None = None
-        self._searching: Future[list[Path]] | None = None
+        self._searching: Future[Found] | None = None
 
     @property
     def recoveries(self) -> list[RecoveryStatus]:
@@ -81,9 +73,22 @@ class Salvage:
 
     def search(self) -> None:
         """Look for recordings that a killed daemon has left; `look` will find them."""
+        self._not_sealed = dict.fromkeys(self._journal.read())
         thread = ThreadPoolExecutor(1, "salvage")
-        self._searching = thread.submit(open_recordings, self._directory)
+        self._searching = thread.submit(search, self._directory, list(self._not_sealed))
         thread.shutdown(wait=False)
+
+    def began(self, path: Path) -> None:
+        """A run records there; the next daemon has to know, should this one be killed."""
+        if path not in self._not_sealed:
+            self._not_sealed[path] = None
+            self._journal.write(self._not_sealed)
+
+    def ended(self, path: Path) -> None:
+        """It is sealed; or it is among the orphans, and not forgotten yet."""
+        if path not in self._tasks and path in self._not_sealed:
+            del self._not_sealed[path]
+            self._journal.write(self._not_sealed)
 
     def add(self, orphans: Iterable[Orphan]) -> None:
         """Recover what a run has left; what is known already is passed over."""
@@ -91,7 +96,7 @@ class Salvage:
             found = self._tasks.get(orphan.path)  # the search may have met it while it was being written
             if orphan.path not in self._found or (found is not None and not found.ours):
                 log.warning("%s was not sealed: %s", orphan.path, orphan.why)
-                self._queue(Task(orphan.path, orphan.why, ours=True))
+                self._queue(Task(orphan.path, orphan.why, True, orphan.committed_lines))
 
     def look(self, *, capturing: bool = False) -> list[RecoveryStatus]:
         """Hear what is done, begin what is next; what came to an end since the last look.
@@ -135,15 +140,24 @@ class Salvage:
         while len(self._found) > MOST_LISTED:
             del self._found[next(iter(self._found))]
 
-    def _take_search(self, searching: Future[list[Path]]) -> None:
+    def _take_search(self, searching: Future[Found]) -> None:
         try:
-            paths = searching.result()
+            found = searching.result()
         except OSError as error:
             log.warning("%s cannot be searched for open recordings: %s", self._directory, error.strerror)
             return
-        for path in paths:
+        for one in found.odd[:MOST_ODD]:
+            log.warning("%s %s: %s", one.path, one.state, one.text)
+            if one.path not in self._found:
+                self._tell(one)
+        if len(found.odd) > MOST_ODD:
+            log.warning("%d more like these in %s", len(found.odd) - MOST_ODD, self._directory)
+        for path in found.open:
             if path not in self._found:
                 self._queue(Task(path))
+        met = {*found.open, *(one.path for one in found.odd)}
+        for path in [path for path in self._not_sealed if path not in met]:
+            self.ended(path)
 
     def _begin(self, *, capturing: bool) -> list[RecoveryStatus]:
         """The next that nobody holds, our own first; those that are held come later, and end some time."""
@@ -155,10 +169,10 @@ class Salvage:
         ]
         ended: list[RecoveryStatus] = []
         for task in sorted(able, key=lambda task: not task.ours):
-            hindrance = _hindrance(task.path) or self._spawn(task)
-            if hindrance is None:
+            hindered = hindrance(task) or self._spawn(task)
+            if hindered is None:
                 break
-            ended += self._heed(task, hindrance)
+            ended += self._heed(task, hindered)
         return ended
 
     def _spawn(self, task: Task) -> RecoveryStatus | None:
@@ -189,11 +203,13 @@ class Salvage:
         self._tell(said)
         if said.state == "waiting" and task.tries + 1 < MOST_TRIES:
             later = time.monotonic() + AGAIN_S
-            self._tasks[task.path] = Task(task.path, task.why, task.ours, task.tries + 1, later)
+            self._tasks[task.path] = replace(task, tries=task.tries + 1, not_before_s=later)
             return []
         if said.state == "waiting":
             said = said.model_copy(update={"state": "left"})
             self._tell(said)
+        if said.state == "recovered" or (said.state == "gone" and not task.committed_lines):
+            self.ended(said.path)
         level = logging.INFO if said.state == "recovered" else logging.WARNING
         log.log(level, "%s %s: %s", said.path, said.state, said.text.removeprefix(RECOVERED))
         return [said]
@@ -208,77 +224,3 @@ def _end(worker: Worker, within_s: float) -> None:
     """By force after a while, which costs nothing: what was cut off begins anew."""
     with contextlib.suppress(DeviceError):
         worker.end(time.monotonic() + within_s)
-
-
-def _hindrance(path: Path) -> RecoveryStatus | None:
-    """What keeps a recording from being recovered now."""
-    try:
-        with locked(path, "recovering", surely=True):
-            return None
-    except StateError as error:
-        return RecoveryStatus(path=path, state="waiting", text=error.message)
-    except FileNotFoundError:
-        return RecoveryStatus(path=path, state="recovered", lines=0, text=_UNBORN)
-    except OSError as error:
-        return RecoveryStatus(path=path, state="failed", text=f"{path}: {error.strerror}")
-
-
-def open_recordings(directory: Path) -> list[Path]:
-    """Recordings in a directory that are not sealed. Raises OSError."""
-    return [path for path in sorted(directory.glob("*.zarr")) if _is_open(path)]
-
-
-def _is_open(path: Path) -> bool:
-    try:
-        attributes = read_root(LocalSource(path))["attributes"]
-    except (DataError, PlaceError):
-        return False  # none, or none that can say what it is: `acquire ls` names it
-    return (attributes.get("format"), attributes.get("state")) == (FORMAT, "recording")
-
-
-def salvage(mailbox: Mailbox, task: Task) -> None:
-    """Life of the process: one recovery, with less of the processors than others get."""
-    os.nice(_NICE)
-    mailbox.post(_salvage(mailbox, task))
-
-
-def _salvage(mailbox: Mailbox, task: Task) -> RecoveryStatus:
-    path = task.path
-    try:
-        if task.ours and not (path / "zarr.json").exists():
-            return _remove_unborn(path)
-        attributes = read_root(LocalSource(path))["attributes"]
-        if not is_here(attributes):
-            return RecoveryStatus(path=path, state="left", text=_ELSEWHERE)
-        reason = f"{RECOVERED}{task.why}" if task.why else Circumstances().reason
-        known = Circumstances(reason, committed_intact=has_run_on(attributes), alone=False)
-        done = recover(path, progress=lambda *_: _ask(mailbox), known=known)
-    except StateError as error:
-        return RecoveryStatus(path=path, state="waiting", text=error.message)
-    except (AcquireError, OSError) as error:
-        return RecoveryStatus(path=path, state="failed", text=str(error))
-    sealed = read_root(LocalSource(path))["attributes"]
-    return RecoveryStatus(
-        path=path,
-        state="recovered",
-        lines=done.lines,
-        condition=sealed["run_condition"],
-        text=str(sealed["end_reason"]),
-    )
-
-
-def _ask(mailbox: Mailbox) -> None:
-    """Ends the process, by an exception, once its owner has gone."""
-    mailbox.take()
-
-
-_ELSEWHERE = "open, and not written on this machine, where it could be seen whether it still is"
-_UNBORN = "its recorder was killed before it had begun: there is nothing of it"
-
-
-def _remove_unborn(path: Path) -> RecoveryStatus:
-    """Its recorder was killed while it made it: no line is in it, and it was never a recording."""
-    if path.is_dir():
-        with locked(path, "removing", surely=True):
-            DISK.remove_tree(path)
-    return RecoveryStatus(path=path, state="recovered", lines=0, text=_UNBORN)

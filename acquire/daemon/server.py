@@ -57,9 +57,9 @@ def serve(config: RigConfig) -> int:
     troubles = Troubles()
     threading.excepthook = troubles.in_thread
     with contextlib.closing(Endpoint(config.control.socket.absolute())) as endpoint, Rig(config) as rig:
-        salvage = Salvage(config.recording.directory.absolute())
+        salvage = Salvage(config.recording.directory.absolute(), _journal(config, "recordings"))
         salvage.search()
-        uploads = Uploads(config.recording.upload_to, _journal(config))
+        uploads = Uploads(config.recording.upload_to, _journal(config, "uploads"))
         uploads.begin()
         proof = Proof(config)
         service = Service(config, lambda: Run(config, rig, proof.choose), proof, salvage, uploads, troubles)
@@ -67,9 +67,9 @@ def serve(config: RigConfig) -> int:
     return leave(code)
 
 
-def _journal(config: RigConfig) -> Path:
-    """The file that says which recordings are not copied yet."""
-    return config.recording.directory.absolute() / f".uploads-{config.name}.json"
+def _journal(config: RigConfig, what: str) -> Path:
+    """The file that says which recordings are not copied, or not sealed yet."""
+    return config.recording.directory.absolute() / f".{what}-{config.name}.json"
 
 
 class Daemon:

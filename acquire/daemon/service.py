@@ -265,6 +265,8 @@ class Service:
         self._tell_waiting(before)
         self._salvage.add(self._seen.orphans)
         if self._seen.path is not None:
+            if self._take is not None:
+                self._salvage.began(Path(self._seen.path))
             self._uploads.add(Path(self._seen.path))
         self._rates.look(self._seen)
         return self._seen
@@ -289,6 +291,7 @@ class Service:
     ) -> None:
         assert self._run is not None
         path = self._run.start(path or default_path(self._config), lines, window, resume=resume)
+        self._salvage.began(path)
         self._uploads.forget(path)
         self._uploads.add(path)
         if window.post_lines is not None:
@@ -369,6 +372,8 @@ class Service:
     def _remember(self) -> None:
         if self._take is not None:
             self._last, self._take = self._take.result(self._seen), None
+            if self._last.condition is not None:
+                self._salvage.ended(self._last.path)
 
     def _recovered(self, found: list[RecoveryStatus]) -> None:
         """The latest recording may have been among what its recorder did not seal."""

@@ -14,16 +14,15 @@ replaced when it dies: a copy goes on where it was.
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from acquire.daemon.copier import MOST_WAIT_S, Copy, Reach, Reached, copy_recordings, wait_s
+from acquire.daemon.journal import Journal
 from acquire.daemon.messages import UploadStatus
-from acquire.errors import ConfigError, DataError, DeviceError, PlaceError, UsageError
-from acquire.store.files import Publisher
+from acquire.errors import AcquireError, ConfigError, DeviceError, UsageError
+from acquire.store.attributes import upload_target
 from acquire.store.opening import read_root
 from acquire.store.remote import check_url, url_below
 from acquire.store.source import LocalSource
@@ -31,6 +30,8 @@ from acquire.stream.messages import Failed
 from acquire.stream.process import Worker
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from acquire.config import RigConfig
 
 MOST_LISTED = 32
@@ -60,10 +61,9 @@ def check_upload(config: RigConfig) -> None:
 def _wants_copy(path: Path) -> bool:
     """The rig that recorded it copies its recordings."""
     try:
-        config = read_root(LocalSource(path))["attributes"].get("config", {})
-    except (DataError, PlaceError):
+        return upload_target(read_root(LocalSource(path))["attributes"]) is not None
+    except AcquireError:
         return False
-    return bool(config.get("recording", {}).get("upload_to"))
 
 
 class Uploads:
@@ -77,7 +77,7 @@ class Uploads:
 
     def __init__(self, target: str | None = None, journal: Path | None = None) -> None:
         self._target = target
-        self._journal = journal
+        self._journal = Journal(journal, "not_uploaded", "to be uploaded")
         self._found: dict[Path, UploadStatus] = {}
         self._noted = True
         """The journal names those that are left."""
@@ -106,7 +106,7 @@ class Uploads:
 
     def begin(self) -> None:
         """Start the process; it goes on with what an earlier daemon has not finished."""
-        for path in self._read_journal():
+        for path in self._journal.read():
             if self._target is None:
                 log.warning("%s was not uploaded, and will not be: recording.upload_to is not set", path)
             else:
@@ -268,28 +268,8 @@ class Uploads:
             time.sleep(_POLL_S)
         return self._answer
 
-    def _read_journal(self) -> list[Path]:
-        if self._journal is None:
-            return []
-        try:
-            return [Path(path) for path in json.loads(self._journal.read_bytes())["not_uploaded"]]
-        except FileNotFoundError:
-            return []
-        except (OSError, ValueError, LookupError, TypeError) as error:
-            log.error("%s does not say what is to be uploaded: %s", self._journal, error)  # noqa: TRY400
-            return []
-
     def _note(self) -> None:
         """Write down what is not copied, where that has changed."""
-        if self._journal is None or self._noted:
-            return
-        self._noted = True
-        left = [str(path) for path, one in self._found.items() if one.state not in _OVER]
-        text = json.dumps({"not_uploaded": left}, indent=1).encode()
-        try:
-            scratch = self._journal.with_name(f"{self._journal.name}.next")
-            Publisher(scratch).replace(self._journal, text, durable=True)
-        except OSError as error:
-            log.error(  # noqa: TRY400
-                "%s cannot be written: %s; the next daemon will not know what to upload", self._journal, error
-            )
+        if not self._noted:
+            self._noted = True
+            self._journal.write(path for path, one in self._found.items() if one.state not in _OVER)

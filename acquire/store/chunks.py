@@ -8,6 +8,7 @@ import numpy as np
 
 from acquire.store.codecs import BLOSC_HEADER, CRC_BYTES, check_size, crc32c, decode, stored_size
 from acquire.store.layout import parse_line_array
+from acquire.store.pages import PAGE
 from acquire.store.shard import ABSENT, index_bytes, shard_key, unpack_index
 
 if TYPE_CHECKING:
@@ -56,10 +57,15 @@ class ChunkReader:
         for shard in range(numbers.start // per_shard, -(-numbers.stop // per_shard)):
             entries, intact = self.index(shard)
             for number in numbers if intact else ():
-                if number // per_shard == shard and ABSENT not in entries[number % per_shard]:
-                    offset, size = entries[number % per_shard].tolist()
-                    found[number] = offset, size
+                offset, size = entries[number % per_shard].tolist()
+                if number // per_shard == shard and size <= self.most_bytes and offset < 2**62:
+                    found[number] = offset, size  # of what is absent, both are larger
         return found
+
+    @property
+    def most_bytes(self) -> int:
+        """Of a chunk as it lies in its file, however badly it was packed."""
+        return 2 * self.shape.chunk_bytes + PAGE
 
     @property
     def chunks(self) -> int:
@@ -121,7 +127,16 @@ class ChunkReader:
         offset, size = entries[number % self.shape.shard_chunks]
         if ABSENT in (offset, size):
             raise AbsentChunkError("it is not on disk")
+        if int(size) > self.most_bytes or int(offset) >= 2**62:
+            raise DamagedChunkError("the index of its file is damaged: the chunk would be too large")
         return int(offset), int(size)
+
+    def file_bytes(self, shard: int) -> int:
+        """Size of a shard's file; 0 where there is none. Raises OSError."""
+        try:
+            return self._source.size(self.shard_file(shard))
+        except FileNotFoundError:
+            return 0
 
     def index(self, shard: int) -> tuple[NDArray[np.uint64], bool]:
         """(chunk, 2) offsets and sizes of a shard, ABSENT where there is none; whether they are intact."""

@@ -10,12 +10,14 @@ import errno
 import fcntl
 import os
 import shutil
+import stat
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from acquire.errors import StateError, UsageError
+from acquire.reading import kind_of, open_regular
 from acquire.store.pages import aligned_bytes, open_direct
 
 if TYPE_CHECKING:
@@ -26,6 +28,9 @@ if TYPE_CHECKING:
 
 SCRATCH = ".next"
 """Where new metadata of a recording is prepared, beside the shards of its first array."""
+
+_NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+_WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 
 NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
 """What a file system without locks answers; some network disks are such."""
@@ -82,7 +87,7 @@ class ShardFile:
     """
 
     def __init__(self, path: Path, *, direct: bool) -> None:
-        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+        self._fd = os.open(path, _NEW, 0o666)
         self._direct = open_direct(path) if direct else -1
         self._cached = (0, 0)
 
@@ -138,8 +143,12 @@ class Disk:
         return ShardFile(path, direct=direct)
 
     def write_file(self, path: Path, data: Buffer, *, durable: bool) -> None:
-        """Write a whole small file, over what was there; ``durable`` forces its bytes to the medium."""
-        fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o666)
+        """Write a whole small file in the place of what was there; ``durable`` forces it to the medium.
+
+        What was there is unlinked and not written over: under another name it may be somebody's file.
+        """
+        self.remove(path)
+        fd = os.open(path, _NEW, 0o666)
         try:
             write_all(fd, [data], 0)
             if durable:
@@ -148,17 +157,28 @@ class Disk:
             os.close(fd)
 
     def patch(self, path: Path, data: Buffer, offset: int) -> None:
-        """Replace bytes of a file that exists, or add some behind its end."""
-        fd = os.open(path, os.O_WRONLY | os.O_CLOEXEC)
+        """Replace bytes of a file that exists, or add some behind its end.
+
+        A file that has another name as well, or that nobody may write to, is somebody's copy: OSError.
+        """
+        fd = open_regular(path, os.O_WRONLY, follow=False)
         try:
+            found = os.fstat(fd)
+            if found.st_nlink > 1 or not found.st_mode & _WRITABLE:
+                why = "has other names (hard links)" if found.st_nlink > 1 else "is read-only"
+                raise PermissionError(errno.EPERM, f"{path} {why} and is not changed")
             write_all(fd, [data], offset)
         finally:
             os.close(fd)
 
     def reserve(self, path: Path, size: int) -> None:
         """A file that keeps ``size`` bytes of the disk for later; remove it to have them."""
-        with path.open("wb") as file:
-            os.posix_fallocate(file.fileno(), 0, size)
+        self.remove(path)
+        fd = os.open(path, _NEW, 0o666)
+        try:
+            os.posix_fallocate(fd, 0, size)
+        finally:
+            os.close(fd)
 
     def rename(self, source: Path, target: Path) -> None:
         """Replace ``target`` in one step."""
@@ -172,6 +192,15 @@ class Disk:
         """Remove a directory with all below it, as far as that can be done."""
         shutil.rmtree(path, ignore_errors=True)
 
+    def remove_directory(self, path: Path) -> None:
+        """Remove a directory; one that holds something stays, and no matter if there is none."""
+        with suppress(FileNotFoundError):
+            try:
+                path.rmdir()
+            except OSError as error:
+                if error.errno != errno.ENOTEMPTY:
+                    raise
+
     def sync_directory(self, path: Path) -> None:
         """Force the entries of a directory to the medium."""
         _sync(path, os.O_DIRECTORY)
@@ -180,7 +209,8 @@ class Disk:
         """Force every file and directory below ``path``, and ``path`` itself, to the medium."""
         for directory, files in _walk(path):
             for file in files:
-                _sync(file)
+                if kind_of(file.lstat().st_mode) is None:
+                    _sync(file)
             self.sync_directory(directory)
 
     def free_bytes(self, path: Path) -> int:
@@ -213,8 +243,8 @@ def measure_disk(directory: Path, size: int = 2**27) -> float:
 
 
 def tree_bytes(path: Path) -> int:
-    """Bytes that all files below ``path`` take of the disk."""
-    return sum(file.stat().st_size for _, files in _walk(path) for file in files)
+    """Bytes of all files below ``path``."""
+    return sum(file.stat().st_size for _, files in _walk(path) for file in files if file.is_file())
 
 
 @contextmanager
@@ -232,7 +262,7 @@ def locked(path: Path, doing: str, *, surely: bool = False) -> Iterator[None]:
 
 def lock(path: Path, doing: str, *, surely: bool = False) -> int:
     """A descriptor that holds the directory ``path`` until it is closed; see `locked`."""
-    fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
@@ -259,7 +289,7 @@ def _walk(path: Path) -> Iterator[tuple[Path, list[Path]]]:
 
 
 def _sync(path: Path, flags: int = 0) -> None:
-    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | flags)
+    fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK | flags)
     try:
         os.fsync(fd)
     finally:

@@ -28,11 +28,16 @@ def this_host() -> dict[str, str]:
 
 def is_here(attributes: Mapping[str, Any]) -> bool:
     """The recording was written on this machine."""
-    name = attributes.get("host", {}).get("name")
+    name = _host(attributes).get("name")
     return bool(name) and name == this_host()["name"]
 
 
 def has_run_on(attributes: Mapping[str, Any]) -> bool:
     """This machine wrote the recording, and has not stopped since."""
-    boot_id = attributes.get("host", {}).get("boot_id")
+    boot_id = _host(attributes).get("boot_id")
     return bool(boot_id) and boot_id == this_host()["boot_id"] and is_here(attributes)
+
+
+def _host(attributes: Mapping[str, Any]) -> Mapping[str, Any]:
+    host = attributes.get("host")
+    return host if isinstance(host, dict) else {}

@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +33,11 @@ Document = dict[str, Any]
 
 PARSE_ERRORS = (LookupError, TypeError, ValueError, AttributeError)
 """What a document that is not what it should be raises when it is taken apart."""
+
+MAX_READ_BYTES = 2**31
+"""Of one chunk that a reader takes into memory; those that are written are much smaller."""
+MAX_READ_CHUNKS = 1024
+"""Of one file, for a reader."""
 
 DATA_TYPES = ("uint8", "uint16", "uint64", "int64")
 
@@ -177,6 +183,10 @@ def parse_line_array(document: Document) -> tuple[ArrayShape, int]:
     if inner["index_location"] != "start" or document["data_type"] not in DATA_TYPES:
         raise ValueError(f"index at the {inner['index_location']}, samples {document['data_type']}")
     dtype = np.dtype(document["data_type"]).newbyteorder("<")
+    if math.prod((chunk_rows, *row_shape)) * dtype.itemsize > MAX_READ_BYTES:
+        raise ValueError(f"chunks of {inner['chunk_shape']} samples")
+    if shard_rows // chunk_rows > MAX_READ_CHUNKS:
+        raise ValueError(f"files of {shard_rows // chunk_rows} chunks")
     codec = codec_of(inner["codecs"])
     return ArrayShape(dtype, tuple(row_shape), chunk_rows, shard_rows // chunk_rows, codec), rows
 

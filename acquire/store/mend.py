@@ -77,7 +77,7 @@ def rewrite_chunk(disk: Disk, path: Path, reader: ChunkReader, chunk: int, rows:
 
 def _holds(reader: ChunkReader, chunk: int, offset: int, size: int) -> bool:
     """There is a whole chunk at this place; what an index did not say, or could not, is not asked for."""
-    if not 0 < size <= 2 * reader.shape.chunk_bytes + PAGE or offset % PAGE or offset < PAGE:
+    if not 0 < size <= reader.most_bytes or offset % PAGE or offset < PAGE:
         return False
     try:
         reader.payload(chunk, offset, size)

@@ -13,7 +13,7 @@ A recording is copied by one process at a time.
 from __future__ import annotations
 
 import copy
-import json
+import os
 import time
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
@@ -21,13 +21,18 @@ from typing import TYPE_CHECKING, Any
 
 from acquire.errors import DataError, StateError, UsageError
 from acquire.lines import ARMS
-from acquire.store.files import DISK, locked
+from acquire.reading import parse_object
+from acquire.store.attributes import segment_of
+from acquire.store.files import DISK, SCRATCH, locked
 from acquire.store.layout import PARSE_ERRORS, group_document, to_json
+from acquire.store.links import refuse_link, refuse_links
 from acquire.store.opening import open_recording
 from acquire.store.refusals import refusal
 from acquire.store.remote import RemoteSource
-from acquire.store.retention import keep_from, release, shard_files
+from acquire.store.removal import ROOT, shard_files
+from acquire.store.retention import keep_from, release
 from acquire.store.scan import COLUMNS
+from acquire.store.shortfall import first_shortfall
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -40,6 +45,10 @@ if TYPE_CHECKING:
 
 LOOK_S = 0.5
 """How often a growing recording is looked at."""
+MARK = "a/lines/.copy-of"
+"""Says at the target whose copy it is, as long as no root does."""
+_OURS = (*ARMS, "gaps", "events", ROOT, SCRATCH)
+"""What the keys of a recording begin with."""
 _ELSEWHERE = "another name there: acquire upload RECORDING URL"
 _HINT = "what is there already stays: the same command goes on with it"
 
@@ -81,6 +90,7 @@ def mirror(
     StoreError and PlaceError when the store fails or refuses, and DataError when a recording that is followed
     has not grown for ``idle_s``: its writer is gone.
     """
+    refuse_link(path, path)
     open_recording(path)  # which says what else it may be
     with only_copy(path):
         return _mirror(_Steps(Mirror(path, url), progress), path, follow, idle_s, report)
@@ -147,6 +157,22 @@ def _nothing() -> None:
     pass
 
 
+def _identity(attributes: dict[str, Any]) -> tuple[str, int]:
+    """Run, and which of its segments."""
+    segment = segment_of(attributes)
+    number = attributes.get("segment_number", 1) if segment is None else segment[1]
+    return str(attributes.get("run_id")), number
+
+
+def _identity_in(data: bytes) -> tuple[str, int] | None:
+    """Of the recording whose root this is; None where it is none that could be read."""
+    try:
+        attributes = parse_object(data)["attributes"]
+    except PARSE_ERRORS:
+        return None
+    return _identity(attributes) if isinstance(attributes, dict) else None
+
+
 class Mirror:
     """One copy; `step` brings it up to date.
 
@@ -158,9 +184,14 @@ class Mirror:
         self.target = RemoteSource(url)
         self._disk = disk
         self._pause = pause
-        self._run_id = str(open_recording(path).attrs["run_id"])
-        if (there := self.target.path) is not None and there.exists() and there.samefile(path):
-            raise UsageError(f"{url} is the recording itself, not a place for its copy", hint="another URL")
+        refuse_links(path)
+        self._identity = _identity(open_recording(path).attrs)
+        if (there := self.target.path) is not None and os.path.lexists(there):
+            if there.exists() and there.samefile(path):
+                raise UsageError(
+                    f"{url} is the recording itself, not a place for its copy", hint="another URL"
+                )
+            refuse_links(there)
         self._bytes = 0
         self._shards = 0
         self._directories: set[str] = set()
@@ -188,15 +219,17 @@ class Mirror:
         PlaceError when it refuses; a later step goes on.
         """
         recording = open_recording(self.path)
-        if recording.attrs["run_id"] != self._run_id:
+        if _identity(recording.attrs) != self._identity:
             raise DataError(f"{self.path} is another recording than it was: run {recording.attrs['run_id']}")
         sealed = recording.state == "sealed"
         if sealed and not self._sealed:  # who recovered it may have mended what was copied
+            refuse_links(self.path)
+            self._refuse_shortfall(recording, None)
             self._sealed, self._next = True, 0
         rows = recording.arms[ARMS[0]].reader("lines").shape.shard_rows
         end = -(-recording.lines // rows) if sealed else recording.lines // rows
         try:
-            self._copy_shards(end, most_shards)
+            self._copy_shards(recording, end, most_shards)
             lines = min(self._next * rows, recording.lines)
             whole = sealed and self._next == end
             if whole or not sealed:
@@ -207,11 +240,24 @@ class Mirror:
         waiting = recording.lines - lines
         return Mirrored(str(self.target), lines, self._shards, self._bytes, whole, waiting)
 
-    def _copy_shards(self, end: int, most: int | None) -> None:
+    def _copy_shards(self, recording: Recording, end: int, most: int | None) -> None:
         before = self._shards
+        if self._next < end:
+            self._mark()
         while self._next < end and (most is None or self._shards - before < most):
+            if not self._sealed:
+                self._refuse_shortfall(recording, range(self._next, self._next + 1))
             self._copy_shard(self._next)
             self._next += 1
+
+    def _refuse_shortfall(self, recording: Recording, shards: range | None) -> None:
+        """What is said to be here, and is not, must not be said there."""
+        if (found := first_shortfall(recording, shards)) is not None:
+            raise DataError(
+                f"{self.path} is not copied: {found}",
+                possible="a recording of which all lines are on disk, or flagged as missing",
+                hint=f"acquire verify {self.path}; acquire recover flags what is lost, then copy again",
+            )
 
     def _let_go(self, line: int | None) -> None:
         """Retention may have what is copied: lines before ``line``; all of a recording that is sealed."""
@@ -222,23 +268,31 @@ class Mirror:
             self._kept_from = line
 
     def _check_target(self) -> None:
-        """Only a copy of the same run may be there."""
-        if not self._there:
-            return
-        if "zarr.json" in self._there:
-            root = self.target.read("zarr.json")
-            try:
-                said = json.loads(root)["attributes"].get("run_id")
-            except PARSE_ERRORS as error:
-                raise UsageError(
-                    f"{self.target} holds something damaged: {error!r}", hint=_ELSEWHERE
-                ) from error
-            if said == self._run_id:
-                self._root = root
-                return
-            raise UsageError(f"{self.target} holds another recording: run {said}", hint=_ELSEWHERE)
-        if any(key.split("/")[0] not in (*ARMS, "gaps", "events") for key in self._there):
-            raise UsageError(f"{self.target} holds something that is no recording", hint=_ELSEWHERE)
+        """Only a copy of the same recording may be there, or one that was begun and never published."""
+        foreign = [key for key in self._there if key.split("/")[0] not in _OURS]
+        root = self.target.read(ROOT) if ROOT in self._there else b""
+        said = _identity_in(root)
+        if said is None and (foreign or (root and len(self._there) == 1)):
+            what = "something damaged" if root else "something that is no recording"
+            raise UsageError(f"{self.target} holds {what}", hint=_ELSEWHERE)
+        if said is not None:
+            self._root = root
+        elif MARK in self._there:
+            said = _identity_in(self.target.read(MARK))
+        if said is not None and said != self._identity:
+            raise UsageError(
+                f"{self.target} holds another recording: run {said[0]}, segment {said[1]}", hint=_ELSEWHERE
+            )
+        if said is None:  # nothing there says whose it is: nothing there is relied on
+            self._there = {}
+
+    def _mark(self) -> None:
+        """Say whose copy this is, before its root can."""
+        if not self._root and MARK not in self._there:
+            run_id, number = self._identity
+            facts = {"run_id": run_id} | ({"segment_number": number} if number > 1 else {})
+            self._put(MARK, to_json({"attributes": facts}))
+            self._there[MARK] = 0
 
     def _copy_shard(self, shard: int) -> None:
         """A shard that is whole is never written again: what is there of the right size is the same."""
@@ -278,12 +332,17 @@ class Mirror:
     def _dropped(self, recording: Recording, lines: int) -> list[list[int]]:
         """Lines that retention deleted here before they could be copied."""
         size = recording.arms[ARMS[0]].reader("lines").shape.shard_rows
-        return [
-            [recording.first_line + shard * size, size]
-            for rows in recording.dropped_rows()
-            for shard in range(rows.start // size, rows.stop // size)
-            if f"a/tick/c/{shard}" not in self._there and shard * size < lines
-        ]
+        start = "a/tick/c/"
+        names = (key[len(start) :] for key in self._there if key.startswith(start))
+        there = sorted(int(name) for name in names if name.isascii() and name.isdecimal())
+        found = []
+        for rows in recording.dropped_rows():
+            at, end = rows.start // size, min(rows.stop, lines) // size
+            for shard in [*(shard for shard in there if at <= shard < end), end]:
+                if at < shard:
+                    found.append([recording.first_line + at * size, (shard - at) * size])
+                at = shard + 1
+        return found
 
     def _put(self, key: str, data: bytes) -> None:
         """Most of it is the same from one time to the next, and a store takes its time for each part."""

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-import json
-import math
 from typing import TYPE_CHECKING, Any
 
 from acquire.codes import code_from_attrs
 from acquire.errors import DataError, PlaceError, UsageError
 from acquire.lines import ARMS
+from acquire.reading import OddFileError, parse_object
+from acquire.store.attributes import check_attributes
 from acquire.store.camera_stream import DAMAGE, CameraStream
+from acquire.store.extent import check_lengths
 from acquire.store.layout import line_columns
 from acquire.store.reader import Recording
 from acquire.store.refusals import refusal, refused
 from acquire.store.source import source_of
-from acquire.store.spec import CAMERA_KEYS, FORMAT
+from acquire.store.spec import FORMAT
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -38,8 +39,10 @@ def open_source(source: Source) -> Recording:
     document = read_root(source)
     _check_format(source, _format(document))
     try:
+        check_attributes(document["attributes"])
         recording = Recording(source, document, open_source)
         _check_complete(recording)
+        check_lengths(recording)
     except (*DAMAGE, UsageError) as error:
         raise DataError(
             f"{source}: the metadata of the recording is damaged: {type(error).__name__}: {error}",
@@ -60,10 +63,14 @@ def read_root(source: Source) -> Document:
     and StoreError where a disk or a store does not say.
     """
     try:
-        document: Document = json.loads(source.read("zarr.json"))
-        dict(document["attributes"])
+        document: Document = parse_object(source.read("zarr.json"))
+        _check_object(document["attributes"])
     except (FileNotFoundError, NotADirectoryError, IsADirectoryError) as error:
         raise _no_root(source) from error
+    except OddFileError as error:
+        raise DataError(
+            f"{source}: zarr.json is damaged: {error.strerror}", hint="a copy of the recording"
+        ) from error
     except OSError as error:
         raise refusal(source, error, "read") from error
     except (ValueError, LookupError, TypeError) as error:
@@ -80,7 +87,7 @@ def _no_root(source: Source) -> AcquireError:
         if _has(source, f"{ARMS[0]}/lines/zarr.json"):
             return DataError(
                 f"{source} is a recording whose root metadata, zarr.json, is missing",
-                hint="zarr.json from a copy of the recording; the lines themselves are still in a/ and b/",
+                hint=f"acquire recover {source}; the lines themselves are still in a/ and b/",
             )
     return PlaceError(f"{source} is not a recording: it holds no zarr.json", hint=hint)
 
@@ -91,6 +98,11 @@ def _has(source: Source, key: str) -> bool:
     except (FileNotFoundError, NotADirectoryError):
         return False
     return True
+
+
+def _check_object(attributes: Any) -> None:
+    if not isinstance(attributes, dict):
+        raise TypeError("its attributes are no JSON object")
 
 
 def _format(document: Document) -> str | None:
@@ -117,27 +129,20 @@ def _check_format(source: Source, name: str | None) -> None:
 
 def _check_complete(recording: Recording) -> None:
     """Touch everything that a recording needs; what is absent or impossible raises DAMAGE or UsageError."""
-    attributes = recording.attrs
-    for key in ("state", "run_condition", "ledger", "layout", "run_id", "end_reason"):
-        attributes[key]
-    attributes["versions"]["acquire"]
-    code_from_attrs(attributes["code"])
+    code_from_attrs(recording.attrs["code"])
     recording.geometry_for(1)
-    _check_number("pixels", int(attributes["geometry"]["pixels"]), above=0)
-    _check_number("clock_hz", recording.clock.clock_hz, above=0)
-    _check_number("line period", recording.line_period_ns, above=0)
-    for arm, stream in recording.arms.items():
-        _check_arm(stream, attributes["cameras"][arm])
+    for path, node in recording.document["consolidated_metadata"]["metadata"].items():
+        if not all(part and part not in (".", "..") and "\0" not in part for part in path.split("/")):
+            raise ValueError(f"{path!r} is no path of an array or a group")
+        _check_object(node["attributes"])
+        node["node_type"]
+    for table in ("gaps", "events"):
+        int(recording.document["consolidated_metadata"]["metadata"][table]["attributes"]["not_listed"])
+    for stream in recording.arms.values():
+        _check_arm(stream)
 
 
-def _check_arm(stream: CameraStream, camera: dict[str, Any]) -> None:
+def _check_arm(stream: CameraStream) -> None:
     for column in line_columns("any"):
         if len(stream.reader(column.name).shape.chunk_shape) != (2 if column.name == "lines" else 1):
             raise ValueError(f"{stream.arm}/{column.name} has the wrong number of axes")
-    for key in CAMERA_KEYS:
-        _check_number(key, float(camera[key]), above=-math.inf if key == "black_level_dn" else 0)
-
-
-def _check_number(name: str, value: float, *, above: float) -> None:
-    if not (math.isfinite(value) and value > above):
-        raise ValueError(f"{name} is {value}")

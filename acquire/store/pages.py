@@ -61,6 +61,6 @@ def is_aligned(array: NDArray[Any]) -> bool:
 def open_direct(path: Path) -> int:
     """A descriptor that writes ``path`` past the page cache; -1 where the file system has no such thing."""
     try:
-        return os.open(path, os.O_WRONLY | os.O_CLOEXEC | os.O_DIRECT)
+        return os.open(path, os.O_WRONLY | os.O_CLOEXEC | os.O_DIRECT | os.O_NOFOLLOW)
     except OSError:
         return -1

@@ -130,7 +130,11 @@ class Recording:
     @cached_property
     def segments(self) -> tuple[Recording, ...]:
         """Recordings that continue this one after an outage, in order. Raises DataError for a damaged one."""
-        return tuple(self._opener(self.source.beside(name)) for name in self.attrs.get("segments", ()))
+        return tuple(self.beside(name) for name in self.attrs.get("segments", ()))
+
+    def beside(self, name: str) -> Recording:
+        """The recording of this name in the same place. Raises DataError."""
+        return self._opener(self.source.beside(name))
 
     def end_ns(self) -> int | None:
         """UTC at which the line after the last is read out; None without lines."""

@@ -17,19 +17,23 @@ from __future__ import annotations
 
 import contextlib
 import copy
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.errors import StateError
+from acquire.errors import AcquireError, StateError
 from acquire.lines import ARMS, LineFlag
 from acquire.store import layout
 from acquire.store.files import DISK, SCRATCH, Publisher, locked
+from acquire.store.links import refuse_links
 from acquire.store.mend import mend_index, rewrite_chunk
 from acquire.store.opening import open_recording
+from acquire.store.rebuild import rebuild_root, root_is_lost, write_copy
+from acquire.store.refusals import refused
+from acquire.store.removal import RESERVE, Dropped, remove, shard_numbers, shards_on_disk
 from acquire.store.resume import list_segments
-from acquire.store.retention import delete_shard, release
+from acquire.store.retention import release
 from acquire.store.scan import (
     COLUMNS,
     ArmScan,
@@ -44,7 +48,6 @@ from acquire.store.scan import (
 )
 from acquire.store.spec import RunCondition
 from acquire.store.table import event_table, gap_table
-from acquire.store.writer import RESERVE
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -88,6 +91,8 @@ class Recovery:
     lines, lines_before : rows of each arm that a reader finds
     indices_mended : files whose index was torn, or did not know all chunks yet
     damage : lines that are lost, of which array and why
+    root_rebuilt : the root's zarr.json was lost, and written anew from what the parts below it say
+    not_listed : why the segments of the run could not be listed in its first recording, if so
     """
 
     path: str
@@ -96,6 +101,8 @@ class Recovery:
     lines_before: int
     indices_mended: int
     damage: tuple[Damage, ...]
+    root_rebuilt: bool = False
+    not_listed: str = ""
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
@@ -110,16 +117,24 @@ def recover(
     """Recover the recording at ``path``, and list it where it goes on in segments; idempotent.
 
     ``progress`` is told chunks looked at, and how many there are; what it raises ends the recovery, which
-    can begin anew at any time. Raises PlaceError where there is no recording, DataError where the disk
-    refuses, StateError while somebody writes it.
+    can begin anew at any time. Raises PlaceError where there is no recording, DataError where one holds
+    links, StoreError where the disk refuses, StateError while somebody writes it.
     """
-    open_recording(path)
-    with locked(path, "recovering", surely=not known.alone):
+    refuse_links(path)
+    if not root_is_lost(path):
+        open_recording(path)
+    with refused(path, "recovered"), locked(path, "recovering", surely=not known.alone):
+        if lost := root_is_lost(path):
+            rebuild_root(path, disk)
         recording = open_recording(path)  # as it is now that nobody writes it
         done = _Recoverer(recording, path, disk, known).run(progress)
-    with contextlib.suppress(StateError):  # who recovers the first recording meanwhile lists them all
-        list_segments(path, disk)
-    return done
+    not_listed = ""
+    try:
+        with contextlib.suppress(StateError):  # who recovers the first recording meanwhile lists them all
+            list_segments(path, disk)
+    except (AcquireError, OSError) as error:
+        not_listed = str(error)
+    return replace(done, changed=done.changed or lost, root_rebuilt=lost, not_listed=not_listed)
 
 
 class _Recoverer:
@@ -162,11 +177,9 @@ class _Recoverer:
         mended = 0
         for name in COLUMNS:
             reader = stream.reader(name)
-            directory = self.path / reader.key / "c"
-            shards = [int(entry.name) for entry in directory.glob("*") if entry.name.isdigit()]
             mended += sum(
                 mend_index(self.disk, self.path, reader, shard, grow=not self.sealed)
-                for shard in sorted(shards)
+                for shard in shard_numbers(self.path / reader.key)
                 if shard >= first_shard
             )
         return mended
@@ -215,19 +228,21 @@ class _Recoverer:
         self._resize(publisher, nodes)
         document["attributes"] = self._attributes(new_gaps)
         self.disk.sync_tree(self.path)
+        write_copy(publisher, self.path, document["attributes"], durable=True)
         publisher.replace(self.path / "zarr.json", layout.to_json(document), durable=True)
         for leftover in (SCRATCH, RESERVE):
             self.disk.remove(hidden / leftover)
         release(self.path, self.disk)
-        for shard in self._dropped_shards():
-            delete_shard(self.disk, self.path, shard)
+        self._delete_dropped()
         self.disk.sync_directory(self.path.parent)
 
-    def _dropped_shards(self) -> list[int]:
+    def _delete_dropped(self) -> None:
         """Shards that retention had told of, and may have had no time to delete."""
         size = self.shape.shard_rows
-        dropped = self.recording.dropped_rows()
-        return [shard for rows in dropped for shard in range(rows.start // size, rows.stop // size)]
+        told = [range(-(-rows.start // size), rows.stop // size) for rows in self.recording.dropped_rows()]
+        for shard in shards_on_disk(self.path):
+            if any(shard in shards for shards in told):
+                remove(self.disk, self.path, Dropped(shard, told))
 
     def _tables(
         self, publisher: Publisher, new_gaps: dict[str, list[tuple[int, int, str]]]

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from acquire.errors import PlaceError, UsageError
+from acquire.store.place import put_bytes, put_copy
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -127,6 +128,14 @@ class RemoteSource:
         with _as_os_errors():
             return int(self._fs.info(self._path(key))["size"])
 
+    def names(self, key: str) -> list[str]:
+        with _as_os_errors():
+            try:
+                found = self._fs.ls(self._path(key), detail=False)
+            except (FileNotFoundError, NotADirectoryError):
+                return []
+        return [path.rstrip("/").rpartition("/")[2] for path in found]
+
     def exists(self) -> bool:
         with _as_os_errors():
             return bool(self._fs.exists(self._root))
@@ -150,12 +159,18 @@ class RemoteSource:
         return FsspecStore.from_url(self.url, storage_options=_options(self.url), read_only=True)
 
     def put(self, key: str, data: bytes) -> None:
-        """Replace one part by ``data``, in one step where the store is an object store."""
+        """Replace one part by ``data``, in one step in an object store and on a disk of this machine."""
+        if self.path is not None:
+            put_bytes(self.path / key, data)
+            return
         with _as_os_errors():
             self._fs.pipe_file(self._path(key), data)
 
     def put_file(self, key: str, file: Path) -> None:
-        """Replace one part by the bytes of a local file."""
+        """Replace one part by the bytes of a local file, as `put` does."""
+        if self.path is not None:
+            put_copy(self.path / key, file)
+            return
         with _as_os_errors():
             self._fs.put_file(str(file), self._path(key))
 

@@ -11,15 +11,16 @@ and the outage is that many lines long; where it began anew, the outage is known
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from glob import escape
 from typing import TYPE_CHECKING
 
 from acquire.errors import DataError, PlaceError, UsageError
 from acquire.lines import ARMS
+from acquire.store.attributes import segment_of
 from acquire.store.files import DISK, SCRATCH, Publisher, locked
 from acquire.store.layout import to_json
+from acquire.store.links import refuse_link
 from acquire.store.opening import open_recording, read_root
 from acquire.store.source import LocalSource
 from acquire.store.terms import Continuation
@@ -64,8 +65,8 @@ def list_segments(path: Path, disk: Disk = DISK) -> None:
 
     Raises OSError, DataError, and StateError while somebody else writes the first recording.
     """
-    segment = read_root(LocalSource(path))["attributes"].get("segment")
-    first = path if segment is None else path.with_name(str(segment["of"]))
+    segment = segment_of(read_root(LocalSource(path))["attributes"])
+    first = path if segment is None else path.with_name(segment[0])
     if not first.is_dir():
         return
     with locked(first, "listing the segments of"):
@@ -74,8 +75,12 @@ def list_segments(path: Path, disk: Disk = DISK) -> None:
 
 def _name(first: Path, segments: list[str], disk: Disk) -> None:
     """List what is not listed yet; the recording is held."""
-    document = json.loads((first / "zarr.json").read_bytes())
+    refuse_link(first, first / ARMS[0] / "lines")
+    refuse_link(first, first / "zarr.json")
+    document = read_root(LocalSource(first))
     listed = document["attributes"].get("segments", [])
+    if not isinstance(listed, list):
+        raise DataError(f"{first}: segments is {listed!r:.50}, not a list of names")
     if new := [name for name in segments if name not in listed]:
         document["attributes"]["segments"] = [*listed, *new]
         publisher = Publisher(first / ARMS[0] / "lines" / SCRATCH, disk)
@@ -84,16 +89,16 @@ def _name(first: Path, segments: list[str], disk: Disk) -> None:
 
 def _segments_beside(first: Path) -> list[str]:
     """Names of recordings that say they are segments of this one, in order."""
-    run_id = read_root(LocalSource(first))["attributes"]["run_id"]
+    run_id = read_root(LocalSource(first))["attributes"].get("run_id")
     found = []
     for path in first.parent.glob(f"{escape(first.stem)}-*{escape(first.suffix)}"):
         try:
             attributes = read_root(LocalSource(path))["attributes"]
         except (DataError, PlaceError):
             continue  # no recording, or none that could say what it is
-        segment = attributes.get("segment")
-        if segment and (segment["of"], attributes.get("run_id")) == (first.name, run_id):
-            found.append((int(segment["number"]), path.name))
+        segment = segment_of(attributes)
+        if segment and (segment[0], attributes.get("run_id")) == (first.name, run_id):
+            found.append((segment[1], path.name))
     return [name for _, name in sorted(found)]
 
 

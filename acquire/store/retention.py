@@ -19,12 +19,14 @@ from zlib import crc32
 
 from acquire.errors import DataError, UsageError
 from acquire.lines import ARMS
+from acquire.reading import read_object
 from acquire.store.files import DISK, Publisher
-from acquire.store.layout import PARSE_ERRORS, line_columns
+from acquire.store.layout import PARSE_ERRORS
+from acquire.store.links import refuse_link
 from acquire.store.opening import open_recording
 from acquire.store.refusals import refusal
 from acquire.store.remote import url_below
-from acquire.store.shard import shard_key
+from acquire.store.removal import Dropped, remove, shard_files
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -71,6 +73,7 @@ def hold(path: Path, first_line: int, count: int, why: str = "", disk: Disk = DI
         )
     held = Hold(first_line, count, why)
     directory = _holds(path)
+    refuse_link(path, directory)
     text = json.dumps({"first_line": first_line, "count": count, "why": why}).encode()
     try:
         disk.make_directory(directory, parents=True)
@@ -93,6 +96,7 @@ def keep_from(path: Path, line: int, url: str, disk: Disk = DISK) -> None:
     same place replaces an earlier one.
     """
     text = json.dumps({"first_line": line, "count": ALL_LINES, "why": _NOT_COPIED}).encode()
+    refuse_link(path, _holds(path))
     try:
         disk.make_directory(_holds(path), parents=True)
         Publisher(_holds(path) / ".copy", disk).replace(_copy_hold(path, url), text, durable=True)
@@ -101,14 +105,19 @@ def keep_from(path: Path, line: int, url: str, disk: Disk = DISK) -> None:
 
 
 def holds_of(path: Path) -> list[Hold]:
-    """What `hold` was asked for, of a recording that is being written."""
+    """What `hold` was asked for, of a recording that is being written.
+
+    A file that cannot be understood may have meant any lines: it holds all of them until it is removed.
+    """
     found = []
     for file in sorted(_holds(path).glob("[0-9]*.json")):
         try:
-            said = json.loads(file.read_bytes())
+            said = read_object(file, follow=False)
             found.append(Hold(int(said["first_line"]), int(said["count"]), str(said["why"])))
-        except PARSE_ERRORS as error:
-            raise DataError(f"{file} is no hold: {error!r}", hint="remove it") from error
+        except FileNotFoundError:
+            continue  # replaced by a wider one, or released, meanwhile
+        except (*PARSE_ERRORS, OSError) as error:
+            found.append(Hold(0, ALL_LINES, f"{file.name} is no hold, remove it: {error}"))
     return found
 
 
@@ -137,6 +146,8 @@ class Keeper:
     """Shards that were dropped, as stretches."""
     sizes: dict[int, int] = field(default_factory=dict)
     """Whole shards that are there → bytes in all their arrays."""
+    odd: set[int] = field(default_factory=set)
+    """Shards that a link leads to by now: they are not deleted, and count as kept."""
 
     def note(self, kind: str, line: int) -> None:
         """An event happened at ``line``."""
@@ -166,7 +177,9 @@ class Keeper:
         for shard in sorted(self.sizes):
             if self._lines(shard).stop > newest - self.policy.margin_lines:
                 break
-            if (excess > 0 or self._old(shard, newest)) and not self._held(shard, held):
+            if shard in self.odd or self._held(shard, held):
+                continue
+            if excess > 0 or self._old(shard, newest):
                 going.append(shard)
                 excess -= self.sizes.pop(shard)
                 self.gone = _with(self.gone, shard)
@@ -178,13 +191,19 @@ class Keeper:
         Returns the latter: they count as kept again.
         """
         held = [hold.lines for hold in self._marks()]
-        saved = [shard for shard in shards if self._held(shard, held)]
-        for shard in shards:
-            if shard in saved:
-                self._restore(shard)
-            else:
-                delete_shard(self.disk, self.path, shard)
+        saved = [shard for shard in shards if self._held(shard, held) or not self._delete(shard)]
+        for shard in saved:
+            self._restore(shard)
         return saved
+
+    def _delete(self, shard: int) -> bool:
+        """Says whether it was; what is not the recording's own any more stays."""
+        try:
+            remove(self.disk, self.path, Dropped(shard, self.gone))
+        except DataError:
+            self.odd.add(shard)
+            return False
+        return True
 
     def attributes(self) -> dict[str, Any]:
         """For the recording's root."""
@@ -225,27 +244,9 @@ class Keeper:
         self.sizes[shard] = shard_bytes(self.path, shard)
 
 
-def shard_files(path: Path, shard: int) -> list[Path]:
-    """The files of a shard in all arrays of both arms, that there are."""
-    files = [
-        path / arm / column.name / shard_key(shard, 2 if column.name == "lines" else 1)
-        for arm in ARMS
-        for column in line_columns("any")
-    ]
-    return [file for file in files if file.exists()]
-
-
 def shard_bytes(path: Path, shard: int) -> int:
     """Bytes of a shard in all arrays of both arms."""
     return sum(file.stat().st_size for file in shard_files(path, shard))
-
-
-def delete_shard(disk: Disk, path: Path, shard: int) -> None:
-    """Delete a shard from all arrays of both arms; no matter if parts of it are gone."""
-    for file in shard_files(path, shard):
-        disk.remove(file)
-    for arm in ARMS:
-        disk.remove_tree(path / arm / "lines" / "c" / str(shard))
 
 
 def _holds(path: Path) -> Path:

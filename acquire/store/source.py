@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
+from acquire.reading import open_regular, read_regular
 from acquire.store.files import tree_bytes
 from acquire.store.remote import RemoteSource, is_url
 
@@ -31,6 +32,9 @@ class Source(Protocol):
     def size(self, key: str) -> int:
         """Bytes of one part."""
 
+    def names(self, key: str) -> list[str]:
+        """Names of what lies directly below ``key``; none where there is nothing."""
+
     def exists(self) -> bool:
         """There is something at this place."""
 
@@ -55,17 +59,17 @@ class LocalSource:
         return self._root
 
     def read(self, key: str) -> bytes:
-        return (self.path / key).read_bytes()
+        return read_regular(f"{self._root}/{key}")
 
     def read_range(self, key: str, start: int, size: int) -> bytes:
-        fd = os.open(f"{self._root}/{key}", os.O_RDONLY | os.O_CLOEXEC)
+        fd = open_regular(f"{self._root}/{key}")
         try:
             return os.pread(fd, size, start)
         finally:
             os.close(fd)
 
     def expect(self, key: str, start: int, size: int) -> None:
-        fd = os.open(f"{self._root}/{key}", os.O_RDONLY | os.O_CLOEXEC)
+        fd = open_regular(f"{self._root}/{key}")
         try:
             os.posix_fadvise(fd, start, size, os.POSIX_FADV_WILLNEED)
         finally:
@@ -73,6 +77,12 @@ class LocalSource:
 
     def size(self, key: str) -> int:
         return (self.path / key).stat().st_size
+
+    def names(self, key: str) -> list[str]:
+        try:
+            return os.listdir(f"{self._root}/{key}")  # noqa: PTH208
+        except (FileNotFoundError, NotADirectoryError):
+            return []
 
     def exists(self) -> bool:
         return self.path.exists()
@@ -89,6 +99,7 @@ class LocalSource:
 
 def source_of(place: Path | str) -> Source:
     """The source for a path, or for a URL. Raises UsageError for a URL that cannot be one."""
-    if is_url(place):
-        return RemoteSource(str(place))
-    return LocalSource(Path(place))
+    if not is_url(place):
+        return LocalSource(Path(place))
+    remote = RemoteSource(str(place))
+    return remote if remote.path is None else LocalSource(remote.path)

@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from acquire.store.source import Source
 
 
+NUMBERS = ("uint8", "uint64")
+MOST_ROWS = 2**20
+
+
 @dataclass(frozen=True, slots=True)
 class Gap:
     """Lines of one arm that were lost."""
@@ -47,7 +51,7 @@ def read_gaps(source: Source, nodes: dict[str, Document]) -> tuple[Gap, ...]:
 def read_events(source: Source, nodes: dict[str, Document]) -> tuple[Event, ...]:
     """What happened, in the order in which it was noted; ``nodes`` are the root's. Raises DataError."""
     table = _Table(source, "events", nodes)
-    texts = table.cells("text")
+    texts = table.cells("text", text=True)
     return tuple(map(Event, table.words("kind"), table.numbers("tick"), table.numbers("line"), texts))
 
 
@@ -57,11 +61,13 @@ class _Table:
     name: str
     nodes: dict[str, Document]
 
-    def cells(self, column: str) -> list[Any]:
+    def cells(self, column: str, *, text: bool = False) -> list[Any]:
         """The cells of one column, numbers or texts."""
         try:
             document = self.nodes[f"{self.name}/{column}"]
             (rows,), data_type = document["shape"], document["data_type"]
+            if data_type not in (("string",) if text else NUMBERS) or not 0 <= rows <= MOST_ROWS:
+                raise ValueError(f"{rows} cells of type {data_type}")
             if rows == 0:
                 return []
             data = self._chunk(column)

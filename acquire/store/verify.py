@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -11,10 +10,13 @@ import numpy as np
 
 from acquire.errors import DataError
 from acquire.lines import ARMS
+from acquire.reading import parse_object
 from acquire.store.camera_stream import DAMAGE
+from acquire.store.links import refuse_links
 from acquire.store.opening import open_source
 from acquire.store.scan import Damage, chunks_of, missing_rows, scan
-from acquire.store.source import source_of
+from acquire.store.shortfall import missing_segments
+from acquire.store.source import LocalSource, source_of
 from acquire.store.suspect import suspect_lines
 
 if TYPE_CHECKING:
@@ -66,9 +68,12 @@ class Verification:
 
 def verify(place: Path | str, progress: Callable[[int, int], None] | None = None) -> Verification:
     """Read all of a recording, here or far away: presence, length and checksum of every chunk, and that
-    numbering, gaps, flags and ledger agree. Raises as `open_recording` does.
+    numbering, gaps, flags and ledger agree, and segments are where they are listed. Raises as
+    `open_recording` does, and DataError for a recording that holds links.
     """
     source = source_of(place)
+    if isinstance(source, LocalSource):
+        refuse_links(source.path)
     recording = open_source(source)
     scans = scan(recording, recording.kept_rows(), progress)
     gone = open_source(source).dropped  # what retention may have deleted meanwhile is no damage
@@ -91,6 +96,7 @@ def verify(place: Path | str, progress: Callable[[int, int], None] | None = None
 
 def _contradictions(recording: Recording, scans: dict[str, ArmScan]) -> Iterator[str]:
     yield from _metadata(recording)
+    yield from missing_segments(recording)
     try:
         listed = {arm: _listed(recording, arm) for arm in ARMS}
         complete = recording.gaps_not_listed == 0
@@ -166,7 +172,7 @@ def _metadata(recording: Recording) -> Iterator[str]:
     nodes = recording.document["consolidated_metadata"]["metadata"]
     for path, document in nodes.items():
         try:
-            own = json.loads(recording.source.read(f"{path}/zarr.json"))
+            own = parse_object(recording.source.read(f"{path}/zarr.json"))
         except DAMAGE as error:
             yield f"{path}/zarr.json cannot be read: {error}"
             continue

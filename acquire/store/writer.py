@@ -21,14 +21,16 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
 
-from acquire.errors import DataError, StateError, UsageError
+from acquire.errors import AcquireError, DataError, UsageError
 from acquire.lines import ARMS
 from acquire.store import layout
 from acquire.store.arm_writer import ArmWriter
 from acquire.store.codecs import EncodeOnce
 from acquire.store.files import DISK, SCRATCH, Publisher, check_new_path, lock
 from acquire.store.pages import keep_freed_memory
+from acquire.store.rebuild import write_copy
 from acquire.store.refusals import refusal
+from acquire.store.removal import RESERVE, Unborn, remove
 from acquire.store.resume import list_segment
 from acquire.store.retention import Keeper, release
 from acquire.store.room import RoomWatch
@@ -46,9 +48,6 @@ if TYPE_CHECKING:
 
 OWN_INTERVAL_S = 1.0
 """How much older than the root the metadata of a group or an array opened by itself may be."""
-
-RESERVE = ".reserve"
-"""Of a recording that is being written, beside the shards of the first array."""
 
 RESERVE_BYTES = 2**20
 """Kept free for the metadata of the end: more than the tables and the root take."""
@@ -128,7 +127,7 @@ class RecordingWriter:
         except (DataError, UsageError, MemoryError):
             if writer is not None:
                 writer.close()
-            disk.remove_tree(path)
+            remove(disk, path, Unborn(0))
             raise
         return writer
 
@@ -145,17 +144,18 @@ class RecordingWriter:
             self._keeper = Keeper(self.path, self.spec.retention, shard_lines, first_line, self._disk)
         try:
             with self._failing("creating the recording"):
+                self._publish_copy()
                 self._publish_root(0, self._publish_parts(0, own=False))  # `prepare` did all that takes time
                 if self.spec.continues is not None and self.spec.continues.listed:
                     list_segment(self.path, self.spec.continues, self._disk)
-        except (DataError, StateError):
+        except AcquireError:
             self.abandon()
             raise
 
     def abandon(self) -> None:
         """Give up what was prepared, before `begin`: nothing is left behind."""
         self.close()
-        self._disk.remove_tree(self.path)
+        remove(self._disk, self.path, Unborn(self._committed))
 
     def _create_parts(self) -> None:
         with self._failing("creating the recording"):
@@ -291,6 +291,7 @@ class RecordingWriter:
             nodes = self._publish_parts(rows, own=True)
             self._disk.sync_tree(self.path)
             ending = Ending(condition, end_reason, {**ledger, "store": self._ledger(rows)})
+            self._publish_copy(ending)
             self._publish_root(rows, nodes, ending)
             if self._keeper is not None:
                 release(self.path, self._disk)
@@ -359,6 +360,8 @@ class RecordingWriter:
         going = self._keeper.choose(rows, -room.free_bytes if looked else 0) if self._keeper else []
         if looked:
             self._stuck = room.full and not going
+        if going:
+            self._publish_copy()
         self._publish_root(rows, nodes)
         if self._keeper and self._keeper.delete(going):
             self._publish_root(rows, nodes)
@@ -367,11 +370,19 @@ class RecordingWriter:
         self, rows: int, nodes: dict[str, layout.Document], ending: Ending | None = None
     ) -> None:
         """The commit itself."""
-        kept = self._keeper.attributes() if self._keeper else {}
-        root = layout.group_document({**root_attributes(self.spec, ending), **kept}, nodes)
+        root = layout.group_document(self._attributes(ending), nodes)
         durable = self._durable or ending is not None
         self._publisher.replace(self.path / "zarr.json", layout.to_json(root), durable=durable)
         self._committed = rows
+
+    def _publish_copy(self, ending: Ending | None = None) -> None:
+        """What the root says, for the case that it is lost; always before the root itself."""
+        durable = self._durable or ending is not None
+        write_copy(self._publisher, self.path, self._attributes(ending), durable=durable)
+
+    def _attributes(self, ending: Ending | None) -> dict[str, Any]:
+        kept = self._keeper.attributes() if self._keeper else {}
+        return {**root_attributes(self.spec, ending), **kept}
 
     def _ledger(self, rows: int) -> dict[str, Any]:
         end = self.spec.first_line + rows

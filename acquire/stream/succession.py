@@ -44,10 +44,11 @@ READY_S = 20.0
 
 @dataclass(frozen=True, slots=True)
 class Orphan:
-    """A recording whose recorder did not live to seal it, and why."""
+    """A recording whose recorder did not live to seal it, and why; lines of it were acknowledged."""
 
     path: Path
     why: str
+    committed_lines: int = 0
 
 
 class Resumption:

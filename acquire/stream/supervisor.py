@@ -135,6 +135,11 @@ class Supervisor:
         return self._resumption.why
 
     @property
+    def _committed_lines(self) -> int:
+        """That the recorder has acknowledged of the recording under way."""
+        return self._counters[RECORDER]["committed"]
+
+    @property
     def dead(self) -> frozenset[str]:
         """Processes that died, and whose place nobody took."""
         return frozenset(self._dead)
@@ -180,7 +185,7 @@ class Supervisor:
         self._going_on = False
         if self.began is not None and self.sealed is None and self.path is not None:
             why = self.fault or "its recorder did not end in time"
-            self._orphans.append(Orphan(self.path, why))
+            self._orphans.append(Orphan(self.path, why, self._committed_lines))
 
     def begin(self, message: Begin) -> None:
         """Have the recorder begin; returns when it has. Raises what it refuses with."""
@@ -404,14 +409,15 @@ class Supervisor:
 
     def _go_on(self, begin: Begin, began: Began, death: str) -> Begin:
         """With the recording of a recorder that was killed, beside it."""
+        committed = self._committed_lines
         if self._going_on or self._cut_short is not None:  # and the counters may be neither's
-            following = once_more(begin)
+            following, committed = once_more(begin), 0
         else:
-            following = continuation(begin, began, self._counters[RECORDER]["committed"], death)
+            following = continuation(begin, began, committed, death)
         self._begin = following
         if following.path != begin.path:  # else it was killed before it had made anything
             why = f"its recorder was {death}; it goes on in {following.path.name}"
-            self._orphans.append(Orphan(begin.path, why))
+            self._orphans.append(Orphan(begin.path, why, committed))
         self._going_on, self.path = True, following.path
         return following
 
@@ -452,7 +458,7 @@ class Supervisor:
     def _take_end(self, sealed: Sealed) -> None:
         self._note_kept()
         if not sealed.on_disk and self.path is not None:
-            self._orphans.append(Orphan(self.path, sealed.end_reason))
+            self._orphans.append(Orphan(self.path, sealed.end_reason, self._committed_lines))
         begin, began, is_over = self._begin, self.began, self._end_reason or self.fault
         following = None
         if self._plan.goes_on and sealed.end_line is not None and begin and began and not is_over:

@@ -146,3 +146,48 @@ def test_what_another_process_writes_is_left_to_it(start: Start, tmp_path: Path)
             assert "another process is writing it" in acquire("recover", live).err
         finally:
             writer.kill()
+
+
+def test_a_root_that_is_lost_under_the_recorder_costs_no_line(start: Start) -> None:
+    """Somebody deletes it, and then the recorder is killed: what was acknowledged is there in the end."""
+    daemon = start()
+    path = record(daemon)
+    with daemon.client() as client:
+        recorder = psutil.Process(client.status().processes["recorder"])
+    recorder.suspend()
+    told = committed(daemon)
+    (path / "zarr.json").unlink()
+    recorder.kill()
+    assert daemon("stop").code == 0
+    until(lambda: recovery(daemon, "x.zarr")[0] == "recovered")
+    assert open_recording(path).lines >= told > 0
+    assert verify(path).intact
+
+
+def test_a_directory_that_is_lost_under_the_recorder_is_named(start: Start) -> None:
+    """As when its disk is unmounted: what was acknowledged is counted, and nothing is called recovered."""
+    daemon = start()
+    path = record(daemon)
+    path.rename(daemon.home / "moved")
+    daemon("stop")
+    until(lambda: recovery(daemon, "x.zarr")[0] == "gone")
+    _, text = recovery(daemon, "x.zarr")
+    assert "lines of it were acknowledged" in text
+    assert "not sealed" in daemon("status").out
+
+
+def test_what_is_recorded_outside_the_directory_is_sealed_by_the_next_daemon(
+    start: Start, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    """Wherever it is, and whatever it is called."""
+    daemon = start()
+    path = tmp_path_factory.mktemp("elsewhere") / "take-1"
+    with daemon.client() as client:
+        client.arm()
+        client.start(path)
+    until(lambda: committed(daemon) > 300)
+    kill_all(daemon)
+    again = start()
+    until(lambda: end_of(path)[0] == "sealed")
+    until(lambda: recovery(again, "take-1")[0] == "recovered")
+    assert verify(path).intact

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import os
+import random
+import subprocess
+import sys
 import threading
+import time
 import uuid
 
 import numpy as np
@@ -13,6 +17,7 @@ from store_helpers import Truth, check_rows, fill, make_spec
 
 from acquire.errors import DataError, PlaceError, StateError, UsageError
 from acquire.store import (
+    Continuation,
     RecordingWriter,
     Retention,
     RunCondition,
@@ -214,9 +219,104 @@ def test_another_recording_is_not_written_over(path, tmp_path):
     with pytest.raises(DataError, match="another recording than it was"):
         copying.step()
     RemoteSource(place).put("zarr.json", b"{")
-    with pytest.raises(UsageError, match="something damaged"):
+    with pytest.raises(UsageError, match="another recording: run run-1"):
         mirror(path, place)
     assert RemoteSource(place).read("zarr.json") == b"{"
+
+
+@pytest.mark.parametrize("root", [b"", b"{", None])
+def test_a_copy_whose_root_was_torn_goes_on(path, tmp_path, root):
+    """As a kill leaves it where a part is not put in one step: not published yet."""
+    far = tmp_path / "far.zarr"
+    mirror(write(path), f"file://{far}")
+    whole = {file: file.stat().st_mtime_ns for file in far.rglob("*") if file.is_file()}
+    (far / "zarr.json").unlink()
+    if root is not None:
+        (far / "zarr.json").write_bytes(root)
+    (far / "b" / "lines" / "c" / "1" / "0").write_bytes(b"torn")
+    (far / "a" / "lines" / "c" / "1" / ".next").write_bytes(b"left by a kill")
+    (far / ".next").write_bytes(b"left by a kill")
+    assert mirror(path, f"file://{far}").shards == 1
+    check_rows(zarr.open_group(far, mode="r"), SPEC, 150)
+    assert verify(far).intact == verify(path).intact
+    untouched = far / "b" / "lines" / "c" / "0" / "0"
+    assert untouched.stat().st_mtime_ns == whole[untouched]
+    other = write(tmp_path / "other.zarr", spec=make_spec(run_id="run-2"))
+    (far / "zarr.json").write_bytes(b"")
+    with pytest.raises(UsageError, match="another recording: run run-1"):
+        mirror(other, f"file://{far}")
+
+
+def test_what_no_mark_vouches_for_is_copied_anew(path, tmp_path):
+    """Versions that left none: files of the right size may be another recording's."""
+    far = tmp_path / "far.zarr"
+    mirror(write(tmp_path / "other.zarr", spec=make_spec(run_id="other", codec="none")), f"file://{far}")
+    (far / "zarr.json").unlink()
+    (far / "a" / "lines" / ".copy-of").unlink()
+    assert mirror(write(path, spec=make_spec(codec="none")), f"file://{far}").shards == 3
+    follows = Continuation("run.zarr", 2, 0, None, "test")
+    segment = write(tmp_path / "run-2.zarr", spec=make_spec(continues=follows))
+    with pytest.raises(UsageError, match="segment 1"):
+        mirror(segment, f"file://{far}")
+
+
+def test_a_kill_at_any_moment_leaves_whole_parts(path, tmp_path):
+    """Readers there meet the old bytes or the new ones; a copy that is cut off, however often, goes on."""
+    write(path, lines=1000)
+    far = tmp_path / "far.zarr"
+    script = f"from pathlib import Path; from acquire.store import mirror; mirror(Path({str(path)!r}), 'file://{far}')"
+    moment = random.Random(3)
+    for _ in range(4):
+        with subprocess.Popen([sys.executable, "-c", script], start_new_session=True) as process:
+            shards = moment.randrange(12)
+            while process.poll() is None and len(list(far.glob("a/lines/c/*/0"))) < shards:
+                time.sleep(0.001)
+            process.kill()
+        for file in far.rglob("[!.]*"):
+            if file.is_file() and file.name != "zarr.json":
+                assert file.read_bytes() == (path / file.relative_to(far)).read_bytes()
+    assert mirror(path, f"file://{far}").sealed
+    assert verify(far).intact == verify(path).intact
+    check_rows(zarr.open_group(far, mode="r"), SPEC, 1000)
+
+
+def test_links_are_refused_on_either_side(path, tmp_path):
+    write(path)
+    far, precious = tmp_path / "far.zarr", tmp_path / "precious"
+    precious.mkdir()
+    for place, target in (("b", precious), ("zarr.json", tmp_path / "victim")):
+        far.mkdir()
+        (far / place).symlink_to(target)
+        with pytest.raises(DataError, match=f"holds a link, not touched: {place}"):
+            mirror(path, f"file://{far}")
+        (far / place).unlink()
+        far.rmdir()
+    far.symlink_to(precious)
+    with pytest.raises(DataError, match="is a link, not touched"):
+        mirror(path, f"file://{far}")
+    shard = path / "a" / "lines" / "c" / "1" / "0"
+    shard.rename(tmp_path / "moved")
+    shard.symlink_to(tmp_path / "moved")
+    for attempt in (lambda: mirror(path, f"file://{tmp_path}/new.zarr"), lambda: verify(path)):
+        with pytest.raises(DataError, match="holds a link, not touched: a/lines/c/1/0"):
+            attempt()
+    assert open_recording(path).cut(1064, 5).mask.any(), "a reader follows links"
+    assert not any(precious.iterdir())
+    assert not (tmp_path / "new.zarr").exists()
+
+
+def test_what_is_not_whole_here_is_not_copied(path, tmp_path):
+    """A file cut short, or gone; once its lines are flagged, they are told there as well."""
+    write(path)
+    with (path / "b" / "lines" / "c" / "1" / "0").open("r+b") as file:
+        file.truncate(5000)
+    far = tmp_path / "far.zarr"
+    with pytest.raises(DataError, match=r"is not copied: b/lines: lines 1080 to 1127: .*cut short"):
+        mirror(path, f"file://{far}")
+    assert not far.exists()
+    recover(path)
+    assert mirror(path, f"file://{far}").sealed
+    assert open_recording(far).gaps == open_recording(path).gaps
 
 
 def test_a_recording_is_not_copied_onto_itself(path, tmp_path):

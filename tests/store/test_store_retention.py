@@ -12,7 +12,8 @@ from store_helpers import Truth, fill, make_spec
 from acquire.errors import DataError, UsageError
 from acquire.store import RecordingWriter, Retention, RunCondition, hold, open_recording, recover, verify
 from acquire.store.files import Disk
-from acquire.store.retention import Keeper, shard_bytes, shard_files
+from acquire.store.removal import COPY, shard_files
+from acquire.store.retention import Keeper, shard_bytes
 
 SHARD = 64
 """Lines: 4 chunks of 16."""
@@ -101,7 +102,7 @@ def test_events_and_marked_lines_are_held_with_their_margin(path):
         with pytest.raises(DataError, match=r"lines 1128 to 1191 are gone already; possible: the others"):
             hold(path, 1120, 200)
         writer.seal(RunCondition.GOOD, "done", {})
-    assert not list(path.rglob(".*"))
+    assert [file.name for file in path.rglob(".*")] == [COPY]
     assert verify(path).intact
 
 
@@ -223,14 +224,20 @@ def test_holds_that_cannot_be_are_refused(path):
         hold(path, 1000, 5)
 
 
-def test_a_file_that_is_no_hold_is_named(path):
+def test_a_file_that_is_no_hold_holds_everything_and_is_named(path):
+    """It may have meant any line; the recording goes on until the disk is full, and says why."""
     with RecordingWriter.create(path, spec_of(AGE)) as writer:
-        hold(path, 1000, 5)
+        grow(writer, 6 * SHARD)
+        hold(path, 1500, 5)
         (path / "a" / "lines" / ".holds" / "1-2.json").write_text("{")
-        fill(writer, 40)
-        with pytest.raises(DataError, match=r"1-2\.json is no hold"):
-            writer.commit()
-        writer.seal(RunCondition.ABORTED, "no hold", {})
+        grow(writer, 6 * SHARD)
+        assert left(path) == list(range(4, 12))
+        (why,) = [why for _, _, why in open_recording(path).attrs["holds"] if "no hold" in why]
+        assert "1-2.json is no hold, remove it" in why
+        (path / "a" / "lines" / ".holds" / "1-2.json").unlink()
+        grow(writer, SHARD)
+        assert left(path)[0] == 8 - 1
+        writer.seal(RunCondition.GOOD, "done", {})
     assert verify(path).intact
 
 

@@ -1,0 +1,170 @@
+"""The process that recovers what a recorder did not seal, one recording; and the search for such recordings.
+
+What is not a recording, holds links, or was written elsewhere is named and left alone. What its recorder had
+not begun is removed, if nobody ever counted a line of it; everything else stays, whatever is missing of it.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from acquire.daemon.messages import RecoveryStatus
+from acquire.errors import AcquireError, DataError, StateError
+from acquire.store import FORMAT, Circumstances, recover
+from acquire.store.files import DISK, locked
+from acquire.store.host import has_run_on, is_here
+from acquire.store.links import refuse_link, refuse_links
+from acquire.store.opening import read_root
+from acquire.store.rebuild import known_attributes
+from acquire.store.removal import Unborn, remove, shards_on_disk
+from acquire.store.source import LocalSource
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+    from acquire.stream.process import Mailbox
+
+RECOVERED = "recovered: "
+"""How the end reason begins of a recording that was recovered."""
+_NICE = 10
+_ELSEWHERE = "open, and not written on this machine, where it could be seen whether it still is"
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One recording to be recovered. ``ours``: this daemon's run has left it, ``why``, after its recorder
+    had acknowledged ``committed_lines``.
+    """
+
+    path: Path
+    why: str = ""
+    ours: bool = False
+    committed_lines: int = 0
+    tries: int = 0
+    not_before_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """What a search has met: recordings that are not sealed, and what nothing can be done about."""
+
+    open: list[Path]
+    odd: list[RecoveryStatus]
+
+
+def search(directory: Path, recorded: Iterable[Path] = ()) -> Found:
+    """Recordings in a directory that are not sealed, and of those that are known to have been ``recorded``.
+
+    Raises OSError where the directory cannot be read.
+    """
+    paths = sorted(path for path in directory.iterdir() if path.name.endswith(".zarr"))
+    found = Found([], [])
+    for path in paths:
+        _look_at(path, found, known=False)
+    for path in recorded:
+        if path not in paths:
+            _look_at(path, found, known=True)
+    return found
+
+
+def _look_at(path: Path, found: Found, *, known: bool) -> None:
+    """``known``: it is not only a name that looks like a recording's."""
+    try:
+        attributes = read_root(LocalSource(path))["attributes"]
+    except AcquireError as error:
+        if known and path.is_dir():
+            found.open.append(path)  # its root may be rebuilt
+        elif known and not os.path.lexists(path):
+            text = (
+                "it was being recorded when an earlier daemon ended, and is not there: is its disk mounted?"
+            )
+            found.odd.append(RecoveryStatus(path=path, state="gone", text=text))
+        else:
+            found.odd.append(RecoveryStatus(path=path, state="left", text=error.message))
+        return
+    if (attributes.get("format"), attributes.get("state")) == (FORMAT, "recording"):
+        found.open.append(path)
+
+
+def salvage(mailbox: Mailbox, task: Task) -> None:
+    """Life of the process: one recovery, with less of the processors than others get."""
+    os.nice(_NICE)
+    mailbox.post(_salvage(mailbox, task))
+
+
+def _salvage(mailbox: Mailbox, task: Task) -> RecoveryStatus:
+    path = task.path
+    try:
+        refuse_links(path)
+        attributes = known_attributes(path)
+        if attributes is None and not shards_on_disk(path):
+            return _remove_unborn(task)
+        if not task.ours and not is_here(attributes or {}):
+            return RecoveryStatus(path=path, state="left", text=_ELSEWHERE)
+        reason = f"{RECOVERED}{task.why}" if task.why else Circumstances().reason
+        known = Circumstances(reason, committed_intact=has_run_on(attributes or {}), alone=False)
+        done = recover(path, progress=lambda *_: _ask(mailbox), known=known)
+    except StateError as error:
+        return RecoveryStatus(path=path, state="waiting", text=error.message)
+    except FileNotFoundError:
+        return RecoveryStatus(path=path, state="gone", text=_gone(task))
+    except (AcquireError, OSError) as error:
+        lost = f"; {task.committed_lines} lines of it were acknowledged" if task.committed_lines else ""
+        return RecoveryStatus(path=path, state="failed", text=f"{error}{lost}")
+    sealed = read_root(LocalSource(path))["attributes"]
+    text = str(sealed["end_reason"])
+    if done.lines < task.committed_lines:
+        text += f"; of {task.committed_lines} acknowledged lines only {done.lines} are on disk"
+    if done.not_listed:
+        text += f"; not listed in its first recording: {done.not_listed}"
+    return RecoveryStatus(
+        path=path, state="recovered", lines=done.lines, condition=sealed["run_condition"], text=text
+    )
+
+
+def _ask(mailbox: Mailbox) -> None:
+    """Ends the process, by an exception, once its owner has gone."""
+    mailbox.take()
+
+
+def _gone(task: Task) -> str:
+    if not task.committed_lines:
+        return "it is not there; no line of it was committed"
+    return (
+        f"it is not there any more, and {task.committed_lines} lines of it were acknowledged: "
+        "was its disk unmounted, or the directory moved or removed?"
+    )
+
+
+def _remove_unborn(task: Task) -> RecoveryStatus:
+    """Its recorder was killed while it made it: no line is in it, and it was never a recording."""
+    if not task.path.is_dir():
+        return RecoveryStatus(path=task.path, state="gone", text=_gone(task))
+    if not task.ours:
+        return RecoveryStatus(path=task.path, state="left", text="it holds no line and has no root")
+    with locked(task.path, "removing", surely=True):
+        remove(DISK, task.path, Unborn(task.committed_lines))
+    text = (
+        "its recorder was killed before it had begun: no line was committed, and what it had made is removed"
+    )
+    return RecoveryStatus(path=task.path, state="gone", lines=0, text=text)
+
+
+def hindrance(task: Task) -> RecoveryStatus | None:
+    """What keeps a recording from being recovered now."""
+    path = task.path
+    try:
+        refuse_link(path, path)
+        with locked(path, "recovering", surely=True):
+            return None
+    except StateError as error:
+        return RecoveryStatus(path=path, state="waiting", text=error.message)
+    except FileNotFoundError:
+        return RecoveryStatus(path=path, state="gone", text=_gone(task))
+    except DataError as error:
+        return RecoveryStatus(path=path, state="left", text=error.message)
+    except OSError as error:
+        return RecoveryStatus(path=path, state="failed", text=f"{path}: {error.strerror}")

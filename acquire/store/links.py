@@ -1,0 +1,56 @@
+"""Links in recordings: a reader follows them; who repairs, copies, holds or deletes refuses them.
+
+Through a link it would reach what does not belong to the recording: the originals of an archive that keeps
+its files elsewhere (git-annex), another recording, or any file of the system.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from acquire.errors import DataError
+from acquire.reading import kind_of
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+def refuse_links(root: Path) -> None:
+    """Raise DataError unless ``root`` and all below it are directories and regular files."""
+    refuse_link(root, root)
+    waiting = [str(root)]
+    while waiting:
+        try:
+            with os.scandir(waiting.pop()) as entries:
+                for entry in entries:
+                    if entry.is_dir(follow_symlinks=False):
+                        waiting.append(entry.path)
+                    elif (kind := kind_of(entry.stat(follow_symlinks=False).st_mode)) is not None:
+                        raise _odd(root, entry.path, kind)
+        except FileNotFoundError:
+            continue  # retention, or a commit, has removed it meanwhile
+        except OSError as error:
+            raise DataError(f"{root} cannot be looked through: {error.filename}: {error.strerror}") from error
+
+
+def refuse_link(root: Path, path: Path) -> None:
+    """Raise DataError where ``root``, ``path`` or a directory between them is a link, or something odder."""
+    below = path.relative_to(root)
+    for part in (*reversed(below.parents), below):
+        with suppress(FileNotFoundError, NotADirectoryError):
+            mode = os.lstat(root / part).st_mode
+            if (kind := kind_of(mode)) is not None and not stat.S_ISDIR(mode):
+                raise _odd(root, str(root / part), kind)
+
+
+def _odd(root: Path, path: str, kind: str) -> DataError:
+    where = os.path.relpath(path, root)
+    what = f"is {kind}, not touched" if where == "." else f"holds {kind}, not touched: {where}"
+    return DataError(
+        f"{root} {what}",
+        possible="directories and regular files",
+        hint="where a link leads to, or a copy with files in the place of links: cp -rL, git annex unlock",
+    )

@@ -1,0 +1,141 @@
+"""The root of a recording anew, where its zarr.json is lost: from what the parts below it say.
+
+::
+
+    a/lines/.attributes          the root's attributes, once more ─┐
+    a/*, b/*, gaps/*, events/*   each array's own zarr.json ───────┴▶ zarr.json
+
+The copy of the attributes is written before the first line, and again when retention has lines dropped and
+when the recording is sealed. Arrays know their lengths to within a second: what is on disk beyond that is
+found by `recover`. Recordings of versions that kept no copy cannot be rebuilt: their arms can be read.
+"""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+from acquire.errors import DataError
+from acquire.lines import ARMS
+from acquire.reading import read_object
+from acquire.store import layout
+from acquire.store.files import SCRATCH, Publisher
+from acquire.store.removal import COPY, ROOT
+from acquire.store.table import event_table, gap_table
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from acquire.store.files import Disk
+
+LOST_FACTS = "run_id, first_line, geometry, code, clock, cameras, trigger, config"
+"""What only the root and its copy say."""
+DAMAGED_ROOT = "zarr.json.damaged"
+"""What a root that cannot be read is renamed to."""
+
+
+def root_is_lost(path: Path) -> bool:
+    """There are the arms of a recording, and no root, or one that is no JSON object with attributes."""
+    if not any((path / arm).is_dir() for arm in ARMS):
+        return False
+    try:
+        return not isinstance(read_object(path / ROOT).get("attributes"), dict)
+    except (FileNotFoundError, ValueError):
+        return True
+    except OSError:
+        return False  # it may be intact: whoever opens it says what is wrong
+
+
+def known_attributes(path: Path) -> dict[str, Any] | None:
+    """The root's attributes, or else their copy; None where there is neither."""
+    for file in (path / ROOT, path / ARMS[0] / "lines" / COPY):
+        with suppress(OSError, ValueError):
+            if isinstance(attributes := read_object(file, follow=False).get("attributes"), dict):
+                return attributes
+    return None
+
+
+def write_copy(publisher: Publisher, path: Path, attributes: dict[str, Any], *, durable: bool) -> None:
+    """Keep the root's attributes a second time. Raises OSError."""
+    text = layout.to_json({"attributes": attributes})
+    publisher.replace(path / ARMS[0] / "lines" / COPY, text, durable=durable)
+
+
+def rebuild_root(path: Path, disk: Disk) -> None:
+    """Write the root of the recording at ``path`` anew; one that cannot be read is kept under another name.
+
+    Raises DataError, and touches nothing, where too much is lost.
+    """
+    attributes = known_attributes(path)
+    if attributes is None:
+        raise DataError(
+            f"{path}: its root zarr.json is lost, and with it {LOST_FACTS}",
+            possible=f"the arrays of {' and '.join(ARMS)} can be read with zarr; nothing was touched",
+            hint="a copy of the recording, or of its zarr.json",
+        )
+    nodes = _arms(path, attributes) | gap_table(path).nodes() | event_table(path).nodes()
+    nodes |= _tables(path)
+    try:
+        if (path / ROOT).exists():
+            disk.rename(path / ROOT, path / DAMAGED_ROOT)
+        publisher = Publisher(path / ARMS[0] / "lines" / SCRATCH, disk)
+        publisher.replace(path / ROOT, layout.to_json(layout.group_document(attributes, nodes)), durable=True)
+    except OSError as error:
+        raise DataError(f"{path}: its root cannot be written anew: {error.strerror or error}") from error
+
+
+def _arms(path: Path, attributes: dict[str, Any]) -> dict[str, layout.Document]:
+    """Metadata of both arms, of the rows that all arrays have; of an open recording, of whole chunks."""
+    nodes: dict[str, layout.Document] = {}
+    for column in layout.line_columns("any"):
+        # Arrays of one column are alike in both arms: either may speak for the other.
+        found = [_own(path / arm / column.name) for arm in ARMS]
+        known = next(filter(None, found), None)
+        if known is None:
+            raise DataError(
+                f"{path}: its root zarr.json is lost, and what the arrays {column.name} of both arms are",
+                possible="the other arrays can be read with zarr; nothing was touched",
+                hint="a copy of the recording, or of its zarr.json",
+            )
+        for arm, own in zip(ARMS, found, strict=True):
+            nodes[f"{arm}/{column.name}"] = own or known
+    try:
+        shapes = {key: layout.parse_line_array(node) for key, node in nodes.items()}
+        rows = min(rows for _, rows in shapes.values())
+        if attributes.get("state") != "sealed":
+            rows -= rows % max(shape.chunk_rows for shape, _ in shapes.values())
+        for key in shapes:
+            nodes[key] = nodes[key] | {"shape": [rows, *nodes[key]["shape"][1:]]}
+        first_line = int(attributes["first_line"])
+    except layout.PARSE_ERRORS as error:
+        raise DataError(
+            f"{path}: its root zarr.json is lost, and its arrays are damaged: {error!r}"
+        ) from error
+    groups = {arm: layout.group_document({"arm": arm, "first_line": first_line}, {}) for arm in ARMS}
+    return groups | nodes
+
+
+def _tables(path: Path) -> dict[str, layout.Document]:
+    """Metadata of the tables, as far as it is there: what they list is not needed for the lines."""
+    nodes: dict[str, layout.Document] = {}
+    for table in (gap_table(path), event_table(path)):
+        own = {key: _own(path / key) for key in table.nodes()}
+        if all(own.values()):
+            nodes |= {key: document for key, document in own.items() if document}
+    return {key: _bare(document) for key, document in nodes.items()}
+
+
+def _own(directory: Path) -> layout.Document | None:
+    """What an array or a group says of itself, if it does."""
+    try:
+        document = read_object(directory / ROOT, follow=False)
+    except (OSError, ValueError):
+        return None
+    return document if isinstance(document.get("attributes"), dict) and document.get("node_type") else None
+
+
+def _bare(document: layout.Document) -> layout.Document:
+    """A node as consolidated metadata has it: groups carry none of their own there."""
+    if document["node_type"] == "array":
+        return document
+    return layout.group_document(document["attributes"], {})
