@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from acquire.lines import Segment
-    from acquire.store import Mirrored, Verification
+    from acquire.store import Mirrored, Recording, Verification
 
 PlaceArgument = Annotated[
     str, typer.Argument(metavar="RECORDING", help="A directory NAME.zarr, or its URL: s3://bucket/NAME.zarr.")
@@ -30,6 +30,9 @@ RecordingArgument = Annotated[
 
 LISTED = 20
 """Damaged stretches that are printed; --json has all of them."""
+
+MOST_NS = 2**62
+"""After 1970: what a calendar can name."""
 
 CELL_CHARACTERS = 72
 """What a table shows of an error; --json has all of it."""
@@ -70,7 +73,8 @@ def info(recording: PlaceArgument, json: JsonFlag = False) -> None:
     from acquire.store import open_recording, suspect_lines
 
     opened = open_recording(recording)
-    facts = opened.info() | {"suspect": [found.to_dict() for found in suspect_lines(opened)]}
+    suspect = [found.to_dict() for found in suspect_lines(opened)]
+    facts = opened.info() | {"damage": _damage(opened), "suspect": suspect}
     if json:
         gaps = [
             {"arm": gap.arm, "first_line": gap.first_line, "count": gap.count, "cause": gap.cause}
@@ -122,6 +126,10 @@ def recover(recording: RecordingArgument, json: JsonFlag = False) -> None:
     found = f"; {added} lines were on disk that no commit listed" if added else ""
     what = f"recovered and sealed{found}" if done.changed else "nothing to recover"
     say(f"{done.path}: {done.lines} lines, {what}")
+    if done.root_rebuilt:
+        say("  its root zarr.json was lost, and is written anew from the copy of its attributes")
+    if done.not_listed:
+        say(f"  it is not listed in the first recording of its run: {done.not_listed}")
     if done.indices_mended:
         say(f"  {done.indices_mended} indices of files were mended")
     _print_list("lost, flagged as missing", map(str, done.damage))
@@ -228,28 +236,40 @@ def _may_be_one(path: Path) -> bool:
 
     try:
         return path.is_dir() and not (format_of(path) or "").startswith("acquire-video/")
-    except AcquireError:
+    except (AcquireError, OSError):
         return True
 
 
 def _summary(path: Path) -> dict[str, Any]:
     from acquire.store import open_recording
+    from acquire.store.camera_stream import DAMAGE
 
     try:
-        facts = open_recording(path).info()
+        opened = open_recording(path)
+        facts = opened.info() | {"damage": _damage(opened)}
     except AcquireError as error:
         return {"path": str(path), "error": error.message}
-    except OSError as error:  # a file of a recording that is being written was replaced meanwhile
-        return {"path": str(path), "error": f"{path} cannot be read: {error.strerror}"}
-    keys = ("path", "run_id", "state", "run_condition", "lines", "duration_s", "bytes", "start_ns")
+    except (*DAMAGE, MemoryError) as error:  # whatever is wrong with one, the others are listed
+        return {"path": str(path), "error": f"{path} cannot be read: {error}"}
+    keys = ("path", "run_id", "state", "run_condition", "lines", "duration_s", "bytes", "start_ns", "damage")
     return {key: facts[key] for key in keys}
+
+
+def _damage(recording: Recording) -> str | None:
+    """What shows without reading the lines: files that are gone or cut short, segments that are not there."""
+    from acquire.store.shortfall import first_shortfall, missing_segments
+
+    if not recording.is_here:
+        return None  # a store far away would be asked for every file
+    found = first_shortfall(recording)
+    return next(missing_segments(recording), None) if found is None else str(found)
 
 
 def _row(facts: dict[str, Any]) -> tuple[str, ...]:
     name = Path(facts["path"]).name
     if "error" in facts:
         return (name, "-", "-", "-", _short(facts["error"].removeprefix(facts["path"]).lstrip(": ")), "-")
-    state = facts["run_condition"] or facts["state"]
+    state = (facts["run_condition"] or facts["state"]) + (", DAMAGED" if facts["damage"] else "")
     size = quantity(facts["bytes"], "B")
     return (name, str(facts["lines"]), f"{facts['duration_s']:.3f} s", size, state, _utc(facts["start_ns"]))
 
@@ -280,6 +300,7 @@ def _readable(facts: dict[str, Any]) -> dict[str, Any]:
         "code": ", ".join(f"{key} {value}" for key, value in facts["code"].items()),
         "clock": f"{facts['clock']['clock_hz']} Hz, UTC known to {facts['clock']['uncertainty_ns']} ns",
         "size": quantity(facts["bytes"], "B"),
+        "damaged": facts["damage"],
         "disk": _disk(facts["disk"]),
         "at risk": _at_risk(facts["durability"]),
         "lost lines": ", ".join(f"{arm} {count}" for arm, count in facts["lost_lines"].items()),
@@ -325,7 +346,8 @@ def _disk(disk: dict[str, float] | None) -> str | None:
     if disk is None:
         return None
     free, rate = quantity(disk["free_bytes"], "B"), quantity(disk["bytes_per_s"], "B/s")
-    return f"{free} free, full in {timedelta(seconds=round(disk['seconds_to_full']))} at {rate}"
+    seconds = min(disk["seconds_to_full"], timedelta.max.total_seconds() / 2)
+    return f"{free} free, full in {timedelta(seconds=round(seconds))} at {rate}"
 
 
 def _at_risk(durability: dict[str, Any]) -> str | None:
@@ -340,6 +362,8 @@ def _at_risk(durability: dict[str, Any]) -> str | None:
 def _utc(time_ns: int | None) -> str:
     if time_ns is None:
         return "-"
+    if not 0 <= time_ns < MOST_NS:
+        return f"{time_ns} ns after 1970"
     return datetime.fromtimestamp(time_ns / 1e9, UTC).strftime("%Y-%m-%d %H:%M:%S.%f")
 
 

@@ -71,9 +71,16 @@ class _Book(_Facts):
     missing: dict[str, Count] = {}
 
 
+def _a_book(value: Any) -> Any:
+    """Of an arm: lines stored, and missing by cause; a ledger may tell something else instead."""
+    if isinstance(value, dict):
+        _Book.model_validate(value)
+    return value
+
+
 class _Ledger(_Facts):
-    a: _Book | None = None
-    b: _Book | None = None
+    a: Annotated[Any, AfterValidator(_a_book)] = None
+    b: Annotated[Any, AfterValidator(_a_book)] = None
 
 
 class _Outage(_Facts):

@@ -245,10 +245,19 @@ class Mirror:
         if self._next < end:
             self._mark()
         while self._next < end and (most is None or self._shards - before < most):
+            if (kept := self._next_kept(recording)) != self._next:
+                self._next = kept
+                continue
             if not self._sealed:
                 self._refuse_shortfall(recording, range(self._next, self._next + 1))
             self._copy_shard(self._next)
             self._next += 1
+
+    def _next_kept(self, recording: Recording) -> int:
+        """The next shard that retention has not dropped: of endless recordings there may be very many."""
+        size = recording.arms[ARMS[0]].reader("lines").shape.shard_rows
+        dropped = (rows for rows in recording.dropped_rows() if self._next * size in rows)
+        return max((rows.stop // size for rows in dropped), default=self._next)
 
     def _refuse_shortfall(self, recording: Recording, shards: range | None) -> None:
         """What is said to be here, and is not, must not be said there."""

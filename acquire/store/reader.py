@@ -78,6 +78,11 @@ class Recording:
     def _open(self) -> zarr.Group:
         return self.group
 
+    @property
+    def is_here(self) -> bool:
+        """It lies on a disk of this machine."""
+        return isinstance(self.source, LocalSource)
+
     def refreshed(self) -> Recording:
         """The recording as it is now: of one that is growing, what was committed since."""
         return self._opener(self.source)
