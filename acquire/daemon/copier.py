@@ -27,7 +27,7 @@ from acquire.store.attributes import segment_of
 from acquire.store.mirror import LOOK_S, Mirror, only_copy
 from acquire.store.opening import read_root
 from acquire.store.refusals import refusal
-from acquire.store.remote import RemoteSource, be_patient, url_below
+from acquire.store.remote import RemoteSource, be_patient, check_url, url_below
 from acquire.store.source import LocalSource
 
 if TYPE_CHECKING:
@@ -104,6 +104,9 @@ def copy_recordings(mailbox: Mailbox, target: str, copies: tuple[Copy, ...]) -> 
     """Life of the process, until its owner ends it; it begins with ``copies``."""
     os.nice(_NICE)
     be_patient()
+    with contextlib.suppress(UsageError):  # each try says so
+        check_url(target)  # what it imports takes a moment
+    mailbox.post(Reached(0))
     copier = Copier(mailbox, target)
     for copy in copies:
         copier.add(copy.path, ours=copy.ours)

@@ -37,7 +37,9 @@ if TYPE_CHECKING:
 MOST_LISTED = 32
 """Recordings that are copied, and that are not, of which the status tells: the latest."""
 ANSWER_S = 5.0
-"""How long arming waits for the store's answer."""
+"""How long arming waits for the store's answer, once the process that asks is there."""
+START_S = 60.0
+"""How long it waits for that process: an interpreter takes its time on a busy machine."""
 _END_S = 3.0
 _POLL_S = 0.02
 _OVER = ("copied", "gone")
@@ -87,6 +89,8 @@ class Uploads:
         self._deaths = 0
         """Within so short a time that something must be wrong."""
         self._not_before_s = 0.0
+        self._awake = False
+        """The process has said something."""
         self._questions = 0
         self._answer: Reached | None = None
         self.warning: str | None = None
@@ -210,6 +214,7 @@ class Uploads:
             return
         try:
             self._born_s = time.monotonic()
+            self._awake = False
             self._worker = Worker("uploads", copy_recordings, self._target, self._copies())
         except DeviceError as error:
             self._wait_for_another(str(error))
@@ -222,6 +227,7 @@ class Uploads:
     def _hear(self, worker: Worker) -> str | None:
         """Take what the process says; why it ends, if it says so."""
         while (said := worker.message()) is not None:
+            self._awake = True
             if isinstance(said, UploadStatus):
                 self._heed(said)
             elif isinstance(said, Reached):
@@ -260,8 +266,11 @@ class Uploads:
         self._questions += 1
         self._answer = None
         self._post(Reach(self._questions))
-        deadline = time.monotonic() + ANSWER_S
+        deadline = time.monotonic() + START_S
+        asked = False
         while self._answer is None or self._answer.number != self._questions:
+            if self._awake and not asked:
+                asked, deadline = True, min(deadline, time.monotonic() + ANSWER_S)
             if time.monotonic() > deadline:
                 return None
             self.look()

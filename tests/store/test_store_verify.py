@@ -11,7 +11,7 @@ import pytest
 import zarr
 from store_helpers import Truth, check_rows, fill, make_spec
 
-from acquire.errors import DataError, StateError
+from acquire.errors import PlaceError, StateError
 from acquire.lines import ARMS, LineFlag
 from acquire.store import Circumstances, Gap, RecordingWriter, RunCondition, open_recording, recover, verify
 from acquire.store.host import has_run_on, is_here
@@ -241,7 +241,7 @@ def test_what_a_commit_did_not_list_is_added(path):
 
 def test_what_is_not_a_recording_cannot_be_verified_or_recovered(tmp_path):
     for attempt in (verify, recover):
-        with pytest.raises(DataError, match="does not exist"):
+        with pytest.raises(PlaceError, match="does not exist"):
             attempt(tmp_path / "no.zarr")
 
 
