@@ -41,6 +41,8 @@ SUPERVISE_S = 0.2
 """Time between two looks at the capture path."""
 DRAIN_S = 0.05
 """The same while somebody waits for a recording to be sealed."""
+COMMAND_S = 60.0
+"""For the command that is under way when the daemon is told to end, such as `arm` on a busy host."""
 MOST_WAITING = 8
 """Commands that wait for the one under way; each holds a connection."""
 
@@ -64,6 +66,9 @@ def serve(config: RigConfig) -> int:
         proof = Proof(config)
         service = Service(config, lambda: Run(config, rig, proof.choose), proof, salvage, uploads, troubles)
         code = asyncio.run(Daemon(service, endpoint).run())
+        last_resort = LastResort(endpoint.remove)
+        last_resort.within(END_S)  # for devices that do not let go
+    last_resort.cancel()
     return leave(code)
 
 
@@ -161,6 +166,7 @@ class Daemon:
             self._last_resort.within(END_S)
             return
         log.info("%s: ending", number.name)
-        self._last_resort.within(END_S)
+        busy = self._service.status().busy is not None
+        self._last_resort.within(END_S + (COMMAND_S if busy else 0.0))
         self._exit_code = EXIT_INTERRUPTED if number is signal.SIGINT else 0
         self._ending.set()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import logging
 import socket
 import threading
 import time
@@ -320,6 +321,15 @@ def test_every_answer_is_documented(path: Path, daemon: Client) -> None:
             assert all(one["description"] for one in operation["responses"].values())
 
 
+@pytest.fixture
+def _no_log() -> Iterator[None]:
+    """What cannot be encoded reaches no report of the tests."""
+    logging.disable()
+    yield
+    logging.disable(logging.NOTSET)
+
+
+@pytest.mark.usefixtures("_no_log")
 def test_whatever_is_in_the_status_it_is_answered(daemon: Client, path: Path, run: FakeRun) -> None:
     """File names that are not UTF-8, and a device's own words, reach JSON as text."""
     odd = "caf\udce9 \x1b[2J\u202e"

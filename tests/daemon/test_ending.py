@@ -52,3 +52,44 @@ def test_nothing_is_forced_where_all_threads_end() -> None:
         timeout=300,
     )
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, "0\n", "")
+
+
+HUNG = """
+import asyncio, contextlib, os, pathlib, signal, sys, threading
+sys.path.insert(0, sys.argv[2])
+from fake_run import FakeRun, rig_config
+from acquire.daemon import server
+from acquire.daemon.endpoint import Endpoint
+from acquire.daemon.service import Service
+server.END_S = 0.5
+socket = pathlib.Path(sys.argv[1])
+
+class Hung(FakeRun):
+    def close(self):
+        threading.Event().wait()
+
+async def live():
+    service = Service(rig_config(socket.parent), Hung)
+    daemon = server.Daemon(service, endpoint)
+    service.arm()
+    asyncio.get_running_loop().call_later(0.1, os.kill, os.getpid(), signal.SIGTERM)
+    await daemon.run()
+
+with contextlib.closing(Endpoint(socket)) as endpoint:
+    asyncio.run(live())
+"""
+
+
+def test_a_device_that_does_not_let_go_keeps_no_daemon_from_ending(tmp_path: Path) -> None:
+    socket = tmp_path / "c.sock"
+    ended = subprocess.run(
+        [sys.executable, "-c", HUNG, socket, Path(__file__).parent],
+        check=False,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert ended.returncode == 1, ended.stderr
+    assert "ending by force: thread MainThread" in ended.stderr
+    assert "thread devices_0 at" in ended.stderr
+    assert not socket.exists()
