@@ -13,6 +13,7 @@ under a name that stands for everything it was made from::
 from __future__ import annotations
 
 import ctypes
+import fcntl
 import hashlib
 import os
 import tempfile
@@ -203,9 +204,12 @@ def library(build: Build) -> Path:
     path = cache_directory() / f"{_fingerprint(build)}.so"
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
-            _compile(_translate(build, Path(scratch)), Path(scratch) / path.name)
-            (Path(scratch) / path.name).rename(path)  # several may build at once: the last one stays
+        with path.with_suffix(".lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)  # of several that need it, one compiles it
+            if not path.exists():
+                with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
+                    _compile(_translate(build, Path(scratch)), Path(scratch) / path.name)
+                    (Path(scratch) / path.name).rename(path)
     return path
 
 
