@@ -130,7 +130,7 @@ class Link:
 
     @property
     def limit_s(self) -> float:
-        """No request is on the way for longer: it has its answer by then, or TriggerError is raised."""
+        """A request has its answer by then, or TriggerError is raised; a late host may take longer."""
         return self._attempts * self._reply_s
 
     @property
@@ -256,10 +256,14 @@ class Link:
         return [call for call in sent if call.answer is None and not self._is_on_the_way(call)]
 
     def _expire(self, sent: list[_Call]) -> None:
-        """While answers come, one that is missing will be found out by its successor's."""
+        """While answers come, one that is missing will be found out by its successor's.
+
+        A host that was late itself, or stopped for a while, still makes all its attempts.
+        """
         now_s = time.monotonic()
         for call in sent:
-            if call.answer is None and now_s > call.begun_s + self.limit_s:
+            late = now_s > call.begun_s + self.limit_s and call.attempts == self._attempts
+            if call.answer is None and late:
                 raise self._given_up(call)
             if self._is_on_the_way(call) and max(call.sent_s, self._progress_s) <= now_s - self._reply_s:
                 del self._on_the_way[call.frame.sequence]
