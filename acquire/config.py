@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import os
-import stat
 import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
@@ -22,6 +21,7 @@ from acquire.errors import ConfigError
 from acquire.event_config import CheckConfig, EventsConfig
 from acquire.geometry import Geometry
 from acquire.plan_config import ReconstructionPlan
+from acquire.reading import read_regular
 from acquire.recording_config import USUAL_CHUNK_BYTES, RecordingConfig, usual_chunk_lines, usual_tag_chunks
 from acquire.scene_config import SceneConfig, SceneFile, VideoSceneConfig, anchored
 from acquire.text import shortened, shown
@@ -394,7 +394,8 @@ def check_plan(table: dict[str, Any], origin: str | Path) -> ReconstructionPlan:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        text = _bytes(path).decode("utf-8-sig")  # editors of some systems begin a file with a mark
+        # Editors of some systems begin a file with a mark.
+        text = read_regular(path, MOST_FILE_BYTES).decode("utf-8-sig")
         return tomllib.loads(text)
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path} is not TOML: byte {error.start} is not UTF-8") from error
@@ -415,18 +416,6 @@ def _check_kind(table: dict[str, Any], wanted: str, path: Path) -> None:
             possible=f"a {wanted} file",
             hint=_USES[found[0]].format(path.stem if path.parent == builtin_directory() else path),
         )
-
-
-def _bytes(path: Path) -> bytes:
-    """The file's; of a pipe, a device or something very long nothing is read, since it might never end."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
-    with os.fdopen(descriptor, "rb") as file:
-        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise ConfigError(f"{path} is no regular file", possible="a TOML file")
-        text = file.read(MOST_FILE_BYTES + 1)
-    if len(text) > MOST_FILE_BYTES:
-        raise ConfigError(f"{path} is too long", possible=f"a TOML file of at most {MOST_FILE_BYTES} bytes")
-    return text
 
 
 def _set(table: dict[str, Any], dotted: str, value: Any) -> None:

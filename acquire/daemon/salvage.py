@@ -104,8 +104,8 @@ class Salvage:
         While ``capturing``, only what the run itself has left is recovered.
         """
         if self._searching is not None and self._searching.done():
-            self._take_search(self._searching)
-            self._searching = None
+            searching, self._searching = self._searching, None  # taken once, whatever comes of it
+            self._take_search(searching)
         ended = self._hear()
         if capturing and self._under_way is not None and not self._under_way.ours:
             self._stand_back()
