@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from acquire.cli.progress import stage_progress
 from acquire.config import check_plan, load_plan
+from acquire.cores import idle_cores, limit_blas
 from acquire.errors import UsageError
 from acquire.recon.segments import Stretch, Voxels
 from acquire.reconstruct.learned import choose, recall
@@ -172,7 +173,11 @@ def _plan(recording: Recording, selection: Selection, asked: Asked) -> Reconstru
     if asked.auto:
         from acquire.reconstruct.propose import propose
 
-        with stage_progress("looking for what changes", "--from and --to, for a part") as advance:
+        # threads of BLAS that wait for a core that others use cost five times the time
+        with (
+            stage_progress("looking for what changes", "--from and --to, for a part") as advance,
+            limit_blas(idle_cores()),
+        ):
             return propose(recording, selection, whole=asked.ends == "whole", progress=advance)
     if asked.plan is not None:
         return load_plan(asked.plan)

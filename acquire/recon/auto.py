@@ -16,6 +16,8 @@ from acquire.recon.api import reconstruct
 from acquire.recon.segments import Voxels
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from acquire.lines import Segment
 
 TEMPORAL_MERGES = (64, 16, 4, 1)
@@ -42,18 +44,26 @@ class Tempo:
         return f"unseen samples are predicted with an error of: {words}"
 
 
-def tempo(segment: Segment) -> Tempo:
-    """How fast a segment changes, from its lines alone."""
+def tempo(segment: Segment, progress: Callable[[float], object] | None = None) -> Tempo:
+    """How fast a segment changes, from its lines alone; ``progress`` takes the share of it that is done."""
+    most = 1 + len(TEMPORAL_MERGES)
+
+    def done() -> None:
+        if progress is not None:
+            progress(len(tried) / most)
+
     geometry = segment.geometry
     side = min(geometry.substeps, geometry.size)
     still = _error(segment, Voxels(1, geometry.span))
     tried = [(0, still)]
+    done()
     best, chosen = still, Voxels(1, geometry.span)
     for merge in TEMPORAL_MERGES:
         if best <= EXPLAINED:
             break
         error = _error(segment, Voxels(side, merge))
         tried.append((merge, error))
+        done()
         if error * BETTER <= best:
             best, chosen = error, Voxels(side, merge)
         elif chosen.temporal_merge < geometry.span:

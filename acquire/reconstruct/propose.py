@@ -33,7 +33,7 @@ def propose(
     selection: Selection,
     *,
     whole: bool = False,
-    progress: Callable[[int, int], object] | None = None,
+    progress: Callable[[float, int], object] | None = None,
 ) -> ReconstructionPlan:
     """Sub-segments of neighbouring stretches that are equally fast, each with the reason."""
     stream = selection.stream
@@ -41,11 +41,11 @@ def propose(
     begin, end = selection.extent(Voxels(1, 1), Voxels(1, 1), whole=whole)
     stretches = split(begin, end, Voxels(1, 1), LOOKED_AT * size)
 
-    def look(number: int) -> Tempo:
+    def look(number: int, done: Callable[[float], object]) -> Tempo:
         # lines that see nothing else: what the neighbours do is judged with them
         stretch = stretches[number]
         inner = stream.sub_segment(Stretch(stretch.begin, stretch.end, Voxels(1, size)))
-        return tempo(recording.cut(inner.first_line, inner.lines))
+        return tempo(recording.cut(inner.first_line, inner.lines), done)
 
     found = list(zip(stretches, _tempos(len(stretches), look, progress), strict=True))
     groups = [list(group) for _, group in groupby(found, key=lambda each: each[1].voxels)]
@@ -55,19 +55,21 @@ def propose(
 
 
 def _tempos(
-    count: int, look: Callable[[int], Tempo], progress: Callable[[int, int], object] | None
+    count: int,
+    look: Callable[[int, Callable[[float], object]], Tempo],
+    progress: Callable[[float, int], object] | None,
 ) -> list[Tempo]:
     """Of every stretch: looked at, or between two that were looked at and are in the same voxels."""
     places = sorted({round(i * (count - 1) / max(1, PLACES - 1)) for i in range(PLACES)})
     known: dict[int, Tempo] = {}
+    tell = progress or (lambda _done, _of: None)
     waiting = deque(places)
     while waiting:
         place = waiting.popleft()
-        known[place] = look(place)
+        known[place] = look(place, lambda share: tell(len(known) + share, len(known) + 1 + len(waiting)))
         if not waiting:
             waiting.extend(_between(known))
-        if progress is not None:
-            progress(len(known), len(known) + len(waiting))
+        tell(len(known), len(known) + len(waiting))
     return [known[max(place for place in known if place <= number)] for number in range(count)]
 
 

@@ -38,18 +38,20 @@ def test_a_long_recording_is_looked_at_in_some_places_and_where_it_changes():
     still, fast = (Tempo(voxels, ((0, 0.1),)) for voxels in (Voxels(1, 770), Voxels(3, 4)))
     looked, told = [], []
 
-    def look(number):
+    def look(number, done):
         looked.append(number)
+        done(0.5)
         return fast if 70 <= number < 101 else still
 
     found = _tempos(130, look, lambda done, of: told.append((done, of)))
     assert found == [still] * 70 + [fast] * 31 + [still] * 29
     assert len(looked) == len(set(looked)) <= PLACES + 2 * 4
     assert told[-1] == (len(looked), len(looked))
-    assert _tempos(3, lambda _: still, None) == [still] * 3
+    assert told[0] == (0.5, PLACES)
+    assert _tempos(3, lambda *_: still, None) == [still] * 3
 
 
 def test_stills_of_other_lengths_are_alike():
-    assert len(_tempos(50, lambda number: Tempo(Voxels(1, 770 + number % 3), ((0, 0.1),)), None)) == 50
+    assert len(_tempos(50, lambda number, _: Tempo(Voxels(1, 770 + number % 3), ((0, 0.1),)), None)) == 50
     assert not _alike(Voxels(1, 770), Voxels(1, 64))
     assert _alike(Voxels(1, 770), Voxels(1, 767))
