@@ -31,6 +31,7 @@ from numcodecs import blosc
 
 from acquire.cores import limit_blas, usable_cores
 from acquire.forward.kernels import transpose_frames
+from acquire.stream.nursery import warm_up
 
 pytest_plugins = ["left_out"]
 
@@ -83,6 +84,7 @@ def pytest_exception_interact(node: pytest.Item | pytest.Collector) -> None:
 def _made_once() -> None:
     """What lives as long as the process, however many tests use it."""
     multiprocessing.resource_tracker.ensure_running()
+    warm_up("acquire.stream.recorder", "acquire.stream.watcher", "acquire.sim.devices")
     if importlib.util.find_spec(
         "dask"
     ):  # xarray reads through it where it is there, in threads that it keeps

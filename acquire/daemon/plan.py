@@ -124,6 +124,15 @@ class Run:
         return {**calibration, **facts, "clock": lines.get("clock", {})}
 
 
+def worker_modules(rig: Rig) -> tuple[str, ...]:
+    """What the processes of a run import: to be imported once, before any run is armed."""
+    modules = {type(opener).__module__ for opener in rig.openers().values()}
+    modules |= {f"acquire.stream.{name}" for name in ("recorder", "grabber", "watcher")}
+    if rig.config.simulates_cameras:
+        modules.add("acquire.sim.pipeline")  # imported by simulated cameras when they are opened
+    return tuple(sorted(modules))
+
+
 def capture_plan(config: RigConfig, rig: Rig, run_id: str) -> CapturePlan:
     """What the capture path is asked to do. Raises UsageError for what cannot work."""
     return CapturePlan(

@@ -21,7 +21,7 @@ from acquire.daemon.control import build_app
 from acquire.daemon.ending import END_S, LastResort, leave
 from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.notify import notify
-from acquire.daemon.plan import Run
+from acquire.daemon.plan import Run, worker_modules
 from acquire.daemon.proof import Proof
 from acquire.daemon.salvage import Salvage
 from acquire.daemon.service import Service
@@ -30,6 +30,7 @@ from acquire.daemon.troubles import Troubles
 from acquire.daemon.uploads import Uploads
 from acquire.errors import EXIT_INTERRUPTED, StateError
 from acquire.rig import Rig
+from acquire.stream.nursery import nursery, warm_up
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -59,6 +60,7 @@ def serve(config: RigConfig) -> int:
     troubles = Troubles()
     threading.excepthook = troubles.in_thread
     with contextlib.closing(Endpoint(config.control.socket.absolute())) as endpoint, Rig(config) as rig:
+        warm_up(*worker_modules(rig))
         salvage = Salvage(config.recording.directory.absolute(), _journal(config, "recordings"))
         salvage.search()
         uploads = Uploads(config.recording.upload_to, _journal(config, "uploads"))
@@ -108,6 +110,7 @@ class Daemon:
     async def _supervise(self, serving: asyncio.Task[None]) -> None:
         while not (self._ending.is_set() or serving.done()):
             try:
+                nursery()  # another one, where it has died: the next run must find it warm
                 await self._in_device_thread(self._service.supervise)
             except Exception as error:  # noqa: BLE001 - a defect in one look must not end the service
                 self._troubles.note("supervision", error)

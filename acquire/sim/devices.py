@@ -8,7 +8,6 @@ camera that loses lines: the queue behind it has no end, it is merely late (``be
 
 from __future__ import annotations
 
-import multiprocessing
 from collections import deque
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
@@ -21,6 +20,7 @@ from acquire.clock import NS_PER_S
 from acquire.cores import limit_blas
 from acquire.errors import CameraError
 from acquire.lines import ARMS
+from acquire.stream import nursery
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -226,6 +226,6 @@ class SimulatedCameraOpener:
     line_rate_hz: float
 
     def __call__(self) -> SimulatedCamera:
-        if multiprocessing.parent_process() is not None:
+        if nursery.is_worker():
             limit_blas(1)  # the cores are for the capture path
         return SimulatedCamera(self.wire, self.optics, self.config, self.block_lines, self.line_rate_hz)

@@ -25,13 +25,16 @@ from typing import TYPE_CHECKING, Any
 from acquire.errors import AcquireError, DeviceError
 from acquire.logs import write_log
 from acquire.stream.messages import Failed, Quit
+from acquire.stream.nursery import UNTOLD, nursery
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from multiprocessing.connection import Connection
     from types import FrameType
 
-_KILL_WAIT_S = 5.0
+_KILL_WAIT_S = 30.0
+"""For the kernel to end a process that was killed: one that waits for a disk goes when the disk answers."""
+_LAST_WORD_S = 0.1
 _FLUSH_S = 0.1
 _IMPORTANT = -15
 """Niceness; threads that are started later have it as well."""
@@ -78,34 +81,39 @@ class Mailbox:
 
 
 class Worker:
-    """The owner's side of one child process: ``target(mailbox, *args)``, spawned."""
+    """The owner's side of one child process, forked from the nursery: ``target(mailbox, *args)``.
+
+    It is on its way when this returns: `expect` waits for its first word.
+    """
 
     def __init__(self, name: str, target: Callable[..., None], *args: Any) -> None:
-        context = multiprocessing.get_context("spawn")
         self.name = name
         self._sending = threading.Lock()
         self._outbox: deque[object] = deque()
-        self.pipe, theirs = context.Pipe()
+        self.pipe, theirs = multiprocessing.Pipe()
         self._has_room = select.poll()
         self._has_room.register(self.pipe, select.POLLOUT)
-        self._process = context.Process(
-            target=_live, args=(theirs, name, target, *args), name=f"acquire-{name}", daemon=True
-        )
         try:
-            self._process.start()
+            self._child = nursery().bear(name, _live, theirs, name, target, *args)
         except (OSError, pickle.PicklingError, AttributeError, TypeError) as error:
             self.pipe.close()
             raise DeviceError(f"{name}: the process cannot be started: {error}") from error
         finally:
             theirs.close()
-        self.pid = self._process.pid
+
+    @property
+    def pid(self) -> int | None:
+        """The process's number; None while it is not known yet."""
+        return self._child.pid()
 
     @property
     def death(self) -> str | None:
         """How the process ended, or None while it lives."""
-        code = self._process.exitcode
+        code = self._child.exit_code()
         if code is None:
             return None
+        if code == UNTOLD:
+            return "ended, and nobody is left to say how"
         return f"killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
 
     @property
@@ -144,7 +152,7 @@ class Worker:
 
     def kill(self) -> None:
         """End the process by force; it dies when the system lets it, which may take a disk's answer."""
-        self._process.kill()
+        self._child.kill()
 
     def message(self, timeout_s: float = 0.0) -> object | None:
         """The child's next message, or None when there is none."""
@@ -162,8 +170,9 @@ class Worker:
         if isinstance(message, Failed):
             raise message.error
         if isinstance(message, kind):
+            self._child.pid(max(0.0, deadline - time.monotonic()))
             return message
-        self._process.join(0.1 if message is None else 0.0)
+        self._child.exit_code(_LAST_WORD_S if message is None else 0.0)
         raise DeviceError(f"{self.name}: {self.death or 'no answer in time'}")
 
     def end(self, deadline: float) -> None:
@@ -174,22 +183,21 @@ class Worker:
         if self.pipe.closed:
             return
         self.post(Quit())
-        while self._process.exitcode is None and (left_s := deadline - time.monotonic()) > 0:
+        while self._child.exit_code() is None and (left_s := deadline - time.monotonic()) > 0:
             self.flush()
-            self._process.join(min(left_s, _FLUSH_S) if self._outbox else left_s)
-        forced = self._process.exitcode is None
+            self._child.exit_code(min(left_s, _FLUSH_S) if self._outbox else left_s)
+        forced = self._child.exit_code() is None
         if forced:
-            self._process.kill()
-            self._process.join(_KILL_WAIT_S)
+            self._child.kill()
+            self._child.exit_code(_KILL_WAIT_S)
         self.pipe.close()
-        if self._process.exitcode is None:
-            # Python would wait for it without a limit when this process ends.
-            multiprocessing.process._children.discard(self._process)  # type: ignore[attr-defined]
+        if self._child.exit_code() is None:
+            self._child.close()
             raise DeviceError(
                 f"{self.name}: the process was killed, and has not ended within {_KILL_WAIT_S:g} s",
                 hint="it waits for a disk or device that does not answer, and ends when that does",
             )
-        self._process.close()
+        self._child.close()
         if forced:
             raise DeviceError(f"{self.name}: the process did not end when told to, and was killed")
 

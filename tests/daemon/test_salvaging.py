@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from waiting import until
 
 from acquire.capacity.load import Load, recording_spec, trigger_run
 from acquire.clock import ClockFit
@@ -233,9 +234,11 @@ def test_a_recovery_that_is_killed_is_told(salvage: Salvage, tmp_path: Path) -> 
     path = leave_open(tmp_path / "r.zarr")
     salvage.add([Orphan(path, "killed")])
     salvage.look()
-    assert salvage._worker is not None
-    assert salvage._worker.pid is not None
-    os.kill(salvage._worker.pid, signal.SIGKILL)
+    worker = salvage._worker
+    assert worker is not None
+    until(lambda: worker.pid is not None, "the process")
+    assert worker.pid is not None
+    os.kill(worker.pid, signal.SIGKILL)
     (ended,) = salvage.wait(WAIT_S)
     assert ended.state == "failed"
     assert "killed by SIGKILL" in ended.text

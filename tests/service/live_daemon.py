@@ -131,9 +131,9 @@ class Daemon:
         return psutil.Process(self.process.pid).children(recursive=True)
 
     def workers(self) -> list[psutil.Process]:
-        """Recorder and grabbers, in the order in which they were started."""
-        spawned = [child for child in self.children() if "spawn_main" in " ".join(child.cmdline())]
-        return sorted(spawned, key=lambda child: child.pid)
+        """Recorder and grabbers, in the order in which they were started: the children of the nursery."""
+        (nursery,) = psutil.Process(self.process.pid).children()
+        return sorted(nursery.children(), key=lambda child: child.pid)
 
     def end(self, number: signal.Signals = signal.SIGTERM) -> int:
         """Send a signal and wait; the exit code."""

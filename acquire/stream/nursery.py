@@ -1,0 +1,347 @@
+"""Worker processes that begin in milliseconds: forked from one that has imported what they need.
+
+::
+
+    owner ── job: a pickle | its descriptors ──▶ nursery ── fork ──▶ worker
+      ▲                                           │  ▲                  │
+      └──────── process number, how it ended ─────┘  └───── its end ────┘
+
+The nursery imports modules and does nothing else: it has one thread, no device, no file. Whatever must not be
+forked, such as a GenTL producer or a library's threads, is loaded by the worker, in a process of its own. It
+ends with its owner, since the kernel closes the owner's end of the socket; workers see their owner's end by
+themselves (`acquire.stream.process`). A nursery that has died is replaced, and its workers are not touched.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import gc
+import importlib
+import io
+import os
+import pickle
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import dataclass
+from multiprocessing import spawn
+from multiprocessing.context import set_spawning_popen
+from multiprocessing.reduction import ForkingPickler
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+_MOST_FDS = 250
+"""Descriptors in one message; the kernel takes 253."""
+_REAP_S = 1.0
+"""For the nursery to say how a worker ended."""
+UNTOLD = 255
+"""Exit code of a worker whose nursery has died: nobody is left who could know it."""
+_START = "import sys; from acquire.stream import nursery; nursery.main(int(sys.argv[1]), sys.argv[2:])"
+
+
+class Child:
+    """The owner's view of one worker process. It may not be born yet; then its number is not known."""
+
+    def __init__(self, status: socket.socket) -> None:
+        self._status = status
+        self._pidfd = -1
+        self._pid: int | None = None
+        self._exit_code: int | None = None
+        self._dead_since_s: float | None = None
+
+    def pid(self, timeout_s: float = 0.0) -> int | None:
+        """Its process number, once it is born."""
+        deadline = time.monotonic() + timeout_s
+        while self._pid is None and self._exit_code is None and self._hear(deadline):
+            continue
+        return self._pid
+
+    def exit_code(self, timeout_s: float = 0.0) -> int | None:
+        """How it ended (below 0: by which signal), or None when it still lives after ``timeout_s``.
+
+        `UNTOLD` where the nursery cannot say any more.
+        """
+        deadline = time.monotonic() + timeout_s
+        while self._exit_code is None and self._hear(deadline):
+            continue
+        return self._exit_code
+
+    def kill(self) -> None:
+        """End it by force."""
+        if self._pidfd >= 0:
+            with contextlib.suppress(ProcessLookupError):
+                signal.pidfd_send_signal(self._pidfd, signal.SIGKILL)
+
+    def close(self) -> None:
+        """Forget it. Idempotent."""
+        self._status.close()
+        if self._pidfd >= 0:
+            os.close(self._pidfd)
+            self._pidfd = -1
+
+    def _hear(self, deadline: float) -> bool:
+        """Wait for the nursery's next word, or the process's end; False where nothing is new by then."""
+        sources = [fd for fd in (self._status.fileno(), self._pidfd) if fd >= 0]
+        while sources:
+            ready = _readable(sources, deadline - time.monotonic())
+            if self._status.fileno() in ready:
+                self._listen()
+                return True
+            if self._pidfd in ready and self._is_overdue():
+                self._exit_code = UNTOLD
+                return True
+            if not ready or time.monotonic() >= deadline:
+                return False
+            time.sleep(_REAP_S / 100)  # it has ended: the nursery will say how
+        return False
+
+    def _listen(self) -> None:
+        try:
+            word, fds, _, _ = socket.recv_fds(self._status, 64, 1, socket.MSG_CMSG_CLOEXEC)
+        except OSError:
+            word, fds = b"", []
+        if fds:
+            self._pid, self._pidfd = int(word), fds[0]
+            return
+        self._status.close()
+        if word:
+            self._exit_code = int(word)
+        elif self._pidfd < 0:
+            self._exit_code = UNTOLD  # the nursery died before this process was born
+
+    def _is_overdue(self) -> bool:
+        """The process ended a while ago, and the nursery, dead or stopped, has not said how."""
+        self._dead_since_s = self._dead_since_s or time.monotonic()
+        return self._status.fileno() < 0 or time.monotonic() - self._dead_since_s > _REAP_S
+
+
+class Nursery:
+    """The owner's side: one process, which forks a worker for every `bear`."""
+
+    def __init__(self, modules: tuple[str, ...] = ()) -> None:
+        """Start it; it imports ``modules`` meanwhile, those that are there."""
+        self.modules = modules
+        self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        path = os.pathsep.join(entry for entry in sys.path if entry)
+        with theirs:
+            self._process = subprocess.Popen(  # noqa: S603 - ourselves
+                [sys.executable, "-c", _START, str(theirs.fileno()), *modules],
+                stdin=subprocess.DEVNULL,
+                pass_fds=(theirs.fileno(),),
+                env={**os.environ, "PYTHONPATH": path, "OPENBLAS_NUM_THREADS": "1"},
+            )
+        self.owner = os.getpid()
+
+    @property
+    def alive(self) -> bool:
+        return self._process.poll() is None
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def bear(self, name: str, target: Callable[..., None], *args: Any) -> Child:
+        """A process that calls ``target(*args)``. Raises what pickling raises, and OSError."""
+        parcel = _Parcel()
+        job = _pack(parcel, name, target, args)
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        page = os.memfd_create("acquire-job")
+        try:
+            with theirs, open(page, "wb", closefd=False) as file:
+                file.write(job)
+                file.flush()
+                socket.send_fds(self._channel, [b"job"], [theirs.fileno(), page, *parcel.fds])
+        except BaseException:
+            ours.close()
+            raise
+        finally:
+            os.close(page)
+        return Child(ours)
+
+    def close(self) -> None:
+        """End it; workers go on. Idempotent."""
+        self._channel.close()
+        if self.owner == os.getpid():
+            self._process.kill()  # it has nothing that could be lost
+            self._process.wait()
+
+
+class Own:
+    """The nursery of one owner, made when it is first needed."""
+
+    def __init__(self) -> None:
+        self._nursery: Nursery | None = None
+        self._changing = threading.Lock()
+
+    def get(self) -> Nursery:
+        with self._changing:
+            found = self._nursery
+            if found is None or found.owner != os.getpid():
+                found = self._nursery = Nursery()
+            elif not found.alive:
+                found.close()
+                found = self._nursery = Nursery(found.modules)
+            return found
+
+    def replace(self, new: Callable[[], Nursery | None]) -> None:
+        with self._changing:
+            if self._nursery is not None:
+                self._nursery.close()
+            self._nursery = new()
+
+
+_own = Own()
+
+
+def nursery() -> Nursery:
+    """This process's own; another one where it has died."""
+    return _own.get()
+
+
+def warm_up(*modules: str) -> None:
+    """Let the nursery of this process import ``modules`` from now on, so that workers begin at once."""
+    _own.replace(lambda: Nursery(modules))
+
+
+@atexit.register
+def end() -> None:
+    """End the nursery of this process. Idempotent."""
+    _own.replace(lambda: None)
+
+
+# ---- the way of a job
+
+
+class _Parcel:
+    """Collects the descriptors of what is pickled: all that multiprocessing asks a ``popen`` object for."""
+
+    def __init__(self) -> None:
+        self.fds: list[int] = []
+
+    def duplicate_for_child(self, fd: int) -> int:
+        self.fds.append(fd)
+        return len(self.fds) - 1
+
+    def DupFd(self, index: int) -> Received:  # noqa: N802 - multiprocessing's name
+        return Received(index)
+
+
+@dataclass(frozen=True, slots=True)
+class Received:
+    """A descriptor that came with a job."""
+
+    index: int
+
+    def detach(self) -> int:
+        return _received[self.index]
+
+
+_received: list[int] = []
+
+
+def is_worker() -> bool:
+    """This process is a nursery's worker, whose cores are for the capture path."""
+    return bool(_received)
+
+
+def _pack(parcel: _Parcel, name: str, target: Callable[..., None], args: tuple[Any, ...]) -> bytes:
+    buffer = io.BytesIO()
+    set_spawning_popen(parcel)  # type: ignore[arg-type]
+    try:
+        ForkingPickler(buffer, pickle.HIGHEST_PROTOCOL).dump((name, target, args))
+    finally:
+        set_spawning_popen(None)
+    job = buffer.getvalue()
+    here = spawn.get_preparation_data(name)
+    keys = ["sys_path", "sys_argv", "dir"]
+    if b"__main__" in job:  # it needs the owner's main module
+        keys += ["init_main_from_name", "init_main_from_path"]
+    place = {key: here[key] for key in keys if key in here}
+    return pickle.dumps((place, dict(os.environ), job))
+
+
+def _readable(sources: list[int], timeout_s: float) -> set[int]:
+    waiting = select.poll()
+    for source in sources:
+        waiting.register(source, select.POLLIN)
+    return {source for source, _ in waiting.poll(max(0.0, timeout_s) * 1000)}
+
+
+# ---- the nursery's process
+
+
+def main(fd: int, modules: list[str]) -> None:
+    """Life of the nursery, and of every worker."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal's foreground group: left to the owner
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    for module in modules:
+        with contextlib.suppress(ImportError):  # of a driver that is not installed: its worker says so
+            importlib.import_module(module)
+    gc.collect()
+    gc.freeze()  # what was imported stays shared between the workers
+    page = _keep(socket.socket(fileno=fd))
+    if page is None:
+        return
+    with open(page, "rb") as file:  # noqa: PTH123 - a descriptor
+        file.seek(0)
+        place, environment, job = pickle.load(file)  # noqa: S301 - from the owner
+    os.environ.clear()
+    os.environ.update(environment)
+    spawn.prepare(place)
+    name, target, args = pickle.loads(job)  # noqa: S301
+    with contextlib.suppress(OSError), open("/proc/self/comm", "w", encoding="utf-8") as comm:  # noqa: PTH123
+        comm.write(f"acquire {name}"[:15])
+    target(*args)
+
+
+def _keep(channel: socket.socket) -> int | None:
+    """Fork workers until the owner is gone. In a worker: the descriptor of its job."""
+    waiting = select.poll()
+    waiting.register(channel, select.POLLIN)
+    children: dict[int, tuple[int, socket.socket]] = {}
+    while True:
+        for ready, _ in waiting.poll():
+            if ready in children:
+                waiting.unregister(ready)
+                _tell_end(ready, *children.pop(ready))
+                continue
+            _, fds, _, _ = socket.recv_fds(channel, 16, _MOST_FDS, socket.MSG_CMSG_CLOEXEC)
+            if not fds:
+                return None
+            pid = os.fork()
+            if pid == 0:
+                return _begin(channel, children, fds)
+            status = socket.socket(fileno=fds.pop(0))
+            pidfd = os.pidfd_open(pid)
+            with contextlib.suppress(OSError):
+                socket.send_fds(status, [str(pid).encode()], [pidfd])
+            for fd in fds:
+                os.close(fd)
+            children[pidfd] = pid, status
+            waiting.register(pidfd, select.POLLIN)
+
+
+def _begin(channel: socket.socket, children: dict[int, tuple[int, socket.socket]], fds: list[int]) -> int:
+    """First steps of a worker: let go of all that is the nursery's."""
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    channel.close()
+    for pidfd, (_, status) in children.items():
+        status.close()
+        os.close(pidfd)
+    os.close(fds[0])
+    _received[:] = fds[2:]
+    return fds[1]
+
+
+def _tell_end(pidfd: int, pid: int, status: socket.socket) -> None:
+    _, ended = os.waitpid(pid, 0)
+    os.close(pidfd)
+    with status, contextlib.suppress(OSError):
+        status.send(str(os.waitstatus_to_exitcode(ended)).encode())
