@@ -112,6 +112,12 @@ class StreamConfig(FrozenModel):
         le=600,
         description="an arm that is silent for longer has stalled, unless its camera is waited for longer",
     )
+    arm_timeout_s: float = Field(
+        default=120.0,
+        gt=0,
+        le=3600,
+        description="longest wait at arm for a process or a camera to become ready",
+    )
     realtime: bool = Field(
         default=False,
         description="grabbers before everything else on the host, where its user may (RLIMIT_RTPRIO); "

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from acquire.capacity.load import Load
 
-PART_S = 0.25
+PART_S = 0.15
 """How long each part is made to work."""
 _BLOCKS = 8
 """Different ones, so that a processor's cache does not hold them all."""

@@ -50,7 +50,8 @@ def arm(
     """Start trigger and cameras; nothing is written yet.
 
     The daemon measures first what ring, codec and disk sustain here (a second; valid for ten minutes), and
-    refuses, exit code 2, where that is less than what is configured. So it does where recordings are to be
+    refuses, exit code 2, where the best of three measurements is less than what is configured; simulated
+    cameras wait for a busy host, and get a warning. So it does where recordings are to be
     uploaded and the store says no; one that cannot be reached is a warning.
 
     Example: [bold]acquire arm[/]
@@ -152,10 +153,11 @@ def status(
 
 
 def _daemon(socket: Path | None) -> Client:
+    from acquire.cli.progress import teller
     from acquire.config import default_socket
     from acquire.daemon.client import Client
 
-    return Client(socket or default_socket())
+    return Client(socket or default_socket(), teller())
 
 
 def _damage(last: LastRecording) -> str:

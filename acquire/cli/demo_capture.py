@@ -52,7 +52,7 @@ def record(plan: DemoPlan, journal: Journal) -> Captured:
                 await_daemon(client, process, log)
                 note["detail"] = f"process {process.pid}"
             with journal.stage("Arm trigger and cameras"):
-                client.arm()
+                client.arm(force=True)  # simulated cameras wait for a host that is busy
             with journal.stage("Record") as note:
                 captured = _record(client, plan.out / "recording.zarr", plan.lines)
                 note["detail"] = f"{plan.lines} lines of both arms"

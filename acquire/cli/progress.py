@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 from acquire.cli.output import json_asked, note, note_json
 
+import typer
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from types import TracebackType
@@ -177,6 +179,19 @@ def stage_progress(what: str, advice: str = "") -> Iterator[Callable[[float, flo
     """`Progress` of work that says how far it is: the function given takes (done, of how much)."""
     with Progress(what, advice) as progress:
         yield progress.advance
+
+
+def teller() -> Callable[[str], None]:
+    """Prints what a command is waiting for, a line whenever that changes, in a pipe as on a terminal."""
+    latest = ""
+
+    def tell(what: str) -> None:
+        nonlocal latest
+        if what != latest:
+            latest = what
+            typer.echo(f"acquire: {what} …", err=True)
+
+    return tell
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import http.client
 import json
+import select
 import time
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
@@ -19,18 +20,23 @@ from pydantic import BaseModel, ValidationError
 
 from acquire.daemon.messages import ArmRequest, ErrorMessage, MarkRequest, StartRequest, Status
 from acquire.daemon.peer import connect
+from acquire.daemon.starting import is_one_starting
 from acquire.daemon.states import State
 from acquire.errors import AcquireError, NoDaemonError, StateError, UsageError
 from acquire.text import shortened
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
+    import socket
+    from collections.abc import Callable, Collection
     from pathlib import Path
 
 CONNECT_TIMEOUT_S = 5.0
 STATUS_TIMEOUT_S = 10.0
-COMMAND_TIMEOUT_S = 120.0
-"""Above the sum of what the daemon allows itself for the slowest command and one before it in the queue."""
+COMMAND_TIMEOUT_S = 30.0
+"""For the answer to a command when the daemon says that it does nothing; while it works, it is waited for."""
+STARTING_TIMEOUT_S = 60.0
+"""For the socket of a daemon that is starting."""
+PROGRESS_S = 0.5
 POLL_S = 0.1
 MOST_BYTES = 2**24
 """Of an answer."""
@@ -44,8 +50,10 @@ class Client:
     Raises NoDaemonError where nobody answers, and whatever the daemon refuses with.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, tell: Callable[[str], object] = lambda _: None) -> None:
+        """``tell`` is called now and then with what is being waited for."""
         self.path = path
+        self._tell = tell
 
     def __enter__(self) -> Self:
         return self
@@ -127,7 +135,7 @@ class Client:
     def _call(
         self, method: str, command: str, timeout_s: float = COMMAND_TIMEOUT_S, body: BaseModel | None = None
     ) -> Status:
-        with connect(self.path, CONNECT_TIMEOUT_S) as connection:
+        with self._connect() as connection:
             connection.settimeout(timeout_s)
             http_connection = http.client.HTTPConnection("acquire")
             http_connection.sock = connection
@@ -135,6 +143,8 @@ class Client:
             text = None if body is None else json.dumps(body.model_dump(mode="json"))
             try:
                 http_connection.request(method, f"/{command}", text, headers)
+                if method == "POST":
+                    self._await_answer(connection, timeout_s)
                 response = http_connection.getresponse()
                 return self._read(response.status, response.read(MOST_BYTES), command)
             except TimeoutError as error:
@@ -145,6 +155,34 @@ class Client:
                 raise NoDaemonError(f"the daemon on {self.path} went away during {command}") from error
             finally:
                 http_connection.close()
+
+    def _connect(self) -> socket.socket:
+        """To the daemon, or to one that is only starting, once it listens."""
+        deadline = time.monotonic() + STARTING_TIMEOUT_S
+        while True:
+            try:
+                return connect(self.path, CONNECT_TIMEOUT_S)
+            except NoDaemonError:
+                if time.monotonic() > deadline or not is_one_starting(self.path):
+                    raise
+            self._tell(f"waiting for a daemon on {self.path}: one is starting")
+            time.sleep(POLL_S)
+
+    def _await_answer(self, connection: socket.socket, timeout_s: float) -> None:
+        """As long as the daemon is at work; TimeoutError when it has nothing under way for so long."""
+        answered = select.poll()
+        answered.register(connection, select.POLLIN)
+        deadline = time.monotonic() + timeout_s
+        while not answered.poll(PROGRESS_S * 1000):
+            try:
+                status = self.status()
+            except NoDaemonError:
+                return  # it has gone, or hangs: so says the connection
+            if status.busy is not None or status.state is State.DRAINING:
+                self._tell(status.busy or str(status.state))
+                deadline = time.monotonic() + timeout_s
+            elif time.monotonic() > deadline:
+                raise TimeoutError
 
     def _read(self, status: int, content: bytes, command: str) -> Status:
         try:

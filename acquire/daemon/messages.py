@@ -271,7 +271,9 @@ class Status(_Message):
     state: State
     since: datetime
     possible: list[Text] = Field(description="commands that the state allows")
-    busy: Text | None = Field(description="the command being carried out")
+    busy: Text | None = Field(
+        description="the command being carried out, and after a colon what it is waiting for"
+    )
     name: Text = Field(description="of the rig")
     version: Text
     pid: int

@@ -50,11 +50,14 @@ class Run:
             return configured
         return self._choice.codec if self._choice else "none"
 
-    def arm(self) -> None:
-        """Cameras and trigger run; on failure everything is undone and the first error raised."""
+    def arm(self, tell: Callable[[str], object] = lambda _: None) -> None:
+        """Cameras and trigger run; on failure everything is undone and the first error raised.
+
+        ``tell`` is called with what is being waited for.
+        """
         if self._config.recording.codec == "auto":
             self._choice = self._choose(self._config)
-        self._capture.arm()
+        self._capture.arm(self._config.stream.arm_timeout_s, tell)
 
     def start(self, path: Path, lines: int | None, window: Window = NOW, *, resume: bool = False) -> Path:
         """Record to ``path``, or, to ``resume`` what is there, to a segment beside it; says where.

@@ -13,6 +13,7 @@ import logging
 import os
 import signal
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, TypeVar
 
@@ -44,6 +45,8 @@ DRAIN_S = 0.05
 """The same while somebody waits for a recording to be sealed."""
 COMMAND_S = 60.0
 """For the command that is under way when the daemon is told to end, such as `arm` on a busy host."""
+WATCHDOG_S = 0.5
+"""Between two words to systemd: `WatchdogSec` has to be a few of these."""
 MOST_WAITING = 8
 """Commands that wait for the one under way; each holds a connection."""
 
@@ -88,6 +91,7 @@ class Daemon:
         self._troubles = service.troubles
         self._devices = ThreadPoolExecutor(1, thread_name_prefix="devices")
         self._waiting = 0
+        self._begun_s: float | None = None
         self._ending = asyncio.Event()
         self._last_resort = LastResort(endpoint.remove)
         self._exit_code = 0
@@ -98,12 +102,14 @@ class Daemon:
         self._take_signals()
         asyncio.get_running_loop().set_exception_handler(self._troubles.in_loop)
         serving = asyncio.create_task(self._server.answer())
+        watchdog = asyncio.create_task(self._feed_watchdog())
         log.info("listening on %s (process %d)", self._endpoint.path, os.getpid())
         notify("READY=1")
         try:
             await self._supervise(serving)
         finally:
             await self._end(serving)
+            watchdog.cancel()
             self._last_resort.cancel()
         return self._exit_code
 
@@ -114,10 +120,18 @@ class Daemon:
                 await self._in_device_thread(self._service.supervise)
             except Exception as error:  # noqa: BLE001 - a defect in one look must not end the service
                 self._troubles.note("supervision", error)
-            notify("WATCHDOG=1")
             draining = self._service.status().state is State.DRAINING
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._ending.wait(), DRAIN_S if draining else SUPERVISE_S)
+
+    async def _feed_watchdog(self) -> None:
+        """Tell systemd that all is well: while nothing is under way, or what is under way goes on."""
+        while True:
+            begun_s = self._begun_s
+            moved_s = max(begun_s or 0.0, self._service.moved_s)
+            if begun_s is None or time.monotonic() - moved_s < self._service.patience_s:
+                notify("WATCHDOG=1")
+            await asyncio.sleep(WATCHDOG_S)
 
     async def _end(self, serving: asyncio.Task[None]) -> None:
         """Seal and release first, while the status is still answered; then close the API."""
@@ -155,7 +169,14 @@ class Daemon:
             self._waiting -= 1
 
     async def _in_device_thread(self, work: Callable[[], T]) -> T:
-        return await asyncio.get_running_loop().run_in_executor(self._devices, work)
+        def timed() -> T:
+            self._begun_s = time.monotonic()
+            try:
+                return work()
+            finally:
+                self._begun_s = None
+
+        return await asyncio.get_running_loop().run_in_executor(self._devices, timed)
 
     def _take_signals(self) -> None:
         loop = asyncio.get_running_loop()

@@ -51,7 +51,7 @@ class Run(Protocol):
 
     run_id: str
 
-    def arm(self) -> None: ...
+    def arm(self, tell: Callable[[str], object]) -> None: ...
     def start(self, path: Path, lines: int | None, window: Window, *, resume: bool = False) -> Path: ...
     def mark(self, text: str) -> Note: ...
     def extend(self, line: int) -> None: ...
@@ -64,7 +64,7 @@ class Run(Protocol):
 class Prove(Protocol):
     """What the service needs of `acquire.daemon.proof.Proof`."""
 
-    def __call__(self, *, force: bool) -> CapacityStatus: ...
+    def __call__(self, *, force: bool, tell: Callable[[str], object]) -> CapacityStatus: ...
 
 
 class Service:
@@ -90,7 +90,7 @@ class Service:
         self._born = time.monotonic()
         self._state = State.IDLE
         self._since = datetime.now(UTC)
-        self._busy: Event | None = None
+        self._busy: str | None = None
         self._run: Run | None = None
         self._seen = CaptureStatus()
         self._rates = Rates()
@@ -111,8 +111,8 @@ class Service:
 
     @property
     def patience_s(self) -> float:
-        """How long a recording's end may take while nothing more of it reaches the disk."""
-        return self._config.recording.seal_timeout_s + RECOVERY_S
+        """Longest step of a command, or time in which nothing more of a recording reaches the disk."""
+        return max(self._config.recording.seal_timeout_s + RECOVERY_S, self._config.stream.arm_timeout_s)
 
     @property
     def hurried(self) -> bool:
@@ -132,9 +132,9 @@ class Service:
             self._recovered(self._salvage.look(capturing=True))  # what is under way would be measured, too
             self._uploads.prove(force=request.force)
             if self._prove is not None:
-                self._capacity = self._prove(force=request.force)
+                self._capacity = self._prove(force=request.force, tell=self._tell)
             run = self._open_run()
-            run.arm()
+            run.arm(self._tell)
             self._run, self._seen, self._rates = run, CaptureStatus(), Rates()
             self._order = StandingOrder(self._config)
             self._go(Event.ARM, run.run_id)
@@ -412,6 +412,11 @@ class Service:
             self._busy = None
             self._publish()
 
+    def _tell(self, what: str) -> None:
+        """What the command under way is waiting for; for the status."""
+        self._busy = f"{(self._busy or '').split(':')[0]}: {what}"
+        self._publish()
+
     def _go(self, event: Event, why: str = "") -> None:
         before, self._state = self._state, after(self._state, event)
         self._since = datetime.now(UTC)
@@ -420,6 +425,7 @@ class Service:
         self._publish()
 
     def _publish(self) -> None:
+        self.moved_s = time.monotonic()
         self._status = Status(
             state=self._state,
             since=self._since,

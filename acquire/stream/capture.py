@@ -45,8 +45,9 @@ if TYPE_CHECKING:
 _TAG_RING = RingShape(slots=64, rows=256, width=3, dtype="uint64")
 TOLD_S = 1.0
 """What is waited for longer than this is told."""
-_UNDO_S = 1.0
-_LEAST_END_S = 1.0
+_UNDO_S = 5.0
+_LEAST_END_S = 5.0
+"""For the processes, even when the time is up: one that is killed leaves its camera running."""
 
 
 class Capture:
@@ -79,17 +80,17 @@ class Capture:
         self._final: CaptureStatus | None = None
         self._used = self._closed = self._emptied = False
 
-    def arm(self, timeout_s: float = 20.0) -> None:
-        """Start everything; lines flow and are discarded.
+    def arm(self, timeout_s: float = 120.0, tell: Callable[[str], object] = lambda _: None) -> None:
+        """Start everything; lines flow and are discarded. ``tell`` is called with what is being waited for.
 
         On failure everything is undone and the first error raised: the camera's or trigger's own, or
-        DeviceError for a process that dies or does not answer within ``timeout_s``.
+        DeviceError for a process that dies, or does not answer within ``timeout_s`` of the one before it.
         """
         if self._used or self._closed:
             raise StateError("arm: this capture has been used", hint="make another")
         self._used = True
         try:
-            self._begin(time.monotonic() + timeout_s)
+            self._begin(timeout_s, tell)
         except BaseException as error:
             try:
                 self.close(_UNDO_S)
@@ -153,7 +154,7 @@ class Capture:
         """Process numbers: of the recorder, and of each grabber."""
         return {name: worker.pid for name, worker in self._workers.items()}
 
-    def close(self, timeout_s: float = 10.0) -> None:
+    def close(self, timeout_s: float = 30.0) -> None:
         """End everything, in the module's order; a recording under way is sealed as interrupted. Idempotent.
 
         Takes little more than ``timeout_s``: what has not ended by then is killed. Raises the first error
@@ -174,17 +175,17 @@ class Capture:
 
     # ---- begin
 
-    def _begin(self, deadline: float) -> None:
+    def _begin(self, timeout_s: float, tell: Callable[[str], object]) -> None:
+        tell("memory for the rings")
         self._make_memory()
         self._spawn()
-        self._workers[RECORDER].expect(Ready, deadline)
-        cameras: dict[str, dict[str, Any]] = {}
-        for name, arms in self._plan.grabbers.items():
-            facts = self._workers[name].expect(Ready, deadline).facts
-            cameras |= dict.fromkeys(arms, facts)
-        if WATCHER in self._workers:
-            self._workers[WATCHER].expect(Ready, deadline)
-        self.cameras = cameras
+        facts: dict[str, dict[str, Any]] = {}
+        for name, worker in self._workers.items():
+            cameras = self._plan.grabbers.get(name, ())
+            tell(f"{worker.name}: {'the camera is being opened' if cameras else 'starting'}")
+            facts |= dict.fromkeys(cameras, worker.expect(Ready, time.monotonic() + timeout_s).facts)
+        self.cameras = facts
+        tell("trigger")
         self._trigger_used = True
         self._trigger.prepare(self._plan.run)
         self.clock = self._trigger.start()

@@ -38,7 +38,7 @@ MOST = 5
 _SHORT_S = 60.0
 """A segment that lasts for less says that the disk still has trouble."""
 _LONGEST_WAIT_S = 60.0
-READY_S = 20.0
+READY_S = 120.0
 """How long a successor may take until it is ready."""
 
 

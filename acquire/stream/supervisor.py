@@ -53,8 +53,9 @@ RECORDER = "recorder"
 """Key of the recorder among the workers; the grabbers have their arms' names."""
 
 _TAG_WAIT_S = 0.02
-_ANSWER_S = 20.0
-_JOIN_S = 5.0
+_ANSWER_S = 120.0
+"""For a recording to be created. A recorder that hangs, rather than waits for the disk, is noticed sooner."""
+_JOIN_S = 30.0
 _MOST_EVENTS = 1024
 _MOST_KEPT = 256
 """Recordings whose lines are remembered; those that a ring still holds lines of are fewer."""

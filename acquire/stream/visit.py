@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from acquire.stream.process import Mailbox
 
 T = TypeVar("T")
-_END_S = 5.0
+_END_S = 30.0
 
 
 @dataclass(frozen=True, slots=True)

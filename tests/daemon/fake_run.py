@@ -13,6 +13,7 @@ from acquire.stream import CaptureStatus, Window
 from acquire.stream.messages import Note
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from pathlib import Path
 
     from acquire.config import RigConfig
@@ -67,7 +68,7 @@ class FakeRun:
             end_reason=reason,
         )
 
-    def arm(self) -> None:
+    def arm(self, tell: Callable[[str], object] = print) -> None:
         assert self.may_arm.wait(300)
         self._call("arm")
         self.seen = CALM

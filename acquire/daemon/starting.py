@@ -1,0 +1,47 @@
+"""Whether a daemon of this user is only starting: its interpreter runs, and its socket is still to come."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+LONGEST_S = 60.0
+"""A daemon that is older than this does not start any more."""
+
+
+def is_one_starting(socket: Path) -> bool:
+    """Some ``acquire serve`` has just been started that may listen on ``socket``."""
+    return any(_may_listen(process, socket) for process in Path("/proc").iterdir() if process.name.isdigit())
+
+
+def _may_listen(process: Path, socket: Path) -> bool:
+    try:
+        if process.stat().st_uid != os.geteuid():
+            return False
+        words = (process / "cmdline").read_bytes().decode(errors="replace").split("\0")
+        if "serve" not in words or not any(Path(word).name == "acquire" for word in words):
+            return False
+        given = _socket_of(words, (process / "environ").read_bytes())
+        return _age_s(process) < LONGEST_S and (given is None or Path(given).name == socket.name)
+    except (OSError, ValueError):
+        return False  # it has ended meanwhile
+
+
+def _socket_of(words: list[str], environment: bytes) -> str | None:
+    """The socket that the process was told to listen on; None: its configuration says so."""
+    for word, following in zip(words, [*words[1:], ""], strict=True):
+        if word == "--socket":
+            return following
+        if word.startswith("--socket="):
+            return word.removeprefix("--socket=")
+    for entry in environment.split(b"\0"):
+        if entry.startswith(b"ACQUIRE_SOCKET="):
+            return os.fsdecode(entry.removeprefix(b"ACQUIRE_SOCKET="))
+    return None
+
+
+def _age_s(process: Path) -> float:
+    """Since the process began; its start is the 22nd field of ``stat``, counted behind the name's bracket."""
+    began = int((process / "stat").read_text(errors="replace").rpartition(")")[2].split()[19])
+    return time.clock_gettime(time.CLOCK_BOOTTIME) - began / os.sysconf("SC_CLK_TCK")
