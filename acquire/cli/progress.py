@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING, Any, Self
 
 from acquire.cli.output import json_asked, note, note_json
 
-import typer
-
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from types import TracebackType
@@ -189,7 +187,10 @@ def teller() -> Callable[[str], None]:
         nonlocal latest
         if what != latest:
             latest = what
-            typer.echo(f"acquire: {what} …", err=True)
+            if json_asked():
+                note_json({"waiting": what})
+            else:
+                note(f"{what} …")
 
     return tell
 
