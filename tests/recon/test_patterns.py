@@ -125,7 +125,7 @@ def test_more_iterations_do_not_spoil_the_picture() -> None:
 
 def test_the_bandwidth_is_found_from_the_lines() -> None:
     slow = estimate_coefficients(segment(), 3, 1)
-    assert slow == 32
+    assert 32 <= slow <= 40
     fast = TRUTH * (0.5 + 0.5 * np.sin(2 * np.pi * INSTANTS / 9))[:, None, None]
     assert estimate_coefficients(segment(fast), 3, 1) > slow
     assert estimate_coefficients(segment(), 3, 50) == GEOMETRY.video_shape(3, 50)[0]
