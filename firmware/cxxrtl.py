@@ -17,15 +17,17 @@ import fcntl
 import hashlib
 import os
 import tempfile
+from dataclasses import replace
 from enum import IntFlag
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from acquire.errors import UsageError
 from acquire.sim.rtl import COMPILER
 from acquire.sim.rtl import missing_tools as missing
+from acquire.trigger import registers as r
 from firmware.toolchain import ToolError, run_tool
 
 if TYPE_CHECKING:
@@ -41,6 +43,7 @@ INPUTS = (
     "clock_external",
     "clear_to_send",
 )
+_CLOCK_HZ = 90_000_000
 _HARNESS = Path(__file__).with_name("twin.cpp")
 _OUTPUT_ROOM = 4096
 _CHANGES_ROOM = 65536
@@ -107,8 +110,8 @@ class Twin:
     """One device in this process. Not for several threads at a time; `close` frees it."""
 
     def __init__(self, build: Build, record: bool = True) -> None:
-        self._library = _load(build)
-        self._twin = self._library.twin_new(build.divisor)
+        self._library = _load(_alike(build))
+        self._twin = self._library.twin_new(build.divisor, build.clock_hz, build.serial)
         self._pending = bytearray()
         self._received = bytearray()
         self._output = (ctypes.c_uint8 * _OUTPUT_ROOM)()
@@ -201,6 +204,7 @@ def library(build: Build) -> Path:
     """The compiled gateware of ``build``, made now unless it is there already."""
     if reason := missing():
         raise UsageError(f"the gateware cannot be compiled: there is no {reason}")
+    build = _alike(build)
     path = cache_directory() / f"{_fingerprint(build)}.so"
     if not path.exists():
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -216,6 +220,7 @@ def library(build: Build) -> Path:
 @cache
 def _load(build: Build) -> ctypes.CDLL:
     loaded = ctypes.CDLL(str(library(build)))
+    loaded.twin_new.argtypes = [ctypes.c_uint32, ctypes.c_uint32, ctypes.c_uint64]
     loaded.twin_new.restype = ctypes.c_void_p
     loaded.twin_clock.restype = loaded.twin_pins.restype = loaded.twin_run.restype = ctypes.c_uint64
     for name in ("twin_free", "twin_clock", "twin_pins", "twin_link_busy"):
@@ -224,6 +229,11 @@ def _load(build: Build) -> ctypes.CDLL:
     loaded.twin_latest.argtypes, loaded.twin_latest.restype = [ctypes.c_void_p], ctypes.c_void_p
     loaded.twin_run.argtypes = [ctypes.c_void_p, ctypes.c_uint64, ctypes.POINTER(_Exchange)]
     return loaded
+
+
+def _alike(build: Build) -> Build:
+    """The build whose library serves this one: a twin is told its clock and serial number when made."""
+    return replace(build, clock_hz=_CLOCK_HZ, baud=_CLOCK_HZ // build.divisor, serial=0)
 
 
 def _fingerprint(build: Build) -> str:
@@ -241,14 +251,20 @@ def _translate(build: Build, directory: Path) -> Path:
     """Amaranth → C++."""
     os.environ["AMARANTH_USE_YOSYS"] = "builtin"  # a distribution's older yosys would break it
     from amaranth.back import cxxrtl
-    from amaranth.hdl import ClockDomain, Module
+    from amaranth.hdl import ClockDomain, Module, Signal
 
-    from firmware.top import SyncTrigger
+    from firmware.top import Build, SyncTrigger
+
+    told = {r.CLOCK_HZ: Signal(32, name="told_clock_hz"), r.SERIAL: Signal(64, name="told_serial")}
+
+    class Told(Build):
+        def constants(self) -> dict[r.Register, Any]:
+            return {**super().constants(), **told}
 
     top = Module()
     top.domains += (domain := ClockDomain("sync", reset_less=True))  # half the work per clock
-    top.submodules.trigger = trigger = SyncTrigger(build)
-    ports = [domain.clk, *(getattr(trigger, name) for name in trigger.signature.members)]
+    top.submodules.trigger = trigger = SyncTrigger(Told(**vars(build)))
+    ports = [domain.clk, *told.values(), *(getattr(trigger, name) for name in trigger.signature.members)]
     design = directory / "design.cpp"
     design.write_text(cxxrtl.convert(top, name="top", ports=ports), encoding="utf-8")
     return design

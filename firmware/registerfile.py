@@ -12,6 +12,8 @@ r"""The registers that `acquire.trigger.registers` defines, as words the host re
 written, and only while nothing is armed or runs.
 """
 
+from collections.abc import Mapping
+
 from amaranth.hdl import Cat, Const, Elaboratable, Module, Signal, Value
 from amaranth.lib import wiring
 from amaranth.lib.wiring import In, Out
@@ -36,7 +38,7 @@ class RegisterFile(wiring.Component):
     write: In(1)
     write_data: In(32)
 
-    def __init__(self, constants: dict[r.Register, int], resets: dict[r.Register, int]) -> None:
+    def __init__(self, constants: Mapping[r.Register, int | Value], resets: dict[r.Register, int]) -> None:
         """``resets``: values at power-up of a board that needs others than the definition's."""
         super().__init__()
         self._constants = constants
@@ -78,7 +80,8 @@ class RegisterFile(wiring.Component):
 
     def _words(self, m: Module, register: r.Register) -> list[Value]:
         if register.access == "constant":
-            value: Value = Const(self._constants[register], register.width)
+            value = Value.cast(self._constants[register])
+            value = Cat(value, Const(0, register.width))[: register.width]
         elif register.access == "command":
             value = Const(0, register.width)
         else:

@@ -246,13 +246,15 @@ class SyncTrigger(wiring.Component):
         file, commands, timing, checks = self.file, self.commands, self.timing, self.checks
         m.submodules.watchdog = watchdog = Watchdog()
         enabled = file.field(r.EXTERNAL_ARM, "enable")
+        code_busy = Signal()
+        m.d.sync += code_busy.eq(self.code.busy)  # in time for the next command; its path was the longest
         m.d.comb += [
             checks.code_checked.eq(self.code.checked),
             checks.clock_locked.eq(self.locked.level),
             commands.config_error.eq(checks.error),
             commands.config_address.eq(checks.address),
             commands.length_good.eq(checks.length_good),
-            commands.busy.eq(self.code.busy | self.tagger.telling),
+            commands.busy.eq(code_busy | self.tagger.telling),
             commands.edge.eq(self.arm.edge & enabled),
             commands.watchdog.eq(watchdog.bark),
             commands.clock_locked.eq(self.locked.level),

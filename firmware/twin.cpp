@@ -140,9 +140,11 @@ static bool receive(Twin &twin) {
 
 extern "C" {
 
-Twin *twin_new(uint32_t divisor) {
+Twin *twin_new(uint32_t divisor, uint32_t clock_hz, uint64_t serial) {
     Twin *twin = new Twin;
     twin->divisor = divisor;
+    twin->top.p_told__clock__hz.set<uint32_t>(clock_hz);
+    twin->top.p_told__serial.set<uint64_t>(serial);
     twin->top.p_rx.set<uint8_t>(1);
     twin->top.p_clear__to__send.set<uint8_t>(1);
     twin->top.p_clock__locked.set<uint8_t>(1);
