@@ -104,15 +104,22 @@ def _arms(path: Path, attributes: dict[str, Any]) -> dict[str, layout.Document]:
         rows = min(rows for _, rows in shapes.values())
         if attributes.get("state") != "sealed":
             rows -= rows % max(shape.chunk_rows for shape, _ in shapes.values())
+            # Whatever retention had dropped was committed, though an array may not say so yet.
+            first_line = int(attributes["first_line"])
+            dropped = (int(first) + int(count) for first, count in attributes.get("dropped", ()))
+            rows = max([rows, *(end - first_line for end in dropped)])
         for key in shapes:
             nodes[key] = nodes[key] | {"shape": [rows, *nodes[key]["shape"][1:]]}
-        first_line = int(attributes["first_line"])
+        group = {"first_line": int(attributes["first_line"])}
     except layout.PARSE_ERRORS as error:
         raise DataError(
             f"{path}: its root zarr.json is lost, and its arrays are damaged: {error!r}"
         ) from error
-    groups = {arm: layout.group_document({"arm": arm, "first_line": first_line}, {}) for arm in ARMS}
-    return groups | nodes
+    ordered: dict[str, layout.Document] = {}  # a group, and what is in it: zarr relies on that
+    for arm in ARMS:
+        ordered[arm] = layout.group_document({"arm": arm, **group}, {})
+        ordered |= {key: node for key, node in nodes.items() if key.startswith(f"{arm}/")}
+    return ordered
 
 
 def _tables(path: Path) -> dict[str, layout.Document]:

@@ -55,13 +55,13 @@ def remove(disk: Disk, path: Path, proof: Unborn | Dropped) -> None:
         case Dropped(shard, told):
             if not any(shard in shards for shards in told):
                 raise DataError(f"{path}: shard {shard} is not deleted: retention has not told of it")
-            for file in shard_files(path, shard):
+            files = shard_files(path, shard)
+            for file in files:
                 refuse_link(path, file)
+            for file in files:
                 disk.remove(file)
             for arm in ARMS:
-                directory = path / arm / "lines" / "c" / str(shard)
-                refuse_link(path, directory)
-                disk.remove_directory(directory)
+                disk.remove_directory(path / arm / "lines" / "c" / str(shard))
 
 
 def shard_files(path: Path, shard: int) -> list[Path]:
