@@ -71,6 +71,8 @@ KILLS_PER_RUN = 4
 """Fewer than the successors that one process can have."""
 WAIT_S = 90.0
 LONGEST_PAUSE_S = 0.5
+ROOT_LOST = 0.5
+"""Of the recorders that are killed, so many lose the root of their recording as well."""
 
 
 @dataclass
@@ -78,6 +80,8 @@ class Outcome:
     """What was killed, and what was wrong with the recordings afterwards: nothing, one hopes."""
 
     killed: Counter[str] = field(default_factory=Counter)
+    roots: int = 0
+    """Recordings whose zarr.json was deleted under their recorder."""
     recordings: int = 0
     lines: int = 0
     missing: Counter[str] = field(default_factory=Counter)
@@ -85,7 +89,7 @@ class Outcome:
 
     def __str__(self) -> str:
         rows = [
-            f"killed      {sum(self.killed.values())}: {dict(self.killed)}",
+            f"killed      {sum(self.killed.values())}: {dict(self.killed)}; {self.roots} roots deleted",
             f"recordings  {self.recordings}, {self.lines} lines of each arm",
             f"missing     {dict(self.missing) or 0} (flagged and listed)",
             f"faults      {len(self.faults)}",
@@ -162,6 +166,10 @@ class Storm:
         """A process at a random moment; then wait until another has taken its place."""
         time.sleep(self._chance.uniform(0, LONGEST_PAUSE_S))
         name, before = self._chance.choice(VICTIMS), client.status()
+        if name == "recorder" and before.recording is not None and self._chance.random() < ROOT_LOST:
+            os.kill(before.processes[name], signal.SIGSTOP)  # or its next commit would write another
+            (before.recording.path / "zarr.json").unlink(missing_ok=True)
+            self.outcome.roots += 1
         os.kill(before.processes[name], signal.SIGKILL)
         self.outcome.killed[name] += 1
 
@@ -216,9 +224,15 @@ class Storm:
 
 def _open_parts(path: Path) -> list[str]:
     """Of a recording and its segments, those that are not sealed, or not listed in the first."""
+    if not (path / "zarr.json").exists():
+        return [path.name]
     listed = [path.name, *open_recording(path).attrs.get("segments", [])]
     parts = [path, *path.parent.glob(f"{path.stem}-*.zarr")]
-    return [part.name for part in parts if part.name not in listed or open_recording(part).state != "sealed"]
+    return [part.name for part in parts if part.name not in listed or not _is_sealed(part)]
+
+
+def _is_sealed(path: Path) -> bool:
+    return (path / "zarr.json").exists() and open_recording(path).state == "sealed"
 
 
 def check_recording(path: Path) -> list[str]:

@@ -3,7 +3,8 @@
 ::
 
     whole recordings   writer                     reader, opening, suspect  verify  recover  mirror  video
-      with             retention room resume                                scan    mend
+      with             retention room resume      attributes extent         scan    mend     place
+      kept from loss   removal, links             shortfall                         rebuild
     one arm            arm_writer                 camera_stream
     one array          array_writer → shard       stretch → chunks          tables: table, table_reader
     what is written    terms, spec (attributes), layout (metadata), codecs (bytes)
