@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import json
 import math
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any
@@ -28,6 +29,7 @@ from acquire.errors import DataError, PlaceError, UsageError
 from acquire.store.camera_stream import DAMAGE, child_array
 from acquire.store.delivery import delivery_to
 from acquire.store.layout import group_document, to_json
+from acquire.store.opening import read_root
 from acquire.store.refusals import refused
 from acquire.store.source import source_of
 
@@ -189,6 +191,8 @@ def open_video(place: Path | str) -> VideoFile:
             there = source.exists()
         if not there:
             raise PlaceError(f"{source} does not exist", hint=_VIDEO)
+        with suppress(PlaceError):  # said below, in a video's words
+            read_root(source)  # zarr would wait for a pipe, and read a device for ever
         group = zarr.open_group(source.zarr_store(), mode="r", zarr_format=3)
         attributes = dict(group.attrs)
         if attributes.get("format") != FORMAT:

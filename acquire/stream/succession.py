@@ -17,6 +17,7 @@ on; nobody takes its place.
 from __future__ import annotations
 
 import math
+import os
 import time
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -171,8 +172,8 @@ def once_more(following: Begin) -> Begin:
 def free_name(path: Path) -> Path:
     """The first of NAME-2, NAME-3 … beside ``path`` that does not exist."""
     number = 2
-    while (found := path.with_name(f"{path.stem}-{number}{path.suffix}")).exists():
-        number += 1
+    while os.path.lexists(found := path.with_name(f"{path.stem}-{number}{path.suffix}")):
+        number += 1  # a link that leads nowhere has the name as well
     return found
 
 

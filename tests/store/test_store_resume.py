@@ -20,6 +20,7 @@ from acquire.store import (
     verify,
 )
 from acquire.store.files import locked
+from acquire.stream.succession import free_name
 
 
 @pytest.fixture
@@ -148,3 +149,9 @@ def test_a_segment_alone_is_recovered_all_the_same(killed):
     late = go_on(killed, 2, 1100)
     shutil.rmtree(killed)
     assert recover(late).lines == 40
+
+
+def test_a_link_that_leads_nowhere_takes_a_segments_name(tmp_path):
+    """A recorder that is replaced must find a name that it can have."""
+    (tmp_path / "run-2.zarr").symlink_to(tmp_path / "nowhere")
+    assert free_name(tmp_path / "run.zarr") == tmp_path / "run-3.zarr"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ import zarr
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from acquire.errors import PlaceError, UsageError
+from acquire.errors import DataError, PlaceError, UsageError
 from acquire.store import open_video, write_video
 
 TIME = np.int64(1_790_000_000_000_000_000)
@@ -113,3 +114,10 @@ def test_what_is_not_a_video_says_so(tmp_path):
     zarr.create_group(tmp_path / "g.zarr")
     with pytest.raises(PlaceError, match="not a video"):
         open_video(tmp_path / "g.zarr")
+
+
+def test_a_pipe_in_the_place_of_a_video_keeps_nobody_waiting(tmp_path):
+    (tmp_path / "v.zarr").mkdir()
+    os.mkfifo(tmp_path / "v.zarr" / "zarr.json")
+    with pytest.raises(DataError, match="it is a pipe, not a file"):
+        open_video(tmp_path / "v.zarr")
