@@ -32,7 +32,8 @@ SMALL: dict[str, Any] = {
     "geometry.stages": STAGES,
     "recording.chunk_lines": 1024,
     "stream.block_lines": 128,
-    "stream.ring_slots": 512,  # two seconds: a busy machine loses nothing but what a test takes away
+    "stream.ring_slots": 512,
+    "simulation.speed": 0.25,  # a ring of eight seconds: a busy machine loses only what a test takes
 }
 
 
@@ -86,7 +87,7 @@ def check_lines(config: RigConfig, recording: Recording, arm: str) -> np.ndarray
 @needs_compiler
 def test_what_is_recorded_through_the_producer_is_eq1(tmp_path: Path) -> None:
     config = rig_config()
-    recording, status = record(config, tmp_path / "r.zarr", 20_000)
+    recording, status = record(config, tmp_path / "r.zarr", 5000)
     assert status.condition is RunCondition.GOOD
     for arm in "ab":
         assert not check_lines(config, recording, arm).any()
@@ -111,7 +112,7 @@ def gige_config(**changes: Any) -> RigConfig:
 @pytest.mark.needs_aravis
 def test_what_is_recorded_through_gige_vision_is_eq1(tmp_path: Path) -> None:
     config = gige_config()
-    recording, status = record(config, tmp_path / "r.zarr", 20_000)
+    recording, status = record(config, tmp_path / "r.zarr", 5000)
     assert status.condition is RunCondition.GOOD
     for arm in "ab":
         assert not check_lines(config, recording, arm).any()
@@ -130,7 +131,7 @@ def test_over_a_bad_link_every_line_is_eq1_flagged_or_lost_also_after_the_camera
         rig.simulated._gige.transmission = Transmission(link=BadLink(0.05), resends=False)
 
     def happen(rig: Rig, run: Run) -> None:
-        until(lambda: run.poll().recorded_lines > 10_000, "lines")
+        until(lambda: run.poll().recorded_lines > 2500, "lines")
         gige = rig.simulated._gige
         gige._servers.pop("a").end(time.monotonic() + 20)
         until(lambda: run.poll().lines["a"]["reopened"] or _reopen(gige, rig), "the camera")
@@ -139,7 +140,7 @@ def test_over_a_bad_link_every_line_is_eq1_flagged_or_lost_also_after_the_camera
         gige.opener("a", rig.simulated._sensor)
         return False
 
-    recording, status = record(config, tmp_path / "r.zarr", 60_000, happen, prepare=prepare)
+    recording, status = record(config, tmp_path / "r.zarr", 15_000, happen, prepare=prepare)
     assert status.end_reason == "line budget reached"
     for arm in "ab":
         flags = check_lines(config, recording, arm)
@@ -148,7 +149,7 @@ def test_over_a_bad_link_every_line_is_eq1_flagged_or_lost_also_after_the_camera
         assert missing == sum(gap.count for gap in gaps)
         assert {gap.cause for gap in gaps} <= {"id_gap", "incomplete", "device_lost"}
         assert ("device_lost" in {gap.cause for gap in gaps}) == (arm == "a")
-        assert (flags & LineFlag.INCOMPLETE != 0).sum() > 1000
+        assert (flags & LineFlag.INCOMPLETE != 0).sum() > 300
 
 
 @pytest.mark.parametrize("rig", ["rig-demo", pytest.param("rig-demo-gentl", marks=needs_compiler)])
@@ -157,7 +158,7 @@ def test_both_arms_from_one_camera_are_eq1(tmp_path: Path, rig: str) -> None:
     given = dict(SMALL)
     given |= {"cameras.layout": "compact", "cameras.b.serial": "SIM-A", "cameras.b.first_column": STAGES + 5}
     config = load_rig(rig, given | ({"cameras.a.settings": settings} if "gentl" in rig else {}))
-    recording, status = record(config, tmp_path / "r.zarr", 20_000, stamps="gentl" in rig)
+    recording, status = record(config, tmp_path / "r.zarr", 5000, stamps="gentl" in rig)
     assert status.condition is RunCondition.GOOD
     assert recording.attrs["layout"] == "compact"
     for arm in "ab":
@@ -183,11 +184,11 @@ def test_faults_of_one_camera_are_gaps_by_cause_and_the_other_arm_is_whole(tmp_p
 
     def happen(rig: Rig, run: Run) -> None:
         memory = rig.simulated._gentl._bench.cameras["SIM-A"]
-        frame = memory["FRAMES"] + 100
+        frame = memory["FRAMES"] + 40
         for kind, after, count in (("DROP", 0, 2), ("OVERRUN", 20, 3), ("SHORT", 40, 60), ("MISSED", 0, 5)):
             memory.inject(kind, (frame + 60) * 100 + 30 if kind == "MISSED" else frame + after, count)
 
-    recording, status = record(config, tmp_path / "r.zarr", 50_000, happen)
+    recording, status = record(config, tmp_path / "r.zarr", 20_000, happen)
     lost = {cause: lines for cause, lines in status.lines["a"]["lost"].items() if lines}
     assert lost == {"id_gap": 200, "no_buffer": 300, "incomplete": 40, "missed_trigger": 5}
     gaps = {gap.cause: gap.count for gap in recording.gaps if gap.arm == "a"}
@@ -202,7 +203,7 @@ def test_a_camera_that_was_away_goes_on_at_the_right_line_and_the_gap_is_recorde
     config = rig_config(**{"stream.reopen_s": 20.0})
 
     def happen(rig: Rig, run: Run) -> None:
-        until(lambda: run.poll().recorded_lines > 10_000, "lines")
+        until(lambda: run.poll().recorded_lines > 2500, "lines")
         memory = rig.simulated._gentl._bench.cameras["SIM-A"]
         memory.unplug()
         until(
@@ -210,7 +211,7 @@ def test_a_camera_that_was_away_goes_on_at_the_right_line_and_the_gap_is_recorde
         )
         memory.plug()
 
-    recording, status = record(config, tmp_path / "r.zarr", 80_000, happen)
+    recording, status = record(config, tmp_path / "r.zarr", 20_000, happen)
     (gap,) = [gap for gap in recording.gaps if gap.arm == "a"]
     assert gap.cause == "device_lost"
     assert status.lines["a"]["lost"]["device_lost"] == gap.count > 0
@@ -225,7 +226,7 @@ def test_a_camera_that_does_not_come_back_ends_the_recording_in_time(tmp_path: P
     config = rig_config(**{"stream.reopen_s": 0.5})
 
     def happen(rig: Rig, run: Run) -> None:
-        until(lambda: run.poll().recorded_lines > 5_000, "lines")
+        until(lambda: run.poll().recorded_lines > 1000, "lines")
         rig.simulated._gentl._bench.cameras["SIM-A"].unplug()
         begin = time.monotonic()
         until(lambda: run.poll().done, "the end")

@@ -20,6 +20,7 @@ from gige_helpers import (
     spec_at,
 )
 from ramp_sensor import ramp
+from waiting import until
 
 from acquire.camera.aravis import AravisCamera, AravisOpener
 from acquire.camera.settings import Setting
@@ -261,3 +262,18 @@ def test_aravis_own_lossy_camera_agrees_with_its_own_account(tmp_path: Path, per
         assert pixel == (number - 65_535 if number > 65_535 else number) % 255, f"frame {frame}"
     assert statistics["lines"] + statistics["lost"] == next_line
     assert len(flagged) > frames * per_thousand // 1000
+
+
+def test_frames_that_find_no_buffer_are_lost_for_that_reason() -> None:
+    """Aravis counts each of their packets."""
+    with our_camera(HEIGHT, Transmission(resends=False)) as (sensor, address):
+        camera = open_in_time(AravisOpener(spec_at(address, HEIGHT, line_rate_hz=1.0)))  # sixteen buffers
+        try:
+            camera.arm()
+            sensor.allowed = 100 * HEIGHT
+            until(lambda: camera._starved_frames() >= 100 - 16, "every buffer to be filled")
+            found = take(camera, sensor, 107, window=108)
+        finally:
+            camera.close()
+    assert found.whole == [*range(16), *range(100, 108)]
+    assert (found.flagged, found.lost) == ([], {"no_buffer": (100 - 16) * HEIGHT})
