@@ -59,9 +59,10 @@ def prove(proof: Proof, first: bool = False, only: Container[str] | None = None)
     LOG.info("%s: %d claims, %d lemmas", proof.name, len(proof.claims), proof.lemmas)
     with tempfile.TemporaryDirectory() as scratch:
         folder = _translated(proof, Path(scratch))
-        broken = _base(folder, proof.depth, first, only) or _step(folder, proof.depth, first, only)
         if only is not None:
+            broken = _step(folder, proof.depth, first, only) or _base(folder, proof.depth, first, only)
             return Verdict(proof.name, broken, (), time.monotonic() - began)
+        broken = _base(folder, proof.depth, first, only) or _step(folder, proof.depth, first, only)
         covered = set() if broken else _covered(proof, folder)
     missing = () if broken else tuple(name for name in proof.covers if name not in covered)
     return Verdict(proof.name, broken, missing, time.monotonic() - began)
