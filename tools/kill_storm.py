@@ -2,7 +2,8 @@
 
 ::
 
-    arm, start ─▶ kill a process at random ─▶ another takes its place ─▶ … ─▶ stop, or kill the daemon
+    arm, start ─▶ stop the recorder for a while, as a disk does, and let it go on or kill it
+               ─▶ kill a process at random ─▶ another takes its place ─▶ … ─▶ stop, or kill the daemon
                ─▶ the daemon, or the next one, seals what is left ─▶ every row is its line, or flagged and
                   listed; nothing acknowledged is missing
 
@@ -67,12 +68,16 @@ socket = "{home}/c.sock"
 scene = "{scene}"
 """
 VICTIMS = ("recorder", "a", "b")
+STOPS = 0.3
+"""So often the recorder is stopped before something is killed."""
 KILLS_PER_RUN = 4
 """Fewer than the successors that one process can have."""
 WAIT_S = 90.0
 LONGEST_PAUSE_S = 0.5
 ROOT_LOST = 0.5
 """Of the recorders that are killed, so many lose the root of their recording as well."""
+LONGEST_STOP_S = 3.0
+"""Of a recorder: less than what the rings hold."""
 
 
 @dataclass
@@ -82,6 +87,7 @@ class Outcome:
     killed: Counter[str] = field(default_factory=Counter)
     roots: int = 0
     """Recordings whose zarr.json was deleted under their recorder."""
+    stopped: int = 0
     recordings: int = 0
     lines: int = 0
     missing: Counter[str] = field(default_factory=Counter)
@@ -90,6 +96,7 @@ class Outcome:
     def __str__(self) -> str:
         rows = [
             f"killed      {sum(self.killed.values())}: {dict(self.killed)}; {self.roots} roots deleted",
+            f"stopped     {self.stopped} times, for up to {LONGEST_STOP_S:g} s",
             f"recordings  {self.recordings}, {self.lines} lines of each arm",
             f"missing     {dict(self.missing) or 0} (flagged and listed)",
             f"faults      {len(self.faults)}",
@@ -166,6 +173,13 @@ class Storm:
         """A process at a random moment; then wait until another has taken its place."""
         time.sleep(self._chance.uniform(0, LONGEST_PAUSE_S))
         name, before = self._chance.choice(VICTIMS), client.status()
+        recorder = before.processes["recorder"]
+        if self._chance.random() < STOPS:
+            self.outcome.stopped += 1
+            os.kill(recorder, signal.SIGSTOP)
+            time.sleep(self._chance.uniform(0, LONGEST_STOP_S))
+            if name != "recorder":  # else it is killed as it is
+                os.kill(recorder, signal.SIGCONT)
         if name == "recorder" and before.recording is not None and self._chance.random() < ROOT_LOST:
             os.kill(before.processes[name], signal.SIGSTOP)  # or its next commit would write another
             (before.recording.path / "zarr.json").unlink(missing_ok=True)

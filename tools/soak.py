@@ -3,7 +3,8 @@
 ::
 
     pattern cameras, time-compressed ─▶ … armed, recorded, stopped, again and again …
-    meanwhile: a camera goes and comes back · a camera drops blocks · the recorder is stopped for a while
+    meanwhile: a camera goes and comes back · a camera drops blocks · the recorder is stopped for a while,
+               or until the rings are full and the recording has to go on in a further segment
 
 ``python -m tools.soak --hours 8 --minutes 4`` simulates 8 hours of lines at 2 kHz. At the end of every cycle,
 and every other second of it, the memory of each process is noted; of the owner, which alone outlives a cycle,
@@ -41,6 +42,7 @@ from acquire.lines import ARMS
 from acquire.sim.clock import Wire
 from acquire.sim.trigger_model import TriggerModel
 from acquire.sim.twin_links import TwinTransport
+from acquire.store import open_recording
 from acquire.stream import Capture
 from acquire.stream.shared import Counters
 from acquire.trigger.driver import TriggerDriver
@@ -52,13 +54,15 @@ if TYPE_CHECKING:
 
 CLOCK_HZ = 90_000_000
 SIMULATED_HZ = 2000.0
-FAULTS = ("gone", "drop", "pause")
+FAULTS = ("gone", "drop", "pause", "freeze")
 CYCLE_S = 4.0
 SAMPLE_S = 2.0
 LEAST_SAMPLES = 20
 MOST_GROWTH_MB = 2.0
 """In the second half of what was noted of one process, if there is enough of it: less is called flat."""
 LONGEST_PAUSE_S = 0.3
+LONGEST_RING_S = 5.0
+"""A longer one is not filled: a freeze is a pause then."""
 WAIT_S = 60.0
 
 
@@ -105,6 +109,7 @@ class Soak:
     """What was simulated, and what was found."""
 
     cycles: int = 0
+    segments: int = 0
     lines: int = 0
     faults: Counter[str] = field(default_factory=Counter)
     lost: Counter[str] = field(default_factory=Counter)
@@ -142,6 +147,7 @@ class Soak:
         hours = self.lines / SIMULATED_HZ / 3600
         rows = [
             f"cycles   {self.cycles}, {self.lines} lines of each arm = {hours:.2f} hours",
+            f"segments {self.segments}",
             f"faults   {dict(self.faults)}; lines lost to them {dict(self.lost)}",
             *(f"memory   {self._memory(name)}" for name in self.memory),
             f"handles  {handles}, {handles_end}; threads {threads}, {threads_end}",
@@ -160,12 +166,13 @@ def soak(home: Path, lines: int, line_rate_hz: float, seed: int, cycle_s: float 
     """Simulate ``lines`` lines in cycles of arm, record, stop, each with faults of its own."""
     chance, found = random.Random(seed), Soak()
     load = Load(8, "uint16", line_rate_hz, substeps=2, stages=8, block_lines=512, ring_slots=1024)
+    place = home / "cycle"
     with ProcessPoolExecutor(1, get_context("spawn")) as reader:
         while found.lines < lines:
-            path = home / "r.zarr"
-            seen = _cycle(path, load, chance, found, cycle_s)
-            _examine(seen, reader.submit(check_recording, path).result(), found)
-            shutil.rmtree(path)
+            place.mkdir()
+            seen = _cycle(place / "r.zarr", load, chance, found, cycle_s)
+            _examine(seen, reader.submit(check_parts, place).result(), found)
+            shutil.rmtree(place)
             found.cycles += 1
             gc.collect()
             found.usage.append(_usage())
@@ -182,12 +189,14 @@ def _cycle(path: Path, load: Load, chance: random.Random, found: Soak, cycle_s: 
     openers: dict[str, CameraOpener] = {
         arm: FaultyOpener(opener, faults, arm) for arm, opener in plan.openers.items()
     }
-    plan = replace(plan, openers=openers, reopen_timeout_s=20.0, stall_timeout_s=25.0, realtime=False)
+    plan = replace(
+        plan, openers=openers, reopen_timeout_s=20.0, stall_timeout_s=25.0, realtime=False, goes_on=True
+    )
     capture = Capture(plan, trigger)
     try:
         capture.arm()
         capture.start(path, recording_spec(load, capture.clock))
-        _throw(capture, faults, chance, found, time.monotonic() + cycle_s)
+        _throw(capture, faults, chance, found, time.monotonic() + cycle_s, plan.ring_s)
         found.note_memory(capture.pids)
         capture.stop("end of the cycle")
         _until(lambda: capture.poll().done)
@@ -199,7 +208,25 @@ def _cycle(path: Path, load: Load, chance: random.Random, found: Soak, cycle_s: 
     return capture.poll()
 
 
-def _throw(capture: Capture, faults: Counters, chance: random.Random, found: Soak, until_s: float) -> None:
+def _stop_recorder(capture: Capture, chance: random.Random, *, until_full: bool) -> None:
+    pid, before = capture.pids["recorder"], capture.poll()
+    assert pid is not None
+    os.kill(pid, signal.SIGSTOP)
+    if until_full:
+        _until(
+            lambda: all(
+                ring["drops"] > before.ring[arm]["drops"] for arm, ring in capture.poll().ring.items()
+            )
+        )
+    time.sleep(chance.uniform(0, LONGEST_PAUSE_S))
+    os.kill(pid, signal.SIGCONT)
+    if until_full:
+        _until(lambda: capture.poll().path != before.path and capture.poll().committed_lines > 0)
+
+
+def _throw(
+    capture: Capture, faults: Counters, chance: random.Random, found: Soak, until_s: float, ring_s: float
+) -> None:
     note_s = time.monotonic() + SAMPLE_S
     while (now_s := time.monotonic()) < until_s:
         if now_s >= note_s:
@@ -208,27 +235,44 @@ def _throw(capture: Capture, faults: Counters, chance: random.Random, found: Soa
         time.sleep(chance.uniform(0.2, 1.0))
         fault = chance.choice(FAULTS)
         found.faults[fault] += 1
-        if fault == "pause":  # as a slow disk does
-            pid = capture.pids["recorder"]
-            assert pid is not None
-            os.kill(pid, signal.SIGSTOP)
-            time.sleep(chance.uniform(0, LONGEST_PAUSE_S))
-            os.kill(pid, signal.SIGCONT)
+        if fault in ("pause", "freeze"):  # as a slow disk does
+            _stop_recorder(capture, chance, until_full=fault == "freeze" and ring_s < LONGEST_RING_S)
         else:
             faults[f"{fault}_{chance.choice(ARMS)}"] = 1
 
 
-def _examine(seen: CaptureStatus, wrong: list[str], found: Soak) -> None:
-    """The books to the line; what is ``wrong`` with the rows of the recording."""
-    for name, arm in seen.lines.items():
-        told = arm["preroll"] + arm["lost"]["ring_full"] + arm["discarded"] + arm["recorded"] - arm["missing"]
-        if arm["delivered"] != told:
-            found.wrong.append(f"cycle {found.cycles}: arm {name}: {arm['delivered']} delivered, {told} told")
-        found.lost.update({cause: lines for cause, lines in arm["lost"].items() if lines})
-    if seen.fault:
-        found.wrong.append(f"cycle {found.cycles}: {seen.fault}")
+@dataclass
+class Parts:
+    """A recording and the segments in which it went on: what they hold together, what is wrong with them."""
+
+    count: int = 0
+    lines: int = 0
+    stored: Counter[str] = field(default_factory=Counter)
+    wrong: list[str] = field(default_factory=list)
+
+
+def check_parts(place: Path) -> Parts:
+    """Of everything that lies in a directory."""
+    found = Parts()
+    for path in sorted(place.glob("*.zarr")):
+        recording = open_recording(path)
+        found.count += 1
+        found.lines += recording.lines
+        found.stored.update({arm: recording.attrs["ledger"][arm]["stored"] for arm in ARMS})
+        found.wrong += [f"{path.name}: {fault}" for fault in check_recording(path)]
+    return found
+
+
+def _examine(seen: CaptureStatus, parts: Parts, found: Soak) -> None:
+    """The books to the line: of what was delivered and of what the recordings hold."""
+    wrong = [*parts.wrong, *([seen.fault] if seen.fault else [])]
+    for name, account in seen.accounts.items():
+        if not account.balanced or account.stored != parts.stored[name]:
+            wrong.append(f"arm {name}: {account}, but {parts.stored[name]} lines are recorded")
+        found.lost.update({cause: lines for cause, lines in account.lost.items() if lines})
     found.wrong += [f"cycle {found.cycles}: {text}" for text in wrong]
-    found.lines += seen.recorded_lines
+    found.lines += parts.lines
+    found.segments += parts.count
 
 
 def own_mb(pid: int) -> float:

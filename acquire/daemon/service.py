@@ -247,7 +247,7 @@ class Service:
             return
         assert self._run is not None
         for note in self._run.events():
-            self._heed(note)
+            self._heed_unasked(note)
         if self._state is State.RECORDING and (seen.draining or seen.done):
             self._go(Event.FULL)
         if self._state is not State.DRAINING:
@@ -299,6 +299,13 @@ class Service:
         self._take = Take(path, lines, by_event)
         self._go(Event.START, f"{path}, {'until stopped' if lines is None else f'{lines} lines'}")
 
+    def _heed_unasked(self, note: Note) -> None:
+        """A disk that does not create a recording must not end the watch for the next event."""
+        try:
+            self._heed(note)
+        except AcquireError as error:
+            self.troubles.note(f"event {note.kind} at line {note.line}", error)
+
     def _heed(self, note: Note) -> None:
         """Do at an event what the rig asks for."""
         assert self._run is not None
@@ -331,7 +338,7 @@ class Service:
             return
         self._go(Event.SEALED if stays else Event.RELEASED, self._last_words())
         if stays and take.late is not None:
-            self._heed(take.late)
+            self._heed_unasked(take.late)
 
     def _with_cause(self, trouble: str) -> str:
         """What went wrong while ending often follows from what ended it: that comes first."""

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from acquire.errors import AcquireError, DataError, StateError, UsageError
 from acquire.lines import ARMS
-from acquire.stream import grabber, recorder, watcher
+from acquire.stream import grabber, recorder, recorder_plan, watcher
 from acquire.stream.ledger import Counted, account
 from acquire.stream.losses import Cause
 from acquire.stream.messages import Begin, Interrupt, Note, Quit, Ready, RunStarted
@@ -157,15 +157,16 @@ class Capture:
     def close(self, timeout_s: float = 30.0) -> None:
         """End everything, in the module's order; a recording under way is sealed as interrupted. Idempotent.
 
-        Takes little more than ``timeout_s``: what has not ended by then is killed. Raises the first error
-        that it met, after everything has ended.
+        What has not ended in ``timeout_s`` is killed; a recorder that still writes what the rings hold is
+        given as long again from its latest commit on. Raises the first error that it met, after everything
+        has ended.
         """
         if self._closed:
             return
         self._closed = True
         deadline = time.monotonic() + timeout_s
         _run_all(
-            lambda: self._end_recording(deadline),
+            lambda: self._end_recording(timeout_s),
             self._end_tags,
             self._end_trigger,
             lambda: self._end_workers(deadline),
@@ -206,7 +207,7 @@ class Capture:
 
     def _make_memory(self) -> None:
         self._tags = Ring("tags", _TAG_RING)
-        self._counters[RECORDER] = Counters(recorder.COUNTERS)
+        self._counters[RECORDER] = Counters(recorder_plan.COUNTERS)
         self._counters[TRIGGER] = Counters(TRIGGER_COUNTERS)
         if self._plan.watch is not None:
             self._counters[WATCHER] = Counters(watcher.COUNTERS)
@@ -223,7 +224,7 @@ class Capture:
 
     def _new_recorder(self) -> Worker:
         plan = self._plan
-        what = recorder.RecorderPlan(
+        what = recorder_plan.RecorderPlan(
             plan.run,
             plan.stages,
             plan.stall_timeout_s,
@@ -422,13 +423,15 @@ class Capture:
 
     # ---- end
 
-    def _end_recording(self, deadline: float) -> None:
+    def _end_recording(self, timeout_s: float) -> None:
         supervisor = self._supervisor
         if supervisor is None or not supervisor.recording:
             return
         self._workers[RECORDER].post(Interrupt("the capture was closed", ARMS, Cause.INTERRUPTED))
-        if not supervisor.wait_sealed(deadline):
-            raise DataError("the recording could not be sealed in time", hint="recover it")
+        committed = -1
+        while not supervisor.wait_sealed(time.monotonic() + timeout_s):
+            if committed == (committed := self._counters[RECORDER]["committed"]):
+                raise DataError("the recording could not be sealed in time", hint="recover it")
 
     def _end_tags(self) -> None:
         if self._supervisor is not None:

@@ -19,19 +19,15 @@ from __future__ import annotations
 
 import select
 import time
-from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from acquire.errors import AcquireError, DataError, StateError, UsageError
 from acquire.lines import ARMS
 from acquire.store import RecordingWriter, RunCondition
-from acquire.store.files import DISK, Disk
-from acquire.store.suspect import CODE_EVENTS, DOUBTFUL
 from acquire.stream.kept import Kept
 from acquire.stream.losses import Cause
 from acquire.stream.messages import (
@@ -46,37 +42,20 @@ from acquire.stream.messages import (
     Refused,
     RunStarted,
 )
+from acquire.stream.opening import Notes, Opening, is_verdict
 from acquire.stream.process import OwnerGone, become_important
 from acquire.stream.session import OPEN_END, Session
-from acquire.stream.stalls import HELD_UP_S, Arm, Backlog, HoldUps, Lent, find_stall
+from acquire.stream.stalls import HELD_UP_S, Arm, Backlog, DiskWaits, HoldUps, Lent, find_stall
 from acquire.stream.tagger import Tagger
 from acquire.stream.window import Span, hold, span
 from acquire.stream.witness import Witness
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
-
     from acquire.stream.messages import Sealed
     from acquire.stream.process import Mailbox
+    from acquire.stream.recorder_plan import RecorderPlan
     from acquire.stream.ring import Ring, RingBlock
     from acquire.stream.shared import Counters
-    from acquire.trigger.base import TriggerRun
-
-COUNTERS = (
-    *("recorded", "committed", "draining", "rows_a", "rows_b", "missing_a", "missing_b"),
-    *("discarded_a", "discarded_b", "stored_a", "stored_b", "turns", "awaited_a", "awaited_b"),
-    *("unsaved_a", "unsaved_b", "overrun_a", "overrun_b", "overrun_to_a", "overrun_to_b"),
-    *("disk_since_ns", "store_since_ns"),
-)
-"""Of the latest recording: rows in both arms, rows that a reader finds, whether its last line is known; per
-arm the rows written and those of them that are missing. Since armed: per arm the lines taken from its ring
-that no recording holds, those that one does, and those that a disk which failed did not keep; those that
-found their ring full and are a gap in a recording, and the line after the last of these; turns of the loop,
-which stand still when it hangs or waits for the disk. Since when, by the monotonic clock, the loop waits for
-the disk, and the thread that creates and seals recordings is at work; 0 while they do not. The owner alone
-counts how often it has seen that an arm's next grabber is only starting: its silence means nothing then."""
-
-T = TypeVar("T")
 
 _WAIT_S = 0.02
 _COMMIT_INTERVAL_S = 0.1
@@ -87,32 +66,6 @@ _CALM_BLOCKS = 2
 """Waiting in a ring. With more, the disk is kept busy while blocks are made ready: two processors for one."""
 _LONGEST_DRAIN_S = 0.05
 """While messages and commits wait."""
-_NOTES = 1024
-"""Events that are remembered for recordings which begin later and hold their lines."""
-
-
-@dataclass(frozen=True, slots=True)
-class RecorderPlan:
-    """What the recorder needs to know. Picklable."""
-
-    run: TriggerRun
-    stages: int
-    stall_timeout_s: float
-    tag_wait_s: float
-    max_skew_lines: int
-    realtime: bool = False
-    disk: Disk = DISK
-    goes_on: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class Opening:
-    """A recording that is being created, for the lines in ``span``; None: for those that come then."""
-
-    begin: Begin
-    span: Span | None
-    writer: Future[RecordingWriter]
-    cancelled: bool = False
 
 
 def record(
@@ -160,12 +113,13 @@ class Recorder:
         self._opening: Opening | None = None
         self._session: Session | None = None
         self._closing: tuple[Session, Future[Sealed]] | None = None
-        self._notes: deque[Note] = deque(maxlen=_NOTES)
+        self._notes = Notes()
         self._line_rate_hz = 0.0
         self._trouble: tuple[str, dict[str, Cause]] | None = None
         self._owner = True
         self._busy = False
         self._commit_s = 0.0
+        self._waits = DiskWaits(counters)
         self._hold_ups = HoldUps()
         self._cut_short = False
         self._waited_in_vain_for = -1
@@ -244,7 +198,7 @@ class Recorder:
             self._mailbox.post(Refused(error))
             return
         writer = self._disk.submit(
-            self._in_store, RecordingWriter.prepare, begin.path, begin.spec, self._plan.disk
+            self._waits.elsewhere, RecordingWriter.prepare, begin.path, begin.spec, self._plan.disk
         )
         self._opening = Opening(begin, span, writer)
 
@@ -263,9 +217,9 @@ class Recorder:
         self._counters.add(f"discarded_{name}", sign * (end - first - stored))
 
     def _note(self, note: Note) -> None:
-        self._notes.append(note)
+        self._notes.add(note)
         if self._session is not None:
-            if _is_verdict(note, before=self._session.first_line):
+            if is_verdict(note, before=self._session.first_line):
                 note = replace(note, line=self._session.first_line)
             self._session.note(note.kind, note.line, note.text)
 
@@ -331,8 +285,8 @@ class Recorder:
         first_line = self._next_line() if opening.span is None else opening.span.first_line
         try:
             writer = opening.writer.result()
-            self._check_wanted(opening, writer, first_line)
-            with self._at_disk():
+            with self._waits.loop():
+                self._check_wanted(opening, writer, first_line)
                 writer.begin(first_line)
         except AcquireError as error:
             self._refuse(opening, error)
@@ -358,22 +312,13 @@ class Recorder:
 
     def _check_wanted(self, opening: Opening, writer: RecordingWriter, first_line: int) -> None:
         """Raises UsageError for a recording that nobody wants any more, once nothing of it is left."""
-        end_line = opening.begin.end_line
-        if not opening.cancelled and (end_line is None or first_line < end_line):
-            return
-        with self._at_disk():
+        if not opening.is_wanted(first_line):
             writer.abandon()
-        raise UsageError(f"start: line {first_line} is past the recording's end; nothing was recorded")
+            raise UsageError(f"start: line {first_line} is past the recording's end; nothing was recorded")
 
     def _new_session(self, writer: RecordingWriter, opening: Opening, first_line: int) -> Session:
         assert self._tagger is not None
-        lines, at = opening.begin.lines, first_line
-        if opening.span is not None:
-            at = opening.span.at
-            lines = None if opening.span.end_line is None else opening.span.end_line - first_line
-        elif opening.begin.end_line is not None:
-            lines = opening.begin.end_line - first_line
-        session = Session(writer, self._tagger, self._blank, first_line, lines)
+        session = Session(writer, self._tagger, self._blank, first_line, opening.lines_from(first_line))
         self._witness.begin()
         session.doubted = self._witness.doubted()
         window = opening.begin.window
@@ -381,18 +326,13 @@ class Recorder:
             session.before = Cause.RECORDER_LOST
             session.bridges_to = self._newest_line()
         if window.kind:
-            self._notes.append(Note(at, window.kind, window.text))
+            at = first_line if opening.span is None else opening.span.at
+            self._notes.add(Note(at, window.kind, window.text))
         if doubt := self._witness.doubt():
-            self._notes.append(Note(first_line, "code_check", doubt))
-        for note in [*self._standing_doubts(first_line), *self._notes]:
+            self._notes.add(Note(first_line, "code_check", doubt))
+        for note in self._notes.before_and_since(first_line):
             session.note(note.kind, note.line, note.text)
         return session
-
-    def _standing_doubts(self, first_line: int) -> list[Note]:
-        """Arms whose code was in doubt before the line, and is at it."""
-        latest = {note.kind[-1]: note for note in self._notes if _is_verdict(note, before=first_line)}
-        doubts = [note for note in latest.values() if note.kind in DOUBTFUL.values()]
-        return [replace(note, line=first_line) for note in doubts]
 
     def _close(self, session: Session, error: Exception | None = None) -> None:
         for name, arm in self._arms.items():
@@ -402,7 +342,7 @@ class Recorder:
                 error = error or another
         self._session = None
         self._publish(session)
-        self._closing = session, self._disk.submit(self._in_store, session.close, error)
+        self._closing = session, self._disk.submit(self._waits.elsewhere, session.close, error)
 
     # ---- tags and lines
 
@@ -459,7 +399,7 @@ class Recorder:
             full = f"the ring of arm {name} was full at line {line}"
             session.cut(line, f"too slow to write: {full}{self._held_up}")
         self._count_overrun(name, block, session)
-        with self._at_disk():
+        with self._waits.loop():
             written = session.take(name, block, hurry=arm.ring.fill > _CALM_BLOCKS)
         if written:
             end_line = session.books[name].next_line
@@ -489,7 +429,7 @@ class Recorder:
             return
         try:
             if self._session is not None:
-                with self._at_disk():
+                with self._waits.loop():
                     self._session.give_back(name)
         finally:
             self._count(name, lent.first_line, lent.end_line)
@@ -500,23 +440,6 @@ class Recorder:
         """For an end reason."""
         longest_s = self._hold_ups.longest_s
         return f", after {longest_s:.1f} s without an answer of the disk" if longest_s >= 1 else ""
-
-    @contextmanager
-    def _at_disk(self) -> Iterator[None]:
-        """The loop waits for the disk, which may take its time."""
-        self._counters["disk_since_ns"] = time.monotonic_ns()
-        try:
-            yield
-        finally:
-            self._counters["disk_since_ns"] = 0
-
-    def _in_store(self, work: Callable[..., T], *args: Any) -> T:
-        """In the other thread: do what is told when it begins and ends."""
-        self._counters["store_since_ns"] = time.monotonic_ns()
-        try:
-            return work(*args)
-        finally:
-            self._counters["store_since_ns"] = 0
 
     def _may_go(self, ring: Ring, block: RingBlock) -> bool:
         """Nothing is gained by letting the block wait any longer for its tag."""
@@ -556,7 +479,7 @@ class Recorder:
     def _commit_now_and_then(self, session: Session) -> None:
         begun = time.monotonic()
         if begun >= self._commit_s:
-            with self._at_disk():
+            with self._waits.loop():
                 session.commit()
             ended = time.monotonic()
             self._commit_s = ended + max(_COMMIT_INTERVAL_S, (_COMMIT_SHARE - 1) * (ended - begun))
@@ -570,8 +493,3 @@ class Recorder:
         for name, book in session.books.items():
             counters[f"rows_{name}"] = rows[name]
             counters[f"missing_{name}"] = book.missing.total()
-
-
-def _is_verdict(note: Note, *, before: int) -> bool:
-    """On the code of lines from before the line ``before`` on, and so of that line as well."""
-    return note.kind in CODE_EVENTS and note.line < before

@@ -8,17 +8,22 @@ the arms while nothing is recorded.
 from __future__ import annotations
 
 import time
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from acquire.lines import ARMS
 from acquire.store import RunCondition
 from acquire.stream.kept import Kept
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
     from acquire.stream.ring import Ring
     from acquire.stream.session import Session
     from acquire.stream.shared import Counters
+
+T = TypeVar("T")
 
 NEARLY_FULL = 0.9
 """Of a ring: the recording is ended while the rest can still take what comes."""
@@ -65,6 +70,32 @@ class Backlog:
         if not self._caught_up or self._taken <= max(1, slots // PATIENCE_SHARE):
             return False
         return fill >= max(self._first_fill, NEARLY_FULL * slots)
+
+
+class DiskWaits:
+    """Publishes since when the disk is waited for: by a process's loop, and by a thread beside it."""
+
+    def __init__(self, counters: Counters) -> None:
+        self._counters = counters
+
+    @contextmanager
+    def loop(self) -> Iterator[None]:
+        """The loop itself waits, and shows no other life."""
+        with self._publishing("disk_since_ns"):
+            yield
+
+    def elsewhere(self, work: Callable[..., T], *args: Any) -> T:
+        """Do what another thread was given."""
+        with self._publishing("store_since_ns"):
+            return work(*args)
+
+    @contextmanager
+    def _publishing(self, name: str) -> Iterator[None]:
+        self._counters[name] = time.monotonic_ns()
+        try:
+            yield
+        finally:
+            self._counters[name] = 0
 
 
 class HoldUps:

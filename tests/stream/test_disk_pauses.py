@@ -244,6 +244,28 @@ def test_what_is_closed_during_a_pause_can_be_recovered(tmp_path: Path) -> None:
     check_lines(tmp_path / "r.zarr")
 
 
+def test_a_recorder_that_is_killed_during_a_pause_is_replaced_and_no_line_is_lost(tmp_path: Path) -> None:
+    """Its successor finds a disk that does not answer either, and waits like it."""
+    disk = PausingDisk(tmp_path / "gate", "pages")
+    with recording(tmp_path / "r.zarr", disk, ring_slots=4000, goes_on=True) as capture:
+        disk.gate.touch()
+        until(disk.held.exists, "a write that is held up")
+        recorder = capture.pids["recorder"]
+        assert recorder is not None
+        os.kill(recorder, signal.SIGKILL)
+        until(lambda: capture.poll().path == str(tmp_path / "r-2.zarr"), "a successor")
+        disk.gate.unlink()
+        until(lambda: capture.poll().committed_lines > 500, "committed lines")
+        capture.stop()
+        seen = until_done(capture)
+        assert seen.condition == "GOOD"
+        recover(tmp_path / "r.zarr")
+        one, two = open_recording(tmp_path / "r.zarr"), check_whole(tmp_path / "r-2.zarr")
+        check_lines(one.path)
+        assert one.first_line < two.first_line <= one.first_line + one.lines
+    assert all(account.balanced and not account.lost for account in capture.poll().accounts.values())
+
+
 def test_a_disk_is_not_waited_for_longer_than_the_rig_allows(tmp_path: Path) -> None:
     disk = PausingDisk(tmp_path / "gate", "pages")
     with recording(tmp_path / "r.zarr", disk, patience_s=1.0) as capture:

@@ -19,7 +19,8 @@ from acquire.store import RunCondition, Suspect, open_recording, suspect_lines
 from acquire.store.suspect import DOUBTFUL, VERIFIED
 from acquire.stream.losses import Cause, Loss, LossLog
 from acquire.stream.messages import Began, Begin, End, Note, Refused, RunStarted, Sealed
-from acquire.stream.recorder import COUNTERS, Recorder, RecorderPlan
+from acquire.stream.recorder import Recorder
+from acquire.stream.recorder_plan import COUNTERS, RecorderPlan
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.shared import Counters
 from acquire.stream.window import NOW, Window

@@ -1,0 +1,63 @@
+"""A recording that is being created: its lines, and what happened before that belongs to it."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from acquire.store.suspect import CODE_EVENTS, DOUBTFUL
+from acquire.stream.messages import Note
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future
+
+    from acquire.store import RecordingWriter
+    from acquire.stream.messages import Begin
+    from acquire.stream.window import Span
+
+_MOST_NOTES = 1024
+"""Events that are remembered for recordings which begin later and hold their lines."""
+
+
+@dataclass(frozen=True, slots=True)
+class Opening:
+    """A recording that is being created, for the lines in ``span``; None: for those that come then."""
+
+    begin: Begin
+    span: Span | None
+    writer: Future[RecordingWriter]
+    cancelled: bool = False
+
+    def is_wanted(self, first_line: int) -> bool:
+        """Nobody has cancelled it, and it would not begin where it should have ended."""
+        return not self.cancelled and (self.begin.end_line is None or first_line < self.begin.end_line)
+
+    def lines_from(self, first_line: int) -> int | None:
+        """How many lines it takes from there on; None: until it is told to end."""
+        if self.span is not None:
+            return None if self.span.end_line is None else self.span.end_line - first_line
+        return self.begin.lines if self.begin.end_line is None else self.begin.end_line - first_line
+
+
+class Notes:
+    """What happened lately, at which lines."""
+
+    def __init__(self) -> None:
+        self._notes: deque[Note] = deque(maxlen=_MOST_NOTES)
+
+    def add(self, note: Note) -> None:
+        self._notes.append(note)
+
+    def before_and_since(self, first_line: int) -> list[Note]:
+        """For a recording that begins there: everything, and first of all which arms' code is in doubt there,
+        since it was in doubt before.
+        """
+        latest = {note.kind[-1]: note for note in self._notes if is_verdict(note, before=first_line)}
+        doubts = [note for note in latest.values() if note.kind in DOUBTFUL.values()]
+        return [*(replace(note, line=first_line) for note in doubts), *self._notes]
+
+
+def is_verdict(note: Note, *, before: int) -> bool:
+    """On the code of lines from before the line ``before`` on, and so of that line as well."""
+    return note.kind in CODE_EVENTS and note.line < before
