@@ -208,6 +208,11 @@ def _cycle(path: Path, load: Load, chance: random.Random, found: Soak, cycle_s: 
     return capture.poll()
 
 
+def has_gone_on(now: CaptureStatus, before: CaptureStatus) -> bool:
+    """In a further segment; or it is over, for another reason that the books tell."""
+    return now.done or (now.path != before.path and now.committed_lines > 0)
+
+
 def _stop_recorder(capture: Capture, chance: random.Random, *, until_full: bool) -> None:
     pid, before = capture.pids["recorder"], capture.poll()
     assert pid is not None
@@ -221,7 +226,7 @@ def _stop_recorder(capture: Capture, chance: random.Random, *, until_full: bool)
     time.sleep(chance.uniform(0, LONGEST_PAUSE_S))
     os.kill(pid, signal.SIGCONT)
     if until_full:
-        _until(lambda: capture.poll().path != before.path and capture.poll().committed_lines > 0)
+        _until(lambda: has_gone_on(capture.poll(), before))
 
 
 def _throw(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -46,12 +47,12 @@ def committed(status: Status) -> int:
 
 
 def waits(client: Client, text: str) -> Callable[[], bool]:
-    """What is waited for is told; meanwhile nothing is given up."""
+    """What is waited for is told, as ``text``; meanwhile nothing is given up."""
 
     def told() -> bool:
         status = client.status()
         assert (status.state, status.fault) == (State.RECORDING, None)
-        return text in (status.waiting or "")
+        return re.search(text, status.waiting or "") is not None
 
     return told
 
@@ -88,7 +89,7 @@ def test_a_recorder_that_pauses_for_seconds_is_waited_for(tmp_path: Path) -> Non
     with recording(tmp_path, path, LONG_RING) as (daemon, client):
         pid = client.status().processes["recorder"]
         os.kill(pid, signal.SIGSTOP)
-        until(waits(client, "for 5 s; the rings hold "), "the words")
+        until(waits(client, "for ([5-9]|1[0-9]) s; the rings hold "), "the words")
         assert "waiting" in daemon("status").out
         os.kill(pid, signal.SIGCONT)
         until(lambda: client.status().waiting is None, "the end of the pause")
@@ -124,23 +125,28 @@ def test_a_recorder_that_pauses_for_long_costs_no_recorded_line(tmp_path: Path) 
 def test_a_disk_that_freezes_is_waited_for_and_the_recording_goes_on(tmp_path: Path) -> None:
     """Frozen once for as long as the rings hold, then for longer."""
     with frozen_disk.mounted(tmp_path) as disk:
-        path, second = disk.path / "x.zarr", disk.path / "x-2.zarr"
+        path = disk.path / "x.zarr"
         with recording(tmp_path, path, SMALL_DISK) as (_, client):
-            for text in ("the disk has not answered for 2 s; the rings hold ", "the rings are full"):
+            for text in (r"the disk has not answered for \d+ s; the rings hold ", "the rings are full"):
                 disk.freeze()
                 until(waits(client, text), "the words")
                 disk.thaw()
                 until(lambda: client.status().waiting is None, "the end of the pause")
-            until(lambda: (now := client.status().recording) is not None and now.path == second, "a segment")
+            until(lambda: (now := client.status().recording) is not None and now.path != path, "a segment")
             until(lambda: committed(client.status()) > 300, "committed lines")
             status = ended(client)
-        one, two = open_recording(path), open_recording(second)
-        for found in (one, two):
-            check_whole(found)
-        assert (one.attrs["run_condition"], two.attrs["run_condition"]) == ("INTERRUPTED", "GOOD")
-        assert [segment.path for segment in one.segments] == [second]
-        assert one.lines > 60_000  # both pauses are in it, as far as the rings held them
-        check_books(status, one, two)
+        assert status.fault is None
+        first = open_recording(path)
+        parts = [first, *first.segments]
+        for part in parts:
+            check_whole(part)
+        assert [part.attrs["run_condition"] for part in parts] == ["INTERRUPTED"] * (len(parts) - 1) + [
+            "GOOD"
+        ]
+        assert (
+            sum(part.lines for part in parts) > 60_000
+        )  # what came in both pauses, as far as the rings held it
+        check_books(status, *parts)
 
 
 @pytest.mark.needs_freeze

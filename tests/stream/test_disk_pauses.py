@@ -6,7 +6,9 @@ before the first line that they had no room for, sealed when the disk answers, a
 
 from __future__ import annotations
 
+import itertools
 import os
+import re
 import signal
 import threading
 from collections.abc import Iterator
@@ -28,8 +30,11 @@ from acquire.store.files import DISK, Disk
 from acquire.store.recover import recover
 from acquire.stream import Capture, CaptureStatus
 
-LOAD = Load(256, "uint16", 8000.0, substeps=2, stages=8, block_lines=64, ring_slots=400, chunk_lines=256)
-"""A ring of 3.2 s: a busy host has a second or two to come back after a pause."""
+LOAD = Load(64, "uint16", 8000.0, substeps=2, stages=8, block_lines=64, ring_slots=4000, chunk_lines=256)
+"""A ring of 32 s: a busy host takes its time to come back after a pause."""
+WORDS = r"the disk has not answered for \d+ s; the rings hold \d+ s more"
+SHORT_RING = 400
+"""Slots of one that is full after 3.2 s."""
 
 
 @contextmanager
@@ -42,11 +47,6 @@ def recording(
         capture.start(path, spec, lines)
         until(lambda: capture.poll().committed_lines > 500, "committed lines")
         yield capture
-
-
-def fill(capture: Capture) -> float:
-    seen = capture.poll()
-    return min(ring["fill"] / ring["slots"] for ring in seen.ring.values())
 
 
 def overflow(capture: Capture) -> bool:
@@ -64,7 +64,7 @@ def check_whole(path: Path) -> Recording:
     found = open_recording(path)
     assert found.state == "sealed"
     assert verify(path).intact
-    check_lines(path)
+    check_lines(path, LOAD)
     for arm in ARMS:
         book = found.attrs["ledger"][arm]
         assert (book["balanced"], book["stored"], book["missing"]) == (True, found.lines, {})
@@ -87,14 +87,9 @@ def test_a_pause_is_waited_out_as_long_as_the_rings_hold(tmp_path: Path, at: str
     with recording(tmp_path / "r.zarr", disk, fsync=fsync, goes_on=True) as capture:
         for _ in range(2):
             disk.gate.touch()
-            until(
-                lambda: "the disk has not answered for 1 s; the rings hold " in capture.poll().waiting,
-                "words",
-            )
-            assert fill(capture) > 0.2
+            until(lambda: re.match(WORDS, capture.poll().waiting), "words")
             disk.gate.unlink()
-            until(lambda: fill(capture) < 0.2, "rings that empty")
-        assert capture.poll().waiting == ""
+            until(lambda: capture.poll().waiting == "", "the end of the pause")
         capture.stop()
         seen = until_done(capture)
         assert (seen.condition, seen.end_reason, seen.ledger["tainted_by"]) == ("GOOD", "stopped", {})
@@ -104,9 +99,9 @@ def test_a_pause_is_waited_out_as_long_as_the_rings_hold(tmp_path: Path, at: str
 
 @pytest.mark.parametrize("how", ["pages", "commit", "SIGSTOP"])
 def test_after_a_longer_pause_the_recording_goes_on_in_a_further_segment(tmp_path: Path, how: str) -> None:
-    path, second = tmp_path / "r.zarr", tmp_path / "r-2.zarr"
+    path = tmp_path / "r.zarr"
     disk = PausingDisk(tmp_path / "gate", how)
-    with recording(path, disk, goes_on=True) as capture:
+    with recording(path, disk, ring_slots=SHORT_RING, goes_on=True) as capture:
         recorder = capture.pids["recorder"]
         assert recorder is not None
         if how == "SIGSTOP":
@@ -114,37 +109,43 @@ def test_after_a_longer_pause_the_recording_goes_on_in_a_further_segment(tmp_pat
         else:
             disk.gate.touch()
         until(lambda: overflow(capture), "full rings")
-        seen = capture.poll()
-        assert (seen.recording, seen.draining, seen.done, seen.fault) == (True, False, False, None)
-        assert "the rings are full: what comes now belongs to no recording" in seen.waiting
+        until(
+            lambda: "the rings are full: what comes now belongs to no rec" in capture.poll().waiting, "words"
+        )
+        check_records(capture)
+        held_up = capture.poll().path
         disk.gate.unlink(missing_ok=True)
         os.kill(recorder, signal.SIGCONT)
-        until(lambda: capture.poll().path == str(second), "a segment")
+        until(lambda: capture.poll().path != held_up, "a segment")
         until(lambda: capture.poll().committed_lines > 500, "committed lines")
-        seen = capture.poll()
-        assert (seen.recording, seen.draining, seen.done, seen.fault) == (True, False, False, None)
+        check_records(capture)
         assert capture.pids["recorder"] == recorder
         capture.stop()
-        seen = until_done(capture)
-        assert (seen.condition, seen.end_reason) == ("GOOD", "stopped")
-        one, two = check_whole(path), check_whole(second)
-        assert one.attrs["run_condition"] == "INTERRUPTED"
-        assert one.attrs["end_reason"].startswith("too slow to write: ")
-        assert "without an answer of the disk" in one.attrs["end_reason"]
-        assert one.lines >= 400 * 64
-        assert [segment.path for segment in one.segments] == [second]
-        assert two.attrs["run_id"] == one.attrs["run_id"]
-        outage = two.attrs["segment"]["outage"]
-        assert outage["after_line"] == one.first_line + one.lines - 1
-        assert outage["lines"] == two.first_line - (one.first_line + one.lines) > 0
-        assert [event.kind for event in two.events][:1] == ["started"]
-        assert any(event.kind == "resumed" for event in two.events)
-        check_books(capture, path, second)
+        assert until_done(capture).end_reason == "stopped"
+        first = check_whole(path)
+        parts = [first, *(check_whole(part.path) for part in first.segments)]  # a busy host may need several
+        assert [part.path.name for part in parts[:2]] == ["r.zarr", "r-2.zarr"]
+        for one, two in itertools.pairwise(parts):
+            assert one.attrs["run_condition"] == "INTERRUPTED"
+            assert one.attrs["end_reason"].startswith("too slow to write: ")
+            assert two.attrs["run_id"] == one.attrs["run_id"]
+            outage = two.attrs["segment"]["outage"]
+            assert outage["after_line"] == one.first_line + one.lines - 1
+            assert outage["lines"] == two.first_line - (one.first_line + one.lines) > 0
+            assert any(event.kind == "resumed" for event in two.events)
+        assert sum(part.lines for part in parts) >= SHORT_RING * 64
+        check_books(capture, *(part.path for part in parts))
+
+
+def check_records(capture: Capture) -> None:
+    """It does not seem to end."""
+    seen = capture.poll()
+    assert (seen.recording, seen.draining, seen.done, seen.fault) == (True, False, False, None)
 
 
 def test_a_recording_that_must_not_go_on_ends_there(tmp_path: Path) -> None:
     disk = PausingDisk(tmp_path / "gate", "pages")
-    with recording(tmp_path / "r.zarr", disk) as capture:
+    with recording(tmp_path / "r.zarr", disk, ring_slots=SHORT_RING) as capture:
         disk.gate.touch()
         until(lambda: overflow(capture), "full rings")
         disk.gate.unlink()
@@ -161,7 +162,7 @@ def test_a_stop_during_a_pause_ends_where_it_was_asked_for(tmp_path: Path) -> No
         before = capture.poll().lines["a"]["delivered"]
         capture.stop()
         after = capture.poll().lines["a"]["delivered"]
-        until(lambda: overflow(capture), "full rings")
+        until(lambda: capture.poll().lines["a"]["delivered"] > after + 2000, "lines that are not wanted")
         disk.gate.unlink()
         seen = until_done(capture)
         assert (seen.condition, seen.end_reason) == ("GOOD", "stopped")
@@ -171,11 +172,11 @@ def test_a_stop_during_a_pause_ends_where_it_was_asked_for(tmp_path: Path) -> No
 
 
 def test_a_budget_that_ends_during_the_pause_is_kept(tmp_path: Path) -> None:
-    """The rings hold the last line, or the recording would end after it: there is nothing to go on with."""
+    """The rings hold the last line, and what comes after it is not wanted."""
     disk = PausingDisk(tmp_path / "gate", "commit")
     with recording(tmp_path / "r.zarr", disk, 12_000, goes_on=True) as capture:
         disk.gate.touch()
-        until(lambda: overflow(capture), "full rings")
+        until(lambda: capture.poll().lines["b"]["delivered"] > 40_000, "the last line and more")
         disk.gate.unlink()
         seen = until_done(capture)
         assert (seen.condition, seen.recorded_lines) == ("GOOD", 12_000)
@@ -241,13 +242,13 @@ def test_what_is_closed_during_a_pause_can_be_recovered(tmp_path: Path) -> None:
     recover(tmp_path / "r.zarr")
     found = open_recording(tmp_path / "r.zarr")
     assert (found.state, found.lines >= acknowledged) == ("sealed", True)
-    check_lines(tmp_path / "r.zarr")
+    check_lines(tmp_path / "r.zarr", LOAD)
 
 
 def test_a_recorder_that_is_killed_during_a_pause_is_replaced_and_no_line_is_lost(tmp_path: Path) -> None:
     """Its successor finds a disk that does not answer either, and waits like it."""
     disk = PausingDisk(tmp_path / "gate", "pages")
-    with recording(tmp_path / "r.zarr", disk, ring_slots=4000, goes_on=True) as capture:
+    with recording(tmp_path / "r.zarr", disk, goes_on=True) as capture:
         disk.gate.touch()
         until(disk.held.exists, "a write that is held up")
         recorder = capture.pids["recorder"]
@@ -261,7 +262,7 @@ def test_a_recorder_that_is_killed_during_a_pause_is_replaced_and_no_line_is_los
         assert seen.condition == "GOOD"
         recover(tmp_path / "r.zarr")
         one, two = open_recording(tmp_path / "r.zarr"), check_whole(tmp_path / "r-2.zarr")
-        check_lines(one.path)
+        check_lines(one.path, LOAD)
         assert one.first_line < two.first_line <= one.first_line + one.lines
     assert all(account.balanced and not account.lost for account in capture.poll().accounts.values())
 

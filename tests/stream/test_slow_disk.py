@@ -71,12 +71,12 @@ def until_done(capture: Capture, path: Path) -> tuple[CaptureStatus, int]:
     return seen, acknowledged
 
 
-def check_lines(path: Path) -> None:
+def check_lines(path: Path, load: Load = LOAD) -> None:
     """Every row is its line, and none is missing."""
     recording = open_recording(path)
     assert not recording.gaps
     for arm in ARMS:
-        expected = Pattern(arm, LOAD.pixels, LOAD.dtype, 4095).lines(recording.first_line, recording.lines)
+        expected = Pattern(arm, load.pixels, load.dtype, 4095).lines(recording.first_line, recording.lines)
         np.testing.assert_array_equal(recording.camera(arm).lines[:], expected)
         assert not recording.camera(arm).flags[:].any() & 1
 

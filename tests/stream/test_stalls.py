@@ -13,7 +13,7 @@ from acquire.stream.losses import Cause
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.session import Session
 from acquire.stream.shared import Counters
-from acquire.stream.stalls import Arm, Heartbeat, find_stall
+from acquire.stream.stalls import HELD_UP_S, Arm, Heartbeat, HoldUps, find_stall
 
 LIMIT_S, SKEW = 10.0, 1000
 
@@ -117,3 +117,18 @@ def test_a_counter_that_stands_still_shows_no_life(counters: Counters) -> None:
 def test_the_watchers_own_absence_is_not_held_against_the_watched(counters: Counters) -> None:
     heart = Heartbeat(counters, "beats")
     assert heart.look(time.monotonic() + 1000) < 1
+
+
+def test_a_hold_up_counts_until_lines_that_came_after_it_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = [1000.0]
+    monkeypatch.setattr("acquire.stream.stalls.time.monotonic", lambda: clock[0])
+    found = HoldUps()
+    for step_s, longest_s in ((HELD_UP_S / 2, 0.0), (3.0, 3.0), (0.1, 3.0), (1.0, 3.0)):
+        clock[0] += step_s
+        found.look()
+        assert found.longest_s == pytest.approx(longest_s)
+    assert found.over_s == clock[0]
+    found.took(clock[0] - 2.0)
+    assert found.longest_s == pytest.approx(3.0)
+    found.took(clock[0] + 0.1)
+    assert found.longest_s == 0.0
