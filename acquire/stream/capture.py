@@ -337,7 +337,7 @@ class Capture:
         since_ns = self._counters[RECORDER]["store_since_ns"]
         if since_ns and (store_s := time.monotonic() - since_ns / 1e9) > TOLD_S:
             return f"the disk has been at work for {store_s:.0f} s to create or seal a recording"
-        if why := supervisor.resuming:
+        if why := supervisor.resumption.why:
             return f"the recording goes on in a further segment when the disk lets it: {why}"
         return ""
 

@@ -73,6 +73,7 @@ class Supervisor:
     sealed : how the latest recording ended
     fault : what failed first
     path : where the latest recording is: not where it was begun, if its recorder was killed meanwhile
+    resumption : when a recording that the disk has ended goes on, and why it has not yet
     """
 
     def __init__(
@@ -112,7 +113,7 @@ class Supervisor:
         self._orphans: list[Orphan] = []
         self._kept: dict[str, deque[tuple[int, int]]] = {arm: deque(maxlen=_MOST_KEPT) for arm in ARMS}
         self._going_on = False
-        self._resumption = Resumption()
+        self.resumption = Resumption()
         self._cut_short: Sealed | None = None
         self._hung: str | None = None
         self._last_words: dict[str, str] = {}
@@ -129,11 +130,6 @@ class Supervisor:
     def silent_s(self) -> float:
         """How long the recorder has shown no life."""
         return self._loop.still_s
-
-    @property
-    def resuming(self) -> str:
-        """Why a recording that the disk ended has not gone on yet, in words; "" where it has."""
-        return self._resumption.why
 
     @property
     def _committed_lines(self) -> int:
@@ -192,7 +188,7 @@ class Supervisor:
         """Have the recorder begin; returns when it has. Raises what it refuses with."""
         with self._news:
             self.began = self.sealed = self._refused = self._begin = self._end_reason = self._cut_short = None
-            self._resumption = Resumption()
+            self.resumption = Resumption()
             self._asked = message
             self._workers[RECORDER].post(message)
             self._news.wait_for(lambda: self.began or self._refused or self.fault, _ANSWER_S)
@@ -429,7 +425,7 @@ class Supervisor:
                     self._succession.ready(name)
                 case Began():
                     self.began, self._going_on, self._cut_short = message, False, None
-                    self._resumption.began(time.monotonic())
+                    self.resumption.began(time.monotonic())
                     self.path = self._begin.path if self._begin else self.path
                     if self._end_reason is not None:
                         self._workers[RECORDER].post(End(self._end_reason))
@@ -449,7 +445,7 @@ class Supervisor:
     def _take_refusal(self, name: str, refused: Refused, error: AcquireError) -> None:
         """Of a first recording, or of one that goes on after a disk's trouble or a recorder's death."""
         if self._cut_short is not None:
-            self._resumption.ended(time.monotonic(), error.message)
+            self.resumption.ended(time.monotonic(), error.message)
         elif self._begin is None:
             self._refused = refused
         else:
@@ -468,7 +464,7 @@ class Supervisor:
             self.sealed = sealed
             return
         self._begin, self._cut_short = following, sealed
-        self._resumption.ended(time.monotonic(), sealed.end_reason)
+        self.resumption.ended(time.monotonic(), sealed.end_reason)
 
     def _note_kept(self) -> None:
         if self.began is None:
@@ -480,7 +476,7 @@ class Supervisor:
     def _resume_when_due(self) -> None:
         """Have a recording that the disk ended go on in a further segment."""
         with self._news:
-            if self._begin is None or not self._resumption.is_due(time.monotonic()):
+            if self._begin is None or not self.resumption.is_due(time.monotonic()):
                 return
             self._begin = once_more(self._begin)
         self._workers[RECORDER].post(self._begin)
@@ -489,7 +485,7 @@ class Supervisor:
         """Nobody wants the further segment any more that has not begun yet."""
         if self._cut_short is not None:
             self.sealed, self._cut_short = self._cut_short, None
-            self._resumption = Resumption()
+            self.resumption = Resumption()
             self._workers[RECORDER].post(Cancel())
             self._news.notify_all()
 
