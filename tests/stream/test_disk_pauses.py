@@ -30,7 +30,7 @@ from acquire.store.files import DISK, Disk
 from acquire.store.recover import recover
 from acquire.stream import Capture, CaptureStatus
 
-LOAD = Load(64, "uint16", 8000.0, substeps=2, stages=8, block_lines=64, ring_slots=4000, chunk_lines=256)
+LOAD = Load(64, "uint16", 8000.0, substeps=2, stages=8, block_lines=64, ring_slots=4000, chunk_lines=512)
 """A ring of 32 s: a busy host takes its time to come back after a pause."""
 WORDS = r"the disk has not answered for \d+ s; the rings hold \d+ s more"
 SHORT_RING = 400
