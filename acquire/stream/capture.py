@@ -428,7 +428,7 @@ class Capture:
         if supervisor is None or not supervisor.recording:
             return
         self._workers[RECORDER].post(Interrupt("the capture was closed", ARMS, Cause.INTERRUPTED))
-        committed = -1
+        committed = self._counters[RECORDER]["committed"]
         while not supervisor.wait_sealed(time.monotonic() + timeout_s):
             if committed == (committed := self._counters[RECORDER]["committed"]):
                 raise DataError("the recording could not be sealed in time", hint="recover it")

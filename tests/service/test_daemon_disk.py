@@ -163,7 +163,7 @@ def test_a_daemon_ends_although_its_disk_does_not_answer(tmp_path: Path) -> None
             acknowledged = committed(client.status())
             children = daemon.children()
             daemon.process.send_signal(signal.SIGTERM)
-            daemon.process.wait(90)
+            daemon.process.wait(200)
             disk.thaw()
             until_gone(children)
         other = Daemon(again, SMALL_DISK, f"recording.directory='{disk.path}'")
