@@ -108,8 +108,8 @@ DEVICES: dict[str, Callable[[], tuple[Any, Any]]] = {
 def open_arrays(device: str = "cpu", dtype: str = "float32") -> Arrays:
     """Arrays on a device; UsageError where there is no such device or dtype."""
     if dtype not in DTYPES:
-        raise UsageError(f"dtype {dtype!r}", possible=", ".join(DTYPES))
+        raise UsageError(f"dtype {dtype!r} is not known", possible=", ".join(DTYPES))
     if device not in DEVICES:
-        raise UsageError(f"device {device!r}", possible=", ".join(DEVICES))
+        raise UsageError(f"device {device!r} is not known", possible=", ".join(DEVICES))
     xp, where = DEVICES[device]()
     return Arrays(xp, where, dtype)

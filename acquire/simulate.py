@@ -116,7 +116,7 @@ def simulate(
     interrupted, leaves a sealed recording that says so.
     """
     if lines < 1:
-        raise UsageError(f"simulation of {lines} lines", possible="1 or more")
+        raise UsageError(f"a simulation of {lines} lines is not possible", possible="1 or more")
     code, bench = config.code.build(), bench_of(config, scene)
     cameras = {arm: bench.camera(arm, code) for arm in ARMS}
     for camera in cameras.values():

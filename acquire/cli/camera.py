@@ -152,7 +152,11 @@ class _Bench:
 
 def _check_out(path: Path) -> None:
     if path.suffix.lower() not in (".png", ".npy"):
-        raise UsageError(f"snapshot to {path}", possible=".png, .npy")
+        raise UsageError(
+            f"snapshot to {path}: its suffix names no format",
+            possible=".png, .npy",
+            hint=f"--out {path.with_suffix('.png')}",
+        )
     if path.exists():
         raise UsageError(f"snapshot to {path}: it exists and stays untouched", hint="--out with a new file")
     if not path.absolute().parent.is_dir():

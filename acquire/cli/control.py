@@ -147,7 +147,7 @@ def status(
 
     waits = {SEALED_WORD: SEALED, **{str(state): frozenset({state}) for state in State}}
     if wait is not None and wait not in waits:
-        raise UsageError(f"status --wait {wait}", possible=", ".join(waits))
+        raise UsageError(f"--wait {wait} is no state", possible=", ".join(waits))
     with _daemon(socket) as daemon:
         _show(daemon.status() if wait is None else daemon.wait(waits[wait], timeout), json)
 

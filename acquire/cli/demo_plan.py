@@ -128,7 +128,7 @@ def _check_out(out: Path) -> None:
 def _check_budgets(plan: DemoPlan) -> None:
     for budget_s in (plan.budget_s, plan.twist_budget_s):
         if budget_s is not None and not budget_s > 0:
-            raise UsageError(f"demo with a budget of {budget_s} s", possible="more than 0")
+            raise UsageError(f"a budget of {budget_s} s is out of range", possible="more than 0")
 
 
 def _check_cameras(rig: RigConfig) -> None:
@@ -145,9 +145,13 @@ def _check_cameras(rig: RigConfig) -> None:
 
 def _check_rig(plan: DemoPlan, rig: RigConfig) -> None:
     if rig.trigger.driver not in ("simulated", "rtl"):
-        raise UsageError(f"demo with trigger driver {rig.trigger.driver!r}", possible="'simulated', 'rtl'")
+        raise UsageError(
+            f"demo cannot use trigger driver {rig.trigger.driver!r}", possible="'simulated', 'rtl'"
+        )
     if rig.code.kind != "prbs":
-        raise UsageError(f"demo of {plan.config} with code.kind = {rig.code.kind!r}", possible="'prbs'")
+        raise UsageError(
+            f"demo cannot use {plan.config} with code.kind = {rig.code.kind!r}", possible="'prbs'"
+        )
     geometry = rig.geometry.segment(SEGMENT_LINES)
     if geometry.size % N_M or geometry.size < N_M * LEAST_SIDE:
         raise UsageError(

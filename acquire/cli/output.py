@@ -7,6 +7,7 @@ of somebody else's recording can neither forge a line nor send an escape sequenc
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import sys
@@ -49,15 +50,21 @@ def json_text(value: Any, indent: int | None = None) -> str:
 def print_facts(facts: Mapping[str, Any]) -> None:
     """``name  value`` per line, aligned; None is left out, several values stand side by side.
 
-    On a terminal what is longer than its line goes on below itself, by whole words; for other programs a
-    fact stays on one line.
+    What is longer than its line (`room`) goes on below itself, by whole words; for other programs a fact
+    stays on one line.
     """
     shown = {name: value for name, value in facts.items() if value is not None}
     width = max(map(len, shown), default=0)
-    columns = shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
     for name, value in shown.items():
-        for line in _wrapped(f"{name:<{width}}  {visible(_words(value))}", width + 2, columns):
+        for line in _wrapped(f"{name:<{width}}  {visible(_words(value))}", width + 2, room()):
             say(line)
+
+
+def room(*, err: bool = False) -> int:
+    """Columns of a line: those of the terminal, or what COLUMNS says for stdout; no limit in a pipe."""
+    terminal = (sys.stderr if err else sys.stdout).isatty()
+    asked = bool(os.environ.get("COLUMNS")) and not err
+    return shutil.get_terminal_size().columns if terminal or asked else sys.maxsize
 
 
 def _wrapped(text: str, indent: int, columns: int) -> list[str]:
@@ -83,10 +90,19 @@ def _words(value: Any) -> str:
 
 
 def print_table(columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
-    """A plain table, aligned; numbers to the right. Never cut: it is read by people and by grep."""
+    """A plain table, aligned; numbers to the right. Never cut: it is read by people and by grep.
+
+    What is wider than the line (`room`) is shown row by row, a cell in a line, and no word is broken.
+    """
     cells = [[visible(cell) for cell in row] for row in rows]
     titles = list(columns)
     widths = [max(map(len, column)) for column in zip(titles, *cells, strict=True)]
+    if sum(widths) + 2 * (len(widths) - 1) > room():
+        for number, row in enumerate(cells):
+            if number:
+                say()
+            print_facts({title: cell for title, cell in zip(titles, row, strict=True) if cell})
+        return
     right = [bool(cells) and all(row[i][:1].isdigit() for row in cells) for i in range(len(titles))]
     for line in (titles, *cells):
         padded = (
@@ -109,12 +125,13 @@ def print_error(error: AcquireError, *, as_json: bool) -> None:
         typer.echo(json_text({"error": about}), err=True)
         return
     first, *others = error.message.split("\n")
-    say(f"acquire: error: {first}", err=True)
-    for line in others:
-        say(f"  {line.strip()}", err=True)
-    for word, text in (("possible", error.possible), ("try", error.hint)):
-        if text:
-            say(f"  {word}: {text}", err=True)
+    paragraphs = [f"acquire: error: {first}", *(f"  {line.strip()}" for line in others)]
+    paragraphs += [
+        f"  {word}: {text}" for word, text in (("possible", error.possible), ("try", error.hint)) if text
+    ]
+    for paragraph in paragraphs:
+        for line in _wrapped(visible(paragraph), 4, room(err=True)):
+            say(line, err=True)
 
 
 def print_warning(text: str) -> None:

@@ -39,7 +39,7 @@ def paper(
     """
     chosen = list(dict.fromkeys(figures or NAMES))
     if wrong := [name for name in chosen if name not in NAMES]:
-        raise UsageError(f"figure {wrong[0]}", possible=", ".join(NAMES))
+        raise UsageError(f"figure {wrong[0]!r} is not known", possible=", ".join(NAMES))
     from acquire.cores import idle_cores, limit_blas
     from acquire.evaluate.paper import Studio, make
     from acquire.evaluate.paper.page import draw, summarise, write_page

@@ -95,7 +95,10 @@ def reconstruct(
     from acquire.store.delivery import check_new_place
 
     if out is None and not auto:
-        raise UsageError("reconstruct without --out", possible="--out NAME.zarr")
+        raise UsageError(
+            "reconstruct needs --out, where the video goes",
+            possible="--out NAME.zarr; --auto alone shows a plan",
+        )
     open_arrays(device if dask is None else "cpu", dtype)  # a cluster's devices are not here
     opened = open_recording(recording)
     asked = Asked(

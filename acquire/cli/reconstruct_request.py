@@ -87,9 +87,9 @@ def _learned(prepared: Prepared) -> str | None:
 
 def _requests(recording: Recording, asked: Asked) -> Prepared:
     if asked.ends not in ENDS:
-        raise UsageError(f"--ends {asked.ends}", possible="trusted, whole")
+        raise UsageError(f"--ends {asked.ends} is not known", possible="trusted, whole")
     if (asked.plan is not None) + bool(asked.segments) + asked.auto + asked.preview > 1:
-        raise UsageError("a plan, segments, --auto and --preview together", possible="one of them")
+        raise UsageError("--plan, --segment, --auto and --preview exclude each other", possible="one of them")
     selection, whole = _select(recording, asked), ENDS[asked.ends]
     if asked.preview:
         options = replace(asked.options, iterations=PREVIEW_ITERATIONS, bandwidth=PREVIEW_BANDWIDTH)
@@ -109,7 +109,7 @@ def parse_voxels(text: str) -> Voxels:
     """``3x4`` is N_m = 3, T_m = 4."""
     found = re.fullmatch(r"(\d+)[x×](\d+)", text)
     if found is None:
-        raise UsageError(f"voxels {text!r}", possible="NMxTM, as 3x1 or 1x820")
+        raise UsageError(f"voxels {text!r} cannot be read", possible="NMxTM, as 3x1 or 1x820")
     return Voxels(int(found[1]), int(found[2]))
 
 
@@ -132,7 +132,9 @@ def parse_duration_ns(text: str) -> int:
     """``52ms``, ``0.052 s``, ``300us``."""
     found = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)\s*(ns|us|ms|s)", text)
     if found is None:
-        raise UsageError(f"time {text!r}", possible="52ms, 0.052s, 300us")
+        raise UsageError(
+            f"time {text!r} cannot be read", possible="52ms, 0.052s, 300us, or UTC as 2026-01-31T12:00:00"
+        )
     return round(float(found[1]) * NS[found[2]])
 
 
@@ -141,7 +143,9 @@ def _select(recording: Recording, asked: Asked) -> Selection:
     if not timed:
         return by_lines(recording, asked.first_line, asked.lines)
     if asked.first_line is not None or asked.lines is not None:
-        raise UsageError("lines and times together", possible="--first-line and --lines, or --from and --to")
+        raise UsageError(
+            "lines and times exclude each other", possible="--first-line and --lines, or --from and --to"
+        )
     return by_time(recording, _after_ns(recording, asked.begin), _after_ns(recording, asked.end))
 
 

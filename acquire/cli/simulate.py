@@ -51,7 +51,9 @@ def simulate(
     from acquire.store.files import check_new_path
 
     if out is None and not explain:
-        raise UsageError("simulate without --out", possible="--out NAME.zarr, or --explain")
+        raise UsageError(
+            "simulate needs --out, where the recording goes", possible="--out NAME.zarr, or --explain"
+        )
     limit_blas(1)  # the arms share the cores
     shown = load_scene(scene)
     rig = load_rig(config or shown.rig, parse_settings(settings or []))
@@ -77,10 +79,10 @@ def simulate(
 
 def _line_count(rig: RigConfig, default: int, lines: int | None, duration: float | None) -> int:
     if lines is not None and duration is not None:
-        raise UsageError("simulate with --lines and --duration", possible="one of them")
+        raise UsageError("--lines and --duration exclude each other", possible="one of them")
     if duration is not None:
         if not duration > 0:
-            raise UsageError(f"simulate with --duration {duration}", possible="more than 0")
+            raise UsageError(f"--duration {duration} is out of range", possible="more than 0")
         return max(1, round(duration * rig.line_rate_hz))
     return default if lines is None else lines
 

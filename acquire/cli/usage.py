@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -20,13 +21,16 @@ _WordsError = next(
 )
 """What typer raises for words that it cannot take: click's, or the copy of click that typer brings."""
 
+NARROW = 80
+"""Columns that tables of options need."""
+_MARKUP = re.compile(r"\[(bold|/)\]")
 _EXTRA = re.compile(r"extra == ['\"](\w+)['\"]")
 
 
 def run(app: typer.Typer) -> int:
     """Run the command that the words name; its exit code. Raises UsageError for words that are wrong."""
     try:
-        code = app(standalone_mode=False)
+        code = _command(app)(standalone_mode=False)
     except typer.Abort:
         return EXIT_INTERRUPTED
     except _WordsError as error:
@@ -35,6 +39,23 @@ def run(app: typer.Typer) -> int:
             return UsageError.exit_code
         raise _as_ours(error) from error
     return code if isinstance(code, int) else 0
+
+
+def _command(app: typer.Typer) -> Any:
+    """The commands; on a narrow terminal with plain help, since tables would break words and cut names."""
+    command = typer.main.get_command(app)
+    if shutil.get_terminal_size().columns < NARROW:
+        _make_plain(command)
+    return command
+
+
+def _make_plain(command: Any) -> None:
+    command.rich_markup_mode = None
+    for name in ("help", "short_help", "epilog"):
+        text = getattr(command, name)
+        setattr(command, name, text and _MARKUP.sub("", text))
+    for below in getattr(command, "commands", {}).values():
+        _make_plain(below)
 
 
 def not_installed(error: ModuleNotFoundError) -> UsageError:

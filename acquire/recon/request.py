@@ -49,16 +49,25 @@ class Request:
 
     def __post_init__(self) -> None:
         if self.bandwidth is not None and not 0 < self.bandwidth <= 1:
-            raise UsageError(f"bandwidth {self.bandwidth}", possible="more than 0, up to 1 (frames' Nyquist)")
+            raise UsageError(
+                f"bandwidth {self.bandwidth} is out of range",
+                possible="more than 0, up to 1 (frames' Nyquist)",
+            )
         if self.tv_weight is not None and not 0 <= self.tv_weight < float("inf"):
-            raise UsageError(f"TV weight {self.tv_weight}", possible="a finite number of at least 0")
+            raise UsageError(
+                f"TV weight {self.tv_weight} is out of range", possible="a finite number of at least 0"
+            )
         if self.budget_s is not None and not self.budget_s > 0:
-            raise UsageError(f"budget of {self.budget_s} s", possible="more than 0")
+            raise UsageError(f"budget of {self.budget_s} s is out of range", possible="more than 0")
         if not is_integer(self.iterations) or self.iterations < 1:
-            raise UsageError(f"{self.iterations!r} iterations", possible="an integer of at least 1")
+            raise UsageError(
+                f"{self.iterations!r} iterations are not possible", possible="an integer of at least 1"
+            )
         for option, given in (("initial", self.initial), ("denoiser", self.denoiser)):
             if given is not None and self.solver != "admm":
-                raise UsageError(f"{option} for solver {self.solver!r}", possible="solver 'admm'")
+                raise UsageError(
+                    f"{option} for solver {self.solver!r} is not known", possible="solver 'admm'"
+                )
 
     def check_shapes(self, size: int, video_shape: tuple[int, int, int]) -> None:
         """Raise UsageError unless the given arrays are finite and fit the segment."""
@@ -69,9 +78,9 @@ class Request:
 def preset_iterations(solver: str, preset: str) -> int:
     """Most iterations of a preset; UsageError for names that are none."""
     if solver not in ITERATIONS:
-        raise UsageError(f"solver {solver!r}", possible=", ".join(ITERATIONS))
+        raise UsageError(f"solver {solver!r} is not known", possible=", ".join(ITERATIONS))
     if preset not in ITERATIONS[solver]:
-        raise UsageError(f"preset {preset!r}", possible=", ".join(ITERATIONS[solver]))
+        raise UsageError(f"preset {preset!r} is not known", possible=", ".join(ITERATIONS[solver]))
     return ITERATIONS[solver][preset]
 
 
@@ -79,6 +88,6 @@ def _check_array(what: str, given: NDArray[Any] | None, shape: tuple[int, ...]) 
     if given is None:
         return
     if np.shape(given) != shape:
-        raise UsageError(f"{what} of shape {np.shape(given)}", possible=f"{shape}")
+        raise UsageError(f"{what} of shape {np.shape(given)} does not fit", possible=f"{shape}")
     if not np.isfinite(given).all():
         raise UsageError(f"{what} with values that are not finite")

@@ -152,7 +152,7 @@ def open_pool(
     ``watch`` is called from inside a task where the caller has no time of its own (`Here`).
     """
     if workers is not None and workers < 1:
-        raise UsageError(f"{workers} workers", possible="1 or more")
+        raise UsageError(f"{workers} workers cannot solve anything", possible="1 or more")
     if cluster is not None:
         with _cluster(cluster) as pool:
             yield pool
@@ -183,7 +183,9 @@ def _cluster(address: str) -> Iterator[Cluster]:
     try:
         from distributed import Client
     except ModuleNotFoundError as error:
-        raise UsageError("--dask without dask.distributed", hint="pip install 'tdi-acquire[dask]'") from error
+        raise UsageError(
+            "--dask needs dask.distributed, which is not installed", hint="pip install 'tdi-acquire[dask]'"
+        ) from error
     try:
         client = Client(  # type: ignore[no-untyped-call]
             address, timeout=SCHEDULER_TIMEOUT_S, set_as_default=False

@@ -86,7 +86,7 @@ def by_lines(recording: Recording, first_line: int | None = None, lines: int | N
     end = whole.end_line if lines is None else first + lines
     if not whole.first_line <= first < end <= whole.end_line:
         have = f"lines {whole.first_line} to {whole.end_line - 1}" if recording.lines else "no lines yet"
-        raise UsageError(f"lines {first} to {end - 1} of {recording}", possible=have)
+        raise UsageError(f"lines {first} to {end - 1} of {recording} are not there", possible=have)
     return Selection(Stream(whole.stages, whole.substeps, first, end), Times.of(recording))
 
 
@@ -126,7 +126,9 @@ def in_glimpses(selection: Selection, voxels: Voxels, count: int) -> Request:
     length = (end - begin) // count
     if length < voxels.temporal_merge:
         most = (end - begin) // voxels.temporal_merge
-        raise UsageError(f"{count} glimpses of {selection.length(end - begin)}", possible=f"up to {most}")
+        raise UsageError(
+            f"{count} glimpses of {selection.length(end - begin)} are too many", possible=f"up to {most}"
+        )
     whole = Voxels(voxels.spatial_merge, length)
     stretches = tuple(Stretch(begin + i * length, begin + (i + 1) * length, whole) for i in range(count))
     glimpses = tuple(_glimpse(stream, stretch, voxels) for stretch in stretches)
@@ -159,7 +161,10 @@ def along_plan(selection: Selection, plan: ReconstructionPlan, grid: Voxels | No
         length = part.length_substeps(geometry.substeps, substep_s)
         if edge + (length or 1) > end:
             wanted, most = (selection.length(to - begin) for to in (edge + (length or 1), end))
-            raise UsageError(f"plan with {part.name or 'a segment'} to {wanted}", possible=f"{most} in all")
+            raise UsageError(
+                f"the plan goes beyond the lines, with {part.name or 'a segment'} to {wanted}",
+                possible=f"{most} in all",
+            )
         stop = end if length is None else edge + length
         stretches.append(Stretch(edge, stop, stream.evened(each, stop - edge)))
         edge = stop

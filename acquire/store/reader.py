@@ -174,7 +174,7 @@ class Recording:
     def camera(self, arm: str) -> CameraStream:
         """The arrays of arm ``"a"`` or ``"b"``."""
         if arm not in self.arms:
-            raise UsageError(f"arm {arm!r} of {self}", possible=", ".join(self.arms))
+            raise UsageError(f"{self} has no arm {arm!r}", possible=", ".join(self.arms))
         return self.arms[arm]
 
     def geometry_for(self, lines: int) -> Geometry:
@@ -204,7 +204,10 @@ class Recording:
         start, stop = self._rows(first_line, lines)
         geometry = self.geometry_for(lines)
         if (pixels := self.arms["a"].pixels) != geometry.stages:
-            raise UsageError(f"cut of lines with {pixels} pixels", possible=f"M = {geometry.stages} pixels")
+            raise UsageError(
+                f"lines with {pixels} pixels cannot be cut for reconstruction",
+                possible=f"M = {geometry.stages} pixels",
+            )
         stretches = self._fetched(start, stop)
         samples = np.empty((len(ARMS), lines, pixels), self.arms["a"].dtype)
         for arm, of_arm in zip(stretches.values(), samples, strict=True):
@@ -299,7 +302,7 @@ class Recording:
                 if self.lines
                 else "no lines yet"
             )
-            raise UsageError(f"cut of {lines} lines from line {first_line} on", possible=have)
+            raise UsageError(f"{lines} lines from line {first_line} on are not all there", possible=have)
         return start, start + lines
 
     def _camera_numbers(self, key: str) -> list[float]:

@@ -61,15 +61,16 @@ def hold(path: Path, first_line: int, count: int, why: str = "", disk: Disk = DI
     UsageError for a range that cannot be one.
     """
     if first_line < 0 or count < 1:
-        raise UsageError(f"hold of {count} lines from line {first_line}", possible="1 line or more")
+        raise UsageError(f"{count} lines from line {first_line} on cannot be held", possible="1 line or more")
     recording = open_recording(path)
     if recording.state == "sealed":
         raise UsageError(
-            f"hold of lines of {path}, which is sealed", possible="nothing of it is deleted any more"
+            f"{path} is sealed: no line of it need be held", possible="nothing of it is deleted any more"
         )
     if first_line + count <= recording.first_line:
         raise UsageError(
-            f"hold of lines {first_line} to {first_line + count - 1}", possible=f"{recording.first_line} on"
+            f"lines {first_line} to {first_line + count - 1} cannot be held: they came before the recording",
+            possible=f"{recording.first_line} on",
         )
     held = Hold(first_line, count, why)
     directory = _holds(path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -14,6 +15,7 @@ import typer
 
 from acquire import __version__
 from acquire.cli import app, control
+from acquire.cli.output import print_table
 from acquire.errors import EXIT_INTERRUPTED
 
 Cli = Callable[..., Any]
@@ -54,6 +56,67 @@ def test_wrong_words_are_exit_2(cli: Cli, words: list[str]) -> None:
     assert cli(*words).code == 2
 
 
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_help_fits_a_narrow_terminal_and_cuts_no_name(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
+    said = cli(*words, "--help").out
+    assert max(map(len, said.splitlines())) <= 60
+    assert not re.search(r"-…|-\.\.\.|\[/?(bold)?\]", said)
+    example = said[said.index("Example:") :].split()
+    assert example[: len(words) + 2] == ["Example:", "acquire", *words]
+
+
+@pytest.mark.parametrize(
+    ("words", "command", "message"),
+    [
+        (("stauts",), "acquire", "no such command 'stauts'"),
+        (("start", "--line", "5"), "acquire start", "start: no such option: --line"),
+        (("cut",), "acquire cut", "cut: missing argument 'RECORDING'"),
+        (("start", "--lines", "x"), "acquire start", "start: invalid value for '--lines'"),
+        (("trigger", "lod"), "acquire trigger", "trigger: no such command 'lod'"),
+    ],
+)
+def test_wrong_words_are_told_in_the_voice_of_all_errors(
+    cli: Cli, words: tuple[str, ...], command: str, message: str
+) -> None:
+    answer = cli(*words)
+    assert (answer.code, answer.out) == (2, "")
+    assert answer.err.startswith(f"acquire: error: {message}")
+    assert answer.err.endswith(f"  try: {command} --help\n")
+    error = json.loads(cli(*words, "--json").err)["error"]
+    assert error["message"].startswith(message)
+    assert (error["kind"], error["exit_code"], error["hint"]) == ("UsageError", 2, f"{command} --help")
+
+
+def test_what_is_wider_than_the_terminal_is_shown_without_breaking_a_word(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rows = [("run.zarr", "1000", "in good order"), ("other.zarr", "2", "")]
+    titles = ("recording", "lines", "how it ended")
+    monkeypatch.setenv("COLUMNS", "40")
+    print_table(titles, rows)
+    assert capsys.readouterr().out.splitlines() == [
+        "recording   lines  how it ended",
+        "run.zarr     1000  in good order",
+        "other.zarr      2",
+    ]
+    monkeypatch.setenv("COLUMNS", "30")
+    print_table(titles, rows)
+    assert capsys.readouterr().out.splitlines() == [
+        "recording     run.zarr",
+        "lines         1000",
+        "how it ended  in good order",
+        "",
+        "recording  other.zarr",
+        "lines      2",
+    ]
+    monkeypatch.delenv("COLUMNS")
+    print_table(("a" * 300,), [("b",)])
+    assert len(capsys.readouterr().out.splitlines()) == 2
+
+
 @pytest.mark.parametrize("command", ["status", "arm", "start", "stop", "disarm"])
 def test_no_daemon_in_words(cli: Cli, tmp_path: Path, command: str) -> None:
     answer = cli(command, "--socket", tmp_path / "no.sock")
@@ -78,7 +141,7 @@ def test_socket_from_the_environment(cli: Cli, tmp_path: Path, monkeypatch: pyte
 def test_unknown_state_to_wait_for(cli: Cli) -> None:
     answer = cli("status", "--wait", "done")
     assert answer.code == 2
-    assert "possible: idle, armed, recording, draining, faulted" in answer.err
+    assert "idle, armed, recording, draining, faulted" in answer.err
 
 
 def test_interrupted(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
