@@ -135,7 +135,7 @@ def test_start_passes_everything_on(cli: Cli, answering: Callable[[Status], Fake
 def test_wait_passes_state_and_time_on(cli: Cli, answering: Callable[[Status], FakeClient]) -> None:
     client = answering(status(State.IDLE))
     assert cli("status", "--wait", "idle", "--timeout", 300).code == 0
-    assert client.calls == [("wait", {State.IDLE}, 5.0, {})]
+    assert client.calls == [("wait", {State.IDLE}, 300.0, {})]
 
 
 @pytest.mark.parametrize(
