@@ -14,6 +14,7 @@ import stat
 import time
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from acquire.errors import StateError, UsageError
@@ -22,7 +23,6 @@ from acquire.store.pages import aligned_bytes, open_direct
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
-    from pathlib import Path
 
     from typing_extensions import Buffer
 
@@ -86,8 +86,9 @@ class ShardFile:
     written, since a cache that fills up stalls whoever writes.
     """
 
-    def __init__(self, path: Path, *, direct: bool) -> None:
-        self._fd = os.open(path, _NEW, 0o666)
+    def __init__(self, path: Path, *, direct: bool, fd: int = -1) -> None:
+        """``fd``: the file is there already, open under this descriptor, which is taken over."""
+        self._fd = os.open(path, _NEW, 0o666) if fd < 0 else fd
         self._direct = open_direct(path) if direct else -1
         self._cached = (0, 0)
 
@@ -223,14 +224,19 @@ DISK = Disk()
 """The one that is used unless told otherwise."""
 
 
+_MEASURED = ".acquire-{}.measure"
+
+
 def measure_disk(directory: Path, size: int = 2**27) -> float:
     """Bytes per second that the disk of ``directory`` takes, past the page cache where that can be.
 
-    Writes ``size`` bytes and deletes them. Raises OSError.
+    Writes ``size`` bytes to a file that loses its name first, so that a kill leaves nothing. Raises OSError.
     """
+    for path in directory.glob(_MEASURED.format("*")):  # where a file cannot be made without a name
+        if not Path("/proc", path.stem.removeprefix(".acquire-")).exists():
+            path.unlink(missing_ok=True)
     block = aligned_bytes(2**22)
-    path = directory / f".acquire-{os.getpid()}.measure"
-    file = ShardFile(path, direct=True)
+    file = _nameless(directory)
     try:
         begun = time.perf_counter()
         for offset in range(0, size, len(block)):
@@ -239,7 +245,21 @@ def measure_disk(directory: Path, size: int = 2**27) -> float:
         return size / (time.perf_counter() - begun)
     finally:
         file.close()
-        path.unlink()
+
+
+def _nameless(directory: Path) -> ShardFile:
+    """A new file that has no name, or, where the file system makes none, one that has lost it."""
+    try:
+        fd = os.open(directory, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600)
+    except OSError as error:
+        if error.errno not in (errno.EOPNOTSUPP, errno.EISDIR, errno.EINVAL):
+            raise
+        path = directory / _MEASURED.format(os.getpid())
+        try:
+            return ShardFile(path, direct=True)
+        finally:
+            path.unlink(missing_ok=True)
+    return ShardFile(Path(f"/proc/self/fd/{fd}"), direct=True, fd=fd)
 
 
 def tree_bytes(path: Path) -> int:

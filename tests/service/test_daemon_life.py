@@ -79,7 +79,7 @@ def test_a_recording_goes_on_in_a_segment(daemon: Daemon) -> None:
     shown = daemon("info", "days-2.zarr").out
     assert "days.zarr after line" in shown
     refused = daemon("start", "none.zarr", "--resume")
-    assert (refused.code, "does not exist" in refused.err) == (6, True)
+    assert (refused.code, "does not exist" in refused.err) == (2, True)
     assert daemon("disarm").code == 0
 
 

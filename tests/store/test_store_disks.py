@@ -5,13 +5,16 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import signal
 import subprocess
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
 import zarr
 from store_helpers import Truth, check_rows, fill, make_spec
+from waiting import until
 
 from acquire.errors import DataError, UsageError
 from acquire.lines import ARMS
@@ -273,6 +276,32 @@ def test_rates_that_cannot_be_are_refused(wrong):
 
 def test_the_disk_is_measured_and_nothing_is_left(tmp_path):
     assert measure_disk(tmp_path, size=2**23) > 1e5
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_a_kill_while_the_disk_is_measured_leaves_nothing(tmp_path, monkeypatch, named):
+    """Also where the file system makes no file without a name; the next look clears what older ones left."""
+    if named:
+        monkeypatch.setattr(os, "O_TMPFILE", os.O_TMPFILE & ~os.O_DIRECTORY)  # is refused: EISDIR
+    left = tmp_path / ".acquire-999999999.measure"
+    left.touch()
+    child = os.fork()
+    if child == 0:
+        try:
+            measure_disk(tmp_path, size=2**50)
+        finally:
+            os._exit(1)
+
+    def has_file() -> bool:
+        targets = [str(entry.readlink()) for entry in Path(f"/proc/{child}/fd").iterdir()]
+        return any(str(tmp_path) in target and "deleted" in target for target in targets)
+
+    try:
+        until(has_file, "the file that is written")
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
     assert not list(tmp_path.iterdir())
 
 
