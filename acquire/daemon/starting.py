@@ -12,10 +12,11 @@ LONGEST_S = 60.0
 
 def is_one_starting(socket: Path) -> bool:
     """Some ``acquire serve`` has just been started that may listen on ``socket``."""
-    return any(_may_listen(process, socket) for process in Path("/proc").iterdir() if process.name.isdigit())
+    return any(may_listen(process, socket) for process in Path("/proc").iterdir() if process.name.isdigit())
 
 
-def _may_listen(process: Path, socket: Path) -> bool:
+def may_listen(process: Path, socket: Path) -> bool:
+    """The process, in ``/proc``, is a daemon of this user that was just started, perhaps for this socket."""
     try:
         if process.stat().st_uid != os.geteuid():
             return False

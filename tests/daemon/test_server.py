@@ -6,7 +6,9 @@ import asyncio
 import contextlib
 import os
 import signal
+import subprocess
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -19,9 +21,10 @@ from acquire.daemon.client import Client
 from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.server import Daemon
 from acquire.daemon.service import Service
+from acquire.daemon.starting import is_one_starting, may_listen
 from acquire.daemon.states import State
 from acquire.daemon.troubles import MOST_LISTED, Troubles
-from acquire.errors import EXIT_INTERRUPTED, StateError
+from acquire.errors import EXIT_INTERRUPTED, NoDaemonError, StateError
 
 Script = Callable[[Client], None]
 
@@ -95,6 +98,80 @@ def test_second_signal_does_not_wait_for_lines(path: Path) -> None:
         assert run.seen.condition == "INTERRUPTED"
 
     assert live(path, run, script) == EXIT_INTERRUPTED
+
+
+def test_the_watchdog_is_fed_while_a_command_is_inside_its_limit(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An `arm` that takes its time is no reason to kill the daemon; one that exceeds its limit is."""
+    monkeypatch.setattr("acquire.daemon.server.WATCHDOG_S", 0.02)
+    pings: list[str] = []
+    monkeypatch.setattr("acquire.daemon.server.notify", pings.append)
+    patience_s = [300.0]
+    monkeypatch.setattr(Service, "patience_s", property(lambda _: patience_s[0]))
+    run = FakeRun()
+    run.may_arm.clear()
+
+    def script(client: Client) -> None:
+        with ThreadPoolExecutor(1) as other:
+            arming = other.submit(client.arm)
+            try:
+                until(lambda: client.status().busy is not None)
+                before = len(pings)
+                until(lambda: len(pings) > before + 5)
+                patience_s[0] = 0.0
+                silent = len(pings) + 1  # one may have been under way
+                for _ in range(10):
+                    client.status()
+                    time.sleep(0.02)
+                assert len(pings) <= silent
+            finally:
+                run.may_arm.set()
+            arming.result()
+        before = len(pings)
+        until(lambda: len(pings) > before)
+
+    assert live(path, run, script) == 0
+
+
+def test_a_mark_is_taken_while_a_stop_is_waited_for(path: Path) -> None:
+    run = FakeRun()
+    run.seals_at_stop = False
+
+    def script(client: Client) -> None:
+        client.arm()
+        client.start()
+        with ThreadPoolExecutor(1) as other:
+            stopping = other.submit(client.stop)
+            try:
+                client.wait({State.DRAINING}, 300)
+                client.mark("meanwhile")
+                assert not stopping.done()
+            finally:
+                run.seal()
+            assert stopping.result().state is State.ARMED
+        assert ("mark", "meanwhile") in run.calls
+
+    assert live(path, run, script) == 0
+
+
+def test_a_client_waits_for_a_daemon_that_is_starting(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only while one is: a process of ours whose command line says so."""
+    said: list[str] = []
+    command = ["bash", "-c", "read", "acquire", "serve", "--socket", str(path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE) as starting, ThreadPoolExecutor(1) as other:
+        process = Path(f"/proc/{starting.pid}")
+        until(lambda: may_listen(process, path), "its command line")
+        assert not may_listen(process, path.with_name("another.sock"))
+        assert is_one_starting(path)
+        monkeypatch.setattr("acquire.daemon.client.STARTING_TIMEOUT_S", 0.5)  # there may be others
+        waiting = other.submit(Client(path, said.append).status)
+        until(lambda: said, "a word")
+        starting.kill()
+        with pytest.raises(NoDaemonError):
+            waiting.result()
+    assert "one is starting" in said[0]
+    assert not may_listen(process, path)
 
 
 def test_faults_are_seen_without_being_asked_for(path: Path) -> None:
