@@ -2,15 +2,15 @@
 
 ::
 
-    25 MHz ─┬─▶ PLL · 18 / 5 ─▶ 90 MHz  sync
-            └─▶ PLL 480 MHz ─┬▶ 48 MHz  usb_io    finds the bits on D+ and D−
-                             └▶ 12 MHz  usb       everything else of USB
+    25 MHz ─▶ PLL · 18 / 5 ─┬▶ 90 MHz           sync
+                            └▶ PLL 480 MHz ─┬▶ 48 MHz  usb_io    finds the bits on D+ and D−
+                                            └▶ 12 MHz  usb       everything else of USB
 """
 
 from dataclasses import replace
 from types import SimpleNamespace
 
-from amaranth.hdl import ClockDomain, Elaboratable, Instance, IOPort, Module, Signal
+from amaranth.hdl import ClockDomain, ClockSignal, Elaboratable, Instance, IOPort, Module, Signal, Value
 
 from firmware.boards import ulx3s
 from firmware.boards.ulx3s import Ulx3s
@@ -40,24 +40,27 @@ class Ulx3sUsb(Ulx3s):
             ClockDomain("usb", reset_less=True),
             ClockDomain("usb_io", reset_less=True),
         )
-        m.submodules.usb_pll = _usb_pll(self.reference, usb.clk, usb_io.clk)
+        m.submodules.usb_pll = _usb_pll(ClockSignal("sync"), usb.clk, usb_io.clk)
         for name, line in self.lines.items():
             m.submodules[name] = Instance("BB", i_I=line.o, i_T=~line.oe, o_O=line.i, io_B=self.pads[name])
         return m
 
 
-def _usb_pll(reference: Signal, usb: Signal, usb_io: Signal) -> Instance:
-    """25 MHz / 5 is compared with 480 MHz / 96: the oscillator that 10 and 40 make 48 and 12 MHz of."""
+def _usb_pll(reference: Value, usb: Signal, usb_io: Signal) -> Instance:
+    """90 MHz / 9 is compared with 480 MHz / 48: the oscillator that 10 and 40 make 48 and 12 MHz of.
+
+    From 25 MHz it could only be compared at 5 MHz; the maker wants 10.
+    """
     feedback = Signal()
     return Instance(
         "EHXPLLL",
-        p_CLKI_DIV=5,
+        p_CLKI_DIV=9,
         p_CLKFB_DIV=1,
         p_CLKOP_DIV=10,
         p_CLKOP_ENABLE="ENABLED",
         p_CLKOS_DIV=40,
         p_CLKOS_ENABLE="ENABLED",
-        p_CLKOS2_DIV=96,
+        p_CLKOS2_DIV=48,
         p_CLKOS2_ENABLE="ENABLED",
         p_FEEDBK_PATH="CLKOS2",
         i_CLKI=reference,

@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
+import pytest
 from amaranth.back import rtlil
-from amaranth.hdl import Fragment
+from amaranth.hdl import Fragment, Signal
 
 from firmware.boards import ulx3s
 from firmware.build import main, synthesize
@@ -51,6 +53,20 @@ def test_the_ulx3s_netlist_fits_a_quarter_of_the_device_and_can_be_made_again(tm
     assert 10 <= compared_mhz <= 400, "the maker's limits of the phase detector"
     assert 400 <= oscillator_mhz <= 800, "and of the oscillator"
     assert oscillator_mhz / divide["CLKOP"] == 90
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.skipif(find_spec("luna") is None, reason="no luna-usb")
+def test_the_pll_of_usb_is_within_its_limits_too() -> None:
+    from firmware.boards.ulx3s_usb import _usb_pll
+
+    parameters = _usb_pll(Signal(), Signal(), Signal()).parameters
+    divide = {name.removesuffix("_DIV"): value for name, value in parameters.items() if name.endswith("_DIV")}
+    compared_mhz = 90 / divide["CLKI"]
+    oscillator_mhz = compared_mhz * divide["CLKFB"] * divide["CLKOS2"]
+    assert compared_mhz >= 10
+    assert 400 <= oscillator_mhz <= 800
+    assert (oscillator_mhz / divide["CLKOP"], oscillator_mhz / divide["CLKOS"]) == (48, 12)
 
 
 def test_one_command_writes_what_the_vendor_s_tools_need(tmp_path: Path) -> None:
