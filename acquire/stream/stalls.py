@@ -33,7 +33,6 @@ have leapt there in a pause."""
 HELD_UP_S = 0.25
 """More than a busy host keeps a process waiting: what others said meanwhile has still to be heard."""
 _LONGEST_LOOK_S = 0.5
-_EXCESS_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,12 +182,14 @@ class Heartbeat:
 class Excess:
     """An arm that counts lines which the trigger has not issued is not triggered by it.
 
-    Tags come in steps and late: only what exceeds them by ``margin_lines`` for a whole second counts.
+    Tags come in steps and late, on a busy host by seconds: only what exceeds them by ``margin_lines`` for
+    longer than ``limit_s`` counts.
     """
 
-    def __init__(self, counters: Counters, margin_lines: int) -> None:
+    def __init__(self, counters: Counters, margin_lines: int, limit_s: float) -> None:
         self._counters = counters
         self._margin_lines = margin_lines
+        self._limit_s = limit_s
         self._since_s: float | None = None
 
     def look(self, newest_pulse: int, now_s: float) -> int:
@@ -198,7 +199,7 @@ class Excess:
             self._since_s = None
             return 0
         self._since_s = self._since_s or now_s
-        return line if now_s - self._since_s > _EXCESS_S else 0
+        return line if now_s - self._since_s > self._limit_s else 0
 
 
 def find_stall(session: Session, arms: dict[str, Arm], limit_s: float, max_skew_lines: int) -> Stall | None:

@@ -100,8 +100,8 @@ class Supervisor:
         self._loop = Heartbeat(counters[RECORDER], "turns")
         self._cameras = {arm: Heartbeat(counters[arm], "delivered") for arm in ARMS}
         self._arms_of = plan.grabbers
-        margin_lines = plan.margin_lines
-        self._excess = {arm: Excess(counters[arm], margin_lines) for arm in ARMS if margin_lines is not None}
+        margin, limit_s = plan.margin_lines, plan.stall_timeout_s
+        self._excess = {arm: Excess(counters[arm], margin, limit_s) for arm in ARMS if margin is not None}
         self._counters = counters
         self._ask_s = 0.0
         self._newest_pulse: int | None = None
