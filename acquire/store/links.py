@@ -13,13 +13,17 @@ from typing import TYPE_CHECKING
 
 from acquire.errors import DataError
 from acquire.reading import kind_of
+from acquire.store.refusals import refusal, refused
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 
 def refuse_links(root: Path) -> None:
-    """Raise DataError unless ``root`` and all below it are directories and regular files."""
+    """Raise DataError unless ``root`` and all below it are directories and regular files.
+
+    Raises as `refusals.refusal` where that cannot be found out.
+    """
     refuse_link(root, root)
     waiting = [str(root)]
     while waiting:
@@ -33,14 +37,14 @@ def refuse_links(root: Path) -> None:
         except FileNotFoundError:
             continue  # retention, or a commit, has removed it meanwhile
         except OSError as error:
-            raise DataError(f"{root} cannot be looked through: {error.filename}: {error.strerror}") from error
+            raise refusal(root, error, "read") from error
 
 
 def refuse_link(root: Path, path: Path) -> None:
     """Raise DataError where ``root``, ``path`` or a directory between them is a link, or something odder."""
     below = path.relative_to(root)
     for part in (*reversed(below.parents), below):
-        with suppress(FileNotFoundError, NotADirectoryError):
+        with refused(root, "read"), suppress(FileNotFoundError, NotADirectoryError):
             mode = os.lstat(root / part).st_mode
             if (kind := kind_of(mode)) is not None and not stat.S_ISDIR(mode):
                 raise _odd(root, str(root / part), kind)
