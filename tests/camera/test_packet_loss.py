@@ -20,7 +20,6 @@ from gige_helpers import (
     spec_at,
 )
 from ramp_sensor import ramp
-from waiting import until
 
 from acquire.camera.aravis import AravisCamera, AravisOpener
 from acquire.camera.settings import Setting
@@ -31,8 +30,8 @@ from acquire.sim.gige.camera import Transmission
 pytestmark = pytest.mark.needs_aravis
 
 HEIGHT = 50
-FRAMES = 400
-WINDOW = 40
+FRAMES = 300
+WINDOW = 6
 """Frames that the camera may be ahead of the reader."""
 PACKETS = 6
 """A frame of 50 lines of 48 pixels is four packets of payload between leader and trailer."""
@@ -120,12 +119,14 @@ def take(camera: AravisCamera, sensor: object, last_frame: int, window: int) -> 
     """Frames up to ``last_frame``, which is whole; whole ones are checked pixel by pixel."""
     whole, flagged, lost = [], [], Counter()
     deadline = time.monotonic() + WAIT_S
-    next_line = 0
+    next_line = allowed = 0
     while next_line <= last_frame * HEIGHT:
         assert time.monotonic() < deadline, f"at line {next_line} of {last_frame * HEIGHT}"
-        sensor.allowed = min(next_line + window * HEIGHT, (last_frame + 1) * HEIGHT)
+        allowed = max(allowed, next_line + window * HEIGHT)
+        sensor.allowed = min(allowed, (last_frame + 1) * HEIGHT)
         block = camera.next_block(0.05)
-        if block is None:
+        if block is None:  # all that came is read, and none of it has a number
+            allowed += HEIGHT
             continue
         for loss in block.losses:
             lost[str(loss.cause)] += loss.count
@@ -151,7 +152,7 @@ CASES: dict[str, tuple[dict, dict, dict]] = {
     "30 per cent": ({"share": 0.3}, {}, {}),
     "half": ({"share": 0.5}, {}, {}),
     "leaders": ({"without": {k: {LEADER} for k in (3, 4, 9, 20, 21, 22, 80)}}, {}, {}),
-    "every other leader": ({"without": {k: {LEADER} for k in range(1, 300, 2)}}, {}, {}),
+    "every other leader": ({"without": {k: {LEADER} for k in range(1, 280, 2)}}, {}, {}),
     "trailers": ({"without": {k: {TRAILER} for k in (3, 4, 9, 20, 21, 22, 80)}}, {}, {}),
     "payload": ({"without": {k: {2, 3} for k in (3, 4, 9, 20, 21, 22, 80)}}, {}, {}),
     "whole frames": ({"without": dict.fromkeys((3, 9, 10, 11, 80), EVERY)}, {}, {}),
@@ -198,7 +199,7 @@ def test_losses_are_counted_exactly_and_whole_frames_are_where_they_belong(
 
 def test_frames_that_come_again_are_no_wrap() -> None:
     """Aravis itself drops what is less than a hundred frames late."""
-    link = LossyLink(again={50: 200, 51: 201, 52: 202, 180: 330, 300: 305})
+    link = LossyLink(again={50: 200, 51: 201, 52: 202, 170: 290, 280: 285})
     found, statistics = transmit(link, {}, resends=False, first_id=65_535 - 160)
     assert found == Expected(list(range(FRAMES + 1)), [], {})
     assert statistics["stale_frames"] == 4
@@ -208,10 +209,10 @@ def test_packets_that_are_sent_again_make_frames_whole() -> None:
     ratio = Setting("stream", "packet-request-ratio", 2.0)
     quick = Setting("stream", "packet-timeout", 2000)
     link = LossyLink(0.05)
-    found, statistics = transmit(link, {}, ratio, quick, window=8)  # the camera keeps 16 frames
+    found, statistics = transmit(link, {}, ratio, quick)
     assert found == Expected(list(range(FRAMES + 1)), [], {})
     assert statistics["incomplete_frames"] == 0
-    assert sum(packets != EVERY for packets in link.came.values()) > 50
+    assert sum(packets != EVERY for packets in link.came.values()) > 40
 
 
 @pytest.mark.needs_gige_camera
@@ -262,18 +263,3 @@ def test_aravis_own_lossy_camera_agrees_with_its_own_account(tmp_path: Path, per
         assert pixel == (number - 65_535 if number > 65_535 else number) % 255, f"frame {frame}"
     assert statistics["lines"] + statistics["lost"] == next_line
     assert len(flagged) > frames * per_thousand // 1000
-
-
-def test_frames_that_find_no_buffer_are_lost_for_that_reason() -> None:
-    """Aravis counts each of their packets."""
-    with our_camera(HEIGHT, Transmission(resends=False)) as (sensor, address):
-        camera = open_in_time(AravisOpener(spec_at(address, HEIGHT, line_rate_hz=1.0)))  # sixteen buffers
-        try:
-            camera.arm()
-            sensor.allowed = 100 * HEIGHT
-            until(lambda: camera._starved_frames() >= 100 - 16, "every buffer to be filled")
-            found = take(camera, sensor, 107, window=108)
-        finally:
-            camera.close()
-    assert found.whole == [*range(16), *range(100, 108)]
-    assert (found.flagged, found.lost) == ([], {"no_buffer": (100 - 16) * HEIGHT})

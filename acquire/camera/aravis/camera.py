@@ -44,6 +44,9 @@ _SUCCESS, _ABORTED = 0, 7
 _NO_ID = 2**64 - 1
 """Given to a buffer before it is filled. Only the packet that begins a frame brings its number, and a buffer
 whose frame lost that packet would still have the number of the frame before."""
+_NO_PACKET_SOCKET = 1
+"""Aravis' packet socket, which it prefers where it may, takes packets of every other camera on the interface
+for its own until its filter is in place."""
 _HEADERS_BYTES = 36
 """Of IP, UDP and GVSP in every packet of a frame."""
 
@@ -77,6 +80,8 @@ class AravisCamera:
             self._camera = library.arv_camera_new(device_id, error)
         try:
             self._device = library.arv_camera_get_device(self._camera)
+            if library.arv_camera_is_gv_device(self._camera):
+                library.arv_camera_gv_set_stream_options(self._camera, _NO_PACKET_SOCKET)
             self._features = AravisFeatures(library, self._device)
             self._identity = _identify(self._features)
             _check_identity(self._identity, spec)

@@ -74,6 +74,7 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_buffer_set_timestamp": (None, (c_void_p, c_uint64)),
     "arv_camera_is_gv_device": (c_bool, (c_void_p,)),
     "arv_camera_is_uv_device": (c_bool, (c_void_p,)),
+    "arv_camera_gv_set_stream_options": (None, (c_void_p, c_int)),
     "arv_gv_device_is_controller": (c_bool, (c_void_p,)),
     "arv_camera_gv_get_packet_size": (c_uint, (c_void_p, c_void_p)),
     "g_type_name_from_instance": (c_char_p, (c_void_p,)),
