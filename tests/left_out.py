@@ -66,6 +66,7 @@ NEEDS = {
     "needs_throttle": "has the kernel slow a disk down for a process",
     "needs_umockdev": "runs libusb on a made-up bus",
     "needs_genicam": "loads a GenTL producer",
+    "needs_user": "has a file that it may not read",
 }
 """Marker → what a test that carries it does."""
 
@@ -87,6 +88,7 @@ def find_missing() -> dict[str, str]:
         "needs_throttle": not can_throttle(Path(tempfile.gettempdir())) and "the right to slow a disk down",
         "needs_umockdev": missing_for_umockdev(),
         "needs_genicam": not _HAVE_GENICAM and "the genicam package",
+        "needs_user": os.geteuid() == 0 and "a user who is not root",
     }
     return {marker: str(what) for marker, what in lacks.items() if what}
 

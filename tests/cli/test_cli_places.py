@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,6 +18,7 @@ from acquire.store.remote import WAYS_IN, RemoteSource
 Cli = Callable[..., Any]
 
 READERS = {
+    "replay": ("replay", "{place}", "--out", "new.zarr"),
     "info": ("info", "{place}"),
     "verify": ("verify", "{place}"),
     "cut": ("cut", "{place}", "--first-line", "1", "--lines", "1", "--out", "new.npz"),
@@ -29,7 +29,6 @@ READERS = {
 }
 """Commands that take a path or a URL."""
 CHANGERS = {
-    "replay": ("replay", "{place}", "--out", "new.zarr"),
     "recover": ("recover", "{place}"),
     "hold": ("hold", "{place}", "--first-line", "1", "--lines", "1"),
     "upload": ("upload", "{place}", "memory://copies/new.zarr"),
@@ -84,7 +83,8 @@ def test_what_is_no_recording_is_a_wrong_path_and_no_damage(
 ) -> None:
     answer = cli(*(word.format(place=places[what]) for word in words))
     assert answer.code == 2, answer.err
-    assert Path(places[what]).name.partition("\udcff")[0] in answer.err
+    shown = Path(places[what]).name.partition("\udcff")[0][-40:]  # the middle of a long name is left out
+    assert shown in answer.err
     assert "  try: " in answer.err or "  possible: " in answer.err
     assert untouched(tmp_path)
 
@@ -100,7 +100,7 @@ def test_what_is_no_such_file_is_a_wrong_path(
     assert untouched(tmp_path)
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+@pytest.mark.needs_user
 @pytest.mark.parametrize("words", [*READERS.values(), *CHANGERS.values()], ids=[*READERS, *CHANGERS])
 def test_what_this_user_may_not_read_is_told_so(
     cli: Cli, places: dict[str, str], words: tuple[str, ...]
