@@ -12,6 +12,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from acquire.errors import DataError
+from acquire.lines import ARMS
 from acquire.reading import kind_of
 from acquire.store.refusals import refusal, refused
 
@@ -22,9 +23,12 @@ if TYPE_CHECKING:
 def refuse_links(root: Path) -> None:
     """Raise DataError unless ``root`` and all below it are directories and regular files.
 
-    Raises as `refusals.refusal` where that cannot be found out.
+    A directory without any part of a recording is passed over: whoever opens it says that it is none. Raises
+    as `refusals.refusal` where the entries cannot be read.
     """
     refuse_link(root, root)
+    if not any(os.path.lexists(root / part) for part in ("zarr.json", *ARMS)):
+        return
     waiting = [str(root)]
     while waiting:
         try:

@@ -58,6 +58,7 @@ def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
     (there / "directory").mkdir(parents=True)
     (there / "file").write_text("root:x:0:0\n")
     (there / "empty").touch()
+    (there / "directory" / "link").symlink_to(there / "file")
     zarr.create_group(there / "group", zarr_format=3)
     return {
         "absent": str(there / "absent.zarr"),
