@@ -161,8 +161,9 @@ def test_the_demo_records_from_the_gateware(tmp_path: Path) -> None:
         np.testing.assert_array_equal(camera.code_index[:], 3 * np.arange(first, first + 700))
         light = StreamingArm(scene, config.code.build(), 64, 3, arm).lines(first, 700)
         assert light.std() > 1
-        dn = np.clip(np.rint(light * np.float32(asked.responsivity_dn)), 0, asked.white_dn)
-        np.testing.assert_array_equal(camera.lines[:], dn)
+        dn = np.clip(light * np.float64(asked.responsivity_dn), 0, asked.white_dn)
+        # Half a DN is rounding; which way a half goes depends on the order in which blocks were summed.
+        np.testing.assert_allclose(camera.lines[:], dn, rtol=0, atol=0.5 + 1e-3)
 
 
 def test_a_killed_demo_leaves_nothing_behind(tmp_path: Path) -> None:
