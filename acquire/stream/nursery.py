@@ -10,6 +10,10 @@ The nursery imports modules and does nothing else: it has one thread, no device,
 forked, such as a GenTL producer or a library's threads, is loaded by the worker, in a process of its own. It
 ends with its owner, since the kernel closes the owner's end of the socket; workers see their owner's end by
 themselves (`acquire.stream.process`). A nursery that has died is replaced, and its workers are not touched.
+
+multiprocessing's own forkserver is not used, since it reports its living children as dead (exit code 255) when
+it is killed itself: a successor would then write to the ring beside the recorder that it replaces. Here the
+owner holds a pidfd of every worker, which tells the truth whoever else has died.
 """
 
 from __future__ import annotations
