@@ -8,6 +8,8 @@ from pathlib import Path
 
 LONGEST_S = 60.0
 """A daemon that is older than this does not start any more."""
+ACCEPTS = "00010000"
+"""Of the flags in ``/proc/net/unix``: the socket is listening."""
 
 
 def is_one_starting(socket: Path) -> bool:
@@ -24,7 +26,8 @@ def may_listen(process: Path, socket: Path) -> bool:
         if "serve" not in words or not any(Path(word).name == "acquire" for word in words):
             return False
         given = _socket_of(words, (process / "environ").read_bytes())
-        return _age_s(process) < LONGEST_S and (given is None or Path(given).name == socket.name)
+        may_be = given is None or Path(given).name == socket.name
+        return may_be and _age_s(process) < LONGEST_S and not _listens(process)
     except (OSError, ValueError):
         return False  # it has ended meanwhile
 
@@ -40,6 +43,13 @@ def _socket_of(words: list[str], environment: bytes) -> str | None:
         if entry.startswith(b"ACQUIRE_SOCKET="):
             return os.fsdecode(entry.removeprefix(b"ACQUIRE_SOCKET="))
     return None
+
+
+def _listens(process: Path) -> bool:
+    """The process has a Unix socket that it accepts connections on: it listens, somewhere else."""
+    rows = [row.split() for row in (process / "net" / "unix").read_text(errors="replace").splitlines()[1:]]
+    accepting = {f"socket:[{row[6]}]" for row in rows if row[3] == ACCEPTS and len(row) > 7}
+    return any(str(fd.readlink()) in accepting for fd in (process / "fd").iterdir())
 
 
 def _age_s(process: Path) -> float:

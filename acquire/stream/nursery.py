@@ -11,9 +11,9 @@ forked, such as a GenTL producer or a library's threads, is loaded by the worker
 ends with its owner, since the kernel closes the owner's end of the socket; workers see their owner's end by
 themselves (`acquire.stream.process`). A nursery that has died is replaced, and its workers are not touched.
 
-multiprocessing's own forkserver is not used, since it reports its living children as dead (exit code 255) when
-it is killed itself: a successor would then write to the ring beside the recorder that it replaces. Here the
-owner holds a pidfd of every worker, which tells the truth whoever else has died.
+multiprocessing's own forkserver is not used: when it is killed, it reports its living children as dead (exit
+code 255), and a successor would write to the ring beside the recorder that it replaces. Here the owner has a
+pidfd of every worker, which tells the truth whoever else has died.
 """
 
 from __future__ import annotations

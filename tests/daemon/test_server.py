@@ -7,6 +7,7 @@ import contextlib
 import os
 import signal
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -172,6 +173,22 @@ def test_a_client_waits_for_a_daemon_that_is_starting(path: Path, monkeypatch: p
             waiting.result()
     assert "one is starting" in said[0]
     assert not may_listen(process, path)
+
+
+def test_a_daemon_that_listens_elsewhere_is_not_waited_for(tmp_path: Path) -> None:
+    """It is young, and nobody told it a socket: its configuration did."""
+    elsewhere = tmp_path / "elsewhere.sock"
+    listen = "import socket, sys; s = socket.socket(1); s.bind(sys.argv[3]); input(); s.listen(); input()"
+    command = [sys.executable, "-c", listen, "acquire", "serve", str(elsewhere)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE) as young:
+        process = Path(f"/proc/{young.pid}")
+        until(lambda: may_listen(process, tmp_path / "another.sock"), "its command line")
+        assert young.stdin is not None
+        young.stdin.write(b"\n")
+        young.stdin.flush()
+        until(lambda: not may_listen(process, tmp_path / "another.sock"), "its own socket")
+        assert young.poll() is None
+        young.kill()
 
 
 def test_faults_are_seen_without_being_asked_for(path: Path) -> None:
