@@ -175,7 +175,12 @@ class Connection(H11Protocol):
 
 
 class ApiServer(uvicorn.Server):
-    """Serves an API on a listener, within the bounds of this module. Signals are its owner's business."""
+    """Serves an API on a listener, within the bounds of this module. Signals are its owner's business.
+
+    Attributes
+    ----------
+    answering : set once requests are answered; what this takes, such as modules, is loaded by then
+    """
 
     def __init__(self, app: ASGIApp, listener: Listener) -> None:
         config = uvicorn.Config(
@@ -191,11 +196,16 @@ class ApiServer(uvicorn.Server):
         )
         super().__init__(config)
         self._listener = listener
+        self.answering = asyncio.Event()
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
         """They must drain the recording before the API goes away."""
         yield
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        await super().startup(sockets)
+        self.answering.set()
 
     async def answer(self) -> None:
         """Until `should_exit`."""

@@ -102,9 +102,10 @@ class Daemon:
         self._take_signals()
         asyncio.get_running_loop().set_exception_handler(self._troubles.in_loop)
         serving = asyncio.create_task(self._server.answer())
+        if await self._is_answering(serving):
+            log.info("listening on %s (process %d)", self._endpoint.path, os.getpid())
+            notify("READY=1")
         watchdog = asyncio.create_task(self._feed_watchdog())
-        log.info("listening on %s (process %d)", self._endpoint.path, os.getpid())
-        notify("READY=1")
         try:
             await self._supervise(serving)
         finally:
@@ -112,6 +113,13 @@ class Daemon:
             watchdog.cancel()
             self._last_resort.cancel()
         return self._exit_code
+
+    async def _is_answering(self, serving: asyncio.Task[None]) -> bool:
+        """Wait until requests are answered; False where that has failed, and `serving` says why."""
+        answering = asyncio.create_task(self._server.answering.wait())
+        await asyncio.wait((serving, answering), return_when=asyncio.FIRST_COMPLETED)
+        answering.cancel()
+        return self._server.answering.is_set()
 
     async def _supervise(self, serving: asyncio.Task[None]) -> None:
         while not (self._ending.is_set() or serving.done()):
@@ -143,8 +151,10 @@ class Daemon:
         finally:
             patience.cancel()
             self._server.should_exit = True
-            await serving
-            self._devices.shutdown()
+            try:
+                await serving
+            finally:
+                self._devices.shutdown()
         log.info("ended")
 
     async def _wait_for_the_disk(self) -> None:

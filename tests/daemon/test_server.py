@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import errno
 import os
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -19,6 +21,7 @@ from fake_run import FakeRun, rig_config
 from waiting import until
 
 from acquire.daemon.client import Client
+from acquire.daemon.connections import ApiServer
 from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.server import Daemon
 from acquire.daemon.service import Service
@@ -99,6 +102,47 @@ def test_second_signal_does_not_wait_for_lines(path: Path) -> None:
         assert run.seen.condition == "INTERRUPTED"
 
     assert live(path, run, script) == EXIT_INTERRUPTED
+
+
+def test_ready_is_told_once_requests_are_answered(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[str] = []
+    monkeypatch.setattr("acquire.daemon.server.notify", told.append)
+    before: list[str] = []
+    begin = ApiServer.startup
+
+    async def slow(self: ApiServer, sockets: list[socket.socket] | None = None) -> None:
+        await asyncio.sleep(0.1)
+        before.extend(told)
+        await begin(self, sockets)
+
+    monkeypatch.setattr(ApiServer, "startup", slow)
+    assert live(path, FakeRun(), lambda client: until_in(client, State.IDLE)) == 0
+    assert before == []
+    assert told[:2] == ["READY=1", "WATCHDOG=1"]
+
+
+def test_a_daemon_that_cannot_answer_is_never_ready(
+    path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    told: list[str] = []
+    monkeypatch.setattr("acquire.daemon.server.notify", told.append)
+
+    async def fail(*_: object, **__: object) -> None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(ApiServer, "startup", fail)
+
+    async def run() -> int:
+        return await Daemon(Service(rig_config(path.parent), FakeRun), endpoint).run()
+
+    with (
+        caplog.at_level("INFO"),
+        contextlib.closing(Endpoint(path)) as endpoint,
+        pytest.raises(OSError, match="Too many open files"),
+    ):
+        asyncio.run(run())
+    assert "READY=1" not in told
+    assert "listening" not in caplog.text
 
 
 def test_the_watchdog_is_fed_while_a_command_is_inside_its_limit(

@@ -118,7 +118,12 @@ def test_killed_processes_are_replaced(start: Start) -> None:
         assert status.fault is None
         assert status.last is not None
         assert status.last.path == path.with_name(f"{path.stem}-2.zarr")
-    until_gone([recorder, *grabbers])
+        assert status.state is State.ARMED
+        until_gone([recorder, grabbers[-1]])
+        assert grabbers[0].is_running()  # nobody killed it, and the instrument stays armed
+        workers = daemon.workers()
+        client.disarm()
+    until_gone([*grabbers, *workers])
     assert open_recording(status.last.path).state == "sealed"
     assert open_recording(path).lines >= 300
 
