@@ -67,9 +67,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """A process per core for folders; files and single tests run here, where no process has to be started."""
+    """Two processes per core for folders, since many tests wait; files and single tests run in this process."""
     if all(Path(asked).is_dir() for asked in config.args):
-        return min(usable_cores(), MOST_WORKERS)
+        return min(2 * usable_cores(), MOST_WORKERS)
     return 0
 
 
