@@ -67,7 +67,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """Two processes per core for folders, since many tests wait; files and single tests run in this process."""
+    """Two processes per core for folders, since many tests wait; files and single tests run in this one."""
     if all(Path(asked).is_dir() for asked in config.args):
         return min(2 * usable_cores(), MOST_WORKERS)
     return 0

@@ -9,10 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import boto3
+import fsspec
 import pytest
 from moto.moto_server.werkzeug_app import DomainDispatcherApplication, create_backend_app
 from werkzeug.serving import BaseWSGIServer, make_server
 from werkzeug.wrappers import Response
+
+from acquire.store.remote import check_url
 
 BUCKET = "recordings"
 KEYS = {"AWS_ACCESS_KEY_ID": "test", "AWS_SECRET_ACCESS_KEY": "test", "AWS_REGION": "us-east-1"}
@@ -43,6 +46,8 @@ class S3Server:
 
     def start(self) -> None:
         """Listen; after a `stop`, where it was before."""
+        if not self._port:
+            forget_clients()
         self._server = make_server("127.0.0.1", self._port, self._answer, threaded=True)
         self._port = self._server.server_port
         self._thread = threading.Thread(target=self._server.serve_forever, args=(0.05,), name="s3")
@@ -89,6 +94,12 @@ class S3Server:
                 environ["wsgi.input"].read(int(environ.get("CONTENT_LENGTH") or 0))
                 return Response(DENIED, 403, content_type="application/xml")(environ, start_response)
         return self._app(environ, start_response)  # type: ignore[no-any-return]
+
+
+def forget_clients() -> None:
+    """fsspec keeps clients, and they keep the endpoint that they met first: another server's, by now."""
+    check_url(f"s3://{BUCKET}")  # says whose clients they are
+    fsspec.get_filesystem_class("s3").clear_instance_cache()
 
 
 @contextmanager

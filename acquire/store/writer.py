@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Self
 
-from acquire.errors import AcquireError, DataError, UsageError
+from acquire.errors import AcquireError, DataError, StoreError, UsageError
 from acquire.lines import ARMS
 from acquire.store import layout
 from acquire.store.arm_writer import ArmWriter
@@ -111,7 +111,7 @@ class RecordingWriter:
         """Do all that takes time; ``path`` becomes a recording, and takes lines, once `begin` was called.
 
         Raises UsageError when ``path`` exists or cannot be created, before anything is touched, and
-        StoreError or DataError when the disk refuses; then nothing is left behind.
+        StoreError when the disk refuses; then nothing is left behind.
         """
         check_new_path(path)
         try:
@@ -124,7 +124,7 @@ class RecordingWriter:
         try:
             writer = cls(path, spec, disk)
             writer._create_parts()
-        except (DataError, UsageError, MemoryError):
+        except (AcquireError, MemoryError):
             if writer is not None:
                 writer.close()
             remove(disk, path, Unborn(0))
@@ -134,7 +134,7 @@ class RecordingWriter:
     def begin(self, first_line: int) -> None:
         """Make it a recording whose row 0 is line ``first_line``; takes as long as a commit.
 
-        Raises DataError when the disk refuses; then nothing is left behind.
+        Raises StoreError when the disk refuses; then nothing is left behind.
         """
         self.spec = replace(self.spec, first_line=first_line)
         for arm in self._arms.values():
@@ -143,7 +143,7 @@ class RecordingWriter:
             shard_lines = self.spec.chunk_lines * self.spec.shard_chunks
             self._keeper = Keeper(self.path, self.spec.retention, shard_lines, first_line, self._disk)
         try:
-            with self._failing("creating the recording"):
+            with self._failing("creating the recording", StoreError):
                 self._publish_copy()
                 self._publish_root(0, self._publish_parts(0, own=False))  # `prepare` did all that takes time
                 if self.spec.continues is not None and self.spec.continues.listed:
@@ -158,7 +158,7 @@ class RecordingWriter:
         remove(self._disk, self.path, Unborn(self._committed))
 
     def _create_parts(self) -> None:
-        with self._failing("creating the recording"):
+        with self._failing("creating the recording", StoreError):
             self._lock = lock(self.path, "recording to")
             for arm in self._arms.values():
                 arm.create()
@@ -411,14 +411,17 @@ class RecordingWriter:
         return f"{self._committed} lines of each arm are committed and can be read"
 
     @contextmanager
-    def _failing(self, doing: str) -> Iterator[None]:
-        """Turn what the disk refuses into DataError, and remember it: nothing after it is acknowledged."""
+    def _failing(self, doing: str, kind: type[AcquireError] = DataError) -> Iterator[None]:
+        """Turn what the disk refuses into a ``kind``, and remember it: nothing after it is acknowledged.
+
+        As long as there is no line that could be lost, that is a StoreError.
+        """
         try:
             yield
         except OSError as error:
             what = f"{doing}: {error.strerror or error}"
             self._failure = self._failure or what
-            raise DataError(
+            raise kind(
                 f"{self.path}: the disk failed while {what}",
                 possible=self._safe(),
                 hint=_advice(error),

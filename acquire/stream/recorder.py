@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from acquire.errors import AcquireError, DataError, StateError, UsageError
+from acquire.errors import AcquireError, StateError, StoreError, UsageError
 from acquire.lines import ARMS
 from acquire.store import RecordingWriter, RunCondition
 from acquire.stream.kept import Kept
@@ -292,7 +292,7 @@ class Recorder:
             self._refuse(opening, error)
             return
         except (OSError, ValueError, MemoryError) as error:
-            self._refuse(opening, DataError(f"the recording cannot be created: {error!r}"))
+            self._refuse(opening, StoreError(f"the recording cannot be created: {error!r}"))
             return
         self._cut_short = False
         self._session = self._new_session(writer, opening, first_line)

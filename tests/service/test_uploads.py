@@ -201,7 +201,7 @@ def test_a_store_that_says_no_is_refused_and_one_that_is_away_is_a_warning(lab: 
     assert "arm --force" in refused.err
     forced = daemon("arm", "--force")
     assert forced.code == 0
-    assert f"WARNING: {place}: " in forced.out
+    assert f"WARNING: {place} cannot be written" in forced.out
     assert daemon("disarm").code == 0
     lab.server.denies = False
     assert daemon("arm", "--json").json["upload_warning"] is None
@@ -209,5 +209,5 @@ def test_a_store_that_says_no_is_refused_and_one_that_is_away_is_a_warning(lab: 
     lab.server.stop()
     armed = daemon("arm", "--json").json
     assert armed["state"] == "armed"
-    assert armed["upload_warning"].startswith(f"{place}: ")
+    assert armed["upload_warning"].startswith(f"{place} cannot be written: ")
     assert daemon.end() == 0

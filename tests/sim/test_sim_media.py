@@ -118,7 +118,7 @@ def bad_files(tmp_path):
         ("empty.npy", "shape"),
         ("complex.npy", "complex"),
         ("rateless.npy", "frame rate"),
-        ("noise.mp4", "no picture and no video"),
+        ("noise.mp4", "neither a picture nor a video"),
         ("cut.npy", "no array"),
         ("objects.npy", "no array"),
         ("cut.png", "cut.png"),

@@ -82,8 +82,12 @@ def test_lines_follow_the_clock_at_the_configured_speed(speed) -> None:
     assert [tag.line for tag in bench.tags] == list(range(0, int(35 * speed) + 1, 7))
     start = bench.read(r.START_TIME)
     assert all(tag.timestamp == start + 2700 * tag.line for tag in bench.tags)
+    lines = bench.wire.look().issued
     bench.command(Command.STOP)
-    assert bench.wire.look().stopped
+    assert bench.status()["state"] == State.STOPPING  # the line that runs is finished
+    bench.clock.now_ns += int(LINE_NS / speed) + 1
+    assert bench.status()["state"] == State.ENDED
+    assert (bench.wire.look().stopped, bench.wire.look().issued) == (True, lines)
     bench.wire.close()
 
 

@@ -17,7 +17,7 @@ import pytest
 import zarr
 from store_helpers import Truth, check_rows, fill, make_spec
 
-from acquire.errors import DataError, UsageError
+from acquire.errors import DataError, StoreError, UsageError
 from acquire.store import RecordingWriter, RunCondition, open_recording, recover, verify
 from acquire.store.files import Disk, ShardFile
 
@@ -361,7 +361,7 @@ def test_a_disk_that_fails_at_any_step_acknowledges_nothing_false(tmp_path, numb
 def attempt(path: Path, spec, disk: Disk) -> tuple[str, int]:
     try:
         writer = RecordingWriter.create(path, spec, disk)
-    except (DataError, UsageError):
+    except (StoreError, UsageError):
         return "refused", 0
     with writer:
         try:

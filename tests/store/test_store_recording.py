@@ -327,7 +327,7 @@ def test_the_first_line_may_be_chosen_when_all_else_is_ready(path):
 def test_a_disk_that_refuses_the_beginning_leaves_nothing_behind(path):
     writer = RecordingWriter.prepare(path, make_spec())
     shutil.rmtree(path / "a")
-    with pytest.raises(DataError, match="creating the recording"):
+    with pytest.raises(StoreError, match="creating the recording"):
         writer.begin(5)
     assert not path.exists()
 

@@ -13,7 +13,7 @@ import pytest
 from wired_devices import CODE, PIXELS, STAGES, SUBSTEP_TICKS, SUBSTEPS, make_spec
 
 from acquire.clock import ClockFit
-from acquire.errors import DataError
+from acquire.errors import StoreError
 from acquire.lines import ARMS
 from acquire.store import RunCondition, Suspect, open_recording, suspect_lines
 from acquire.store.suspect import DOUBTFUL, VERIFIED
@@ -178,7 +178,7 @@ def test_whatever_keeps_a_recording_from_being_made_refuses_it(
     bed.lines()
     (refused,) = bed.post.said
     assert isinstance(refused, Refused)
-    assert isinstance(refused.error, DataError)
+    assert isinstance(refused.error, StoreError)
     assert repr(error) in str(refused.error)
     bed.post.waiting.append(Begin(tmp_path / "r.zarr", make_spec(), 32))
     bed.lines()
