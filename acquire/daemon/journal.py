@@ -46,15 +46,18 @@ class Journal:
         return [Path(path) for path in paths]
 
     def write(self, paths: Iterable[Path]) -> None:
-        """Write down what is left now; a failure costs a line in the log."""
+        """Write down what is left now, or remove the file; a failure costs a line in the log."""
         left = [str(path) for path in paths]
         if self._file is None or left == self._written:
             return
         self._written = left
-        text = json.dumps({self._key: left}, indent=1).encode()
         try:
-            scratch = self._file.with_name(f"{self._file.name}.next")
-            Publisher(scratch).replace(self._file, text, durable=True)
+            if left:
+                text = json.dumps({self._key: left}, indent=1).encode()
+                scratch = self._file.with_name(f"{self._file.name}.next")
+                Publisher(scratch).replace(self._file, text, durable=True)
+            else:
+                self._file.unlink(missing_ok=True)
         except OSError as error:
             log.error(  # noqa: TRY400
                 "%s cannot be written: %s; the next daemon will not know what is %s",

@@ -54,6 +54,9 @@ class Place:
         return made
 
     def left(self) -> list[str]:
+        """What the journal lists; there is none where nothing is left."""
+        if not self.journal.exists():
+            return []
         return [Path(path).name for path in json.loads(self.journal.read_bytes())["not_uploaded"]]
 
     def write(self, name: str, *, sealed: bool = True, run_id: str = "run", **changes: object) -> Path:
