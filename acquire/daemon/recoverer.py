@@ -17,12 +17,12 @@ from acquire.store.files import DISK, locked
 from acquire.store.host import has_run_on, is_here
 from acquire.store.links import refuse_link, refuse_links
 from acquire.store.opening import read_root
-from acquire.store.rebuild import known_attributes
+from acquire.store.rebuild import known_attributes, root_is_lost
 from acquire.store.removal import Unborn, remove, shards_on_disk
 from acquire.store.source import LocalSource
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Collection
     from pathlib import Path
 
     from acquire.stream.process import Mailbox
@@ -55,18 +55,15 @@ class Found:
     odd: list[RecoveryStatus]
 
 
-def search(directory: Path, recorded: Iterable[Path] = ()) -> Found:
+def search(directory: Path, recorded: Collection[Path] = ()) -> Found:
     """Recordings in a directory that are not sealed, and of those that are known to have been ``recorded``.
 
     Raises OSError where the directory cannot be read.
     """
     paths = sorted(path for path in directory.iterdir() if path.name.endswith(".zarr"))
-    found = Found([], [])
-    for path in paths:
-        _look_at(path, found, known=False)
-    for path in recorded:
-        if path not in paths:
-            _look_at(path, found, known=True)
+    known, found = set(recorded), Found([], [])
+    for path in dict.fromkeys([*paths, *recorded]):
+        _look_at(path, found, known=path in known)
     return found
 
 
@@ -75,7 +72,7 @@ def _look_at(path: Path, found: Found, *, known: bool) -> None:
     try:
         attributes = read_root(LocalSource(path))["attributes"]
     except AcquireError as error:
-        if known and path.is_dir():
+        if path.is_dir() and (known or (root_is_lost(path) and known_attributes(path) is not None)):
             found.open.append(path)  # its root may be rebuilt
         elif known and not os.path.lexists(path):
             text = (

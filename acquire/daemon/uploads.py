@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 MOST_LISTED = 32
 """Recordings that are copied, and that are not, of which the status tells: the latest."""
-ANSWER_S = 5.0
+ANSWER_S = 20.0
 """How long arming waits for the store's answer, once the process that asks is there."""
 START_S = 60.0
 """How long it waits for that process: an interpreter takes its time on a busy machine."""
