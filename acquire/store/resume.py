@@ -82,7 +82,8 @@ def _name(first: Path, segments: list[str], disk: Disk) -> None:
     if not isinstance(listed, list):
         raise DataError(f"{first}: segments is {listed!r:.50}, not a list of names")
     if new := [name for name in segments if name not in listed]:
-        document["attributes"]["segments"] = [*listed, *new]
+        # One that had to be recovered may be listed after those that went on from it: NAME-2 before NAME-10.
+        document["attributes"]["segments"] = sorted([*listed, *new], key=lambda name: (len(name), name))
         publisher = Publisher(first / ARMS[0] / "lines" / SCRATCH, disk)
         publisher.replace(first / "zarr.json", to_json(document), durable=True)
 

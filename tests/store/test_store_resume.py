@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import shutil
 
 import numpy as np
@@ -128,6 +129,17 @@ def go_on(path, number, first_line):
         fill(writer, 40)
         writer.seal(RunCondition.GOOD, "done", {})
     return place
+
+
+def test_segments_are_listed_in_their_order_whenever_that_is(killed):
+    recover(killed)
+    names = [resume(killed, 1500 + 100 * k, 40).name for k in range(10)]
+    assert names[-1] == "run-11.zarr"
+    document = json.loads((killed / "zarr.json").read_bytes())
+    document["attributes"]["segments"].remove("run-3.zarr")
+    (killed / "zarr.json").write_text(json.dumps(document))
+    recover(killed.with_name("run-3.zarr"))
+    assert open_recording(killed).attrs["segments"] == names
 
 
 def test_who_recovers_lists_what_went_on_meanwhile(killed):
