@@ -5,7 +5,7 @@ which is loaded when a camera is opened. Calls through ctypes release the interp
 memory is seen without a copy. Aravis has no CoaXPress.
 """
 
+from acquire.camera.aravis.bindings import load
 from acquire.camera.aravis.camera import FAKE, AravisCamera, AravisOpener, list_cameras
-from acquire.camera.aravis.library import load
 
 __all__ = ["FAKE", "AravisCamera", "AravisOpener", "list_cameras", "load"]

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from acquire.camera.aravis.bindings import errors, load
 from acquire.camera.aravis.features import AravisFeatures
-from acquire.camera.aravis.library import errors, load
 from acquire.camera.aravis.stream import StreamParameters, usual_parameters
 from acquire.camera.assembly import (
     STATISTICS,

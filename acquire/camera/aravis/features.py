@@ -7,7 +7,7 @@ import sys
 from ctypes import byref, c_double, c_int64, c_uint, c_void_p
 from typing import TYPE_CHECKING, Any
 
-from acquire.camera.aravis.library import errors
+from acquire.camera.aravis.bindings import errors
 from acquire.errors import CameraError
 
 if TYPE_CHECKING:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import pytest
@@ -56,7 +55,6 @@ def test_the_ulx3s_netlist_fits_a_quarter_of_the_device_and_can_be_made_again(tm
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-@pytest.mark.skipif(find_spec("luna") is None, reason="no luna-usb")
 def test_the_pll_of_usb_is_within_its_limits_too() -> None:
     from firmware.boards.ulx3s_usb import _usb_pll
 
