@@ -51,9 +51,12 @@ _POLL_S = 0.002
 """How often a waiter looks for a start; pulses themselves are awaited by their due time."""
 _STOP_POLL_S = 0.008
 """How often it looks for a stop while pulses come: often would be most of what a fast camera costs."""
-_WRITE_S = 1e-5
-_TORN_S = 1.0
-"""A write takes microseconds: a sequence that stays odd this long belongs to a writer that died."""
+_WRITE_S, _LONGEST_WRITE_S = 1e-5, 5e-3
+"""Between two looks at a wire that is being written, at first and at last: readers run before the writer on a
+busy host, and two that look all the time would keep it from going on."""
+_TORN_S = 15.0
+"""A write takes microseconds, or as long as a busy host keeps the writer from running: a sequence that
+stays odd this long belongs to a writer that died."""
 
 
 class Clock(Protocol):
@@ -231,14 +234,15 @@ class Wire:
 
     def _observe(self) -> tuple[int, Reading]:
         """A sequence and the reading that belongs to it."""
-        patience_ns = time.monotonic_ns() + int(_TORN_S * 1e9)
+        patience_ns, nap_s = time.monotonic_ns() + int(_TORN_S * 1e9), _WRITE_S
         while time.monotonic_ns() < patience_ns:
             sequence = self._sequence()
             if not sequence & 1 and self._refresh(sequence):
                 train, now_ns = self._known[1], self.clock.monotonic_ns()
                 if self._sequence() == sequence == self._known[0]:
                     return sequence, Reading(train, 0 if train is None else train.issued(now_ns))
-            time.sleep(_WRITE_S)  # not 0: a reader in real time would keep the writer from going on
+            time.sleep(nap_s)
+            nap_s = min(2 * nap_s, _LONGEST_WRITE_S)
         raise DeviceError("the simulated trigger died while it wrote on the wire")
 
     def _sequence(self) -> int:

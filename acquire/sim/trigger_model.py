@@ -327,7 +327,13 @@ class TriggerModel:
 
     def _tell_lines(self, told: int, lines: int) -> None:
         run, every = self._run, self.registers.get(r.TAG_INTERVAL)
-        for line in range(-(-told // every) * every, lines, every):
+        due = range(-(-told // every) * every, lines, every)
+        for number, line in enumerate(due):
+            if (
+                len(self._tags) >= TAG_ROOM
+            ):  # none is taken meanwhile: a late host need not wait for the rest
+                self._lose(len(due) - number)
+                return
             flags = TagFlag.LINE
             if line == 0:
                 flags |= TagFlag.FIRST | (TagFlag.EXTERNAL if run.external else TagFlag(0))
@@ -345,14 +351,19 @@ class TriggerModel:
 
     def _tell(self, record: TagRecord) -> None:
         run = self._run
-        number, run.made = run.made, run.made + 1
         if len(self._tags) >= TAG_ROOM:
-            run.lost, run.gap = run.lost + 1, True
+            self._lose(1)
             return
+        number, run.made = run.made, run.made + 1
         if run.gap:
             record, run.gap = record._replace(flags=record.flags | TagFlag.TAGS_LOST), False
         self._tags.append(encode(Frame(FrameType.TAG, number & 0xFFFF, r.pack_tag(record))))
         run.peak = max(run.peak, len(self._tags))
+
+    def _lose(self, count: int) -> None:
+        """So many tags find no room."""
+        run = self._run
+        run.made, run.lost, run.gap = run.made + count, run.lost + count, True
 
     def _tick(self) -> int:
         return self._tick_at(self._wire.clock.monotonic_ns())
