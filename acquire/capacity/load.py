@@ -286,8 +286,17 @@ def recording_spec(load: Load, clock: ClockFit) -> RecordingSpec:
 
 
 def _cpu_s(pids: dict[str, int | None]) -> dict[str, float]:
-    """Processor seconds of processes (None: this one) and all their threads, ended ones too."""
-    return {name: time.clock_gettime(_cpu_clock(pid or os.getpid())) for name, pid in pids.items()}
+    """Processor seconds of processes (None: this one) and all their threads, ended ones too.
+
+    Raises DataError where a process has ended, which none does in a load that is held.
+    """
+    used_s = {}
+    for name, pid in pids.items():
+        try:
+            used_s[name] = time.clock_gettime(_cpu_clock(pid or os.getpid()))
+        except OSError as error:
+            raise DataError(f"the load could not be held: process {name} ended") from error
+    return used_s
 
 
 def _cpu_clock(pid: int) -> int:
