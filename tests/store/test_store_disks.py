@@ -294,7 +294,10 @@ def test_a_kill_while_the_disk_is_measured_leaves_nothing(tmp_path, monkeypatch,
             os._exit(1)
 
     def has_file() -> bool:
-        targets = [str(entry.readlink()) for entry in Path(f"/proc/{child}/fd").iterdir()]
+        targets = []
+        for entry in Path(f"/proc/{child}/fd").iterdir():
+            with contextlib.suppress(FileNotFoundError):  # it has been closed since
+                targets.append(str(entry.readlink()))
         return any(str(tmp_path) in target and "deleted" in target for target in targets)
 
     try:

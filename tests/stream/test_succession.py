@@ -171,7 +171,8 @@ def test_a_successor_that_is_killed_as_well_is_replaced_and_the_budget_stays(run
 
 
 def test_what_the_ring_could_not_hold_meanwhile_is_a_gap(config, tmp_path):
-    short = config.model_copy(update={"stream": config.stream.model_copy(update={"ring_slots": 256})})
+    # 6 s: they fill while nobody can take its place, and hold what a busy host takes for its successor's disk
+    short = config.model_copy(update={"stream": config.stream.model_copy(update={"ring_slots": 1024})})
     with Rig(short) as rig:
         run = Run(short, rig)
         try:
