@@ -329,9 +329,7 @@ class TriggerModel:
         run, every = self._run, self.registers.get(r.TAG_INTERVAL)
         due = range(-(-told // every) * every, lines, every)
         for number, line in enumerate(due):
-            if (
-                len(self._tags) >= TAG_ROOM
-            ):  # none is taken meanwhile: a late host need not wait for the rest
+            if len(self._tags) >= TAG_ROOM:  # none is taken meanwhile: a late host need not wait for the rest
                 self._lose(len(due) - number)
                 return
             flags = TagFlag.LINE
