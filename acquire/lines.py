@@ -13,6 +13,7 @@ from acquire.errors import UsageError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from acquire.alignment import Alignment
     from acquire.geometry import Geometry
 
 ARMS = ("a", "b")
@@ -97,7 +98,8 @@ class Segment:
     first_line : the trigger's number of the first line
     substep_ns : duration of a sub-step
     black_level_dn, responsivity_dn : DN = black level + responsivity · Y, with Y of Eq. (1);
-        one number for both arms, or one per arm
+        one number for both arms, one per arm, or one per arm and pixel (2, M)
+    alignment : where arm B's image lies beside arm A's; None: on it
     """
 
     lines: NDArray[Any]
@@ -107,8 +109,9 @@ class Segment:
     time_ns: NDArray[np.int64]
     first_line: int = 0
     substep_ns: float = 1.0
-    black_level_dn: float | tuple[float, float] = 0.0
-    responsivity_dn: float | tuple[float, float] = 1.0
+    black_level_dn: float | tuple[float, float] | NDArray[np.float64] = 0.0
+    responsivity_dn: float | tuple[float, float] | NDArray[np.float64] = 1.0
+    alignment: Alignment | None = None
 
     def __post_init__(self) -> None:
         shape = self.geometry.lines_shape
@@ -127,10 +130,7 @@ class Segment:
 
     def samples(self, dtype: type[np.floating[Any]] = np.float32) -> NDArray[Any]:
         """Y of Eq. (1) (2, L_R, M): black level removed, in units of the scene; 0 where masked."""
-        black, gain = (
-            np.asarray(value, dtype).reshape(-1, 1, 1)
-            for value in (self.black_level_dn, self.responsivity_dn)
-        )
+        black, gain = (_beside_lines(value, dtype) for value in (self.black_level_dn, self.responsivity_dn))
         scaled = (self.lines.astype(dtype) - black) / gain
         return np.where(self.mask, scaled, dtype(0))
 
@@ -144,3 +144,9 @@ class Segment:
         offset = np.arange(frames) * temporal_merge - self.geometry.readout_substep
         time_ns: NDArray[np.int64] = self.time_ns[0] + np.rint(offset * self.substep_ns).astype(np.int64)
         return time_ns
+
+
+def _beside_lines(value: object, dtype: type[np.floating[Any]]) -> NDArray[Any]:
+    """A number, or one per arm, or one per arm and pixel, as it stands beside lines (arm, line, pixel)."""
+    given = np.asarray(value, dtype)
+    return given[:, None, :] if given.ndim == 2 else given.reshape(-1, 1, 1)

@@ -3,6 +3,17 @@
 from acquire.forward.arms import DualArm
 from acquire.forward.gathered import GatheredArms
 from acquire.forward.merge import block_bounds, column_merging, hold_video, merge_video
+from acquire.forward.registration import Registration, registration
 from acquire.forward.tdi import TdiArm
 
-__all__ = ["DualArm", "GatheredArms", "TdiArm", "block_bounds", "column_merging", "hold_video", "merge_video"]
+__all__ = [
+    "DualArm",
+    "GatheredArms",
+    "Registration",
+    "TdiArm",
+    "block_bounds",
+    "column_merging",
+    "hold_video",
+    "merge_video",
+    "registration",
+]

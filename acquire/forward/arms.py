@@ -10,13 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from acquire.arrays import Arrays
 from acquire.errors import NumericsError, UsageError
 from acquire.forward.kernels import add_transposed_frames, transpose_frames
+from acquire.forward.registration import registration
 from acquire.forward.tdi import TdiArm
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from acquire.alignment import Alignment
     from acquire.geometry import Geometry
 
 
@@ -29,6 +32,7 @@ class DualArm:
     code : (T,) exposure bits E of the sub-steps touched
     spatial_merge, temporal_merge : N_m, T_m ≥ 1; a voxel's value is held over its block
     dtype : float32 or float64, of voxels and lines
+    alignment : where arm B's image lies beside arm A's; absent: on it
     """
 
     def __init__(
@@ -38,6 +42,7 @@ class DualArm:
         spatial_merge: int = 1,
         temporal_merge: int = 1,
         dtype: type[np.floating[Any]] = np.float32,
+        alignment: Alignment | None = None,
     ) -> None:
         if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.float64)):
             raise UsageError(f"operator of dtype {np.dtype(dtype)}", possible="float32, float64")
@@ -50,18 +55,26 @@ class DualArm:
         self._a = TdiArm(geometry, code, spatial_merge, temporal_merge, dtype=dtype)
         self._b = TdiArm(geometry, code, spatial_merge, temporal_merge, flipped=True, dtype=dtype)
         self._turned = np.empty(self.video_shape, dtype)
+        arrays = Arrays(dtype="float32" if self.dtype == np.float32 else "float64")
+        self._registration = registration(alignment, geometry, spatial_merge, arrays)
 
     def forward(self, video: NDArray[Any]) -> NDArray[Any]:
         """Λ′·X′: (⌈T/T_m⌉, ⌈n/N_m⌉, ⌈n/N_m⌉) → (2, L_R, M)."""
         video = self._checked(video, self.video_shape, "video")
-        transpose_frames(video, self._turned)
+        seen = video if self._registration is None else self._registration.forward(video)
+        transpose_frames(seen, self._turned)
         return np.stack([self._a.forward(video), self._b.forward(self._turned)])
 
     def adjoint(self, lines: NDArray[Any]) -> NDArray[Any]:
         """Λ′ᵀ·Y: (2, L_R, M) → (⌈T/T_m⌉, ⌈n/N_m⌉, ⌈n/N_m⌉)."""
         lines = self._checked(lines, self.lines_shape, "lines")
         video = self._a.adjoint(lines[0])
-        add_transposed_frames(self._b.adjoint(lines[1]), video)
+        seen = self._b.adjoint(lines[1])
+        if self._registration is None:
+            add_transposed_frames(seen, video)
+            return video
+        transpose_frames(seen, self._turned)
+        video += self._registration.adjoint(self._turned)
         return video
 
     def norm_bound(self, steps: int = 10) -> float:

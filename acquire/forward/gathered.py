@@ -15,10 +15,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from acquire.forward.merge import block_bounds, column_merging
+from acquire.forward.registration import registration
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from acquire.alignment import Alignment
     from acquire.arrays import Array, Arrays
     from acquire.geometry import Geometry
 
@@ -33,11 +35,13 @@ class GatheredArms:
         spatial_merge: int,
         temporal_merge: int,
         arrays: Arrays,
+        alignment: Alignment | None = None,
     ) -> None:
         starts, lengths = block_bounds(geometry.size, spatial_merge)
         flipped = geometry.size - starts - lengths
         frames = geometry.video_shape(spatial_merge, temporal_merge)[0]
         self._xp = arrays.xp
+        self._registration = registration(alignment, geometry, spatial_merge, arrays)
         self._merging = arrays.asarray(column_merging(geometry, spatial_merge))
         self._terms = [
             _Terms(*_crossings(geometry, code, order, lengths, temporal_merge), frames, arrays)
@@ -46,7 +50,8 @@ class GatheredArms:
 
     def forward(self, video: Array) -> Array:
         """Λ′·X′: (⌈T/T_m⌉, ⌈n/N_m⌉, ⌈n/N_m⌉) → (2, L_R, M)."""
-        views = (video, self._xp.permute_dims(video, (0, 2, 1)))
+        seen = video if self._registration is None else self._registration.forward(video)
+        views = (video, self._xp.permute_dims(seen, (0, 2, 1)))
         arms = [terms.shear(view) for terms, view in zip(self._terms, views, strict=True)]
         return self._xp.stack(arms) @ self._merging
 
@@ -54,7 +59,8 @@ class GatheredArms:
         """Λ′ᵀ·Y: (2, L_R, M) → (⌈T/T_m⌉, ⌈n/N_m⌉, ⌈n/N_m⌉)."""
         spread = lines @ self._merging.T
         a, b = (terms.unshear(spread[arm, ...]) for arm, terms in enumerate(self._terms))
-        return a + self._xp.permute_dims(b, (0, 2, 1))
+        seen = self._xp.permute_dims(b, (0, 2, 1))
+        return a + (seen if self._registration is None else self._registration.adjoint(seen))
 
 
 class _Terms:

@@ -126,3 +126,20 @@ def add_transposed_frames(video: NDArray[Any], out: NDArray[Any]) -> None:
         for r in range(video.shape[1]):
             for c in range(video.shape[2]):
                 out[t, c, r] += video[t, r, c]
+
+
+@numba.njit(parallel=True, cache=True, fastmath={"contract", "reassoc", "nsz"})
+def gather_frames(
+    frames: NDArray[Any],
+    first: NDArray[np.int64],
+    source: NDArray[np.int64],
+    weight: NDArray[Any],
+    out: NDArray[Any],
+) -> None:
+    """out[k, p] = Σ_j weight[j]·frames[k, source[j]], j from first[p] to first[p + 1]: a CSR matrix."""
+    for k in numba.prange(out.shape[0]):
+        for p in range(out.shape[1]):
+            total = out.dtype.type(0)
+            for j in range(first[p], first[p + 1]):
+                total += weight[j] * frames[k, source[j]]
+            out[k, p] = total

@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.forward import DualArm, GatheredArms, block_bounds, column_merging
+from acquire.forward import DualArm, GatheredArms, block_bounds, column_merging, registration
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from acquire.alignment import Alignment
     from acquire.arrays import Array
     from acquire.geometry import Geometry
     from acquire.recon.basis import Basis
@@ -31,13 +32,14 @@ def band_operator(
     basis: Basis,
     spatial_merge: int = 1,
     temporal_merge: int = 1,
+    alignment: Alignment | None = None,
 ) -> BandOperator | InBasis:
     """B = Λ′·Dᵀ, by the dense factors where these take at most 1 GiB, else by way of the video."""
     side = geometry.video_shape(spatial_merge, temporal_merge)[1]
     itemsize = np.dtype(basis.arrays.dtype).itemsize
     if 2 * geometry.lines * side * basis.count * itemsize <= LARGEST_FACTORS_BYTES:
-        return BandOperator(geometry, code, basis, spatial_merge, temporal_merge)
-    return InBasis(geometry, code, basis, spatial_merge, temporal_merge)
+        return BandOperator(geometry, code, basis, spatial_merge, temporal_merge, alignment)
+    return InBasis(geometry, code, basis, spatial_merge, temporal_merge, alignment)
 
 
 class BandOperator:
@@ -50,12 +52,14 @@ class BandOperator:
         basis: Basis,
         spatial_merge: int = 1,
         temporal_merge: int = 1,
+        alignment: Alignment | None = None,
     ) -> None:
         side = geometry.video_shape(spatial_merge, temporal_merge)[1]
         self.theta_shape = (basis.count, side, side)
         self.lines_shape = geometry.lines_shape
         self._xp, asarray = basis.arrays.xp, basis.arrays.asarray
         self._merging = asarray(column_merging(geometry, spatial_merge))
+        self._registration = registration(alignment, geometry, spatial_merge, basis.arrays)
         starts, lengths = block_bounds(geometry.size, spatial_merge)
         lit = self._lit_cosines(code, basis, temporal_merge)
         flipped = geometry.size - starts - lengths
@@ -66,7 +70,10 @@ class BandOperator:
 
     def forward(self, theta: Array) -> Array:
         """B·θ."""
-        views = (self._xp.permute_dims(theta, axes) for axes in ((1, 0, 2), (2, 0, 1)))  # (block, K, across)
+        seen = theta if self._registration is None else self._registration.forward(theta)
+        views = (  # (block, K, across)
+            self._xp.permute_dims(each, axes) for each, axes in ((theta, (1, 0, 2)), (seen, (2, 0, 1)))
+        )
         return self._xp.stack([self._arm(*pair) for pair in zip(self._factors, views, strict=True)])
 
     def adjoint(self, lines: Array) -> Array:
@@ -76,7 +83,9 @@ class BandOperator:
             self._xp.reshape(self._arm_adjoint(factor, lines[arm, ...]), (side, K, side))
             for arm, factor in enumerate(self._factors)
         )
-        return self._xp.permute_dims(rows, (1, 0, 2)) + self._xp.permute_dims(columns, (1, 2, 0))
+        seen = self._xp.permute_dims(columns, (1, 2, 0))
+        back = seen if self._registration is None else self._registration.adjoint(seen)
+        return self._xp.permute_dims(rows, (1, 0, 2)) + back
 
     def _arm(self, factor: Array, view: Array) -> Array:
         """Columns are merged into pixels on that side of the product where it is the smaller."""
@@ -108,14 +117,15 @@ class InBasis:
         basis: Basis,
         spatial_merge: int = 1,
         temporal_merge: int = 1,
+        alignment: Alignment | None = None,
     ) -> None:
         self._basis, case = basis, (geometry, code, spatial_merge, temporal_merge)
         arrays = basis.arrays
         self._operator: DualArm | GatheredArms
         if arrays.compiled:
-            self._operator = DualArm(*case, np.dtype(arrays.dtype).type)
+            self._operator = DualArm(*case, np.dtype(arrays.dtype).type, alignment)
         else:
-            self._operator = GatheredArms(*case, arrays)
+            self._operator = GatheredArms(*case, arrays, alignment)
 
     def forward(self, theta: Array) -> Array:
         return self._operator.forward(self._basis.synthesize(theta))

@@ -64,7 +64,9 @@ def _tentative(
     frames, side, _ = segment.geometry.video_shape(merge, temporal_merge)
     basis = TemporalBasis(frames, count, arrays)
     problem = pose(segment, merge, temporal_merge, hold_out=0.0, arrays=arrays)
-    operator = problem.masked(band_operator(segment.geometry, segment.code, basis, merge, temporal_merge))
+    operator = problem.masked(
+        band_operator(segment.geometry, segment.code, basis, merge, temporal_merge, segment.alignment)
+    )
     parameters = AdmmParameters(grid_per_coefficient=1)
     solver = Admm(operator, problem.used_samples, (count, side, side), basis, parameters)
     for made in range(ITERATIONS):

@@ -20,7 +20,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from acquire.arrays import dot, host
-from acquire.forward import column_merging
+from acquire.forward import column_merging, registration
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -105,7 +105,9 @@ class CurveOperator:
         self._frame = self._arrays.indices(substeps // temporal_merge)
         self._windows = self._arrays.indices(windows.ravel())
         self._code = self._arrays.asarray(segment.code)
-        views = (patterns, self._xp.flip(self._xp.permute_dims(patterns, (0, 2, 1)), axis=1))
+        aligned = registration(segment.alignment, segment.geometry, 1, self._arrays)
+        seen = patterns if aligned is None else aligned.forward(patterns)
+        views = (patterns, self._xp.flip(self._xp.permute_dims(seen, (0, 2, 1)), axis=1))
         merging = self._arrays.asarray(column_merging(segment.geometry, 1))
         self._profiles = [_profiles(self._xp, view, merging, segment.geometry.substeps) for view in views]
         self._matrix = self._arrays.asarray(cosines.matrix())

@@ -164,7 +164,9 @@ class Refinement:
         """The patterns' operator and the basis of their curves, as these are now."""
         basis = LearnedBasis(self._cosines, self.found.curves)
         geometry, code = self._segment.geometry, self._segment.code
-        self._operator: Operator = band_operator(geometry, code, basis, 1, self._temporal_merge)
+        self._operator: Operator = band_operator(
+            geometry, code, basis, 1, self._temporal_merge, self._segment.alignment
+        )
         return self._problem.masked(self._operator), basis
 
     def _begin(self) -> Admm:

@@ -125,7 +125,9 @@ def pose(
     usable = segment.mask & ~np.logical_or.reduce([np.zeros_like(segment.mask), *bad.values()])
     if not usable.any():
         raise UsageError("no sample of the segment is usable", hint="another line range")
-    operator = DualArm(segment.geometry, segment.code, spatial_merge, temporal_merge)
+    operator = DualArm(
+        segment.geometry, segment.code, spatial_merge, temporal_merge, alignment=segment.alignment
+    )
     norm = operator.norm_bound(steps=5)
     flat = operator.forward(np.ones(operator.video_shape, np.float32))
     scale = _scale(samples[usable], flat[usable])

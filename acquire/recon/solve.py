@@ -132,7 +132,7 @@ def _first_look(
     """In the cosines; few frames with lower penalties from where they turn out to explain the lines."""
     N_m, T_m = request.spatial_merge, request.temporal_merge
     frames, side, _ = segment.geometry.video_shape(N_m, T_m)
-    operator = band_operator(segment.geometry, segment.code, basis, N_m, T_m)
+    operator = band_operator(segment.geometry, segment.code, basis, N_m, T_m, segment.alignment)
 
     def begin(start: Array | None, *, explained: bool = False) -> InBand:
         parameters = _weighted(_defaults(frames, explained=explained), request.tv_weight)
@@ -205,7 +205,7 @@ def solve_twist(segment: Segment, problem: Problem, request: Request, clock: Ite
     count = _coefficients(segment, problem, request, clock) if banded else shape[0]
     basis = TemporalBasis(shape[0], count, problem.arrays)
     make = band_operator if banded else InBasis
-    operator = make(segment.geometry, segment.code, basis, N_m, T_m)
+    operator = make(segment.geometry, segment.code, basis, N_m, T_m, segment.alignment)
     parameters = TwistParameters()
     if request.tv_weight is not None:
         parameters = replace(parameters, tv_weight=request.tv_weight)

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from recon_cases import cases
 
+from acquire.alignment import Alignment
 from acquire.arrays import open_arrays
 from acquire.errors import UsageError
 from acquire.forward import DualArm
@@ -61,7 +62,8 @@ def test_band_operator_is_the_sensing_matrix_in_the_basis(case: tuple[Geometry, 
     code = rng.integers(0, 2, g.span).astype(np.uint8)
     whole = DualArm(g, code, N_m, T_m, np.float64)
     basis = TemporalBasis(whole.video_shape[0], K, DOUBLE)
-    band, composed = BandOperator(g, code, basis, N_m, T_m), InBasis(g, code, basis, N_m, T_m)
+    off = Alignment(*rng.uniform(-2, 2, 2), *rng.uniform(-9, 9, 1)) if seed % 2 else None
+    band, composed = BandOperator(g, code, basis, N_m, T_m, off), InBasis(g, code, basis, N_m, T_m, off)
     theta = rng.standard_normal(band.theta_shape)
     lines = rng.standard_normal(g.lines_shape)
     np.testing.assert_allclose(band.forward(theta), composed.forward(theta), atol=1e-11)

@@ -1,0 +1,73 @@
+"""Where the image of arm B lies beside arm A's: a similarity of the plane, in fine pixels of the scene."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+LARGEST_SHIFT_PIXELS = 1e4
+LARGEST_TURN_DEG = 45.0
+LARGEST_MAGNIFICATION = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Alignment:
+    """What lies at p in arm A's view is at m·Q·p + (rows, columns) in arm B's, both from the field's middle.
+
+    ``rows`` and ``columns`` are fine pixels downwards and to the right in camera A's view, ``turn_deg`` is
+    counter-clockwise, ``magnification`` is m. The effect ``misregistration`` has the same convention.
+    """
+
+    rows: float = 0.0
+    columns: float = 0.0
+    turn_deg: float = 0.0
+    magnification: float = 1.0
+
+    def __post_init__(self) -> None:
+        values = (self.rows, self.columns, self.turn_deg, self.magnification)
+        if not all(map(math.isfinite, values)):
+            raise UsageError(f"alignment {self}", possible="finite numbers")
+        near = max(abs(self.rows), abs(self.columns)) <= LARGEST_SHIFT_PIXELS
+        low = 1 / LARGEST_MAGNIFICATION
+        if not (
+            near
+            and abs(self.turn_deg) <= LARGEST_TURN_DEG
+            and low <= self.magnification <= LARGEST_MAGNIFICATION
+        ):
+            raise UsageError(
+                f"alignment {self}",
+                possible=f"shifts up to {LARGEST_SHIFT_PIXELS:g} fine pixels, turns up to "
+                f"{LARGEST_TURN_DEG:g} degrees, magnification {low:g} to {LARGEST_MAGNIFICATION:g}",
+            )
+
+    @property
+    def matrix(self) -> NDArray[np.float64]:
+        """m·Q on (row, column): (2, 2)."""
+        angle = math.radians(self.turn_deg)
+        turned = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+        return self.magnification * turned
+
+    def sources(self, size: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Row and column (size, size) of arm A's view that each fine pixel of arm B's view shows."""
+        middle = (size - 1) / 2
+        seen = np.indices((size, size), np.float64)
+        offset = np.array([middle + self.rows, middle + self.columns])
+        rows, columns = np.tensordot(np.linalg.inv(self.matrix), seen - offset[:, None, None], axes=1)
+        return rows + middle, columns + middle
+
+    def facts(self) -> dict[str, Any]:
+        """As JSON."""
+        return {
+            "rows": self.rows,
+            "columns": self.columns,
+            "turn_deg": self.turn_deg,
+            "magnification": self.magnification,
+        }

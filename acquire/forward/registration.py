@@ -1,0 +1,123 @@
+"""Registration: arm B's view of the scene made of arm A's, as one sparse matrix R and its transpose.
+
+R interpolates between the four neighbours of where a pixel of arm B looks; beyond the edge the scene is what
+it is at the edge. Its elements are not negative and its rows sum to 1, so a uniform scene stays what it is
+and the bound of ‖Λ′‖ holds with R as without. For voxels of N_m > 1 it is R between holding a voxel over its
+block and taking the mean of one.
+
+It acts on frames that do not change from sub-step to sub-step (coefficients of a basis, patterns), so
+sub-steps cost nothing more. Without an alignment there is no R.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy import sparse
+
+from acquire.arrays import HOST
+from acquire.forward.kernels import gather_frames
+from acquire.forward.merge import block_bounds
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.alignment import Alignment
+    from acquire.arrays import Array, Arrays
+    from acquire.geometry import Geometry
+
+
+def registration(
+    alignment: Alignment | None, geometry: Geometry, spatial_merge: int = 1, arrays: Arrays = HOST
+) -> Registration | None:
+    """R of an alignment; None where there is none, and nothing is done."""
+    return None if alignment is None else Registration(alignment, geometry.size, spatial_merge, arrays)
+
+
+class Registration:
+    """R on frames (k, n′, n′), in any ``arrays``."""
+
+    def __init__(self, alignment: Alignment, size: int, spatial_merge: int, arrays: Arrays = HOST) -> None:
+        matrix = sampling_matrix(alignment, size, spatial_merge)
+        self._forward, self._adjoint = (_Gather(each, arrays) for each in (matrix, matrix.T.tocsr()))
+
+    def forward(self, frames: Array) -> Array:
+        """Arm A's view (k, n′, n′) as arm B sees it."""
+        return self._forward(frames)
+
+    def adjoint(self, frames: Array) -> Array:
+        """Rᵀ, from arm B's view to arm A's."""
+        return self._adjoint(frames)
+
+
+def sampling_matrix(alignment: Alignment, size: int, spatial_merge: int = 1) -> sparse.csr_array:
+    """R (n′², n′²), rows and columns in the order of a frame's elements."""
+    rows, columns = (np.clip(each, 0, size - 1).ravel() for each in alignment.sources(size))
+    row, column = (each.astype(np.int64) for each in (rows, columns))
+    below, right = rows - row, columns - column
+    next_row, next_column = (np.minimum(each + 1, size - 1) for each in (row, column))
+    corners = [
+        ((1 - below) * (1 - right), row * size + column),
+        ((1 - below) * right, row * size + next_column),
+        (below * (1 - right), next_row * size + column),
+        (below * right, next_row * size + next_column),
+    ]
+    weights, sources = (np.concatenate(each) for each in zip(*corners, strict=True))
+    pixels = np.tile(np.arange(size**2), len(corners))
+    fine = sparse.coo_array((weights, (pixels, sources)), shape=(size**2, size**2)).tocsr()
+    if spatial_merge == 1:
+        fine.eliminate_zeros()
+        return fine
+    held = _holding(size, spatial_merge)
+    means = sparse.diags_array(1 / held.sum(axis=0)) @ held.T
+    merged: sparse.csr_array = (means @ fine @ held).tocsr()
+    merged.eliminate_zeros()
+    return merged
+
+
+def _holding(size: int, merge: int) -> sparse.csr_array:
+    """Voxels held over their blocks: (n², n′²)."""
+    _, lengths = block_bounds(size, merge)
+    block = np.repeat(np.arange(len(lengths)), lengths)
+    one = sparse.coo_array((np.ones(size), (np.arange(size), block))).tocsr()
+    whole: sparse.csr_array = sparse.kron(one, one).tocsr()
+    return whole
+
+
+class _Gather:
+    """A sparse matrix along the pixels of frames."""
+
+    def __init__(self, matrix: sparse.csr_array, arrays: Arrays) -> None:
+        self._arrays = arrays
+        self._terms: list[tuple[Array, Array]] = []
+        if arrays.compiled:
+            self._first = matrix.indptr.astype(np.int64)
+            self._source, self._weight = matrix.indices.astype(np.int64), matrix.data.astype(arrays.dtype)
+            return
+        self._terms = [(arrays.indices(index), arrays.asarray(weight)) for index, weight in _padded(matrix)]
+
+    def __call__(self, frames: Array) -> Array:
+        if not self._terms:
+            out = np.empty(frames.shape, frames.dtype)
+            flat, into = frames.reshape(len(frames), -1), out.reshape(len(frames), -1)
+            gather_frames(flat, self._first, self._source, self._weight, into)
+            return out
+        xp = self._arrays.xp
+        flat = xp.reshape(frames, (frames.shape[0], -1))
+        parts = (weight * xp.take(flat, index, axis=1) for index, weight in self._terms)
+        total = next(parts)
+        for part in parts:
+            total += part
+        return xp.reshape(total, frames.shape)
+
+
+def _padded(matrix: sparse.csr_array) -> list[tuple[NDArray[np.int64], NDArray[Any]]]:
+    """Source and weight of the j-th element of every row, for each j; weights of 0 where a row has fewer."""
+    counts = np.diff(matrix.indptr)
+    terms = []
+    for j in range(int(counts.max())):
+        there = counts > j
+        at = np.minimum(matrix.indptr[:-1] + j, matrix.nnz - 1)
+        terms.append((matrix.indices[at].astype(np.int64), np.where(there, matrix.data[at], 0.0)))
+    return terms
