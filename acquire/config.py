@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, PrivateAttr, ValidationError, model_validator
 
 from acquire.codes import TAPS, Code, ConstantCode, PrbsCode, mix_seed
 from acquire.device_config import SEEING_CAMERAS, SIMULATED_CAMERAS, CamerasConfig, TriggerConfig
@@ -20,6 +20,7 @@ from acquire.effect_config import MOST_SECONDS, SEED_END, FilePath, FrozenModel
 from acquire.errors import ConfigError
 from acquire.event_config import CheckConfig, EventsConfig
 from acquire.geometry import Geometry
+from acquire.place import default_socket
 from acquire.plan_config import ReconstructionPlan
 from acquire.reading import read_regular
 from acquire.recording_config import USUAL_CHUNK_BYTES, RecordingConfig, usual_chunk_lines, usual_tag_chunks
@@ -41,12 +42,6 @@ MAX_RING_BYTES = 4 * 2**30
 """Pixels that may wait in the ring of one arm."""
 
 M = TypeVar("M", bound=BaseModel)
-
-
-def default_socket() -> Path:
-    """The control socket where none is configured: in the user's runtime directory, else in one in /tmp."""
-    runtime = os.environ.get("XDG_RUNTIME_DIR") or f"/tmp/acquire-{os.geteuid()}"  # noqa: S108
-    return Path(runtime) / "acquire.sock"
 
 
 class GeometryConfig(FrozenModel):
@@ -174,6 +169,12 @@ class RigConfig(FrozenModel):
     check: CheckConfig = CheckConfig()
     control: ControlConfig = Field(default_factory=ControlConfig)
     simulation: SimulationConfig = SimulationConfig()
+    _origin: str = PrivateAttr("")
+
+    @property
+    def origin(self) -> str:
+        """The file that it was read from; empty where it was none."""
+        return self._origin
 
     @model_validator(mode="after")
     def _ring_fits(self) -> RigConfig:
@@ -342,6 +343,7 @@ def load_rig(name: str | Path, overrides: Mapping[str, Any] | None = None) -> Ri
     for key, value in (overrides or {}).items():
         _set(table, key, value)
     rig = _validate(RigConfig, table, path)
+    rig._origin = str(path.absolute())
     if not rig.needs_scene:
         return rig
     scene = find(rig.scene_file(), beside=path, kind="scene").resolve()

@@ -28,8 +28,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from acquire.client import Client
 from acquire.config import builtin_directory
-from acquire.daemon.client import Client
 from acquire.daemon.states import SEALED, State
 from acquire.errors import AcquireError
 from acquire.lines import ARMS, LineFlag

@@ -12,7 +12,7 @@ from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, q
 from acquire.errors import DataError, UsageError
 
 if TYPE_CHECKING:
-    from acquire.daemon.client import Client
+    from acquire.client import Client
     from acquire.daemon.messages import (
         ArmStatus,
         CheckStatus,
@@ -154,10 +154,9 @@ def status(
 
 def _daemon(socket: Path | None) -> Client:
     from acquire.cli.progress import teller
-    from acquire.config import default_socket
-    from acquire.daemon.client import Client
+    from acquire.client import Client
 
-    return Client(socket or default_socket(), teller())
+    return Client(socket, teller())
 
 
 def _damage(last: LastRecording) -> str:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from acquire.cli.demo_plan import trigger_settings
 from acquire.cli.progress import stage_progress
-from acquire.daemon.client import Client
+from acquire.client import Client
 from acquire.daemon.states import SEALED, State
 from acquire.errors import AcquireError, DataError, NoDaemonError
 

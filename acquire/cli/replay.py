@@ -162,7 +162,7 @@ def _record(stored: Recording, out: Path, speed: float) -> str | None:
     """One attempt; what was lost on the way, None where nothing was."""
     from acquire.cli.demo_capture import await_daemon, daemon_process, follow
     from acquire.cli.replay_rig import replay_rig
-    from acquire.daemon.client import Client
+    from acquire.client import Client
 
     with ExitStack() as held:
         directory = held.enter_context(_private_directory())

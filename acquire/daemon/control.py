@@ -6,8 +6,7 @@ published last, so that it never waits for a device.
 
 from __future__ import annotations
 
-import asyncio
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
@@ -15,27 +14,19 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
 from acquire import __version__
-from acquire.daemon.messages import (
-    HTTP_STATUS,
-    ArmRequest,
-    ErrorMessage,
-    MarkRequest,
-    StartRequest,
-    Status,
-    error_body,
-    fault_error,
-    http_status,
-)
-from acquire.daemon.states import State
+from acquire.daemon.answers import Answers
+from acquire.daemon.local import Local
+from acquire.daemon.messages import HTTP_STATUS, ErrorMessage, error_body, http_status
+from acquire.daemon.routes import routes
 from acquire.errors import AcquireError, UsageError
 from acquire.text import shortened, shown
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
-
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-POLL_S = 0.02
+    from acquire.daemon.local import Run
+    from acquire.daemon.service import Service
+
 MAX_BODY_BYTES = 2**16
 """No request is longer than a path and a number."""
 MOST_EXPLAINED = 5
@@ -49,23 +40,19 @@ REFUSALS = {
 """What is refused before any command sees it."""
 
 
-class Commands(Protocol):
-    """What the API controls."""
-
-    def status(self) -> Status: ...
-    def arm(self, request: ArmRequest) -> None: ...
-    def start(self, request: StartRequest) -> None: ...
-    def mark(self, text: str) -> None: ...
-    def stop(self) -> None: ...
-    def disarm(self) -> None: ...
-
-
-def build_app(service: Commands, run: Callable[[Callable[[], None]], Awaitable[None]]) -> FastAPI:
+def build_app(service: Service, run: Run) -> FastAPI:
     """The API over ``service``; ``run`` carries a command out in the thread that owns the devices."""
+    app = new_app("Control of the capture service.")
+    app.include_router(routes(Local(service, run), Answers()))
+    return app
+
+
+def new_app(description: str) -> FastAPI:
+    """An API without routes: what it refuses with, and how much it reads."""
     app = FastAPI(
         title="acquire",
         version=__version__,
-        description="Control of the capture service.",
+        description=description,
         responses={
             **{code: {"model": ErrorMessage, "description": why} for code, why in REFUSALS.items()},
             **{code: {"model": ErrorMessage, "description": f"{kind.__doc__}"} for kind, code in HTTP_STATUS},
@@ -75,40 +62,6 @@ def build_app(service: Commands, run: Callable[[Callable[[], None]], Awaitable[N
     )
     app.add_middleware(BoundedBody)
     _add_errors(app)
-
-    @app.get("/status", summary="What the daemon is doing, and how well")
-    async def status() -> Status:
-        return service.status()
-
-    @app.post("/arm", summary="idle → armed")
-    async def arm(request: ArmRequest | None = None) -> Status:
-        await run(lambda: service.arm(request or ArmRequest()))
-        return service.status()
-
-    @app.post("/start", summary="armed → recording")
-    async def start(request: StartRequest) -> Status:
-        await run(lambda: service.start(request))
-        return service.status()
-
-    @app.post("/mark", summary="armed, recording or draining: an event at the newest line")
-    async def mark(request: MarkRequest) -> Status:
-        await run(lambda: service.mark(request.text))
-        return service.status()
-
-    @app.post("/stop", summary="recording → draining → armed; returns once the recording is sealed")
-    async def stop() -> Status:
-        await run(service.stop)
-        while (status := service.status()).state is State.DRAINING:
-            await asyncio.sleep(POLL_S)
-        if status.state is State.FAULTED:
-            raise fault_error(status.fault)
-        return status
-
-    @app.post("/disarm", summary="armed → idle; clears a fault")
-    async def disarm() -> Status:
-        await run(service.disarm)
-        return service.status()
-
     return app
 
 

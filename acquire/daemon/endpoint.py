@@ -17,10 +17,10 @@ import socket
 import stat
 from pathlib import Path
 
-from acquire.config import default_socket
 from acquire.daemon.connections import Listener
 from acquire.daemon.peer import ELSEWHERE
 from acquire.errors import StateError, UsageError
+from acquire.place import default_socket
 
 LONGEST_PATH = 107
 """Bytes of a Unix socket's path that the kernel takes."""

@@ -30,11 +30,13 @@ LONGEST_MARK = 400
 """Characters."""
 
 
-class _Message(BaseModel):
+class Message(BaseModel):
+    """Unknown keys are refused; values do not change."""
+
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class ArmRequest(_Message):
+class ArmRequest(Message):
     """How to arm."""
 
     force: bool = Field(
@@ -44,7 +46,7 @@ class ArmRequest(_Message):
     )
 
 
-class StartRequest(_Message):
+class StartRequest(Message):
     """Where to record, and how much."""
 
     path: Path | None = Field(
@@ -109,7 +111,7 @@ class StartRequest(_Message):
         return path
 
 
-class MarkRequest(_Message):
+class MarkRequest(Message):
     """What happens now, in the operator's words."""
 
     text: str = Field(
@@ -117,7 +119,7 @@ class MarkRequest(_Message):
     )
 
 
-class RingStatus(_Message):
+class RingStatus(Message):
     """Fill of the ring between a camera and the recorder, in slots."""
 
     slots: int
@@ -127,7 +129,7 @@ class RingStatus(_Message):
     history: int = Field(default=0, description="slots from the past that a recording can begin with")
 
 
-class LedgerStatus(_Message):
+class LedgerStatus(Message):
     """Every pulse since arm: issued = preroll + stored + discarded + lost + waiting + pending."""
 
     issued: int = Field(description="by the trigger, as far as tags and lines tell")
@@ -142,7 +144,7 @@ class LedgerStatus(_Message):
     balanced: bool
 
 
-class CheckStatus(_Message):
+class CheckStatus(Message):
     """What the lines say of the light's code."""
 
     verdict: Text = Field(description="verified, shifted, inverted, wrong_code, dark or unknown")
@@ -151,7 +153,7 @@ class CheckStatus(_Message):
     lapped: int = Field(description="ring slots that came and went unseen by the check")
 
 
-class ArmStatus(_Message):
+class ArmStatus(Message):
     """One arm since it was armed: what its camera delivered and what became of it, in lines."""
 
     delivered: int = Field(description="by the camera, the preroll included")
@@ -175,7 +177,7 @@ class ArmStatus(_Message):
     check: CheckStatus | None = Field(default=None, description="null: the rig does not check")
 
 
-class RecordingStatus(_Message):
+class RecordingStatus(Message):
     """The recording being written."""
 
     path: Place
@@ -185,7 +187,7 @@ class RecordingStatus(_Message):
     committed_lines: int = Field(description="rows that a reader can see, in both arms")
 
 
-class LastRecording(_Message):
+class LastRecording(Message):
     """The recording that was closed last."""
 
     path: Place
@@ -194,7 +196,7 @@ class LastRecording(_Message):
     end_reason: Text | None
 
 
-class RecoveryStatus(_Message):
+class RecoveryStatus(Message):
     """A recording that its recorder did not seal, and what the daemon made of it."""
 
     path: Place
@@ -207,7 +209,7 @@ class RecoveryStatus(_Message):
     text: Text = Field(default="", description="how it came to that; once it is recovered, its end reason")
 
 
-class UploadStatus(_Message):
+class UploadStatus(Message):
     """A recording on its way to `recording.upload_to`."""
 
     path: Place
@@ -223,7 +225,7 @@ class UploadStatus(_Message):
     hint: Text = ""
 
 
-class CapacityStatus(_Message):
+class CapacityStatus(Message):
     """What this host sustains, as measured before the run was armed; line rates of both arms."""
 
     line_rate_hz: float = Field(description="configured")
@@ -234,7 +236,7 @@ class CapacityStatus(_Message):
     warning: Text | None = None
 
 
-class TriggerStatus(_Message):
+class TriggerStatus(Message):
     """The instrument's clock, since it was armed."""
 
     clock_hz: int
@@ -244,7 +246,7 @@ class TriggerStatus(_Message):
     answers: bool = Field(description="it was not silent for longer than it should be")
 
 
-class DiskStatus(_Message):
+class DiskStatus(Message):
     """Room for recordings that have no path of their own."""
 
     directory: Place
@@ -257,7 +259,7 @@ class DiskStatus(_Message):
     seconds_to_full: float = Field(description="at that rate, to the reserve")
 
 
-class TroubleStatus(_Message):
+class TroubleStatus(Message):
     """A failure that nobody foresaw, in something that nobody asked for; the service goes on."""
 
     text: Text = Field(description="where, and what")
@@ -265,7 +267,7 @@ class TroubleStatus(_Message):
     last: datetime
 
 
-class Status(_Message):
+class Status(Message):
     """What the daemon is doing, and how well."""
 
     state: State
@@ -302,7 +304,7 @@ class Status(_Message):
     troubles: list[TroubleStatus] = Field(default=[], description="unforeseen failures, the latest last")
 
 
-class ErrorMessage(_Message):
+class ErrorMessage(Message):
     """An AcquireError on the wire."""
 
     error: Text = Field(description="name of the class in acquire.errors")

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from acquire.rig import Rig
     from acquire.store import Codec, CodecChoice
     from acquire.stream import CaptureStatus, Window
+    from acquire.stream.ring import RingShape
 
 
 class Run:
@@ -89,6 +90,10 @@ class Run:
     def poll(self) -> CaptureStatus:
         """What the capture path does at this moment."""
         return self._capture.poll()
+
+    def ring_places(self) -> dict[str, tuple[str, RingShape]]:
+        """Arm → path and shape of the memory through which its lines pass; empty once closed."""
+        return self._capture.ring_places()
 
     def close(self) -> None:
         """Seal what is being recorded and release the devices. Idempotent."""

@@ -57,9 +57,14 @@ class Proof:
         return self._chosen[1]
 
     def __call__(
-        self, *, force: bool = False, tell: Callable[[str], object] = _say_nothing
+        self, *, force: bool = False, tell: Callable[[str], object] = _say_nothing, anew: bool = False
     ) -> CapacityStatus:
-        """What is sustained. Raises UsageError where that is less than what is configured, unless forced."""
+        """What is sustained, ``anew`` whatever was measured lately.
+
+        Raises UsageError where that is less than what is configured, unless forced.
+        """
+        if anew:
+            self._chosen = self._measured = None
         try:
             parts = self._parts(tell)
         except (UsageError, DataError) as error:

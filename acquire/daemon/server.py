@@ -150,6 +150,7 @@ class Daemon:
             await self._in_device_thread(self._service.shutdown)
         finally:
             patience.cancel()
+            self._service.news.close()
             self._server.should_exit = True
             try:
                 await serving

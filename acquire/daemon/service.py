@@ -19,14 +19,15 @@ from acquire import __version__
 from acquire.daemon.disk_watch import disk_watch
 from acquire.daemon.events import StandingOrder, budget_lines, window_of
 from acquire.daemon.messages import ArmRequest, LastRecording, Status, fault_error
+from acquire.daemon.news import NewsLog
 from acquire.daemon.plan import default_path
 from acquire.daemon.report import Rates, arm_statuses, trigger_status
 from acquire.daemon.salvage import Salvage
-from acquire.daemon.states import Event, State, after, commands
+from acquire.daemon.states import Event, State, after, commands, possible
 from acquire.daemon.take import Take
 from acquire.daemon.troubles import Troubles
 from acquire.daemon.uploads import Uploads
-from acquire.errors import AcquireError, DeviceError
+from acquire.errors import AcquireError, DeviceError, StateError, UsageError
 from acquire.store import RunCondition
 from acquire.stream import CaptureStatus
 
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from acquire.daemon.messages import CapacityStatus, RecoveryStatus, StartRequest
     from acquire.stream import Window
     from acquire.stream.messages import Note
+    from acquire.stream.ring import RingShape
 
 RECOVERY_S = 20.0
 """How long the end of a recording waits for parts of it that are being recovered; they are in any case."""
@@ -58,13 +60,16 @@ class Run(Protocol):
     def events(self) -> list[Note]: ...
     def stop(self, reason: str) -> None: ...
     def poll(self) -> CaptureStatus: ...
+    def ring_places(self) -> dict[str, tuple[str, RingShape]]: ...
     def close(self) -> None: ...
 
 
 class Prove(Protocol):
     """What the service needs of `acquire.daemon.proof.Proof`."""
 
-    def __call__(self, *, force: bool, tell: Callable[[str], object]) -> CapacityStatus: ...
+    def __call__(
+        self, *, force: bool, tell: Callable[[str], object], anew: bool = False
+    ) -> CapacityStatus: ...
 
 
 class Service:
@@ -79,7 +84,9 @@ class Service:
         uploads: Uploads | None = None,
         troubles: Troubles | None = None,
     ) -> None:
-        self._config = config
+        self.config = self._config = config
+        self.news = NewsLog()
+        self.armed_since = datetime.now(UTC)
         self._open_run = open_run
         self._prove = prove
         self._salvage = salvage or Salvage(config.recording.directory.absolute())
@@ -99,6 +106,7 @@ class Service:
         self._take: Take | None = None
         self._last: LastRecording | None = None
         self._fault: str | None = None
+        self._told: tuple[State, str | None] = self._state, None
         self._publish()
 
     # ---- any thread
@@ -108,6 +116,11 @@ class Service:
         uptime_s = round(time.monotonic() - self._born, 3)
         told = {"uptime_s": uptime_s, "troubles": self.troubles.statuses, "disk": self._disk.status}
         return self._status.model_copy(update=told)
+
+    def ring_places(self) -> tuple[str | None, dict[str, tuple[str, RingShape]]]:
+        """The run, and arm → path and shape of the memory through which its lines pass."""
+        run = self._run
+        return (None, {}) if run is None else (run.run_id, run.ring_places())
 
     @property
     def patience_s(self) -> float:
@@ -136,6 +149,7 @@ class Service:
             run = self._open_run()
             run.arm(self._tell)
             self._run, self._seen, self._rates = run, CaptureStatus(), Rates()
+            self.armed_since = datetime.now(UTC)
             self._order = StandingOrder(self._config)
             self._go(Event.ARM, run.run_id)
             self.supervise()
@@ -170,6 +184,20 @@ class Service:
                 self._release()
             finally:
                 self._go(Event.DISARM)
+
+    def measure(self) -> None:
+        """What the host sustains, anew; nothing may be armed, since that would be measured, too."""
+        if self._state is not State.IDLE:
+            raise StateError(f"cannot measure while {self._state}", possible=possible(self._state))
+        if self._prove is None:
+            raise UsageError("this rig's capacity cannot be measured", hint="acquire bench --config RIG")
+        self._busy = "capacity"
+        self._publish()
+        try:
+            self._capacity = self._prove(force=True, anew=True, tell=self._tell)
+        finally:
+            self._busy = None
+            self._publish()
 
     # ---- supervision
 
@@ -310,6 +338,7 @@ class Service:
         """Do at an event what the rig asks for."""
         assert self._run is not None
         log.info("event: %s at line %d%s", note.kind, note.line, f": {note.text}" if note.text else "")
+        self.news.tell(note.kind, note.text or note.kind, line=note.line)
         if not self._order.covers(note):
             return
         take = self._take
@@ -429,6 +458,10 @@ class Service:
         self._since = datetime.now(UTC)
         level = logging.ERROR if event is Event.FAULT else logging.INFO
         log.log(level, "%s → %s (%s%s)", before, self._state, event, f": {why}" if why else "")
+        path = self._take.path if self._take else self._last.path if self._last else None
+        news = f"{event}: {why}" if why else str(event)
+        importance = "error" if event is Event.FAULT else "info"
+        self.news.tell("state", news, self._state, level=importance, path=path)
         self._publish()
 
     def _publish(self) -> None:
@@ -456,3 +489,7 @@ class Service:
             uploads_left=self._uploads.left,
             upload_warning=self._uploads.warning,
         )
+        self.news.look(self.status())
+        told, self._told = self._told, (self._state, self._busy)
+        if told != self._told:
+            self.news.wake()

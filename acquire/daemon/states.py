@@ -84,7 +84,7 @@ def after(state: State, event: Event) -> State:
     try:
         return TABLE[state, event]
     except KeyError:
-        raise StateError(f"cannot {event} while {state}", possible=_possible(state)) from None
+        raise StateError(f"cannot {event} while {state}", possible=possible(state)) from None
 
 
 def commands(state: State) -> tuple[Event, ...]:
@@ -92,5 +92,6 @@ def commands(state: State) -> tuple[Event, ...]:
     return tuple(event for event in COMMANDS if (state, event) in TABLE)
 
 
-def _possible(state: State) -> str:
+def possible(state: State) -> str:
+    """The same, in words."""
     return ", ".join(commands(state))

@@ -149,6 +149,10 @@ class Capture:
                 return self._final
             return self._look(self._supervisor) if self._supervisor else CaptureStatus()
 
+    def ring_places(self) -> dict[str, tuple[str, RingShape]]:
+        """Arm → path and shape of its ring, for observers that nobody starts from here; empty once closed."""
+        return {} if self._closed else {arm: (ring.path, ring.shape) for arm, ring in self._rings.items()}
+
     @property
     def pids(self) -> dict[str, int | None]:
         """Process numbers: of the recorder, and of each grabber."""

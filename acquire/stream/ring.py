@@ -252,6 +252,11 @@ class Ring:
     # ---- any process
 
     @property
+    def path(self) -> str:
+        """A path to the memory, good while the process lives that made it."""
+        return self._memory.path
+
+    @property
     def fill(self) -> int:
         """Blocks committed and not yet released."""
         tail = self._control[_TAIL]

@@ -14,7 +14,11 @@ from acquire.simulate import simulate
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-EXAMPLES = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+EXAMPLES = [
+    example
+    for example in re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    if "acquire.client" not in example  # tests/service/test_client.py
+]
 BLOCKS = re.findall(r"```sh\n(.*?)```", README, re.DOTALL)
 
 

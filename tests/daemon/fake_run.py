@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from acquire.config import RigConfig
+    from acquire.stream.ring import RingShape
 
 CALM = CaptureStatus(
     ring={arm: {"slots": 8, "fill": 1, "peak": 2, "drops": 0, "dropped_lines": 0} for arm in ARMS},
@@ -94,6 +95,9 @@ class FakeRun:
         self._call("stop", reason)
         if self.seals_at_stop:
             self.seal(reason=reason)
+
+    def ring_places(self) -> dict[str, tuple[str, RingShape]]:
+        return {}
 
     def poll(self) -> CaptureStatus:
         if "poll" in self.refuse and "close" not in self.names:

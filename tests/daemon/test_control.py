@@ -9,8 +9,7 @@ import logging
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
@@ -18,54 +17,14 @@ import pytest
 from fake_run import FakeRun, rig_config
 
 from acquire import errors
-from acquire.daemon import client as client_module
+from acquire.client import Client, core
 from acquire.daemon import connections
 from acquire.daemon import server as server_module
-from acquire.daemon.client import Client
-from acquire.daemon.connections import ApiServer
-from acquire.daemon.control import build_app
 from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.messages import ErrorMessage, http_status
 from acquire.daemon.service import Service
 from acquire.daemon.states import State
 from acquire.errors import AcquireError, CameraError, DeviceError, NoDaemonError, StateError, UsageError
-
-
-@contextlib.contextmanager
-def api(service: Service, endpoint: Endpoint) -> Iterator[None]:
-    """The API in a thread of its own, as the daemon serves it."""
-    with ThreadPoolExecutor(1) as devices:
-
-        async def run(work: Callable[[], None]) -> None:
-            await asyncio.get_running_loop().run_in_executor(devices, work)
-
-        server = ApiServer(build_app(service, run), endpoint.socket)
-        thread = threading.Thread(target=asyncio.run, args=(server.answer(),))
-        thread.start()
-        try:
-            yield
-        finally:
-            server.should_exit = True
-            thread.join(300)
-    assert not thread.is_alive()
-
-
-@pytest.fixture
-def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("s") / "c.sock"
-
-
-@pytest.fixture
-def run() -> FakeRun:
-    """What `arm` opens."""
-    return FakeRun()
-
-
-@pytest.fixture
-def daemon(path: Path, run: FakeRun) -> Iterator[Client]:
-    service = Service(rig_config(path.parent), lambda: run)
-    with contextlib.closing(Endpoint(path)) as endpoint, api(service, endpoint), Client(path) as client:
-        yield client
 
 
 def test_commands(daemon: Client, run: FakeRun, tmp_path: Path) -> None:
@@ -211,7 +170,7 @@ def test_socket_left_behind(path: Path) -> None:
 
 
 def test_daemon_that_does_not_answer(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(client_module, "STATUS_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(core, "STATUS_TIMEOUT_S", 0.2)
     deaf = path.with_name("deaf.sock")
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(str(deaf))

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from acquire.config import default_socket
+from acquire.client import Client
 from acquire.daemon import endpoint, peer
-from acquire.daemon.client import Client
 from acquire.daemon.endpoint import Endpoint, lock_path
 from acquire.errors import NoDaemonError, UsageError
+from acquire.place import default_socket
 
 
 @pytest.fixture

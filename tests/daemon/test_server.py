@@ -20,7 +20,7 @@ import pytest
 from fake_run import FakeRun, rig_config
 from waiting import until
 
-from acquire.daemon.client import Client
+from acquire.client import Client
 from acquire.daemon.connections import ApiServer
 from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.server import Daemon
@@ -209,7 +209,7 @@ def test_a_client_waits_for_a_daemon_that_is_starting(path: Path, monkeypatch: p
         until(lambda: may_listen(process, path), "its command line")
         assert not may_listen(process, path.with_name("another.sock"))
         assert is_one_starting(path)
-        monkeypatch.setattr("acquire.daemon.client.STARTING_TIMEOUT_S", 0.5)  # there may be others
+        monkeypatch.setattr("acquire.client.blocking.STARTING_TIMEOUT_S", 0.5)  # there may be others
         waiting = other.submit(Client(path, said.append).status)
         until(lambda: said, "a word")
         starting.kill()

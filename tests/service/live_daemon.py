@@ -16,8 +16,8 @@ from typing import Any
 
 import psutil
 
+from acquire.client import Client
 from acquire.config import builtin_directory
-from acquire.daemon.client import Client
 
 COMMAND = (str(Path(sys.executable).with_name("acquire")),)
 OBEY_PERMISSIONS = (

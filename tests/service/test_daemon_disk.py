@@ -15,7 +15,7 @@ import pytest
 from live_daemon import SUBSTEPS, Daemon, until_gone
 from waiting import until
 
-from acquire.daemon.client import Client
+from acquire.client import Client
 from acquire.daemon.messages import Status
 from acquire.daemon.states import State
 from acquire.errors import DataError

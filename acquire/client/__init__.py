@@ -1,0 +1,27 @@
+"""The instrument from a script: arm it, record, hear what happens, cut and reconstruct.
+
+::
+
+    from acquire.client import SEALED, Client
+
+    with Client() as client:                       # the default socket; a path; or http://HOST:PORT, token=…
+        client.arm()
+        client.start("run.zarr", pre_s=0.2, post_s=1.0)
+        client.mark("the valve opens")
+        client.wait(SEALED, timeout_s=60)
+        for news in client.events(history=True, timeout_s=0.1):
+            print(news.time, news.text)
+        segment = client.open("run.zarr").cut(first_line, lines=263)
+
+`AsyncClient` has the same with `await`. Both speak the API that the daemon describes at /openapi.json and
+`acquire web` at /api/openapi.json.
+"""
+
+from acquire.client.asynchronous import AsyncClient
+from acquire.client.blocking import Client
+from acquire.client.core import EventReader
+from acquire.daemon.facts import Health, News, Setup
+from acquire.daemon.messages import Status
+from acquire.daemon.states import SEALED, State
+
+__all__ = ["SEALED", "AsyncClient", "Client", "EventReader", "Health", "News", "Setup", "State", "Status"]

@@ -1,0 +1,224 @@
+"""The same client for asyncio: see `acquire.client`."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ssl
+import time
+from typing import TYPE_CHECKING, Self, TypeVar
+
+import h11
+from pydantic import BaseModel
+
+from acquire.client import core
+from acquire.client.core import Call, EventReader, Target
+from acquire.daemon.facts import Health, News, Rings, Setup, Version
+from acquire.daemon.messages import CapacityStatus, Status
+from acquire.daemon.peer import connect
+from acquire.errors import NoDaemonError
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator, AsyncIterator
+    from pathlib import Path
+
+PATIENCE_S = 30.0
+RETRY_S = 0.1
+COMMAND_S = 600.0
+"""For the answer to a command: whoever waits for less cancels the call."""
+_READ_BYTES = 65536
+
+T = TypeVar("T", bound=BaseModel)
+
+
+class AsyncClient:
+    """`Client` with `await`, for one event loop; many calls at a time, each with its own connection."""
+
+    def __init__(self, place: Path | str | None = None, *, token: str | None = None) -> None:
+        """As `Client`'s."""
+        self._target = Target.of(place, token)
+
+    def __repr__(self) -> str:
+        return f"AsyncClient({str(self._target)!r})"
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """A call has its own connection: nothing is left to be closed."""
+
+    async def arm(self, *, force: bool = False, request_id: str | None = None) -> Status:
+        """idle → armed."""
+        return await self.call(core.arm(force=force, request_id=request_id))
+
+    async def start(
+        self,
+        path: Path | str | None = None,
+        *,
+        lines: int | None = None,
+        duration_s: float | None = None,
+        pre_s: float = 0.0,
+        post_s: float | None = None,
+        resume: bool = False,
+        request_id: str | None = None,
+    ) -> Status:
+        """armed → recording."""
+        budget = {
+            "lines": lines,
+            "duration_s": duration_s,
+            "pre_s": pre_s,
+            "post_s": post_s,
+            "resume": resume,
+        }
+        return await self.call(core.start(path, request_id, **budget))
+
+    async def mark(self, text: str = "", *, request_id: str | None = None) -> Status:
+        """An event at the newest line."""
+        return await self.call(core.mark(text, request_id))
+
+    async def stop(self, *, request_id: str | None = None) -> Status:
+        """recording → armed: returns once the recording is sealed."""
+        return await self.call(core.command("stop", Status, request_id=request_id))
+
+    async def disarm(self, *, request_id: str | None = None) -> Status:
+        """armed → idle, or clears a fault."""
+        return await self.call(core.command("disarm", Status, request_id=request_id))
+
+    async def measure(self) -> CapacityStatus:
+        """What ring, codec and disk sustain here, measured now; only while idle."""
+        return await self.call(core.command("capacity", CapacityStatus))
+
+    async def status(self) -> Status:
+        return await self.call(core.fact("status", Status))
+
+    async def health(self) -> Health:
+        return await self.call(core.fact("health", Health))
+
+    async def version(self) -> Version:
+        return await self.call(core.fact("version", Version))
+
+    async def setup(self) -> Setup:
+        return await self.call(core.fact("setup", Setup))
+
+    async def rings(self) -> Rings:
+        return await self.call(core.fact("rings", Rings))
+
+    async def events(self, last_id: str | None = None, *, history: bool = False) -> AsyncIterator[News]:
+        """What happens, as it happens; a connection that breaks is made again, and nothing is missed.
+
+        Raises NoDaemonError where the daemon is gone for longer than `PATIENCE_S`.
+        """
+        reader = EventReader(last_id)
+        lost_s: float | None = None
+        while True:
+            try:
+                async for one in self.follow(reader, history=history):
+                    lost_s = None
+                    if isinstance(one, News):
+                        yield one
+            except NoDaemonError:
+                lost_s = lost_s or time.monotonic()
+                if time.monotonic() - lost_s > PATIENCE_S:
+                    raise
+                await asyncio.sleep(RETRY_S)
+
+    async def follow(
+        self, reader: EventReader, *, history: bool = False, status_s: float | None = None
+    ) -> AsyncIterator[News | Status]:
+        """News, and statuses where ``status_s`` asks for them, of one connection.
+
+        Raises NoDaemonError when it breaks, or gives no sign of life for `core.SILENT_S`.
+        """
+        path = core.events_path(self._target, history=history, status_s=status_s)
+        async with contextlib.aclosing(
+            self._exchange(
+                "GET", path, core.events_headers(self._target, reader.last_id), None, core.SILENT_S
+            )
+        ) as parts:
+            status, rest = 0, b""
+            async for part in parts:
+                if isinstance(part, int):
+                    status = part
+                    continue
+                rest += part
+                if status >= core.BAD:
+                    core.fact("events", Status).read(status, rest, self._target)
+                *lines, rest = rest.split(b"\n")
+                if len(rest) > core.MOST_LINE_BYTES:
+                    raise NoDaemonError(f"the daemon on {self._target} tells news without an end")
+                for line in lines:
+                    for one in reader.take(line.decode().rstrip("\r")):
+                        yield one
+        raise NoDaemonError(f"the daemon on {self._target} has ended")
+
+    async def call(self, call: Call[T]) -> T:
+        """Carry a call out; a command whose connection breaks is sent once more, with the same id."""
+        try:
+            return await self._once(call)
+        except NoDaemonError:
+            if call.request_id is None:
+                raise
+        return await self._once(call)
+
+    async def _once(self, call: Call[T]) -> T:
+        limit_s = COMMAND_S if call.method == "POST" else call.timeout_s
+        status, content = 0, b""
+        path, headers = self._target.path(call.name), call.headers(self._target)
+        async with contextlib.aclosing(
+            self._exchange(call.method, path, headers, call.content, limit_s)
+        ) as parts:
+            async for part in parts:
+                if isinstance(part, int):
+                    status = part
+                else:
+                    content += part
+                if len(content) > core.MOST_BYTES:
+                    raise NoDaemonError(f"the daemon on {self._target} answers without an end")
+        return call.read(status, content, self._target)
+
+    async def _exchange(
+        self, method: str, path: str, headers: dict[str, str], body: bytes | None, limit_s: float
+    ) -> AsyncGenerator[int | bytes, None]:
+        """The answer's status, then its content as it comes. ``limit_s`` bounds each wait."""
+        reader, writer = await self._connect()
+        http = h11.Connection(h11.CLIENT)
+        sent = {"Host": "acquire", **headers} | ({"Content-Length": str(len(body))} if body else {})
+        try:
+            writer.write(
+                http.send(h11.Request(method=method, target=path, headers=list(sent.items()))) or b""
+            )
+            if body:
+                writer.write(http.send(h11.Data(data=body)) or b"")
+            writer.write(http.send(h11.EndOfMessage()) or b"")
+            while True:
+                event = http.next_event()
+                if event is h11.NEED_DATA:
+                    async with asyncio.timeout(limit_s):
+                        http.receive_data(await reader.read(_READ_BYTES))
+                elif isinstance(event, h11.Response):
+                    yield event.status_code
+                elif isinstance(event, h11.Data):
+                    yield bytes(event.data)
+                else:
+                    return
+        except TimeoutError as error:
+            raise NoDaemonError(
+                f"the daemon on {self._target} gave no answer within {limit_s:g} s"
+            ) from error
+        except (OSError, h11.RemoteProtocolError) as error:
+            raise NoDaemonError(f"the daemon on {self._target} went away") from error
+        finally:
+            writer.close()
+
+    async def _connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        target = self._target
+        if target.socket is not None:
+            connection = await asyncio.to_thread(connect, target.socket, core.CONNECT_TIMEOUT_S)
+            connection.setblocking(False)
+            return await asyncio.open_unix_connection(sock=connection)
+        try:
+            async with asyncio.timeout(core.CONNECT_TIMEOUT_S):
+                context = ssl.create_default_context() if target.tls else None
+                return await asyncio.open_connection(target.host, target.port, ssl=context)
+        except OSError as error:
+            raise NoDaemonError(f"nobody answers on {target} ({error})", hint="acquire web") from error

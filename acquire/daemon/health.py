@@ -1,0 +1,154 @@
+"""Is all well? One word, one sentence and what they follow from; the thresholds are here and nowhere else."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from acquire.daemon.facts import Health, HealthCheck
+from acquire.daemon.states import State
+
+if TYPE_CHECKING:
+    from acquire.daemon.messages import ArmStatus, DiskStatus, Status
+
+RING_GOOD, RING_BAD, RING_STOP = 0.25, 0.60, 0.95
+"""Shares of a ring that wait for the recorder: well below the first, lines are lost from the last on."""
+DISK_GOOD_S, DISK_BAD_S = 3600.0, 600.0
+"""Time until the disk is full."""
+SATURATED_GOOD, SATURATED_BAD = 0.001, 0.05
+"""Shares of the lines that have a saturated pixel."""
+RATE_TOLERANCE = 0.02
+"""By which the lines may come slower than configured."""
+SETTLED_S = 6.0
+"""After arming: rates are taken over five seconds."""
+
+CheckLevel = Literal["good", "unknown", "warning", "bad"]
+_RANK = {"good": 0, "unknown": 0, "warning": 1, "bad": 2}
+
+
+def health_of(status: Status, line_rate_hz: float, age_s: float = 0.0) -> Health:
+    """Judge a status. ``line_rate_hz``: at which lines ought to come; ``age_s``: since it was armed."""
+    lost = sum(sum(arm.lost.values()) for arm in status.arms.values()) if status.run_id else 0
+    checks = [*_of_arms(status, line_rate_hz, age_s), *_of_service(status)]
+    worst = max((check for check in checks), key=lambda check: _RANK[check.level])
+    level: Literal["idle", "good", "degraded", "lost", "fault"]
+    if status.state is State.FAULTED:
+        level, sentence = "fault", f"Fault: {status.fault}"
+    elif lost:
+        level, sentence = "lost", f"{lost} lines were lost since the instrument was armed."
+    elif _RANK[worst.level]:
+        level, sentence = "degraded", f"Nothing is lost; {worst.text}."
+    elif status.state is State.IDLE:
+        level, sentence = "idle", "Nothing is armed; all is well."
+    else:
+        level, sentence = "good", "All is well; nothing is lost."
+    return Health(level=level, sentence=sentence, lost_lines=lost, checks=checks)
+
+
+def _of_arms(status: Status, line_rate_hz: float, age_s: float) -> list[HealthCheck]:
+    if status.run_id is None:
+        return []
+    found = []
+    for name, arm in status.arms.items():
+        found += [_ring(name, arm, status.state), _saturation(name, arm), _code(name, arm)]
+        if age_s > SETTLED_S:
+            found.append(_rate(name, arm, line_rate_hz))
+        if arm.ledger is not None and not arm.ledger.balanced:
+            found.append(
+                HealthCheck(name=f"ledger {name}", level="bad", text=f"ledger {name} does not balance")
+            )
+    return found
+
+
+def _ring(name: str, arm: ArmStatus, state: State) -> HealthCheck:
+    """While nothing is recorded, blocks are let go at once."""
+    fill = arm.ring.fill / arm.ring.slots
+    busy = state in (State.RECORDING, State.DRAINING)
+    level: CheckLevel = "bad" if fill > RING_BAD else "warning" if fill >= RING_GOOD and busy else "good"
+    return HealthCheck(
+        name=f"ring {name}",
+        level=level,
+        text=f"ring {name} is {fill:.0%} full",
+        value=round(fill, 4),
+        limit=f"good below {RING_GOOD:.0%}, bad above {RING_BAD:.0%}; lines are lost from {RING_STOP:.0%} on",
+    )
+
+
+def _saturation(name: str, arm: ArmStatus) -> HealthCheck:
+    part = arm.saturated_part
+    level: CheckLevel = "bad" if part > SATURATED_BAD else "warning" if part > SATURATED_GOOD else "good"
+    return HealthCheck(
+        name=f"saturation {name}",
+        level=level,
+        text=f"{part:.1%} of the lines of arm {name} are saturated",
+        value=part,
+        limit=f"good up to {SATURATED_GOOD:.1%} of the lines, bad above {SATURATED_BAD:.0%}",
+    )
+
+
+def _code(name: str, arm: ArmStatus) -> HealthCheck:
+    check = arm.check
+    if check is None or check.verdict == "unknown":
+        why = "is not checked" if check is None else "has not been seen yet"
+        return HealthCheck(name=f"code {name}", level="unknown", text=f"the code of arm {name} {why}")
+    verdict = check.verdict.replace("_", " ") + (f" by {check.shift:+d} sub-steps" if check.shift else "")
+    level: CheckLevel = "good" if check.verdict == "verified" else "bad"
+    return HealthCheck(
+        name=f"code {name}",
+        level=level,
+        text=f"the light's code in arm {name} is {verdict}",
+        value=check.shift,
+    )
+
+
+def _rate(name: str, arm: ArmStatus, line_rate_hz: float) -> HealthCheck:
+    slow = arm.rate_hz < line_rate_hz * (1 - RATE_TOLERANCE)
+    return HealthCheck(
+        name=f"rate {name}",
+        level="warning" if slow else "good",
+        text=f"arm {name} delivers {arm.rate_hz:.0f} lines/s of {line_rate_hz:.0f}",
+        value=round(arm.rate_hz, 1),
+        unit="1/s",
+        limit=f"good from {1 - RATE_TOLERANCE:.0%} of the configured rate on",
+    )
+
+
+def _of_service(status: Status) -> list[HealthCheck]:
+    found = [disk_check(status.disk)]
+    if status.trigger is not None:
+        answers = status.trigger.answers
+        text = (
+            "the trigger answers" if answers else f"the trigger is silent for {status.trigger.silent_s:.0f} s"
+        )
+        level: CheckLevel = "good" if answers else "bad"
+        found.append(
+            HealthCheck(name="trigger", level=level, text=text, value=status.trigger.silent_s, unit="s")
+        )
+    if status.waiting:
+        found.append(HealthCheck(name="waiting", level="bad", text=status.waiting))
+    if status.capacity is not None and status.capacity.warning:
+        found.append(HealthCheck(name="capacity", level="warning", text=status.capacity.warning))
+    failing = next((one for one in status.uploads if one.error), None)
+    if failing is not None:
+        text = f"{status.uploads_left} recordings are not copied: {failing.error}"
+        found.append(HealthCheck(name="uploads", level="warning", text=text, value=status.uploads_left))
+    if status.troubles:
+        found.append(HealthCheck(name="troubles", level="warning", text=status.troubles[-1].text))
+    return found
+
+
+def disk_check(disk: DiskStatus | None) -> HealthCheck:
+    """How long the disk lasts, judged."""
+    limit = f"good from {DISK_GOOD_S / 3600:.0f} h on, bad below {DISK_BAD_S / 60:.0f} min"
+    if disk is None:
+        return HealthCheck(name="disk", level="unknown", text="the disk has not answered yet", limit=limit)
+    left_s = disk.seconds_to_full
+    level: CheckLevel = "bad" if left_s < DISK_BAD_S else "warning" if left_s < DISK_GOOD_S else "good"
+    shown = f"{left_s / 3600:.1f} h" if left_s >= 7200 else f"{left_s / 60:.0f} min"
+    return HealthCheck(
+        name="disk",
+        level=level,
+        text=f"the disk is full in {shown}",
+        value=round(left_s),
+        unit="s",
+        limit=limit,
+    )

@@ -1,0 +1,87 @@
+"""The API over the service in this process: commands run in the thread that owns the devices, one by one;
+all else is answered from what that thread published last, so that it never waits for a device.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+from acquire.daemon.health import health_of
+from acquire.daemon.messages import fault_error
+from acquire.daemon.setup import rings_of, setup_of, version_of
+from acquire.daemon.states import State
+from acquire.daemon.stream import Streams
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from acquire.daemon.facts import Health, Rings, Setup, Version
+    from acquire.daemon.messages import ArmRequest, CapacityStatus, MarkRequest, StartRequest, Status
+    from acquire.daemon.service import Service
+
+POLL_S = 0.02
+Run = Callable[[Callable[[], None]], Awaitable[None]]
+"""Carries a command out in the thread that owns the devices."""
+
+
+class Local:
+    """See the module; the methods are those of `acquire.daemon.routes.Api`."""
+
+    def __init__(self, service: Service, run: Run) -> None:
+        self._service = service
+        self._run = run
+        self._streams = Streams(service.news, service.status)
+
+    async def status(self) -> Status:
+        return self._service.status()
+
+    async def arm(self, request: ArmRequest) -> Status:
+        return await self._do(lambda: self._service.arm(request))
+
+    async def start(self, request: StartRequest) -> Status:
+        return await self._do(lambda: self._service.start(request))
+
+    async def mark(self, request: MarkRequest) -> Status:
+        return await self._do(lambda: self._service.mark(request.text))
+
+    async def stop(self) -> Status:
+        """Returns once the recording is sealed; a fault meanwhile is raised."""
+        await self._run(self._service.stop)
+        while (status := self._service.status()).state is State.DRAINING:
+            await asyncio.sleep(POLL_S)
+        if status.state is State.FAULTED:
+            raise fault_error(status.fault)
+        return status
+
+    async def disarm(self) -> Status:
+        return await self._do(self._service.disarm)
+
+    async def measure(self) -> CapacityStatus:
+        await self._run(self._service.measure)
+        found = self._service.status().capacity
+        assert found is not None
+        return found
+
+    async def health(self) -> Health:
+        status, config = self._service.status(), self._service.config
+        age_s = (datetime.now(UTC) - self._service.armed_since).total_seconds()
+        return health_of(status, config.line_rate_hz * config.simulation.speed, age_s)
+
+    async def version(self) -> Version:
+        return version_of(self._service.config)
+
+    async def setup(self) -> Setup:
+        return setup_of(self._service.config)
+
+    async def rings(self) -> Rings:
+        return rings_of(self._service)
+
+    def events(self, last_id: str | None, status_s: float | None, *, history: bool) -> AsyncIterator[str]:
+        return self._streams.open(last_id, status_s, history=history)
+
+    async def _do(self, command: Callable[[], None]) -> Status:
+        await self._run(command)
+        return self._service.status()

@@ -1,0 +1,155 @@
+"""The routes of the API, over whatever offers it: the daemon's service, or a client that passes it on.
+
+So a page, a script and the command line speak to the same API, whichever process answers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Awaitable, Callable
+from typing import Annotated, Any, Protocol
+
+from fastapi import APIRouter, Header, Query, Response
+from fastapi.responses import StreamingResponse
+
+from acquire.daemon.answers import LONGEST_ID, Answers
+from acquire.daemon.facts import Health, Rings, Setup, Version
+from acquire.daemon.messages import (
+    ArmRequest,
+    CapacityStatus,
+    MarkRequest,
+    StartRequest,
+    Status,
+    fault_error,
+)
+from acquire.daemon.metrics import CONTENT_TYPE, metrics_text
+from acquire.daemon.stream import LEAST_STATUS_S, MOST_STATUS_S
+
+RequestId = Annotated[
+    str | None,
+    Header(
+        min_length=1,
+        max_length=LONGEST_ID,
+        pattern="^[!-~]+$",
+        description="chosen by the client, new for every command: the same again gives the same answer, and "
+        "the command is carried out once",
+    ),
+]
+STREAM: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "server-sent events: `news` (a News, with its id) and `status` (a Status)",
+        "content": {"text/event-stream": {"schema": {"type": "string"}}},
+    }
+}
+TEXT: dict[int | str, dict[str, Any]] = {
+    200: {"description": "Prometheus text format", "content": {"text/plain": {"schema": {"type": "string"}}}}
+}
+NO_STORE = {"Cache-Control": "no-store"}
+
+
+class Api(Protocol):
+    """What the API offers: the daemon's own service, or a client that passes it on (`acquire.web`)."""
+
+    async def status(self) -> Status: ...
+    async def arm(self, request: ArmRequest) -> Status: ...
+    async def start(self, request: StartRequest) -> Status: ...
+    async def mark(self, request: MarkRequest) -> Status: ...
+    async def stop(self) -> Status: ...
+    async def disarm(self) -> Status: ...
+    async def measure(self) -> CapacityStatus: ...
+    async def health(self) -> Health: ...
+    async def version(self) -> Version: ...
+    async def setup(self) -> Setup: ...
+    async def rings(self) -> Rings: ...
+    def events(self, last_id: str | None, status_s: float | None, *, history: bool) -> AsyncIterator[str]: ...
+
+
+def routes(api: Api, answers: Answers) -> APIRouter:
+    """All that ``api`` offers; a command's request id is looked up in ``answers``."""
+    router = APIRouter()
+    _add_commands(router, api, answers)
+    _add_facts(router, api)
+    return router
+
+
+def _add_commands(router: APIRouter, api: Api, answers: Answers) -> None:
+    async def once(request_id: str | None, asked: str, work: Callable[[], Awaitable[Status]]) -> Status:
+        return await answers.once(request_id, asked, work)
+
+    @router.post("/arm", summary="idle → armed")
+    async def arm(request: ArmRequest | None = None, request_id: RequestId = None) -> Status:
+        asked = request or ArmRequest()
+        return await once(request_id, f"arm {asked}", lambda: api.arm(asked))
+
+    @router.post("/start", summary="armed → recording")
+    async def start(request: StartRequest, request_id: RequestId = None) -> Status:
+        return await once(request_id, f"start {request}", lambda: api.start(request))
+
+    @router.post("/mark", summary="armed, recording or draining: an event at the newest line")
+    async def mark(request: MarkRequest, request_id: RequestId = None) -> Status:
+        return await once(request_id, f"mark {request}", lambda: api.mark(request))
+
+    @router.post("/stop", summary="recording → draining → armed; returns once the recording is sealed")
+    async def stop(request_id: RequestId = None) -> Status:
+        return await once(request_id, "stop", api.stop)
+
+    @router.post("/disarm", summary="armed → idle; clears a fault")
+    async def disarm(request_id: RequestId = None) -> Status:
+        return await once(request_id, "disarm", api.disarm)
+
+    @router.post("/capacity", summary="idle: measure what ring, codec and disk sustain here, now")
+    async def measure() -> CapacityStatus:
+        return await api.measure()
+
+
+def _add_facts(router: APIRouter, api: Api) -> None:
+    @router.get("/status", summary="What the daemon is doing, and how well")
+    async def status() -> Status:
+        return await api.status()
+
+    @router.get("/health", summary="Is all well? One word, one sentence, and what they follow from")
+    async def health() -> Health:
+        return await api.health()
+
+    @router.get("/version", summary="Who answers")
+    async def version() -> Version:
+        return await api.version()
+
+    @router.get("/setup", summary="The resolved configuration, and where it is not the default")
+    async def setup() -> Setup:
+        return await api.setup()
+
+    @router.get("/rings", summary="Memory through which the lines pass, for observers on this host")
+    async def rings() -> Rings:
+        return await api.rings()
+
+    @router.get("/events", summary="What happens, as it happens", responses=STREAM, response_class=Response)
+    async def events(
+        last_event_id: Annotated[
+            str | None,
+            Header(max_length=LONGEST_ID, description="of the last news heard: what came after it"),
+        ] = None,
+        status_s: Annotated[
+            float | None,
+            Query(
+                ge=LEAST_STATUS_S,
+                le=MOST_STATUS_S,
+                allow_inf_nan=False,
+                description="also the status, so often and whenever something happens",
+            ),
+        ] = None,
+        history: Annotated[bool, Query(description="first all that is known, not only what comes")] = False,
+    ) -> StreamingResponse:
+        stream = api.events(last_event_id, status_s, history=history)
+        return StreamingResponse(stream, media_type="text/event-stream", headers=NO_STORE)
+
+    @router.get("/metrics", summary="For Prometheus", responses=TEXT, response_class=Response)
+    async def metrics() -> Response:
+        text = metrics_text(await api.status(), await api.health())
+        return Response(text, headers={"Content-Type": CONTENT_TYPE} | NO_STORE)
+
+    @router.get("/healthz", summary="200 as long as the service works; 503 with the fault where it does not")
+    async def healthz() -> Health:
+        found = await api.health()
+        if found.level == "fault":
+            raise fault_error((await api.status()).fault)
+        return found

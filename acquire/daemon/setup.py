@@ -1,0 +1,82 @@
+"""What the daemon is set up with: configuration, versions, the place of its rings."""
+
+from __future__ import annotations
+
+import os
+import platform
+from dataclasses import asdict
+from importlib import metadata
+from typing import TYPE_CHECKING, Any
+
+from acquire import __version__
+from acquire.daemon.facts import RingPlace, Rings, Setup, Version
+from acquire.lines import ARMS
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+    from acquire.config import RigConfig
+    from acquire.daemon.service import Service
+
+LIBRARIES = (
+    "numpy",
+    "zarr",
+    "numcodecs",
+    "awscrt",
+    "pydantic",
+    "fastapi",
+    "uvicorn",
+    "harvesters",
+    "genicam",
+)
+
+
+def version_of(config: RigConfig) -> Version:
+    return Version(acquire=__version__, name=config.name, pid=os.getpid(), python=platform.python_version())
+
+
+def setup_of(config: RigConfig) -> Setup:
+    """All of it is said: a rig file holds no secrets (`recording_config`)."""
+    rate_hz = config.line_rate_hz
+    return Setup(
+        name=config.name,
+        file=config.origin,
+        config=config.model_dump(mode="json"),
+        changed=dict(_changed(config)),
+        line_rate_hz=rate_hz * config.simulation.speed,
+        line_period_ns=1e9 / rate_hz,
+        white_dn=config.cameras.a.white_dn,
+        black_dn={arm: config.cameras.arm(arm).black_level_dn for arm in ARMS},
+        history_s=config.history_s,
+        versions={"acquire": __version__, "python": platform.python_version()} | _libraries(),
+    )
+
+
+def rings_of(service: Service) -> Rings:
+    """Empty while nothing is armed."""
+    run_id, places = service.ring_places()
+    arms = {arm: RingPlace(path=path, **asdict(shape)) for arm, (path, shape) in places.items()}
+    return Rings(run_id=run_id, arms=arms)
+
+
+def _changed(model: BaseModel, prefix: str = "") -> list[tuple[str, Any]]:
+    """Dotted keys that a file or an option has set to something else than the default."""
+    found: list[tuple[str, Any]] = []
+    dumped = model.model_dump(mode="json")
+    for name, field in type(model).model_fields.items():
+        value = getattr(model, name)
+        if hasattr(value, "model_fields_set"):
+            found += _changed(value, f"{prefix}{name}.")
+        elif field.is_required() or value != field.get_default(call_default_factory=True):
+            found.append((f"{prefix}{name}", dumped[name]))
+    return found
+
+
+def _libraries() -> dict[str, str]:
+    found = {}
+    for name in LIBRARIES:
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return found

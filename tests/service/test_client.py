@@ -1,0 +1,30 @@
+"""The README's example of a script, word for word, on a real daemon."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from pathlib import Path
+
+import pytest
+from live_daemon import Daemon
+
+README = Path(__file__).parents[2] / "README.md"
+
+
+def test_the_example_arms_records_marks_cuts_and_reconstructs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (example,) = re.findall(
+        r"```python\n(from acquire.client.*?)```", README.read_text(encoding="utf-8"), re.DOTALL
+    )
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {}
+    with contextlib.closing(Daemon(tmp_path, "stream.ring_slots=64")) as daemon:
+        monkeypatch.setattr("acquire.client.core.default_socket", lambda: daemon.socket)
+        exec(example.replace("lines=200", "lines=40"), names)
+    assert names["video"].shape[1:] == (8, 8)  # type: ignore[attr-defined]
+    said = capsys.readouterr().out
+    assert re.search(r"armed|arm:", said)
+    assert "the valve opens" in said
+    assert "sealed: " in said
