@@ -13,6 +13,7 @@ The layers, top to bottom; imports point downwards only (checked by the tests)::
     daemon        evaluate           the capture service · metrics, report
     rig           reconstruct        config -> devices · recording -> video
     capacity                         what this host captures and records without a loss
+    calibrate                        what an instrument is, measured
     sim           recon              simulated devices · solvers, priors
     stream        forward            capture path · Eq. (1)-(4) of the paper and their adjoints
     store  camera  trigger           recording format · device protocols

@@ -18,6 +18,7 @@ import typer
 
 from acquire.cli import (
     bench,
+    calibrate,
     camera,
     config,
     control,
@@ -53,6 +54,7 @@ MODULES = (
     devices,
     trigger,
     camera,
+    calibrate,
     bench,
 )
 """Modules of commands, in the order of the help; each has ``register(app)``. New groups are added here."""

@@ -1,0 +1,166 @@
+"""Where arm B's image lies on arm A's: shift, turn, magnification, from a still textured target.
+
+Arm A's image is fine along rows, arm B's along columns (`still`), and box-filtered alike. They are compared
+where a coarse column of A meets a coarse row of B in the scene: there each is interpolated along its own fine
+axis only, where it is well sampled. Each point tells the distance along one direction of texture; over the
+field that is shift, turn and magnification, by least squares (Levenberg–Marquardt).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates, spline_filter
+from scipy.optimize import least_squares
+
+from acquire.alignment import Alignment
+from acquire.calibrate.calibration import AlignmentFound
+from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.calibrate.still import Still
+    from acquire.geometry import Geometry
+
+SMOOTHINGS = (4.0, 0.0)
+"""Of the images in fine pixels: first coarse, so that a start some pixels off finds the way."""
+EDGE = 4
+"""Fine pixels at the rim that are not compared: splines and dark columns reach so far."""
+NUMBERS = ("rows", "columns", "turn_deg", "magnification")
+WORST = {"rows": 0.15, "columns": 0.15, "turn_deg": 0.1, "magnification": 0.002}
+"""Uncertainties beyond which an alignment is not worth having: a target without texture."""
+
+
+@dataclass(frozen=True, slots=True)
+class Match:
+    """An alignment; what is left of the difference of the images, relative to their own variation; and the
+    light of arm B over that of arm A, summed over the points that both see.
+    """
+
+    found: AlignmentFound
+    misfit: float
+    brightness: float
+
+
+def align(a: Still, b: Still, geometry: Geometry, start: tuple[float, float] = (0.0, 0.0)) -> Match:
+    """Arm B beside arm A; ``b`` as the model turns it. ``start``: shift in fine pixels, to within some.
+
+    UsageError where the target does not tell: too little texture.
+    """
+    images = _Images(a, b, geometry)
+    numbers = np.array([*start, 0.0, 0.0, 1.0, 0.0])
+    for sigma in SMOOTHINGS:
+        comparison = _Comparison(images, sigma)
+        solved = least_squares(comparison, numbers, x_scale=comparison.scale, method="trf", loss="soft_l1")
+        numbers = solved.x
+    alignment = _alignment(numbers, geometry)
+    freedom = max(1, len(solved.fun) - len(numbers))
+    try:
+        jacobian = np.asarray(solved.jac, np.float64)
+        covariance = np.linalg.inv(jacobian.T @ jacobian) * 2 * solved.cost / freedom
+    except np.linalg.LinAlgError as error:
+        raise _untold() from error
+    errors = np.sqrt(np.diag(covariance)) * _units(geometry)
+    uncertainty = dict(zip(NUMBERS, errors.tolist(), strict=False))
+    if any(not uncertainty[name] <= worst for name, worst in WORST.items()):
+        raise _untold()
+    found = AlignmentFound(alignment, uncertainty)
+    return Match(found, comparison.misfit(numbers), comparison.brightness(numbers))
+
+
+def _untold() -> UsageError:
+    return UsageError(
+        "the target does not tell how arm B lies on arm A: it has too little texture, or moves",
+        possible="sharp dots or a binary pattern of 2 to 6 fine pixels all over, or the USAF target",
+    )
+
+
+def _units(geometry: Geometry) -> NDArray[np.float64]:
+    """Of the six numbers that are fitted: turn and magnification are pixels at the field's edge."""
+    half = geometry.size / 2
+    return np.array([1, 1, np.rad2deg(1 / half), 1 / half, 1, 1])
+
+
+def _alignment(numbers: NDArray[np.float64], geometry: Geometry) -> Alignment:
+    rows, columns, turn, larger = (numbers * _units(geometry))[:4].tolist()
+    return Alignment(rows, columns, turn, 1 + larger)
+
+
+class _Images:
+    """Both arms' images in arm A's view: A (n + S − 1, M), B (M, n + S − 1)."""
+
+    def __init__(self, a: Still, b: Still, geometry: Geometry) -> None:
+        self.geometry = geometry
+        self.a, self.b = a.image, np.rot90(b.image, -1)
+        self.columns, self.rows = a.usable, b.usable
+        self.weight = 1 / max(float(np.hypot(a.uncertainty, b.uncertainty)), 1e-12)
+
+
+class _Comparison:
+    """Differences of the images at the points where their lattices cross, for six numbers: shift (2), turn
+    and magnification as pixels at the field's edge, B's brightness beside A's, and what is added to it.
+    """
+
+    def __init__(self, images: _Images, sigma: float) -> None:
+        self._images, geometry = images, images.geometry
+        n, S = geometry.size, geometry.substeps
+        self._n, self._S, self._middle = n, S, (n - 1) / 2
+        a, b = images.a, images.b
+        if sigma:
+            a, b = gaussian_filter(a, (sigma, sigma / S)), gaussian_filter(b, (sigma / S, sigma))
+        self._a, self._b = spline_filter(a, mode="nearest"), spline_filter(b, mode="nearest")
+        coarse = S * np.arange(geometry.stages) + (S - 1) / 2
+        self._b_rows, self._a_columns = np.meshgrid(coarse, coarse, indexing="ij")
+        good = images.rows[:, None] & images.columns
+        inside = (np.abs(coarse - self._middle) < self._middle - EDGE)[:, None]
+        self._good = good & inside & inside.T
+        self.scale = np.array([0.1, 0.1, 0.1, 0.1, 0.01, 0.01 * max(float(np.abs(a).mean()), 1e-12)])
+        self._level = float(a.std())
+
+    def __call__(self, numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+        a, b, inside = self._pairs(numbers)
+        left = np.where(inside, b - numbers[4] * a - numbers[5], 0.0)[self._good]
+        weighted: NDArray[np.float64] = left * self._images.weight
+        return weighted
+
+    def misfit(self, numbers: NDArray[np.float64]) -> float:
+        """RMS of the differences, relative to the images' variation."""
+        a, b, inside = self._pairs(numbers)
+        left = (b - numbers[4] * a - numbers[5])[self._good & inside]
+        return float(np.sqrt(np.mean(left**2)) / max(self._level, 1e-12)) if left.size else float("inf")
+
+    def brightness(self, numbers: NDArray[np.float64]) -> float:
+        """B's light over A's. Not the fitted factor: blur and noise of either image lower that."""
+        a, b, inside = self._pairs(numbers)
+        seen = self._good & inside
+        total = float(a[seen].sum())
+        return float(b[seen].sum()) / total if total > 0 else 1.0
+
+    def _pairs(self, numbers: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.bool_]]:
+        """A and B where they show the same point, and whether both do."""
+        at_a_row, at_b_column = self._crossings(numbers)
+        half = (self._S - 1) / 2
+        rows_a = at_a_row + half
+        columns_a = (self._a_columns - half) / self._S
+        rows_b = (self._b_rows - half) / self._S
+        columns_b = at_b_column + half
+        a = map_coordinates(self._a, [rows_a, columns_a], order=3, mode="nearest", prefilter=False)
+        b = map_coordinates(self._b, [rows_b, columns_b], order=3, mode="nearest", prefilter=False)
+        low, high = EDGE, self._n - 1 - EDGE
+        inside = (at_a_row > low) & (at_a_row < high) & (at_b_column > low) & (at_b_column < high)
+        return a, b, inside
+
+    def _crossings(self, numbers: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """For each row y of B and column x of A: the row p of A and the column q of B with (y, q) ≙ (p, x).
+
+        With (y, q) − middle = m·Q·((p, x) − middle) + shift: two equations, linear in p and q.
+        """
+        alignment = _alignment(numbers, self._images.geometry)
+        (d, e), (f, g) = alignment.matrix
+        y, x = self._b_rows - self._middle - alignment.rows, self._a_columns - self._middle
+        p = (y - e * x) / d
+        q = f * p + g * x + alignment.columns
+        return p + self._middle, q + self._middle

@@ -1,0 +1,124 @@
+"""A calibration on lines: a segment's offsets, responsivities, mask and alignment. No line is altered."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.calibrate.calibration import Calibration, differing
+from acquire.calibrate.exposure import instrument_of
+from acquire.calibrate.orientation import oriented, view_named
+from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.lines import Segment
+    from acquire.store import Recording
+
+OLD_DAYS = 30
+WARMER_K = 5.0
+SLOWER = 0.01
+
+
+def calibration_of(recording: Recording) -> Calibration | None:
+    """The copy that a recording carries; None where it carries none. DataError for a damaged one."""
+    attrs = recording.attrs.get("calibration")
+    return None if attrs is None else Calibration.from_attrs(attrs)
+
+
+def check_fits(calibration: Calibration, recording: Recording) -> tuple[str, ...]:
+    """What is doubtful about a calibration for a recording, in sentences.
+
+    Raises UsageError where it is of another instrument: geometry, layout, camera, pixel format, gain.
+    """
+    mine, theirs = calibration.instrument, instrument_of(recording)
+    if differences := differing(mine, theirs):
+        raise UsageError(
+            f"the calibration does not fit {recording}: " + "; ".join(differences),
+            hint="a calibration of that instrument, or none: --calibration none",
+        )
+    doubts = []
+    if abs(mine.substep_s / theirs.substep_s - 1) > SLOWER:
+        doubts.append(
+            f"the calibration was made at sub-steps of {mine.substep_s:.3g} s, the recording has "
+            f"{theirs.substep_s:.3g} s: dark current and ambient light differ"
+        )
+    return (*doubts, *_aged(calibration, recording), *_warmer(calibration, recording))
+
+
+def calibrated(segment: Segment, calibration: Calibration) -> Segment:
+    """The segment with all that the calibration holds; what it does not hold stays as it was.
+
+    Raises UsageError for another number of columns, and for an orientation that cannot be put right.
+    """
+    if segment.geometry.stages != calibration.instrument.stages:
+        raise UsageError(
+            f"a calibration of {calibration.instrument.stages} columns for lines of "
+            f"{segment.geometry.stages} pixels",
+            possible="the same",
+        )
+    changes: dict[str, Any] = {}
+    if (black := black_level(segment, calibration)) is not None:
+        changes["black_level_dn"] = black
+    if (responsivity := _responsivity(segment, calibration)) is not None:
+        changes["responsivity_dn"] = responsivity
+    if calibration.usable is not None and not calibration.usable.all():
+        changes["mask"] = segment.mask & calibration.usable[:, None, :]
+    corrected = replace(segment, **changes)
+    if calibration.orientation is not None:
+        corrected = oriented(corrected, view_named(calibration.orientation))
+    if calibration.alignment is not None:
+        corrected = replace(corrected, alignment=calibration.alignment.alignment)
+    return corrected
+
+
+def black_level(segment: Segment, calibration: Calibration) -> NDArray[np.float64] | None:
+    """DN of each column without the coded light (arm, column); None where it was not measured."""
+    offset, ambient = calibration.value("offset_dn"), calibration.value("ambient_dn")
+    if offset is None and ambient is None:
+        return None
+    base = _columns(segment.black_level_dn, segment) if offset is None else offset
+    return base if ambient is None else base + ambient
+
+
+def _responsivity(segment: Segment, calibration: Calibration) -> NDArray[np.float64] | None:
+    gain, balance = calibration.value("gain"), calibration.value("balance")
+    if gain is None and balance is None:
+        return None
+    found = _columns(segment.responsivity_dn, segment)
+    if gain is not None:
+        found = found * gain
+    return found if balance is None else found * balance[:, None]
+
+
+def _columns(value: Any, segment: Segment) -> NDArray[np.float64]:
+    """A number, or one per arm, or one per arm and column, as the last."""
+    given = np.asarray(value, np.float64)
+    beside = given if given.ndim == 2 else given.reshape(-1, 1)
+    return np.broadcast_to(beside, (len(segment.lines), segment.geometry.stages)).copy()
+
+
+def _aged(calibration: Calibration, recording: Recording) -> list[str]:
+    made = [datetime.fromisoformat(step["made"]) for step in calibration.steps.values() if "made" in step]
+    if not made or not recording.lines:
+        return []
+    row = recording.first_available_line - recording.first_line
+    if row >= recording.lines:
+        return []
+    begun = datetime.fromtimestamp(int(recording.arms["a"].read("time", row, row + 1)[0]) * 1e-9, UTC)
+    days = max(abs((begun - each).total_seconds()) for each in made) / 86400
+    return [f"the calibration is {days:.0f} days away from the recording"] if days > OLD_DAYS else []
+
+
+def _warmer(calibration: Calibration, recording: Recording) -> list[str]:
+    known = calibration.steps.get("dark", {}).get("temperature_c", {})
+    found = []
+    for arm, before in known.items():
+        now = recording.attrs["cameras"].get(arm, {}).get("DeviceTemperature")
+        if now is not None and abs(now - before) > WARMER_K:
+            found.append(f"camera {arm} is at {now:.0f} °C; its offsets were measured at {before:.0f} °C")
+    return found

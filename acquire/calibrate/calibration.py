@@ -1,0 +1,271 @@
+"""The model of a calibration: quantities with uncertainties, of which instrument, and how they were found.
+
+::
+
+    offset_dn        (arm, column)   DN of a pixel under a dark code
+    noise_dn         (arm, column)   its temporal standard deviation
+    ambient_dn       (arm, column)   what light that no code switches adds to it
+    gain             (arm, column)   response beside the arm's mean; 1 where the optics hide it
+    balance          (arm)           response beside the mean of both arms, which the splitter divides
+    dn_per_electron  (arm)           K of EMVA 1288
+    read_noise_e     (arm)           σ_d of EMVA 1288
+    full_well_e      (arm)           μ_e.sat of EMVA 1288
+
+and ``usable`` (arm, column), the orientation of arm B, and its alignment on arm A.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from acquire.alignment import Alignment
+from acquire.errors import DataError, UsageError
+from acquire.lines import ARMS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+FORMAT = "acquire-calibration/1"
+DIGITS = 7
+"""Significant digits of the copy in a recording: more than was measured."""
+
+
+@dataclass(frozen=True, slots=True)
+class Quantity:
+    """What an array of a calibration is."""
+
+    dimensions: tuple[str, ...]
+    unit: str
+    meaning: str
+
+
+ARM, COLUMN = ("arm",), ("arm", "column")
+QUANTITIES = {
+    "offset_dn": Quantity(COLUMN, "DN", "of a pixel under a dark code"),
+    "noise_dn": Quantity(COLUMN, "DN", "temporal standard deviation of a dark pixel"),
+    "ambient_dn": Quantity(COLUMN, "DN", "added by light that no code switches"),
+    "gain": Quantity(COLUMN, "1", "response beside the mean of the arm's columns"),
+    "balance": Quantity(ARM, "1", "response of the arm beside the mean of both"),
+    "dn_per_electron": Quantity(ARM, "DN", "system gain K of EMVA 1288"),
+    "read_noise_e": Quantity(ARM, "electron", "temporal dark noise of EMVA 1288"),
+    "full_well_e": Quantity(ARM, "electron", "saturation capacity of EMVA 1288"),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Measured:
+    """Values and their standard uncertainties, float64 of one shape."""
+
+    value: NDArray[np.float64]
+    uncertainty: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        if self.value.shape != self.uncertainty.shape:
+            raise UsageError(
+                f"values {self.value.shape} with uncertainties {self.uncertainty.shape}",
+                possible="the same shape",
+            )
+
+
+class Instrument(BaseModel):
+    """What a calibration belongs to."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    stages: int = Field(ge=1, le=2**16)
+    substeps: int = Field(ge=1, le=8)
+    substep_s: float = Field(gt=0, allow_inf_nan=False)
+    layout: str
+    cameras: dict[str, dict[str, Any]] = Field(description="arm → serial, and settings that lines depend on")
+
+
+@dataclass(frozen=True, slots=True)
+class AlignmentFound:
+    """An alignment of arm B on arm A, and the standard uncertainty of each number."""
+
+    alignment: Alignment
+    uncertainty: dict[str, float]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Finding:
+    """What one step found.
+
+    Attributes
+    ----------
+    step : its name
+    instrument : of the recordings
+    quantities : name → value and uncertainty
+    usable : (arm, column), False for columns that say nothing; None where the step does not tell
+    orientation : name of arm B's view of the scene, where the step tells; see `acquire.calibrate.orientation`
+    alignment : where the step tells
+    facts : JSON: recordings, lines, and what else is worth knowing
+    warnings : what is wrong with it, in sentences
+    """
+
+    step: str
+    instrument: Instrument
+    quantities: Mapping[str, Measured] = field(default_factory=dict)
+    usable: NDArray[np.bool_] | None = None
+    orientation: str | None = None
+    alignment: AlignmentFound | None = None
+    facts: dict[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibration:
+    """What is known of an instrument; see the module. ``steps``: name → how and when it was found (JSON)."""
+
+    instrument: Instrument
+    quantities: Mapping[str, Measured] = field(default_factory=dict)
+    usable: NDArray[np.bool_] | None = None
+    orientation: str | None = None
+    alignment: AlignmentFound | None = None
+    steps: Mapping[str, dict[str, Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        sizes = {"arm": len(ARMS), "column": self.instrument.stages}
+        if self.usable is not None and self.usable.shape != tuple(sizes.values()):
+            raise UsageError(
+                f"calibration with usable columns of shape {self.usable.shape}",
+                possible=f"{tuple(sizes.values())}",
+            )
+        for name, measured in self.quantities.items():
+            if name not in QUANTITIES:
+                raise UsageError(f"calibration with {name!r}", possible=", ".join(QUANTITIES))
+            shape = tuple(sizes[dimension] for dimension in QUANTITIES[name].dimensions)
+            if measured.value.shape != shape or not np.isfinite(measured.value).all():
+                raise UsageError(
+                    f"calibration with {name} of shape {measured.value.shape}",
+                    possible=f"finite numbers {shape}",
+                )
+
+    def value(self, name: str) -> NDArray[np.float64] | None:
+        """Values of a quantity; None where it was not measured."""
+        return self.quantities[name].value if name in self.quantities else None
+
+    def with_step(self, found: Finding) -> Calibration:
+        """The calibration with what a step found in place of what was known of it.
+
+        Raises UsageError where the step's recordings are of another instrument.
+        """
+        differences = differing(self.instrument, found.instrument)
+        if differences:
+            raise UsageError(
+                f"the recordings of {found.step!r} are of another instrument than the calibration: "
+                + "; ".join(differences),
+                hint="another calibration for it: --out NAME.zarr",
+            )
+        now = datetime.now(UTC).isoformat(timespec="seconds")
+        step = {**found.facts, "made": now, "warnings": list(found.warnings)}
+        if found.usable is not None:
+            step["unusable_columns"] = listed(found.usable)
+        steps = {**self.steps, found.step: step}
+        return replace(
+            self,
+            quantities={**self.quantities, **found.quantities},
+            usable=_usable(steps, self.instrument.stages),
+            orientation=found.orientation or self.orientation,
+            alignment=found.alignment or self.alignment,
+            steps=steps,
+        )
+
+    def to_attrs(self) -> dict[str, Any]:
+        """All of it as JSON: the copy that a recording carries."""
+        arrays = {
+            name: {"value": _rounded(each.value), "uncertainty": _rounded(each.uncertainty)}
+            for name, each in self.quantities.items()
+        }
+        return {**self.facts(), "quantities": arrays}
+
+    def facts(self) -> dict[str, Any]:
+        """All but the arrays, as JSON."""
+        found = self.alignment
+        return {
+            "format": FORMAT,
+            "instrument": self.instrument.model_dump(mode="json"),
+            "usable": None if self.usable is None else self.usable.tolist(),
+            "orientation": self.orientation,
+            "alignment": found and {**found.alignment.facts(), "uncertainty": found.uncertainty},
+            "steps": dict(self.steps),
+        }
+
+    @classmethod
+    def from_attrs(
+        cls, attrs: Mapping[str, Any], quantities: Mapping[str, Measured] | None = None
+    ) -> Calibration:
+        """What `to_attrs` wrote; ``quantities`` in place of those in ``attrs``.
+
+        DataError for a damaged one.
+        """
+        try:
+            if quantities is None:
+                quantities = {
+                    name: Measured(np.asarray(each["value"], float), np.asarray(each["uncertainty"], float))
+                    for name, each in attrs["quantities"].items()
+                }
+            usable, found = attrs["usable"], attrs["alignment"]
+            return cls(
+                Instrument.model_validate(attrs["instrument"]),
+                quantities,
+                None if usable is None else np.asarray(usable, np.bool_),
+                attrs["orientation"],
+                None if found is None else _alignment(found),
+                {name: dict(step) for name, step in attrs["steps"].items()},
+            )
+        except (LookupError, TypeError, ValueError, AttributeError, ValidationError, UsageError) as error:
+            raise DataError(f"the calibration is damaged: {error}", hint="measure it again") from error
+
+
+def listed(usable: NDArray[np.bool_]) -> dict[str, list[int]]:
+    """Columns of either arm that are not usable."""
+    return {arm: np.flatnonzero(~row).tolist() for arm, row in zip(ARMS, usable, strict=True)}
+
+
+def _usable(steps: Mapping[str, dict[str, Any]], columns: int) -> NDArray[np.bool_] | None:
+    """Columns that no step found to be no good; None where no step looked."""
+    told = [step["unusable_columns"] for step in steps.values() if "unusable_columns" in step]
+    if not told:
+        return None
+    usable = np.ones((len(ARMS), columns), np.bool_)
+    for each in told:
+        for row, arm in zip(usable, ARMS, strict=True):
+            row[each.get(arm, [])] = False
+    return usable
+
+
+def _alignment(attrs: Mapping[str, Any]) -> AlignmentFound:
+    numbers = {key: float(attrs[key]) for key in Alignment().facts()}
+    return AlignmentFound(Alignment(**numbers), {k: float(v) for k, v in attrs["uncertainty"].items()})
+
+
+def _rounded(values: NDArray[np.float64]) -> Any:
+    """As lists, with as many digits as mean something."""
+    size = np.abs(values[values != 0])
+    decimals = DIGITS - 1 - int(np.floor(np.log10(size.max()))) if size.size else 0
+    return np.round(values, decimals).tolist()
+
+
+def differing(known: Instrument, other: Instrument) -> list[str]:
+    """What makes two instruments differ, so that the calibration of one is none of the other; in words."""
+    found = []
+    for name, meaning in (("stages", "stages M"), ("substeps", "sub-steps S"), ("layout", "layout")):
+        mine, theirs = getattr(known, name), getattr(other, name)
+        if mine != theirs:
+            found.append(f"{meaning} {mine} is {theirs} there")
+    for arm in ARMS:
+        mine, theirs = known.cameras.get(arm, {}), other.cameras.get(arm, {})
+        found += [
+            f"camera {arm}: {key} {mine[key]} is {theirs[key]} there"
+            for key in mine
+            if key in theirs and mine[key] != theirs[key]
+        ]
+    return found

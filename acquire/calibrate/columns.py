@@ -1,0 +1,169 @@
+"""Steps that look at columns under a dark code or a steady light: dark, ambient, flat.
+
+A line-scan sensor's samples of one column are one pixel's: means over lines are fixed patterns, variances
+over lines are temporal noise (EMVA Standard 1288, release 4.0, Linear).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from acquire.calibrate.calibration import Finding, Measured, listed
+from acquire.calibrate.checks import (
+    QUANTISATION,
+    dim,
+    drift,
+    left_out,
+    offset_of,
+    per_arm,
+    refuse_clipped,
+    refuse_coded,
+    refuse_level,
+)
+from acquire.calibrate.exposure import moments, unseen
+from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.calibrate.calibration import Calibration
+    from acquire.calibrate.exposure import Exposure, Progress
+
+NOISY = 6.0
+"""Median absolute deviations of log noise beyond which a column is no good."""
+DEAD, DARK = 0.5, 0.05
+"""Response beside the arm's median below which a column is no good; at an edge it may see half a field."""
+DARK_EDGE = 4.0
+"""Spreads of the gain below the median at which a column at the edge is dark by the optics."""
+EDGE_SHARE = 0.125
+SMOOTH_DEGREE = 4
+
+
+def dark(exposure: Exposure, *, covered: bool = False, progress: Progress = unseen) -> Finding:
+    """Offset and noise per column, from lines without the light.
+
+    ``covered``: the lens is covered, so the code does not matter, and light that is not ours is kept out;
+    else the offset holds that as well. Raises UsageError for a code that lights the scene, and for lines that
+    reach 0, of which the mean is wrong.
+    """
+    if exposure.code_value != 0 and not covered:
+        raise UsageError(
+            f"{exposure.recording} is not dark: its light follows code {exposure.recording.attrs['code']}",
+            possible="code.kind = 'constant', code.value = 0; or a covered lens and --covered",
+        )
+    found = moments(exposure, progress)
+    refuse_clipped(exposure, found)
+    noise = np.sqrt(found.variance)
+    lines = found.lines[:, None]
+    usable = _quiet(noise)
+    quantities = {
+        "offset_dn": Measured(found.mean, np.sqrt(np.maximum(found.variance, QUANTISATION) / lines)),
+        "noise_dn": Measured(noise, noise / np.sqrt(2 * lines)),
+    }
+    facts = {**exposure.facts(), "covered": covered}
+    warnings = (*drift(found), *left_out(usable, "noise"))
+    return Finding("dark", exposure.instrument, quantities, usable, facts=facts, warnings=warnings)
+
+
+def ambient(exposure: Exposure, known: Calibration, *, progress: Progress = unseen) -> Finding:
+    """What light that no code switches adds to each column: an open lens under a dark code, less `dark`.
+
+    Raises UsageError without a dark that was covered.
+    """
+    offset = offset_of(known, "ambient", with_ambient=False)
+    if not known.steps["dark"].get("covered"):
+        raise UsageError(
+            "the offsets of this calibration hold the ambient light already: its dark was not covered",
+            possible="nothing more to do; or acquire calibrate dark --covered first",
+        )
+    seen = dark(exposure, progress=progress)
+    here = seen.quantities["offset_dn"]
+    spread = np.hypot(here.uncertainty, known.quantities["offset_dn"].uncertainty)
+    quantities = {"ambient_dn": Measured(here.value - offset, spread)}
+    facts = {**exposure.facts(), "mean_dn": per_arm((here.value - offset).mean(axis=1))}
+    return Finding("ambient", exposure.instrument, quantities, facts=facts, warnings=seen.warnings)
+
+
+def flat(
+    exposure: Exposure, known: Calibration, *, smooth: bool = False, progress: Progress = unseen
+) -> Finding:
+    """Gain per column and the arms' balance, from a uniform scene under steady light.
+
+    ``smooth``: the scene is not quite uniform, and a smooth profile (polynomial of degree 4) is its own, not
+    the columns'. Columns at the edge that the optics leave dark get the gain 1. Raises UsageError for lines
+    that are too dark or saturated, a code that is not steady, and without a dark.
+    """
+    refuse_coded(exposure, "flat")
+    offset = offset_of(known, "flat")
+    found = moments(exposure, progress)
+    light = found.mean - offset
+    refuse_level(exposure, found, light)
+    response = light / exposure.camera("responsivity_dn")[:, None]
+    alive, middle = response > 0, np.median(response, axis=1, keepdims=True)
+    shape = response / _profile(response, alive) if smooth else response
+    edges = _dark_edges(shape, alive)
+    usable = response > np.where(edges, DARK, DEAD) * middle
+    trusted = usable & ~edges
+    if known.usable is not None:
+        trusted &= known.usable
+    level = np.array([row[good].mean() for row, good in zip(shape, trusted, strict=True)])[:, None]
+    arms = np.array([row[good].mean() for row, good in zip(response, trusted, strict=True)])
+    error = np.hypot(
+        np.sqrt(found.variance / found.lines[:, None]), known.quantities["offset_dn"].uncertainty
+    )
+    own_error = np.sqrt(np.maximum(found.own_variance, QUANTISATION) / found.lines[:, None])
+    relative = np.hypot(own_error, known.quantities["offset_dn"].uncertainty) / light
+    gain = np.where(trusted, shape / level, 1.0)
+    arm_error = np.sqrt((error**2).sum(axis=1)) / light.sum(axis=1)
+    balance = arms / arms.mean()
+    quantities = {
+        "gain": Measured(gain, np.where(trusted, relative, 0.05)),
+        "balance": Measured(balance, balance * np.hypot(*arm_error) / 2),
+    }
+    facts = {
+        **exposure.facts(),
+        "level_dn": per_arm(light.mean(axis=1)),
+        "smooth": smooth,
+        "part_a": round(float(balance[0] / balance.sum()), 6),
+        "optics_hide_columns": listed(trusted | ~usable),
+    }
+    warnings = (*dim(exposure, light), *drift(found), *left_out(usable, "response"))
+    return Finding("flat", exposure.instrument, quantities, usable, facts=facts, warnings=warnings)
+
+
+def _quiet(noise: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Columns whose noise is like that of most."""
+    size = np.log(np.maximum(noise, 1e-6))
+    middle = np.median(size, axis=1, keepdims=True)
+    spread = np.median(np.abs(size - middle), axis=1, keepdims=True)
+    quiet: NDArray[np.bool_] = size - middle <= np.maximum(NOISY * spread, np.log(3.0))
+    return quiet
+
+
+def _dark_edges(shape: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Columns from either edge inwards that are below all others: what lies beyond the field is dark."""
+    dark = np.zeros_like(usable)
+    most = max(1, round(EDGE_SHARE * shape.shape[1]))
+    for row, good, out in zip(shape, usable, dark, strict=True):
+        middle = np.median(row[good])
+        spread = 1.4826 * np.median(np.abs(row[good] - middle))
+        low = row < middle - np.maximum(DARK_EDGE * spread, 2e-3 * middle)
+        for order in (slice(None, most), slice(None, -most - 1, -1)):
+            out[order] = np.logical_and.accumulate(low[order])
+    return dark
+
+
+def _profile(response: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """The smooth part of each arm's response: a polynomial of the columns."""
+    x = np.linspace(-1, 1, response.shape[1])
+    inner = usable & ~_dark_edges(response, usable)
+    fits = [
+        np.polynomial.chebyshev.Chebyshev.fit(x[good], row[good], min(SMOOTH_DEGREE, good.sum() - 1), [-1, 1])
+        for row, good in zip(response, inner, strict=True)
+    ]
+    profile = np.stack([fit(x) for fit in fits])
+    level = np.array([row[good].mean() for row, good in zip(profile, inner, strict=True)])
+    relative: NDArray[np.float64] = profile / level[:, None]
+    return relative

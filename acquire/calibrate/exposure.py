@@ -1,0 +1,220 @@
+"""Lines of both arms under a known light, read from a recording block by block, and their moments."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.calibrate.calibration import Instrument
+from acquire.codes import ConstantCode, code_from_attrs
+from acquire.errors import UsageError
+from acquire.lines import ARMS
+from acquire.store import open_recording
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from acquire.lines import Segment
+    from acquire.store import Recording
+
+    Progress = Callable[[int, int], object]
+    """Is told how many lines are done, of how many."""
+
+BLOCK_LINES = 1024
+FEWEST_LINES = 16
+SETTINGS = (
+    "PixelFormat",
+    "Gain",
+    "AnalogGain",
+    "DigitalGain",
+    "BlackLevel",
+    "Gamma",
+    "PRNUMode",
+    "OperationMode",
+    "TDIStages",
+    "ScanDirection",
+    "ReverseX",
+    "OffsetX",
+    "BinningHorizontal",
+    "BinningVertical",
+    "white_dn",
+    "black_level_dn",
+    "responsivity_dn",
+)
+"""What the numbers of a calibration depend on, of the settings that a camera was read back with."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Exposure:
+    """``lines`` lines from ``first_line`` on of a recording."""
+
+    recording: Recording
+    first_line: int
+    lines: int
+
+    @property
+    def instrument(self) -> Instrument:
+        return instrument_of(self.recording)
+
+    @property
+    def code_value(self) -> int | None:
+        """0 or 1 where the light's code is constant, else None."""
+        code = code_from_attrs(self.recording.attrs["code"])
+        return code.value if isinstance(code, ConstantCode) else None
+
+    def camera(self, key: str) -> NDArray[np.float64]:
+        """A number of each camera: (arm,)."""
+        return np.array([float(self.recording.attrs["cameras"][arm][key]) for arm in ARMS])
+
+    def blocks(self) -> Iterator[Segment]:
+        """All of it, in blocks that fit into memory."""
+        for first in range(0, self.lines, BLOCK_LINES):
+            count = min(BLOCK_LINES, self.lines - first)
+            yield self.recording.cut(self.first_line + first, count)
+
+    def whole(self) -> Segment:
+        """All of it at once."""
+        return self.recording.cut(self.first_line, self.lines)
+
+    def facts(self) -> dict[str, Any]:
+        """Where it is from, as JSON."""
+        cameras = self.recording.attrs["cameras"]
+        warm = {arm: cameras[arm]["DeviceTemperature"] for arm in ARMS if "DeviceTemperature" in cameras[arm]}
+        return {
+            "recording": str(self.recording),
+            "run_id": self.recording.attrs["run_id"],
+            "first_line": self.first_line,
+            "lines": self.lines,
+            **({"temperature_c": warm} if warm else {}),
+        }
+
+
+def open_exposure(place: Path | str, first_line: int | None = None, lines: int | None = None) -> Exposure:
+    """Lines of a recording: all, or as asked. UsageError for too few, and what `open_recording` raises."""
+    recording = open_recording(place)
+    first = recording.first_available_line if first_line is None else first_line
+    count = recording.first_line + recording.lines - first if lines is None else lines
+    if count < FEWEST_LINES:
+        raise UsageError(
+            f"{recording} with {count} lines is too short to calibrate from",
+            possible=f"{FEWEST_LINES} lines or more",
+        )
+    return Exposure(recording, first, count)
+
+
+def instrument_of(recording: Recording) -> Instrument:
+    """The instrument that a recording was made with, as far as it says so."""
+    attrs = recording.attrs
+    cameras = {}
+    for arm in ARMS:
+        facts = attrs["cameras"][arm]
+        configured = attrs.get("config", {}).get("cameras", {}).get(arm, {})
+        serial = facts.get("identity", {}).get("serial") or facts.get("DeviceSerialNumber")
+        settings = {key: facts[key] for key in SETTINGS if key in facts}
+        cameras[arm] = {"serial": serial or configured.get("serial", "unknown"), **settings}
+    geometry = recording.geometry_for(1)
+    return Instrument(
+        stages=geometry.stages,
+        substeps=geometry.substeps,
+        substep_s=recording.line_period_ns * 1e-9 / geometry.substeps,
+        layout=str(attrs["layout"]),
+        cameras=cameras,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moments:
+    """Statistics of samples over lines; all arrays are (arm, column).
+
+    Attributes
+    ----------
+    lines : of each arm that were used
+    mean : in DN
+    variance : temporal, within blocks of `BLOCK_LINES` lines
+    own_variance : the same without what all columns of a line share, as of light that flickers
+    drift : largest difference of a block's mean from the mean, in standard errors of a block's mean
+    at_zero, saturated : share of the samples
+    """
+
+    lines: NDArray[np.int64]
+    mean: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    own_variance: NDArray[np.float64]
+    drift: NDArray[np.float64]
+    at_zero: NDArray[np.float64]
+    saturated: NDArray[np.float64]
+
+
+def unseen(done: int, total: int) -> None:
+    """Nobody watches the progress."""
+
+
+def moments(exposure: Exposure, progress: Progress = unseen) -> Moments:
+    """Statistics of an exposure. UsageError where an arm has no usable line."""
+    white = np.ceil(exposure.camera("white_dn"))[:, None, None]
+    parts: list[tuple[NDArray[Any], ...]] = []
+    done = 0
+    for block in exposure.blocks():
+        parts.append(_block_moments(block, white))
+        done += len(block.time_ns)
+        progress(done, exposure.lines)
+    counts, means, variances, own, zeros, saturated = (np.stack(each) for each in zip(*parts, strict=True))
+    total = counts.sum(axis=0)
+    if not total.all():
+        raise UsageError(f"{exposure.recording}: an arm has no line that arrived", hint="other lines")
+
+    def pooled(values: NDArray[Any], weights: NDArray[Any]) -> NDArray[np.float64]:
+        beside = weights[:, :, None].astype(np.float64)
+        found: NDArray[np.float64] = (values * beside).sum(axis=0) / beside.sum(axis=0).clip(1)
+        return found
+
+    mean, variance = pooled(means, counts), pooled(variances, (counts - 1).clip(0))
+    errors = np.sqrt(variance / counts.clip(1)[:, :, None]).clip(1e-9)
+    return Moments(
+        lines=total,
+        mean=mean,
+        variance=variance,
+        own_variance=pooled(own, (counts - 1).clip(0)),
+        drift=np.abs((means - mean) / errors).max(axis=0) if len(parts) > 1 else np.zeros_like(mean),
+        at_zero=pooled(zeros, counts),
+        saturated=pooled(saturated, counts),
+    )
+
+
+def _block_moments(block: Segment, white: NDArray[Any]) -> tuple[NDArray[Any], ...]:
+    lines = block.lines.astype(np.float64)
+    arrived = np.asarray((block.mask | (lines >= white)).any(axis=2))
+    counts = arrived.sum(axis=1)
+    shape = (len(ARMS), lines.shape[2])
+    found = [np.zeros(shape) for _ in range(5)]
+    mean, variance, own, zeros, saturated = found
+    for arm, here in enumerate(arrived):
+        samples = lines[arm, here]
+        if len(samples) < 2:
+            continue
+        mean[arm] = samples.mean(axis=0)
+        variance[arm] = samples.var(axis=0, ddof=1)
+        own[arm] = _own_variance(samples, mean[arm])
+        zeros[arm], saturated[arm] = (samples == 0).mean(axis=0), (samples >= white[arm]).mean(axis=0)
+    return counts, *found
+
+
+def _own_variance(samples: NDArray[np.float64], mean: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Temporal variance of columns without the factor that all columns of a line share.
+
+    The factor of a line is the mean of its samples beside those of all; taking it away takes the part
+    g_j/Σg of a column's own noise along, for which the result is corrected.
+    """
+    share = mean / mean.sum() if mean.sum() > 0 else np.full(len(mean), 1 / len(mean))
+    change = samples - mean
+    left = change - change.sum(axis=1, keepdims=True) * share
+    raw = (left**2).sum(axis=0) / (len(samples) - 1)
+    # Var(left_j) = v_j·(1 − 2·s_j) + s_j²·Σv, with Σv = Σ raw / (1 − Σs²) to first order
+    total = raw.sum() / max(1 - float((share**2).sum()), 0.5)
+    own: NDArray[np.float64] = (raw - share**2 * total) / np.maximum(1 - 2 * share, 0.1)
+    return own

@@ -1,0 +1,123 @@
+"""A calibration on disk: a Zarr v3 group whose arrays open in zarr-python and xarray without us.
+
+::
+
+    NAME.zarr/   attributes: format, instrument, orientation, alignment, steps (how each was found, and when)
+      gain       (arm, column) float64, with ``units`` and ``long_name``; and so on, as far as measured
+      gain_uncertainty
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import zarr
+from zarr.errors import GroupNotFoundError
+
+from acquire.calibrate.calibration import FORMAT, QUANTITIES, Calibration, Measured
+from acquire.errors import DataError, PlaceError, UsageError
+from acquire.store.camera_stream import DAMAGE, child_array
+from acquire.store.delivery import delivery_to
+from acquire.store.layout import group_document, to_json
+from acquire.store.opening import read_root
+from acquire.store.refusals import refused
+from acquire.store.remote import is_url
+from acquire.store.source import source_of
+
+if TYPE_CHECKING:
+    from acquire.store.delivery import Delivery
+
+UNCERTAINTY = "_uncertainty"
+ROOT = "zarr.json"
+HINT = "the path of a calibration (a directory NAME.zarr), as `acquire calibrate dark … --out` writes one"
+
+
+def save_calibration(place: Path | str, calibration: Calibration) -> None:
+    """Write a calibration; one that is at the path already is replaced as a whole, anything else is not.
+
+    Raises UsageError for what cannot be written, StoreError when the disk refuses.
+    """
+    if is_url(place) or not os.path.lexists(place):
+        _deliver(delivery_to(place), place, calibration)
+        return
+    path = Path(place)
+    open_calibration(path)
+    fresh = path.with_name(f".{path.name}.{os.getpid()}.new.zarr")
+    shutil.rmtree(fresh, ignore_errors=True)
+    _deliver(delivery_to(fresh), fresh, calibration)
+    before = path.with_name(f".{path.name}.{os.getpid()}.before")
+    with refused(path, "written"):
+        path.rename(before)
+        fresh.rename(path)
+        shutil.rmtree(before)
+
+
+def open_calibration(place: Path | str) -> Calibration:
+    """Open a calibration, here or at a URL.
+
+    Raises PlaceError where there is none, DataError for a damaged one, StoreError where that cannot be told.
+    """
+    source = source_of(place)
+    with refused(source, "read"):
+        there = source.exists()
+    if not there:
+        raise PlaceError(f"{source} does not exist", hint=HINT)
+    try:
+        attributes = read_root(source)["attributes"]
+    except PlaceError as error:
+        raise PlaceError(f"{source} is not a calibration: it holds no zarr.json", hint=HINT) from error
+    if attributes.get("format") != FORMAT:
+        raise PlaceError(
+            f"{source} is not a calibration: format {attributes.get('format')!r}",
+            possible=f"{FORMAT!r}",
+            hint=HINT,
+        )
+    try:
+        group = zarr.open_group(source.zarr_store(), mode="r", zarr_format=3)
+        names = [name for name in QUANTITIES if name in group]
+        quantities = {name: Measured(_read(group, name), _read(group, name + UNCERTAINTY)) for name in names}
+    except (GroupNotFoundError, *DAMAGE) as error:
+        raise DataError(f"{source}: an array of the calibration is damaged: {error}") from error
+    return Calibration.from_attrs(attributes, quantities)
+
+
+def _read(group: zarr.Group, name: str) -> Any:
+    return np.asarray(child_array(group, name)[...], np.float64)
+
+
+def _deliver(delivery: Delivery, place: Path | str, calibration: Calibration) -> None:
+    try:
+        with refused(place, "written"):
+            _write(delivery.partial, calibration)
+        delivery.deliver()
+    finally:
+        delivery.clear()
+
+
+def _write(directory: Path, calibration: Calibration) -> None:
+    group = zarr.create_group(directory, zarr_format=3)
+    names = []
+    for name, measured in calibration.quantities.items():
+        quantity = QUANTITIES[name]
+        for key, values, prefix in (
+            (name, measured.value, ""),
+            (name + UNCERTAINTY, measured.uncertainty, "standard uncertainty of: "),
+        ):
+            array = group.create_array(
+                key,
+                shape=values.shape,
+                dtype="float64",
+                dimension_names=quantity.dimensions,
+                attributes={"units": quantity.unit, "long_name": prefix + quantity.meaning},
+            )
+            array[...] = values
+            names.append(key)
+    if not names and not calibration.steps:
+        raise UsageError("a calibration that holds nothing", possible="one step at least")
+    nodes = {name: json.loads((directory / name / ROOT).read_bytes()) for name in names}
+    (directory / ROOT).write_bytes(to_json(group_document(calibration.facts(), nodes)))

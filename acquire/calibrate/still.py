@@ -1,0 +1,101 @@
+"""What one arm alone sees of a scene at rest: more equations than unknowns, so no prior is needed.
+
+Of a scene at rest, line i of an arm is Σ_m E(m + i·S)·z(m), where z is the image summed over S rows at a time
+and m its last row (Eq. 1 with the sums over u and r in the other order). z has n + S − 1 rows, all of them
+fine, and M columns: box-filtered over S × S fine pixels, and sampled at every row. Arm B's is sampled at
+every column of arm A's view instead.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.geometry import Geometry
+    from acquire.lines import Segment
+
+SPARE = 1.25
+"""Lines per unknown below which noise makes nothing of an image."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Still:
+    """One arm's image.
+
+    Attributes
+    ----------
+    image : (n + S − 1, M) in the arm's own rows and columns, scene units summed over S × S fine pixels
+    uncertainty : standard deviation of its elements
+    misfit : RMS of what it does not explain of the lines, relative to their RMS
+    usable : (M,) columns with samples
+    """
+
+    image: NDArray[np.float64]
+    uncertainty: float
+    misfit: float
+    usable: NDArray[np.bool_]
+
+    def blocks(self, substeps: int) -> NDArray[np.float64]:
+        """Of S × S fine pixels without overlap: (M, M)."""
+        found: NDArray[np.float64] = self.image[substeps - 1 :: substeps]
+        return found
+
+
+def stills(segment: Segment) -> tuple[Still, Still]:
+    """Both arms' images of a scene at rest. UsageError for too few lines, or a code that says too little."""
+    samples = segment.samples(np.float64)
+    windows = _windows(segment.code, segment.geometry)
+    a, b = (_still(samples[arm], segment.mask[arm], windows, segment.geometry) for arm in range(len(samples)))
+    return a, b
+
+
+def _windows(code: NDArray[np.uint8], geometry: Geometry) -> NDArray[np.float64]:
+    """E(m + i·S): (L_R, n + S − 1)."""
+    width, S = geometry.size + geometry.substeps - 1, geometry.substeps
+    view = np.lib.stride_tricks.sliding_window_view(code, width)[::S]
+    return view[: geometry.lines].astype(np.float64)
+
+
+def _still(
+    samples: NDArray[np.float64], mask: NDArray[np.bool_], windows: NDArray[Any], geometry: Geometry
+) -> Still:
+    share = mask.mean(axis=0)
+    usable = share > 0.5 * share.max()
+    lines = mask[:, usable].all(axis=1) if usable.any() else np.zeros(len(mask), np.bool_)
+    needed = int(np.ceil(SPARE * windows.shape[1]))
+    if lines.sum() < needed:
+        raise UsageError(
+            f"{lines.sum()} whole lines do not show an image of {windows.shape[1]} rows",
+            possible=f"{needed} or more; {4 * geometry.size} for a good one",
+            hint="more lines of a target at rest, not saturated",
+        )
+    A, y = windows[lines], samples[lines]
+    y = np.where(usable, y, 0)
+    try:
+        factor = cho_factor(A.T @ A)
+    except LinAlgError as error:
+        raise UsageError(
+            "the light's code does not tell the rows of the scene apart",
+            possible="a pseudo-random code",
+            hint="a run with code.kind = 'prbs'",
+        ) from error
+    image = cho_solve(factor, A.T @ y)
+    left = y - A @ image
+    spare = lines.sum() - windows.shape[1]
+    noise = float(np.sqrt((left**2).sum() / (spare * max(usable.sum(), 1))))
+    inverse = cho_solve(factor, np.eye(windows.shape[1]))
+    level = float(np.sqrt((y[:, usable] ** 2).mean()))
+    return Still(
+        image=image,
+        uncertainty=noise * float(np.sqrt(np.diag(inverse).mean())),
+        misfit=noise / level if level > 0 else 0.0,
+        usable=usable,
+    )

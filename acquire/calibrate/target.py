@@ -1,0 +1,149 @@
+"""Steps that look at a target at rest under a pseudo-random code: orientation and alignment of the arms."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.calibrate.align import Match, align
+from acquire.calibrate.apply import calibrated
+from acquire.calibrate.calibration import Finding, Measured
+from acquire.calibrate.orientation import (
+    CLEAR,
+    LEAST_CORRELATION,
+    MODEL,
+    View,
+    correlations,
+    view_named,
+)
+from acquire.calibrate.still import stills
+from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from acquire.calibrate.calibration import Calibration
+    from acquire.calibrate.exposure import Exposure
+    from acquire.calibrate.still import Still
+    from acquire.lines import Segment
+
+MOVES = 3.0
+"""Misfit beside the lines' own noise from which on a target is not at rest."""
+MOST_LINES = 4096
+"""That are looked at; more do not make an alignment better than its model."""
+SAME_BALANCE = 0.002
+BALANCE_ERROR = 0.001
+"""Of the ratio of the arms' light over the field that both see."""
+
+
+def orientation(exposure: Exposure, known: Calibration) -> Finding:
+    """Which of eight views of the scene arm B has. One that is not clear is not told: the finding has None.
+
+    Raises UsageError for too few lines, and for a code that tells nothing.
+    """
+    still_a, still_b = stills(_segment(exposure, replace(known, orientation=None, alignment=None)))
+    view, facts = told(still_a, still_b, exposure.instrument.substeps)
+    return Finding(
+        "orientation",
+        exposure.instrument,
+        orientation=None if view is None else view.name,
+        facts={**exposure.facts(), **facts},
+        warnings=_warnings(view, facts),
+    )
+
+
+def told(a: Still, b: Still, substeps: int) -> tuple[View | None, dict[str, Any]]:
+    """The view that fits the arms' images, if it is clear which, and how clear."""
+    found = correlations(a.blocks(substeps), b.blocks(substeps))
+    ranked = sorted(found, key=lambda view: -found[view][0])
+    best, following = found[ranked[0]][0], max(found[ranked[1]][0], 1e-3)
+    clear = best >= LEAST_CORRELATION and best >= CLEAR * following
+    facts = {
+        "correlation": round(best, 4),
+        "next": {"view": ranked[1].name, "correlation": round(following, 4)},
+        "ratio": round(best / following, 3),
+    }
+    return (ranked[0] if clear else None), facts
+
+
+def _warnings(view: View | None, facts: dict[str, Any]) -> tuple[str, ...]:
+    if view is None:
+        return (
+            f"cannot tell: the best view correlates with {facts['correlation']:.2f}, "
+            f"{facts['next']['view']} with {facts['next']['correlation']:.2f}; a target with sharp, "
+            "irregular texture tells",
+        )
+    if not view.crosses:
+        return (
+            f"arm B sees the scene with {view.name}: both cameras transfer along the same axis; turn one of "
+            "them by 90 degrees",
+        )
+    return ()
+
+
+def alignment(exposure: Exposure, known: Calibration) -> Finding:
+    """Where arm B's image lies on arm A's, and the arms' balance over the field that both see.
+
+    Raises UsageError for a target that does not tell, or that shows another orientation than is known.
+    """
+    segment = _segment(exposure, replace(known, alignment=None))
+    geometry, S = segment.geometry, segment.geometry.substeps
+    still_a, still_b = stills(segment)
+    view, facts = told(still_a, still_b, S)
+    if view is not None and view != MODEL:
+        believed = MODEL.name if known.orientation is None else known.orientation
+        raise UsageError(
+            f"{exposure.recording}: arm B does not see the scene with {believed}, as was believed",
+            hint="acquire calibrate orientation, with the same recording",
+        )
+    shift = correlations(still_a.blocks(S), still_b.blocks(S))[MODEL][1]
+    match = align(still_a, still_b, geometry, (S * shift[0], S * shift[1]))
+    quantities = _balance(known, match)
+    facts = {
+        **exposure.facts(),
+        "lines": len(segment.time_ns),
+        **facts,
+        "misfit": round(match.misfit, 4),
+        "lines_misfit": [round(still_a.misfit, 5), round(still_b.misfit, 5)],
+        "brightness": round(match.brightness, 5),
+    }
+    warnings = []
+    if quantities:
+        warnings.append(
+            f"over the field that both arms see, arm B is {match.brightness - 1:+.1%} brighter than the flat "
+            "says, whose light does not reach beyond the field: the balance is corrected"
+        )
+    return Finding(
+        "align",
+        exposure.instrument,
+        quantities,
+        alignment=match.found,
+        facts=facts,
+        warnings=tuple(warnings),
+    )
+
+
+def _balance(known: Calibration, match: Match) -> dict[str, Measured]:
+    """The arms' balance, where what both see is brighter in one of them."""
+    if abs(match.brightness - 1) <= SAME_BALANCE:
+        return {}
+    before = known.value("balance")
+    before = np.ones(2) if before is None else before
+    swapped = known.orientation is not None and _swapped(view_named(known.orientation))
+    ratio = before[1] / before[0] * (1 / match.brightness if swapped else match.brightness)
+    balance = np.array([2 / (1 + ratio), 2 * ratio / (1 + ratio)])
+    return {"balance": Measured(balance, BALANCE_ERROR * balance)}
+
+
+def _swapped(view: View) -> bool:
+    return (view.turn_deg == 270) != view.mirrored
+
+
+def _segment(exposure: Exposure, known: Calibration) -> Segment:
+    if exposure.code_value is not None:
+        raise UsageError(
+            f"{exposure.recording} has a constant code, which does not tell the rows of a scene apart",
+            possible="a pseudo-random code: code.kind = 'prbs'",
+        )
+    lines = min(exposure.lines, MOST_LINES)
+    return calibrated(replace(exposure, lines=lines).whole(), known)

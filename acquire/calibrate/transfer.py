@@ -1,0 +1,116 @@
+"""The step ``transfer``: electrons behind the numbers, by EMVA 1288's photon transfer method."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from acquire.calibrate.calibration import Finding, Measured
+from acquire.calibrate.checks import (
+    LOWEST_LIGHT_DN,
+    MOST_SATURATED,
+    QUANTISATION,
+    offset_of,
+    per_arm,
+    refuse_coded,
+)
+from acquire.calibrate.exposure import moments, unseen
+from acquire.errors import UsageError
+from acquire.lines import ARMS
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from acquire.calibrate.calibration import Calibration
+    from acquire.calibrate.exposure import Exposure, Progress
+
+
+FALLEN = 3.0
+"""Standard errors by which a level's variance is below the one before it where pixels are full."""
+ROUGHLY = 0.05
+"""Relative uncertainty of a full well that lies somewhere between two levels."""
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One level of light on one arm: means over its columns, in DN and DN²."""
+
+    light: float
+    variance: float
+    error: float
+    saturated: float
+
+
+def transfer(exposures: Sequence[Exposure], known: Calibration, *, progress: Progress = unseen) -> Finding:
+    """DN per electron, read noise and, where the lines reach it, full well: EMVA 1288's photon transfer.
+
+    K = (σ² − σ_d²) / (μ − μ_d) (EMVA 1288 Eq. 13), without what all columns of a line share, which is the
+    light's doing and not the sensor's; over the levels of ``exposures`` up to where pixels are full. Raises
+    UsageError without a dark, for a light that is not steady, and for lines without shot noise.
+    """
+    dark_lines = int(known.steps.get("dark", {}).get("lines", 0))
+    offset = offset_of(known, "transfer")
+    dark_noise = known.quantities["noise_dn"].value
+    usable = np.ones_like(offset, np.bool_) if known.usable is None else known.usable
+    points: dict[str, list[Point]] = {arm: [] for arm in ARMS}
+    for exposure in exposures:
+        refuse_coded(exposure, "transfer")
+        found = moments(exposure, progress)
+        for i, arm in enumerate(ARMS):
+            good = usable[i]
+            own, dark = found.own_variance[i, good], dark_noise[i, good] ** 2
+            errors = 2 * (own**2 / found.lines[i] + dark**2 / dark_lines)
+            points[arm].append(
+                Point(
+                    light=float((found.mean - offset)[i, good].mean()),
+                    variance=float((own - dark).mean()),
+                    error=float(np.sqrt(errors.sum()) / good.sum()),
+                    saturated=float(found.saturated[i, good].mean()),
+                )
+            )
+    slopes = [_slope(sorted(points[arm], key=lambda point: point.light), arm) for arm in ARMS]
+    K, error, full_dn = (np.array(each) for each in zip(*slopes, strict=True))
+    read = np.sqrt(np.maximum((dark_noise**2).mean(axis=1) - QUANTISATION, 0)) / K
+    read_error = read * np.hypot(error / K, 1 / np.sqrt(2.0 * dark_lines * offset.shape[1]))
+    quantities = {"dn_per_electron": Measured(K, error), "read_noise_e": Measured(read, read_error)}
+    if np.isfinite(full_dn).all():
+        quantities["full_well_e"] = Measured(full_dn / K, full_dn / K * np.maximum(error / K, ROUGHLY))
+    facts = {
+        "recordings": [exposure.facts() for exposure in exposures],
+        "lines": sum(exposure.lines for exposure in exposures),
+        "levels": len(exposures),
+        "brightest_e": per_arm(np.array([max(p.light for p in points[arm]) for arm in ARMS]) / K),
+    }
+    return Finding("transfer", exposures[0].instrument, quantities, facts=facts)
+
+
+def _slope(points: list[Point], arm: str) -> tuple[float, float, float]:
+    """K and its standard error from levels that grow, and the light in DN of the last one before pixels are
+    full (inf: they are not).
+    """
+    kept: list[Point] = []
+    full_dn = float("inf")
+    for point in points:
+        fallen = bool(kept) and point.variance < kept[-1].variance - FALLEN * (point.error + kept[-1].error)
+        if point.saturated > MOST_SATURATED or fallen:
+            full_dn = kept[-1].light if kept else point.light
+            break
+        if point.light > LOWEST_LIGHT_DN:
+            kept.append(point)
+    if not kept:
+        raise UsageError(
+            f"arm {arm} has no level between {LOWEST_LIGHT_DN:g} DN and where pixels are full",
+            hint="flats at 10 to 90 % of white",
+        )
+    weights = np.array([(point.light / point.error) ** 2 for point in kept])
+    slopes = np.array([point.variance / point.light for point in kept])
+    K, error = float((weights * slopes).sum() / weights.sum()), float(weights.sum() ** -0.5)
+    if FALLEN * error > K:
+        raise UsageError(
+            f"the lines of arm {arm} have no more noise in the light than in the dark",
+            possible="shot noise that the lines resolve",
+            hint="brighter flats, more lines",
+        )
+    return K, error, full_dn

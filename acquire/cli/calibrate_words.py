@@ -1,0 +1,126 @@
+"""What ``acquire calibrate`` found, in words: values, and how sure they are."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from acquire.calibrate.calibration import AlignmentFound, Calibration, Finding, Measured
+    from acquire.calibrate.check import Check
+
+PER_ARM = {
+    "balance": ("arm's light beside the mean", ""),
+    "dn_per_electron": ("DN per electron", ""),
+    "read_noise_e": ("read noise", " e"),
+    "full_well_e": ("full well", " e"),
+}
+PER_COLUMN = {
+    "offset_dn": ("offset", " DN"),
+    "noise_dn": ("noise", " DN"),
+    "ambient_dn": ("ambient light", " DN"),
+}
+
+
+def found_facts(found: Finding) -> dict[str, Any]:
+    """Name → value and uncertainty, in words."""
+    facts: dict[str, Any] = {"step": f"{found.step}, {found.facts.get('lines', 0)} lines"}
+    facts |= _quantities(found.quantities)
+    if found.step == "flat":
+        facts["arm A's part of the light"] = f"{found.facts['part_a']:.2%}"
+        facts["hidden by the optics"] = _columns(found.facts["optics_hide_columns"])
+    if found.usable is not None and not found.usable.all():
+        bad = {arm: np.flatnonzero(~row).tolist() for arm, row in zip("ab", found.usable, strict=True)}
+        facts["left out"] = _columns(bad)
+    if found.orientation is not None:
+        facts["arm B sees the scene with"] = found.orientation
+        facts["sure"] = (
+            f"correlation {found.facts['correlation']:.2f}, {found.facts['ratio']:.1f} times the next view's"
+        )
+    if found.alignment is not None:
+        facts |= _alignment(found.alignment)
+        facts["left over"] = f"{found.facts['misfit']:.1%} of the images' variation"
+    return facts
+
+
+def known_facts(known: Calibration) -> dict[str, Any]:
+    """All that a calibration holds, in words."""
+    instrument = known.instrument
+    facts: dict[str, Any] = {
+        "instrument": f"M = {instrument.stages}, S = {instrument.substeps}, {instrument.layout}",
+        "cameras": ", ".join(f"{arm} {facts['serial']}" for arm, facts in instrument.cameras.items()),
+    }
+    facts |= _quantities(known.quantities)
+    if known.usable is not None and not known.usable.all():
+        facts["left out"] = f"{int((~known.usable).sum())} columns"
+    if known.orientation is not None:
+        facts["arm B sees the scene with"] = known.orientation
+    if known.alignment is not None:
+        facts |= _alignment(known.alignment)
+    for name, step in known.steps.items():
+        facts[name] = f"{step.get('lines', 0)} lines, {step['made']}" + "".join(
+            f"; {text}" for text in step.get("warnings", ())
+        )
+    return facts
+
+
+def compared_rows(found: Check) -> list[dict[str, str]]:
+    """What was compared, one row each."""
+    return [
+        {
+            "quantity": each.quantity,
+            "changed by": f"{each.change:+.4f}",
+            "unit": each.unit,
+            "sure to": f"{each.sure:.4f}",
+            "so": "holds" if each.holds else "changed: measure it again",
+        }
+        for each in found.compared
+    ]
+
+
+def _quantities(quantities: Any) -> dict[str, str]:
+    facts = {}
+    for name, (label, unit) in PER_COLUMN.items():
+        if name in quantities:
+            facts[label] = _range(quantities[name], unit)
+    if "gain" in quantities:
+        gain = quantities["gain"]
+        spread = " and ".join(f"{row.std():.2%}" for row in gain.value)
+        facts["gain"] = (
+            f"spread {spread} over the columns of a and b; sure to {np.median(gain.uncertainty):.2%} a column"
+        )
+    for name, (label, unit) in PER_ARM.items():
+        if name in quantities:
+            facts[label] = _both(quantities[name], unit)
+    return facts
+
+
+def _range(measured: Measured, unit: str) -> str:
+    arms = "; ".join(
+        f"{arm} {row.mean():.2f}{unit} ({row.min():.2f} to {row.max():.2f})"
+        for arm, row in zip("ab", measured.value, strict=True)
+    )
+    return f"{arms}; sure to {measured.uncertainty.max():.2g}{unit} in the worst column"
+
+
+def _both(measured: Measured, unit: str) -> str:
+    return ", ".join(
+        f"{arm} {value:.5g}{unit} ± {error:.2g}"
+        for arm, value, error in zip("ab", measured.value, measured.uncertainty, strict=True)
+    )
+
+
+def _alignment(found: AlignmentFound) -> dict[str, str]:
+    numbers, errors = found.alignment, found.uncertainty
+    return {
+        "arm B lies": f"{numbers.rows:+.3f} ± {errors['rows']:.3f} fine pixels down, "
+        f"{numbers.columns:+.3f} ± {errors['columns']:.3f} to the right",
+        "turned": f"{numbers.turn_deg:+.4f} ± {errors['turn_deg']:.4f} degrees counter-clockwise",
+        "magnified": f"{numbers.magnification:.5f} ± {errors['magnification']:.5f}",
+    }
+
+
+def _columns(listed: dict[str, list[int]]) -> str | None:
+    told = [f"{arm}: columns {', '.join(map(str, columns))}" for arm, columns in listed.items() if columns]
+    return "; ".join(told) or None

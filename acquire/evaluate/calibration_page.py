@@ -1,0 +1,123 @@
+"""A calibration on one page: what every column has, where arm B's image lies, and how it was found."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import matplotlib as mpl
+import numpy as np
+
+from acquire.evaluate.figures import DPI, INK, MASKED, SOLVER_COLOURS, STYLE
+from acquire.evaluate.paper.drawing import canvas
+from acquire.evaluate.report import fill_template
+from acquire.lines import ARMS
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from acquire.calibrate.calibration import Calibration
+
+PANELS = (
+    ("offset_dn", "offset (DN)"),
+    ("ambient_dn", "ambient (DN)"),
+    ("noise_dn", "noise (DN)"),
+    ("gain", "gain"),
+)
+SPOKES = 9
+ENLARGED = 10.0
+"""Displacements are drawn so much larger where they are small."""
+
+
+def write_page(known: Calibration, directory: Path, name: str, facts: Mapping[str, Any]) -> Path:
+    """Write ``index.html``, ``calibration.json`` and the pictures into ``directory``; returns the page.
+
+    ``facts`` are what the command prints: name → words.
+    """
+    pictures = {}
+    with mpl.rc_context(STYLE):
+        drawings = {"columns": _columns(known), "field": _field(known)}
+        for key, drawing in drawings.items():
+            if drawing is not None:
+                pictures[key] = directory / f"{key}.png"
+                drawing.savefig(pictures[key], dpi=DPI)
+    text = json.dumps(known.to_attrs(), indent=1, allow_nan=False, ensure_ascii=False)
+    (directory / "calibration.json").write_text(text + "\n", encoding="utf-8")
+    shown = {key: value for key, value in facts.items() if value is not None and key not in known.steps}
+    steps = [{"name": step, **about} for step, about in known.steps.items()]
+    page = directory / "index.html"
+    page.write_text(
+        fill_template("calibration.html.j2", {"name": name, "facts": shown, "steps": steps}, pictures),
+        encoding="utf-8",
+    )
+    return page
+
+
+def _columns(known: Calibration) -> Figure | None:
+    """Every quantity that a column has, both arms, with twice the standard uncertainty."""
+    panels = [(key, label) for key, label in PANELS if key in known.quantities]
+    if not panels:
+        return None
+    figure = canvas(1.9 * len(panels) + 0.4)
+    axes = figure.subplots(len(panels), 1, squeeze=False, sharex=True).ravel()
+    for ax, (key, label) in zip(axes, panels, strict=True):
+        _panel(ax, known, key)
+        ax.set_ylabel(label)
+    axes[-1].set_xlabel("column")
+    handles, labels = axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper right", ncols=3)
+    return figure
+
+
+def _panel(ax: Axes, known: Calibration, key: str) -> None:
+    measured = known.quantities[key]
+    usable = np.ones(measured.value.shape, np.bool_) if known.usable is None else known.usable
+    hidden = known.steps.get("flat", {}).get("optics_hide_columns", {}) if key == "gain" else {}
+    x = np.arange(measured.value.shape[1])
+    for arm, value, error, good, colour in zip(
+        ARMS, measured.value, measured.uncertainty, usable, SOLVER_COLOURS, strict=False
+    ):
+        seen = np.where(np.isin(x, hidden.get(arm, [])) | ~good, np.nan, value)
+        ax.fill_between(x, seen - 2 * error, seen + 2 * error, color=colour, alpha=0.25, lw=0)
+        ax.plot(x, seen, ".-", color=colour, lw=1, ms=3, label=f"camera {arm.upper()}")
+        ax.plot(x[~good], value[~good], "x", color=MASKED, ms=6)
+
+
+def _field(known: Calibration) -> Figure | None:
+    """Where points of the scene lie in arm B's image beside arm A's."""
+    if known.alignment is None:
+        return None
+    alignment, half = known.alignment.alignment, known.instrument.stages * known.instrument.substeps / 2
+    at = np.linspace(-0.9 * half, 0.9 * half, SPOKES)
+    points = np.stack(np.meshgrid(at, at, indexing="ij")).reshape(2, -1)
+    moved = alignment.matrix @ points + np.array([[alignment.rows], [alignment.columns]]) - points
+    largest = float(np.hypot(*moved).max())
+    factor = ENLARGED if largest * ENLARGED < half / 3 else 1.0
+    figure = canvas(4.6)
+    ax = figure.subplots()
+    ax.quiver(
+        points[1],
+        points[0],
+        factor * moved[1],
+        factor * moved[0],
+        angles="xy",
+        scale_units="xy",
+        scale=1,
+        color=SOLVER_COLOURS[1],
+        width=0.004,
+    )
+    ax.plot(points[1], points[0], ".", color=INK, ms=3)
+    ax.set(
+        aspect="equal",
+        xlabel="column (fine pixels from the middle)",
+        ylabel="row (downwards)",
+        xlim=(-1.15 * half, 1.15 * half),
+        ylim=(1.15 * half, -1.15 * half),
+    )
+    drawn = "" if factor == 1 else f",\ndrawn {factor:g} × as long"
+    ax.set_title(f"Up to {largest:.2f} fine pixels{drawn}")
+    return figure

@@ -1,0 +1,37 @@
+"""One instrument with everything, recorded once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from instruments import COLUMNS, NOISE, dots, record, white
+
+from acquire.calibrate import Calibration
+from acquire.calibrate.columns import dark, flat
+from acquire.calibrate.exposure import open_exposure
+
+ALL = (
+    *NOISE,
+    *COLUMNS,
+    {"kind": "beam_splitter", "part_a": 0.46},
+    {"kind": "misregistration", "rows": 1.5, "columns": -1.0, "turn_deg": 0.5},
+)
+
+
+@pytest.fixture(scope="session")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Of one instrument: dark, flat, target."""
+    directory = tmp_path_factory.mktemp("instrument")
+    scenes: dict[str, Any] = {"dark": white(effects=ALL), "flat": white(effects=ALL)}
+    scenes["target"] = dots(directory, ALL)
+    return {name: record(directory / f"{name}.zarr", scene, name) for name, scene in scenes.items()}
+
+
+@pytest.fixture(scope="session")
+def known(recordings: dict[str, Path]) -> Calibration:
+    """Dark and flat of it."""
+    first = dark(open_exposure(recordings["dark"]))
+    calibration = Calibration(first.instrument).with_step(first)
+    return calibration.with_step(flat(open_exposure(recordings["flat"]), calibration))

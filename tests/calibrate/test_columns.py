@@ -1,0 +1,183 @@
+"""Offsets, gains, noise and electrons of columns, against what the simulator drew."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import ALL
+from instruments import COLUMNS, NOISE, columns_truth, record, white
+
+from acquire.calibrate import Calibration
+from acquire.calibrate.columns import ambient, dark, flat
+from acquire.calibrate.exposure import Exposure, open_exposure
+from acquire.calibrate.transfer import transfer
+from acquire.errors import UsageError
+
+ARMS = ("a", "b")
+
+
+def measured(*exposures: Exposure) -> Calibration:
+    """A dark, and a flat if there is one."""
+    first = dark(exposures[0])
+    calibration = Calibration(first.instrument).with_step(first)
+    return calibration.with_step(flat(exposures[1], calibration)) if len(exposures) > 1 else calibration
+
+
+def test_offsets_and_noise_are_as_sure_as_they_say(recordings: dict[str, Path], known: Calibration) -> None:
+    truth = columns_truth(white(effects=[{"kind": "column_offsets", "sigma_dn": 2.0, "channels": 6}]), "dark")
+    offset, noise = known.quantities["offset_dn"], known.quantities["noise_dn"]
+    error = offset.value - np.stack([truth[arm] for arm in ARMS])
+    assert np.abs(error).max() < 0.5 + 5 * offset.uncertainty.max()  # the truth is rounded to whole DN
+    sigma = np.hypot(25.0 * 0.1, np.sqrt(1 / 12))
+    assert np.abs(noise.value - sigma).max() < 5 * noise.uncertainty.max()
+    assert noise.value.mean() == pytest.approx(sigma, rel=0.01)
+    assert known.usable is not None
+    assert known.usable.all()
+
+
+def test_gains_to_a_part_in_a_thousand(tmp_path: Path) -> None:
+    effects = [*NOISE, *COLUMNS, {"kind": "beam_splitter", "part_a": 0.46}]
+    paths = [
+        record(tmp_path / f"{each}.zarr", white(effects=effects), each, 1024) for each in ("dark", "flat")
+    ]
+    calibration = measured(*map(open_exposure, paths))
+    gain, truth = calibration.quantities["gain"], columns_truth(white(effects=[COLUMNS[0]]))
+    for i, arm in enumerate(ARMS):
+        own = (truth[arm] - 20.0) / np.mean(truth[arm] - 20.0)
+        error = gain.value[i] - own
+        assert np.abs(error).max() < 1e-3
+        assert np.sqrt(np.mean(error**2)) < 1.5 * np.median(gain.uncertainty)
+
+
+def test_what_the_optics_hide_is_no_gain(recordings: dict[str, Path], known: Calibration) -> None:
+    """Arm B lies 1.5 and −1 fine pixels off: its edge columns get less light, and their gain stays 1."""
+    hidden = known.steps["flat"]["optics_hide_columns"]
+    assert 0 in hidden["b"] or 23 in hidden["b"]
+    assert hidden["a"] == []
+    gain = known.value("gain")
+    assert gain is not None
+    assert all(gain[1, column] == 1 for column in hidden["b"])
+
+
+@pytest.mark.parametrize("part_a", [0.46, 0.5, 0.57])
+def test_the_splitter(tmp_path: Path, part_a: float) -> None:
+    effects = [*NOISE, *COLUMNS, {"kind": "beam_splitter", "part_a": part_a}]
+    paths = [record(tmp_path / f"{each}.zarr", white(0.4, effects), each, 64) for each in ("dark", "flat")]
+    calibration = measured(*map(open_exposure, paths))
+    own = columns_truth(white(0.4, COLUMNS))
+    expected = (
+        part_a
+        * np.mean(own["a"] - 20)
+        / (part_a * np.mean(own["a"] - 20) + (1 - part_a) * np.mean(own["b"] - 20))
+    )
+    assert calibration.steps["flat"]["part_a"] == pytest.approx(expected, abs=2e-3)
+
+
+def test_a_smooth_lamp_is_not_the_columns_doing(tmp_path: Path) -> None:
+    """With --smooth the polynomial part goes to the scene; the columns' own part stays."""
+    effects = [*NOISE, {"kind": "prnu", "prnu": 0.02}]
+    paths = [record(tmp_path / f"{each}.zarr", white(0.4, effects), each) for each in ("dark", "flat")]
+    exposures = [open_exposure(path) for path in paths]
+    plain = measured(*exposures)
+    smooth = plain.with_step(flat(exposures[1], plain, smooth=True))
+    gains = [each.value("gain") for each in (plain, smooth)]
+    assert gains[0] is not None
+    assert gains[1] is not None
+    x = np.linspace(-1, 1, gains[0].shape[1])
+    for row, smoothed in zip(*gains, strict=True):
+        fit = np.polynomial.Chebyshev.fit(x, row, 4)(x)
+        np.testing.assert_allclose(smoothed, row / fit * np.mean(fit / 1), rtol=2e-3)
+
+
+def test_electrons_from_the_noise(recordings: dict[str, Path], known: Calibration) -> None:
+    found = transfer([open_exposure(recordings["flat"])], known)
+    K, read = found.quantities["dn_per_electron"], found.quantities["read_noise_e"]
+    assert np.abs(K.value - 0.1).max() < 4 * K.uncertainty.max()
+    assert K.uncertainty.max() < 2e-3
+    assert np.abs(read.value - 25.0).max() < 4 * read.uncertainty.max()
+    assert "full_well_e" not in found.quantities
+
+
+def test_light_that_flickers_is_not_taken_for_electrons(tmp_path: Path) -> None:
+    """Jitter of 1 % of a sub-step shakes all columns alike, ten times as much as shot noise does."""
+    effects = [*NOISE, *COLUMNS, {"kind": "trigger_jitter", "sigma_s": 2e-6}]
+    paths = [record(tmp_path / f"{each}.zarr", white(effects=effects), each) for each in ("dark", "flat")]
+    exposures = [open_exposure(path) for path in paths]
+    K = transfer([exposures[1]], measured(exposures[0])).quantities["dn_per_electron"]
+    assert np.abs(K.value - 0.1).max() < 4 * K.uncertainty.max()
+
+
+def test_the_full_well_shows_where_the_noise_ends(tmp_path: Path) -> None:
+    effects = [*NOISE, {"kind": "full_well", "capacity_e": 20_000}]
+    levels = [record(tmp_path / f"{x}.zarr", white(x, effects), "flat") for x in (0.1, 0.2, 0.3, 0.37, 0.42)]
+    zero = record(tmp_path / "dark.zarr", white(effects=effects), "dark")
+    found = transfer([open_exposure(path) for path in levels], measured(open_exposure(zero)))
+    assert found.quantities["full_well_e"].value == pytest.approx([20_000, 20_000], rel=0.1)
+    assert found.quantities["dn_per_electron"].value == pytest.approx([0.1, 0.1], rel=0.03)
+
+
+def test_ambient_light_apart_from_the_dark(tmp_path: Path) -> None:
+    bright = [*NOISE, *COLUMNS, {"kind": "stray_light", "ambient": 0.02}]
+    paths = {
+        "covered": record(tmp_path / "covered.zarr", white(effects=[*NOISE, *COLUMNS]), "dark"),
+        "open": record(tmp_path / "open.zarr", white(effects=bright), "dark"),
+    }
+    first = dark(open_exposure(paths["covered"]), covered=True)
+    calibration = Calibration(first.instrument).with_step(first)
+    found = ambient(open_exposure(paths["open"]), calibration)
+    expected = 0.02 * 24 * 27 * 8.0
+    assert found.quantities["ambient_dn"].value.mean() == pytest.approx(expected, rel=0.01)
+    whole = dark(open_exposure(paths["open"]))
+    with pytest.raises(UsageError, match="ambient light already"):
+        ambient(open_exposure(paths["open"]), Calibration(whole.instrument).with_step(whole))
+
+
+def test_dark_lines_that_reach_zero_are_refused(tmp_path: Path) -> None:
+    clipped = record(
+        tmp_path / "dark.zarr", white(effects=NOISE), "dark", **{"cameras.a.black_level_dn": 2.0}
+    )
+    with pytest.raises(UsageError, match="reach 0 DN") as told:
+        dark(open_exposure(clipped))
+    assert "BlackLevel" in told.value.hint
+
+
+def test_lit_lines_are_not_dark_unless_the_lens_is_covered(recordings: dict[str, Path]) -> None:
+    exposure = open_exposure(recordings["flat"])
+    with pytest.raises(UsageError, match="is not dark"):
+        dark(exposure)
+    assert dark(exposure, covered=True).facts["covered"] is True
+
+
+@pytest.mark.parametrize(
+    ("light", "level", "said"),
+    [("flat", 1.0, "saturated"), ("flat", 0.001, "the light adds"), ("target", 0.4, "no steady light")],
+)
+def test_flats_that_are_none_are_refused(
+    tmp_path: Path, known: Calibration, light: str, level: float, said: str
+) -> None:
+    path = record(tmp_path / "flat.zarr", white(level, ALL), light, 64)
+    with pytest.raises(UsageError, match=said):
+        flat(open_exposure(path), known)
+
+
+def test_a_flat_needs_a_dark(recordings: dict[str, Path], known: Calibration) -> None:
+    for step in (flat, lambda each, empty: transfer([each], empty)):
+        with pytest.raises(UsageError, match="offsets of the columns first"):
+            step(open_exposure(recordings["flat"]), Calibration(known.instrument))
+
+
+def test_few_lines_are_refused(recordings: dict[str, Path]) -> None:
+    with pytest.raises(UsageError, match="too short"):
+        open_exposure(recordings["dark"], lines=5)
+
+
+def test_noise_without_electrons_gives_no_gain_of_electrons(tmp_path: Path) -> None:
+    effects = [{"kind": "read_noise", "sigma_e": 25.0}]
+    paths = [
+        record(tmp_path / f"{each}.zarr", white(effects=effects), each, 256) for each in ("dark", "flat")
+    ]
+    exposures = [open_exposure(path) for path in paths]
+    with pytest.raises(UsageError, match="no more noise in the light"):
+        transfer([exposures[1]], measured(exposures[0]))

@@ -1,0 +1,154 @@
+"""Orientation and alignment from a target at rest, and what they put right in the lines."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from instruments import NOISE, N, S, dots, record, white
+
+from acquire.calibrate import Calibration, calibrated
+from acquire.calibrate.exposure import instrument_of, open_exposure
+from acquire.calibrate.orientation import MODEL, VIEWS, View, oriented
+from acquire.calibrate.still import stills
+from acquire.calibrate.target import alignment, orientation
+from acquire.errors import UsageError
+from acquire.forward import DualArm
+from acquire.sim.scenes import build_scene
+from acquire.store import open_recording
+
+
+def empty(path: Path) -> Calibration:
+    return Calibration(instrument_of(open_recording(path)))
+
+
+def test_each_arm_alone_shows_a_scene_at_rest(tmp_path: Path) -> None:
+    scene = dots(tmp_path)
+    path = record(tmp_path / "target.zarr", scene, "target", 256)
+    picture = build_scene(scene, N, 1e-5).frames(0, 1)[0]
+    boxed = np.stack([picture[max(0, m - S + 1) : m + 1].sum(axis=0) for m in range(N + S - 1)])
+    a, b = stills(open_recording(path).cut(0, 256))
+    np.testing.assert_allclose(a.image, boxed.reshape(N + S - 1, -1, S).sum(axis=2), atol=0.2)
+    assert a.misfit < 1e-3
+    turned = np.rot90(picture)
+    boxed = np.stack([turned[max(0, m - S + 1) : m + 1].sum(axis=0) for m in range(N + S - 1)])
+    np.testing.assert_allclose(b.image, boxed.reshape(N + S - 1, -1, S).sum(axis=2), atol=0.2)
+
+
+@pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.name)
+def test_every_orientation_is_told_from_a_target(tmp_path: Path, view: View) -> None:
+    optics = {"b": {"turn_deg": view.turn_deg, "mirror": view.mirrored}}
+    path = record(tmp_path / "target.zarr", dots(tmp_path, NOISE, optics=optics), "target", 256)
+    found = orientation(open_exposure(path), empty(path))
+    assert found.orientation == view.name
+    assert found.facts["ratio"] > 2
+    assert bool(found.warnings) is not view.crosses
+
+
+def test_orientation_is_relative_to_arm_a(tmp_path: Path) -> None:
+    """A turned by 90, B as the scene: the arms are swapped."""
+    optics = {"a": {"turn_deg": 90}, "b": {"turn_deg": 0}}
+    path = record(tmp_path / "target.zarr", dots(tmp_path, NOISE, optics=optics), "target", 256)
+    assert orientation(open_exposure(path), empty(path)).orientation == "turn 270"
+
+
+@pytest.mark.parametrize("which", ["black", "white"])
+def test_a_scene_without_texture_does_not_tell(tmp_path: Path, which: str) -> None:
+    path = record(tmp_path / "plain.zarr", white(0.4 if which == "white" else 0.0, NOISE), "target", 256)
+    found = orientation(open_exposure(path), empty(path))
+    assert found.orientation is None
+    assert "cannot tell" in found.warnings[0]
+    with pytest.raises(UsageError, match="does not tell how arm B lies"):
+        alignment(open_exposure(path), empty(path))
+
+
+@pytest.mark.parametrize("view", [view for view in VIEWS if view.crosses], ids=lambda view: view.name)
+def test_lines_are_put_right(tmp_path: Path, view: View) -> None:
+    """What `oriented` gives is Eq. (4) of what the first of its cameras sees."""
+    scene = dots(tmp_path, optics={"b": {"turn_deg": view.turn_deg, "mirror": view.mirrored}})
+    path = record(tmp_path / "run.zarr", scene, "target", 80)
+    segment = replace(open_recording(path).cut(0, 80), responsivity_dn=(8.0, 8.0))
+    put_right = oriented(segment, view)
+    picture = build_scene(scene, N, 1e-5).frames(0, 1)[0]
+    swapped = (view.turn_deg == 270) != view.mirrored
+    seen = view.seen(picture) if swapped else picture
+    seen = seen[:, ::-1] if swapped and view.mirrored else seen
+    video = np.broadcast_to(seen, (segment.geometry.span, N, N)).astype(np.float32)
+    expected = DualArm(segment.geometry, segment.code).forward(np.ascontiguousarray(video))
+    np.testing.assert_allclose(put_right.samples(), expected, atol=0.07)  # rounded to whole DN
+    if view != MODEL:
+        assert np.abs(segment.samples() - expected).max() > 1
+
+
+def test_cameras_along_the_same_axis_are_refused(recordings: dict[str, Path]) -> None:
+    segment = open_recording(recordings["target"]).cut(0, 80)
+    with pytest.raises(UsageError, match="same axis"):
+        oriented(segment, View(180, mirrored=False))
+
+
+@pytest.mark.parametrize(
+    "off",
+    [
+        {"rows": 0.3, "columns": -0.2},
+        {"rows": -2.0, "columns": 1.3, "turn_deg": -0.6},
+        {"rows": 4.0, "columns": -3.0, "turn_deg": 1.0},
+    ],
+)
+def test_shift_and_turn_to_some_hundredths(tmp_path: Path, off: dict[str, float]) -> None:
+    """With ordinary noise and unequal columns that nothing corrects; a seventh of the paper's pixels."""
+    effects = [*NOISE, {"kind": "prnu", "prnu": 0.01}, {"kind": "misregistration", **off}]
+    path = record(tmp_path / "target.zarr", dots(tmp_path, effects), "target", 768)
+    found = alignment(open_exposure(path), empty(path)).alignment
+    assert found is not None
+    assert found.alignment.rows == pytest.approx(off["rows"], abs=0.06)
+    assert found.alignment.columns == pytest.approx(off["columns"], abs=0.06)
+    assert found.alignment.turn_deg == pytest.approx(off.get("turn_deg", 0), abs=0.08)
+    assert found.alignment.magnification == pytest.approx(1, abs=2e-3)
+    for name in ("rows", "columns"):
+        error = abs(found.alignment.facts()[name] - off[name])
+        assert error < 8 * found.uncertainty[name]
+
+
+def test_light_that_both_arms_see_mends_the_balance(recordings: dict[str, Path], known: Calibration) -> None:
+    """The flat's light ends at the field's edge, which arm B does not see whole: its part looks smaller."""
+    found = alignment(open_exposure(recordings["target"]), known)
+    flats, both = known.value("balance"), found.quantities["balance"].value
+    assert flats is not None
+    truth = 0.54 / 0.46
+    assert abs(both[1] / both[0] - truth) < 0.5 * abs(flats[1] / flats[0] - truth)
+    assert "balance is corrected" in found.warnings[0]
+
+
+def test_another_orientation_than_believed_is_told(tmp_path: Path) -> None:
+    path = record(
+        tmp_path / "target.zarr", dots(tmp_path, NOISE, optics={"b": {"turn_deg": 270}}), "target", 256
+    )
+    with pytest.raises(UsageError, match="as was believed"):
+        alignment(open_exposure(path), empty(path))
+    right = replace(empty(path), orientation="turn 270")
+    found = alignment(open_exposure(path), right).alignment
+    assert found is not None
+    assert abs(found.alignment.rows) < 0.1
+
+
+def test_what_shows_nothing_is_refused(
+    tmp_path: Path, recordings: dict[str, Path], known: Calibration
+) -> None:
+    with pytest.raises(UsageError, match="constant code"):
+        orientation(open_exposure(recordings["flat"]), known)
+    with pytest.raises(UsageError, match="whole lines do not show an image"):
+        orientation(open_exposure(recordings["target"], lines=80), known)
+
+
+def test_dead_columns_are_left_out(tmp_path: Path, recordings: dict[str, Path], known: Calibration) -> None:
+    usable = np.ones((2, N // S), bool)
+    usable[0, [3, 17]] = usable[1, 8] = False
+    holed = replace(known, usable=usable)
+    segment = calibrated(open_recording(recordings["target"]).cut(0, 512), holed)
+    assert not segment.mask[0, :, 3].any()
+    assert segment.mask[0, :, 4].all()
+    found = alignment(open_exposure(recordings["target"]), holed).alignment
+    assert found is not None
+    assert found.alignment.rows == pytest.approx(1.5, abs=0.06)

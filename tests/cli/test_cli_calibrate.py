@@ -1,0 +1,97 @@
+"""``acquire calibrate`` as a user types it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "calibrate"))
+
+from instruments import COLUMNS, NOISE, dots, record, white
+
+Cli = Callable[..., Any]
+OFF = {"kind": "misregistration", "rows": 1.2, "columns": 0.7, "turn_deg": -0.4}
+EFFECTS = (*NOISE, *COLUMNS, OFF, {"kind": "beam_splitter", "part_a": 0.47})
+
+
+@pytest.fixture(scope="module")
+def taken(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    directory = tmp_path_factory.mktemp("taken")
+    scenes: dict[str, Any] = {"dark": white(effects=EFFECTS), "flat": white(effects=EFFECTS)}
+    scenes["target"] = dots(directory, EFFECTS)
+    return {name: record(directory / f"{name}.zarr", scene, name) for name, scene in scenes.items()}
+
+
+def test_step_by_step_to_a_page(cli: Cli, taken: dict[str, Path], tmp_path: Path) -> None:
+    cal = tmp_path / "cal.zarr"
+    steps = {"dark": "dark", "flat": "flat", "transfer": "flat", "orientation": "target", "align": "target"}
+    said = {}
+    for step, recording in steps.items():
+        answer = cli("calibrate", step, taken[recording], "--out", cal)
+        assert answer.code == 0, answer.err
+        assert f"{step}, 512 lines" in answer.out
+        assert f"kept in  {cal}" in answer.out
+        said[step] = answer.out
+    assert "sure to" in said["dark"]
+    assert "arm A's part of the light" in said["flat"]
+    assert "DN per electron" in said["transfer"]
+    assert "turn 90" in said["orientation"]
+    assert "+1.2" in said["align"]
+    answer = cli("calibrate", "show", cal, "--out", tmp_path / "page")
+    assert answer.code == 0, answer.err
+    assert "cameras" in answer.out
+    assert "SIM-A" in answer.out
+    page = (tmp_path / "page" / "index.html").read_text()
+    assert page.count("data:image/png") == 2
+    with Image.open(tmp_path / "page" / "columns.png") as picture:
+        assert picture.width > 1000
+    assert cli("calibrate", "show", cal, "--json").json["orientation"] == "turn 90"
+    answer = cli("calibrate", "check", cal, taken["target"])
+    assert answer.code == 0, answer.err
+    assert answer.out.count("holds") == 4
+
+
+def test_a_check_that_fails_says_what_has_changed(cli: Cli, taken: dict[str, Path], tmp_path: Path) -> None:
+    cal = tmp_path / "cal.zarr"
+    assert cli("calibrate", "align", taken["target"], "--out", cal, "--json").code == 0
+    moved = (*NOISE, OFF | {"rows": 3.0})
+    other = record(tmp_path / "other.zarr", dots(tmp_path, moved), "target")
+    answer = cli("calibrate", "check", cal, other, "--json")
+    assert answer.code == 1
+    rows = {row["quantity"]: row for row in answer.json["compared"]}
+    assert rows["rows"]["so"].startswith("changed")
+    assert rows["columns"]["so"] == "holds"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("flat", "flat"), "does not exist"),
+        (("dark", "flat"), "is not dark"),
+        (("dark", "target"), "is not dark"),
+        (("orientation", "dark"), "constant code"),
+        (("align", "target", "--lines", 60), "whole lines do not show"),
+        (("dark", "dark", "--lines", 3), "too short"),
+    ],
+)
+def test_what_cannot_be_is_refused_and_leaves_nothing(
+    cli: Cli, taken: dict[str, Path], tmp_path: Path, words: Any, said: str
+) -> None:
+    step, recording, *more = words
+    answer = cli("calibrate", step, taken[recording], "--out", tmp_path / "cal.zarr", *more)
+    assert answer.code == 2
+    assert said in answer.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_orientation_that_cannot_be_told_is_not_kept(cli: Cli, tmp_path: Path) -> None:
+    plain = record(tmp_path / "plain.zarr", white(0.4, NOISE), "target", 256)
+    answer = cli("calibrate", "orientation", plain, "--out", tmp_path / "cal.zarr")
+    assert answer.code == 2
+    assert "cannot tell" in answer.err
+    assert not (tmp_path / "cal.zarr").exists()
