@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from acquire.cli.calibrate_words import compared_rows, found_facts, known_facts
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, print_warning, say
 from acquire.cli.progress import stage_progress
 from acquire.errors import PlaceError, UsageError
@@ -198,6 +197,8 @@ def show(
 
     Example: [bold]acquire calibrate show cal.zarr --out cal-page[/]
     """
+    from acquire.cli.calibrate_words import known_facts
+
     known = _any(calibration)
     if json:
         print_json(known.to_attrs())
@@ -228,6 +229,7 @@ def check(
     Example: [bold]acquire calibrate check cal.zarr target-today.zarr[/]
     """
     from acquire.calibrate.check import check as compare
+    from acquire.cli.calibrate_words import compared_rows
 
     known, exposure = _known(calibration), _exposure(recording, first_line, lines)
     with stage_progress("comparing"):
@@ -308,6 +310,8 @@ def _keep(place: str, found: Finding, *, json: bool, new: bool = False) -> None:
 
 
 def _tell(found: Finding, place: str | None, *, json: bool) -> None:
+    from acquire.cli.calibrate_words import found_facts
+
     facts = found_facts(found)
     if json:
         print_json({"calibration": place, "found": facts, "facts": found.facts, "warnings": found.warnings})
