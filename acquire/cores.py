@@ -8,10 +8,16 @@ from __future__ import annotations
 
 import math
 import os
+import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from threadpoolctl import threadpool_limits
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 LOOKS, LOOK_S = 5, 0.004
 """Threads that run in each of several looks are there to stay."""
@@ -34,6 +40,21 @@ def limit_blas(threads: int) -> threadpool_limits:
     The environment variables that BLAS reads at its start come too late in a process that has numpy already.
     """
     return threadpool_limits(threads, user_api="blas")
+
+
+@contextmanager
+def limit_threads(threads: int) -> Iterator[None]:
+    """The same for BLAS and for compiled loops (numba, where it is loaded), whose threads spin likewise."""
+    numba = sys.modules.get("numba")
+    before = numba.get_num_threads() if numba else 0
+    with limit_blas(threads):
+        try:
+            if numba:
+                numba.set_num_threads(min(threads, before))
+            yield
+        finally:
+            if numba:
+                numba.set_num_threads(before)
 
 
 def _running() -> int:

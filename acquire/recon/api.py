@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import time
+from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from acquire.arrays import Dtype, open_arrays
+from acquire.cores import idle_cores, limit_threads
 from acquire.recon.clock import IterationClock
 from acquire.recon.judge import frame_error, judge
+from acquire.recon.least import check_budget, least_seconds
 from acquire.recon.problem import pose
 from acquire.recon.request import Preset, Request, Solver, Stop, preset_iterations
 from acquire.recon.result import Progress, Quality, Reconstruction
@@ -46,6 +50,7 @@ def reconstruct(
     dtype: Dtype = "float32",
     device: str = "cpu",
     stop: Stop | None = None,
+    refuse: bool = True,
 ) -> Reconstruction:
     """Reconstruct the voxels X′ of a segment at N_m = ``spatial_merge``, T_m = ``temporal_merge`` (Eq. 5).
 
@@ -53,7 +58,8 @@ def reconstruct(
     ----------
     segment : lines of both arms, code and mask; masked samples and outliers have no influence
     preset : how many iterations at most: ``"fast"``, ``"balanced"``, ``"best"``
-    budget_s : stop in time, before the preset's iterations if need be (at least one is made)
+    budget_s : the answer is there after so much wall time, within 10 % + 0.3 s, with fewer iterations than
+        the preset's if need be (at least one is made). Compiling (once after installation) is no part of it
     progress : called after every iteration
     solver : ``"admm"`` (default), ``"twist"``, the paper's, which knows neither bandwidth nor sign, or
         ``"twist-band"``, which knows both
@@ -66,12 +72,15 @@ def reconstruct(
     dtype : of the video and all that leads to it; sums that need it are float64 anyway
     device : ``"cpu"`` or ``"gpu"``, where iterations are made; see `acquire.arrays`
     stop : asked after every iteration; once set, the best so far is returned
+    refuse : a budget that cannot be kept here; else as little as possible is done
 
     Raises
     ------
-    UsageError : impossible merge, preset, solver, bandwidth, weight, array, dtype or device; no usable sample
+    UsageError : impossible merge, preset, solver, bandwidth, weight, array, dtype, device or budget; no
+        usable sample
     NumericsError : a dark code, or iterates that are not finite
     """
+    began = time.monotonic()
     count = iterations if iterations is not None else preset_iterations(solver, preset)
     preset_iterations(solver, preset)
     request = Request(
@@ -88,11 +97,16 @@ def reconstruct(
     )
     arrays = open_arrays(device, dtype)
     request.check_shapes(segment.geometry.size, segment.geometry.video_shape(spatial_merge, temporal_merge))
-    clock = IterationClock(count, budget_s, progress, stop)
+    clock = IterationClock(count, budget_s, progress, stop, began)
     held_out = HOLD_OUT if solver != "twist" and static_image is None else 0.0
-    problem = pose(segment, spatial_merge, temporal_merge, hold_out=held_out, arrays=arrays)
-    estimate = _solve(segment, problem, request, clock)
-    return _finish(segment, problem, request, estimate, clock)
+    # threads that wait for a core that others use make times that nobody can foresee
+    with limit_threads(idle_cores()) if budget_s is not None else nullcontext():
+        if budget_s is not None and refuse and arrays.compiled:
+            least_s = least_seconds(segment.geometry, spatial_merge, temporal_merge, solver)
+            check_budget(clock, budget_s, least_s)
+        problem = pose(segment, spatial_merge, temporal_merge, hold_out=held_out, arrays=arrays)
+        estimate = _solve(segment, problem, request, clock)
+        return _finish(segment, problem, request, estimate, clock)
 
 
 def _solve(segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> Estimate:
@@ -116,6 +130,7 @@ def _finish(
         time_ns=segment.frame_time_ns(T_m),
         trusted=trusted,
         seconds=clock.seconds,
+        compiled_s=clock.compiled_s,
         iterations=clock.done,
         iterations_asked=clock.iterations,
         solver=request.solver,
@@ -123,7 +138,7 @@ def _finish(
         frame_error=frame_error(problem, predicted, segment.geometry, T_m),
         ended=clock.ended,
         masked=problem.masked_by,
-        warnings=judge(segment, problem, quality, trusted),
+        warnings=(*judge(segment, problem, quality, trusted), *clock.shortcuts),
         parameters={
             "spatial_merge": request.spatial_merge,
             "temporal_merge": T_m,

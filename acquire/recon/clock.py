@@ -1,10 +1,16 @@
-"""Iterations within limits: their number, a budget of time, and a stop from outside."""
+"""Iterations within limits: their number, a budget of wall time, and a stop from outside.
+
+A budget is kept by looking at the wall before each iteration: whether one as long as the longest of late
+still fits before what comes after the last. A core that is shared makes all of them longer alike.
+"""
 
 from __future__ import annotations
 
 import time
+from collections import deque
 from typing import TYPE_CHECKING
 
+from acquire.recon.compiling import compiled_s
 from acquire.recon.result import Progress
 
 if TYPE_CHECKING:
@@ -12,12 +18,23 @@ if TYPE_CHECKING:
 
     from acquire.recon.request import Stop
 
-FINISH_SHARE = 0.04
-"""Of a budget, kept for what comes after the last iteration: the video and its quality."""
+FINISH_SHARE = 0.02
+"""Of a budget, kept for what comes after the last iteration (the video and its quality), and"""
+FINISH_ITERATIONS = 1.5
+"""as long as so many iterations."""
+REMEMBERED = 20
+"""Iterations of which the longest is what the next may take; some do more than others, as every 20th of a
+refinement."""
+FIRST_OF_STAGE = 4.0
+"""The first of another stage may take so many times the longest before it."""
 
 
 class IterationClock:
-    """Counts iterations over all stages of a solver and says when they must end, and why (``ended``)."""
+    """Counts iterations over all stages of a solver and says when they must end, and why (``ended``).
+
+    Its time is the wall's since ``began`` (`time.monotonic`; else now), without what compiling took.
+    ``shortcuts`` are sentences about what was left out for want of time.
+    """
 
     def __init__(
         self,
@@ -25,46 +42,68 @@ class IterationClock:
         budget_s: float | None = None,
         progress: Callable[[Progress], None] | None = None,
         stop: Stop | None = None,
+        began: float | None = None,
     ) -> None:
         self.iterations, self.done, self.ended = iterations, 0, "done"
+        self.shortcuts: list[str] = []
         self._budget_s, self._progress, self._stop = budget_s, progress, stop
-        self._began = time.perf_counter()
+        self._began = time.monotonic() if began is None else began
+        self._compiled_before = compiled_s()
+        self._lately_s: deque[float] = deque(maxlen=REMEMBERED)
 
     @property
     def seconds(self) -> float:
-        return time.perf_counter() - self._began
+        return time.monotonic() - self._began - self.compiled_s
+
+    @property
+    def compiled_s(self) -> float:
+        """What compiling took meanwhile: once after an installation, and no part of a budget."""
+        return compiled_s() - self._compiled_before
+
+    @property
+    def longest_s(self) -> float:
+        """The longest iteration of late; 0 before the first."""
+        return max(self._lately_s, default=0.0)
 
     def run(self, most: int, stage: str, share: float = 1.0) -> Iterator[int]:
         """Yields before each iteration of a stage that may take ``share`` of the budget.
 
         The very first iteration of all is always made, so that there is something to show.
         """
-        begun, last = self.seconds, min(self.done + most, self.iterations)
-        first = self.done
-        while self.done < last and self._may_go_on(begun, first, share):
+        last = min(self.done + most, self.iterations)
+        expected = FIRST_OF_STAGE * self.longest_s
+        lately = self._lately_s = deque(maxlen=REMEMBERED)
+        while self.done < last and self._may_go_on(expected, share):
+            begun = self.seconds
             yield self.done
             self.done += 1
+            lately.append(self.seconds - begun)
+            expected = self.longest_s
             if self._progress is not None:
                 self._progress(Progress(self.done, self.iterations, self.seconds, stage))
+        if not lately:
+            lately.append(expected / FIRST_OF_STAGE)
 
     def spent(self, share: float) -> bool:
         """Whether that share of the budget is gone."""
         return self._budget_s is not None and self.seconds > share * self._budget_s
 
+    def affords(self, seconds: float, share: float = 1.0) -> bool:
+        """Whether work of so long fits before the end, or into that share of the budget."""
+        if self._budget_s is None:
+            return True
+        finish_s = FINISH_SHARE * self._budget_s + FINISH_ITERATIONS * self.longest_s
+        return self.seconds + seconds <= min(share * self._budget_s, self._budget_s - finish_s)
+
     def converged(self) -> None:
         """Nothing is to be gained from more iterations."""
         self.ended = "converged"
 
-    def _may_go_on(self, begun: float, first: int, share: float) -> bool:
+    def _may_go_on(self, expected: float, share: float) -> bool:
         if self.done and self._stop is not None and self._stop.is_set():
             self.ended = "stopped"
             return False
-        if self._budget_s is None or not self.done:
-            return True
-        made = self.done - first
-        one = (self.seconds - begun) / made if made else 0.0
-        allowed = self._budget_s * share * (1 - FINISH_SHARE)
-        if self.seconds + one <= allowed:
+        if not self.done or self.affords(expected, share):
             return True
         if share >= 1:
             self.ended = "budget"

@@ -43,6 +43,7 @@ class Reconstruction:
         in ``trusted`` were sampled in full (Fig. 5). That interval is nominal: it follows from the geometry
         alone, whatever lines were lost, samples masked, or the code does; ``quality`` says how well it went.
     time_ns : the begin of each frame
+    seconds : wall time, without ``compiled_s``, which compiling took: once after an installation
     iterations : fewer than ``iterations_asked`` where the budget, ``stop`` or the data ended it (``ended``)
     frame_error : (time,) relative RMS residual of the samples that saw each frame; NaN where none did. It is
         no error of the frame, which may be many times larger; see `acquire.recon.judge.frame_error`
@@ -62,4 +63,5 @@ class Reconstruction:
     ended: str = "done"
     masked: dict[str, int] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    compiled_s: float = 0.0
     parameters: dict[str, Any] = field(default_factory=dict)

@@ -21,10 +21,10 @@ from acquire.arrays import host
 from acquire.forward import merge_video
 from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import InBasis, band_operator
-from acquire.recon.bandwidth import estimate_coefficients
+from acquire.recon.bandwidth import FEWEST_COEFFICIENTS, estimate_coefficients
 from acquire.recon.basis import TemporalBasis
 from acquire.recon.curves import CurveFit, CurveOperator
-from acquire.recon.patterns import Refinement, find_patterns
+from acquire.recon.patterns import ROUND, Refinement, find_patterns
 from acquire.recon.twist import Twist, TwistParameters
 
 if TYPE_CHECKING:
@@ -43,6 +43,8 @@ FIRST_LOOK_SHARE = 0.9
 """Of a budget, the most that the first look may take."""
 TENTATIVE_SHARE = 0.15
 """Of a budget, after which the search for the bandwidth hurries."""
+UNSEARCHED_SHARE = 0.2
+"""Of a budget: where posing the problem alone took more, the bandwidth is not looked for."""
 PLAIN_ITERATIONS = 90
 """Of scenes that are not a few patterns: from here on, more iterations fit what voxels cannot hold."""
 USUAL_FRAMES = 980
@@ -173,7 +175,8 @@ def _refine(
     clock: IterationClock,
 ) -> Estimate | None:
     """Patterns and curves from a first look; None where the scene is not made of a few."""
-    found = find_patterns(host(first.solver.theta)) if clock.done < clock.iterations else None
+    goes_on = clock.done < clock.iterations and clock.affords(ROUND * clock.longest_s)
+    found = find_patterns(host(first.solver.theta)) if goes_on else None
     if found is None:
         return None
     basis = TemporalBasis(first.basis.frames, first.basis.count, problem.arrays)
@@ -258,6 +261,15 @@ class Lit:
 
 def _coefficients(segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> int:
     N_m, T_m = request.spatial_merge, request.temporal_merge
+    if request.bandwidth is None and clock.spent(UNSEARCHED_SHARE):
+        frames = segment.geometry.video_shape(N_m, T_m)[0]
+        few = min(frames, FEWEST_COEFFICIENTS)
+        limit_hz = few / (2e-9 * segment.substep_ns * T_m * frames)
+        clock.shortcuts.append(
+            f"the budget left no time to look for the scene's bandwidth: only what is slower than "
+            f"{limit_hz:.3g} Hz is in the video"
+        )
+        return few
     if request.bandwidth is None:
         return estimate_coefficients(segment, N_m, T_m, lambda: clock.spent(TENTATIVE_SHARE), problem.arrays)
     frames = segment.geometry.video_shape(N_m, T_m)[0]

@@ -83,6 +83,7 @@ def solve(task: Task, watch: Watch) -> Part:
         dtype=options.dtype,
         device=options.device,
         stop=watch,
+        refuse=False,  # what is begun is ended in order
     )
     watch.advance(1 - result.iterations / result.iterations_asked)
     substeps = lines.geometry.substeps

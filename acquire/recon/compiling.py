@@ -1,0 +1,42 @@
+"""How long this process has compiled.
+
+The loops are compiled where they are first called, and kept in a cache beside them: it happens once after an
+installation, takes ten seconds or more, and says nothing of what a reconstruction takes.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from numba.core import event
+
+
+class _Stopwatch(event.Listener):
+    """Runs while a loop is compiled. Numba compiles one at a time; those that it calls lie within."""
+
+    def __init__(self) -> None:
+        self._total_s, self._depth, self._begun = 0.0, 0, 0.0
+
+    @property
+    def total_s(self) -> float:
+        return self._total_s + (time.monotonic() - self._begun if self._depth else 0.0)
+
+    def on_start(self, _: Any) -> None:
+        if not self._depth:
+            self._begun = time.monotonic()
+        self._depth += 1
+
+    def on_end(self, _: Any) -> None:
+        self._depth -= 1
+        if not self._depth:
+            self._total_s += time.monotonic() - self._begun
+
+
+_stopwatch = _Stopwatch()
+event.register("numba:compile", _stopwatch)  # type: ignore[no-untyped-call]
+
+
+def compiled_s() -> float:
+    """Wall time that this process has spent compiling so far, in seconds."""
+    return _stopwatch.total_s

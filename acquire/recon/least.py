@@ -1,0 +1,54 @@
+"""The least that a reconstruction takes here and now, so that a budget that cannot be kept is refused.
+
+What every solver does whatever its iterations (the operator's norm, one iteration, the video) grows as one
+pass of the operator over all lines. A pass over some lines of the same geometry, on this machine as busy as
+it is, is scaled up by what the rest was found to take in passes.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from acquire.errors import UsageError
+from acquire.forward import DualArm
+from acquire.geometry import Geometry
+
+if TYPE_CHECKING:
+    from acquire.recon.clock import IterationClock
+
+PROBED_SHARE = 6
+"""The pass is over one of so many lines."""
+LOOKS_S = 0.02
+"""Passes are repeated for so long: a core that is shared gives slices of some milliseconds."""
+PASSES = {"admm": 14.0, "twist-band": 14.0, "twist": 18.0}
+"""A reconstruction of one iteration without a search for the bandwidth, in passes of the operator."""
+MARGIN, MARGIN_S = 0.1, 0.3
+"""A budget may be exceeded by so much of it, and so long."""
+
+
+def least_seconds(geometry: Geometry, spatial_merge: int, temporal_merge: int, solver: str) -> float:
+    """Wall time of the shortest reconstruction of such a segment; within a factor of two."""
+    few = Geometry(geometry.stages, geometry.substeps, max(1, geometry.lines // PROBED_SHARE))
+    code = np.random.default_rng(0).integers(0, 2, few.span).astype(np.uint8)
+    operator = DualArm(few, code, spatial_merge, min(temporal_merge, few.span))
+    video = np.ones(operator.video_shape, np.float32)
+    operator.adjoint(operator.forward(video))  # loads the compiled loops
+    began, passes = time.monotonic(), 0
+    while passes < 1 or time.monotonic() - began < LOOKS_S:
+        operator.adjoint(operator.forward(video))
+        passes += 1
+    once_s = (time.monotonic() - began) / passes
+    return PASSES[solver] * once_s * geometry.lines / few.lines
+
+
+def check_budget(clock: IterationClock, budget_s: float, least_s: float) -> None:
+    """UsageError unless ``budget_s`` can be kept, where the rest takes ``least_s``."""
+    needed = clock.seconds + least_s
+    if needed > (1 + MARGIN) * budget_s + MARGIN_S:
+        raise UsageError(
+            f"a budget of {budget_s:g} s cannot be kept: this segment needs at least {needed:.2g} s here",
+            possible="a longer budget, fewer lines, larger voxels, or a machine that is less busy",
+        )

@@ -1,0 +1,111 @@
+"""A budget is a promise: kept in wall time whatever iterations take, refused where it cannot be."""
+
+from __future__ import annotations
+
+import time
+
+import numba
+import numpy as np
+import pytest
+
+from acquire.errors import UsageError
+from acquire.geometry import Geometry
+from acquire.lines import Segment
+from acquire.recon import clock as clocks
+from acquire.recon import reconstruct
+from acquire.recon.clock import IterationClock
+
+
+class Wall:
+    """A wall clock that goes on only when it is told to."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def wall(monkeypatch: pytest.MonkeyPatch) -> Wall:
+    made = Wall()
+    monkeypatch.setattr(clocks, "time", made)
+    return made
+
+
+def segment(geometry: Geometry) -> Segment:
+    """Light that differs from line to line and from pixel to pixel."""
+    draw = np.random.default_rng(3)
+    return Segment(
+        lines=draw.uniform(100, 200, geometry.lines_shape).astype(np.float32),
+        mask=np.ones(geometry.lines_shape, bool),
+        code=draw.integers(0, 2, geometry.span).astype(np.uint8),
+        geometry=geometry,
+        time_ns=np.arange(geometry.lines, dtype=np.int64) * 30_000,
+        substep_ns=10_000.0,
+    )
+
+
+@pytest.mark.parametrize("each_s", [0.01, 0.1, 0.4])
+def test_what_comes_after_the_last_iteration_fits_as_well(wall: Wall, each_s: float) -> None:
+    clock = IterationClock(1000, 5.0)
+    for _ in clock.run(1000, "solve"):
+        wall.now += each_s
+    wall.now += 1.5 * each_s  # the video
+    assert 4.5 - 2 * each_s < clock.seconds <= 5.0
+    assert clock.ended == "budget"
+
+
+def test_a_machine_that_gets_busy_ends_it_sooner(wall: Wall) -> None:
+    clock = IterationClock(1000, 10.0)
+    for number in clock.run(1000, "solve"):
+        wall.now += 0.1 if number < 50 else 0.6
+    wall.now += 0.9
+    assert 8.0 < clock.seconds <= 10.6
+
+
+def test_a_stage_whose_iterations_are_longer_is_not_begun_too_late(wall: Wall) -> None:
+    clock = IterationClock(1000, 10.0)
+    for _ in clock.run(1000, "first look", 0.95):
+        wall.now += 0.2
+    assert clock.ended == "done"
+    assert list(clock.run(1000, "refine")) == []
+    assert clock.ended == "budget"
+    assert clock.longest_s == pytest.approx(0.2)
+
+
+def test_the_first_iteration_is_made_even_too_late(wall: Wall) -> None:
+    clock = IterationClock(10, 1.0)
+    wall.now += 2.0
+    assert list(clock.run(10, "solve")) == [0]
+
+
+def test_compiling_is_no_part_of_the_time() -> None:
+    began = time.monotonic()
+    clock = IterationClock(10, 1.0)
+    numba.njit(lambda x: x * 2 + 1)(3)
+    assert clock.compiled_s > 0
+    assert clock.seconds + clock.compiled_s <= time.monotonic() - began + 1e-3
+
+
+def test_a_budget_is_kept_by_the_wall() -> None:
+    began = time.monotonic()
+    result = reconstruct(
+        segment(Geometry(20, 3, 120)), 3, 1, budget_s=0.8, solver="twist-band", iterations=100_000
+    )
+    took_s = time.monotonic() - began - result.compiled_s
+    assert result.ended == "budget"
+    assert 0.4 < took_s <= 1.1 * 0.8 + 0.3
+    assert result.seconds <= took_s
+
+
+def test_a_budget_that_cannot_be_kept_is_refused_with_what_can() -> None:
+    large = segment(Geometry(64, 3, 263))
+    with pytest.raises(UsageError, match=r"budget of 0.001 s cannot be kept: .* at least [\d.]+ s here"):
+        reconstruct(large, 1, 4, budget_s=0.001)
+
+
+def test_a_hopeless_budget_gives_the_least_where_it_is_not_to_be_refused() -> None:
+    result = reconstruct(segment(Geometry(20, 3, 120)), 3, 1, budget_s=1e-6, refuse=False)
+    assert (result.iterations, result.ended) == (1, "budget")
+    assert any("no time to look for the scene's bandwidth" in each for each in result.warnings)
