@@ -166,6 +166,11 @@ class RigConfig(FrozenModel):
     stream: StreamConfig = StreamConfig()
     recording: RecordingConfig = RecordingConfig()
     events: EventsConfig = EventsConfig()
+    calibration: FilePath | None = Field(
+        default=None,
+        description="of this instrument, as `acquire calibrate` makes one: a path, also beside this file; "
+        "every recording gets a copy",
+    )
     check: CheckConfig = CheckConfig()
     control: ControlConfig = Field(default_factory=ControlConfig)
     simulation: SimulationConfig = SimulationConfig()
@@ -335,7 +340,7 @@ def find(name: str | Path, beside: Path | None = None, kind: str = "") -> Path:
 def load_rig(name: str | Path, overrides: Mapping[str, Any] | None = None) -> RigConfig:
     """Read, override (dotted keys, as ``{"simulation.speed": 10}``) and validate a rig file.
 
-    Relative paths of scenes are resolved against the file.
+    Relative paths of scenes and calibrations are resolved against the file.
     """
     path = find(name, kind="rig")
     table = _read(path)
@@ -343,11 +348,18 @@ def load_rig(name: str | Path, overrides: Mapping[str, Any] | None = None) -> Ri
     for key, value in (overrides or {}).items():
         _set(table, key, value)
     rig = _validate(RigConfig, table, path)
+    if rig.calibration is not None:
+        rig = rig.model_copy(update={"calibration": _beside(rig.calibration, path)})
     rig._origin = str(path.absolute())
     if not rig.needs_scene:
         return rig
     scene = find(rig.scene_file(), beside=path, kind="scene").resolve()
     return rig.model_copy(update={"simulation": rig.simulation.model_copy(update={"scene": str(scene)})})
+
+
+def _beside(named: Path, file: Path) -> Path:
+    """What a file names: from here on, or else from where the file is."""
+    return named.resolve() if os.path.lexists(named) else (file.parent / named).resolve()
 
 
 def check_directory(rig: RigConfig) -> None:

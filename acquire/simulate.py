@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from acquire import __version__
+from acquire.calibrate.choose import handed_on
 from acquire.clock import ClockFit
 from acquire.errors import AcquireError, UsageError
 from acquire.lines import ARMS, LineBlock, LineFlag
@@ -228,7 +229,7 @@ def _spec(config: RigConfig, scene: SceneConfig) -> RecordingSpec:
         trigger={**trigger, "settings": config.trigger.model_dump(mode="json")},
         cameras=cameras,
         config=config.model_dump(mode="json"),
-        extra=describe(scene),
+        extra=describe(scene) | handed_on(config, scene.optics.layout),
         chunk_lines=config.chunk_lines,
         shard_chunks=recording.shard_chunks,
         tag_chunks=config.tag_chunks,

@@ -49,6 +49,11 @@ class View:
         """Whether the charge moves across arm A's."""
         return self.turn_deg in (90, 270)
 
+    @property
+    def swapped(self) -> bool:
+        """Whether camera B is what the model calls A, once its pixels are in order."""
+        return self.crosses and (self.turn_deg == 270) != self.mirrored
+
     def seen(self, frames: NDArray[Any]) -> NDArray[Any]:
         """The scene (…, row, column) in this view."""
         shown = frames[..., ::-1] if self.mirrored else frames
@@ -90,7 +95,7 @@ def oriented(segment: Segment, view: View) -> Segment:
         )
     if view.mirrored:
         segment = _mapped(segment, _mirror_b)
-    if (view.turn_deg == 270) != view.mirrored:
+    if view.swapped:
         segment = _mapped(segment, _swap)
     return segment
 

@@ -129,14 +129,10 @@ def _balance(known: Calibration, match: Match) -> dict[str, Measured]:
         return {}
     before = known.value("balance")
     before = np.ones(2) if before is None else before
-    swapped = known.orientation is not None and _swapped(view_named(known.orientation))
+    swapped = known.orientation is not None and view_named(known.orientation).swapped
     ratio = before[1] / before[0] * (1 / match.brightness if swapped else match.brightness)
     balance = np.array([2 / (1 + ratio), 2 * ratio / (1 + ratio)])
     return {"balance": Measured(balance, BALANCE_ERROR * balance)}
-
-
-def _swapped(view: View) -> bool:
-    return (view.turn_deg == 270) != view.mirrored
 
 
 def _segment(exposure: Exposure, known: Calibration) -> Segment:

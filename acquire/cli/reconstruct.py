@@ -75,6 +75,10 @@ def reconstruct(
     iterations: Annotated[int | None, typer.Option(help="Instead of the preset's.")] = None,
     dtype: Annotated[str, typer.Option(help="float32 or float64: how exactly it is computed.")] = "float32",
     device: Annotated[str, typer.Option(help="cpu, or gpu: CUDA by way of CuPy.")] = "cpu",
+    calibration: Annotated[
+        str | None,
+        typer.Option(metavar="CAL", help="Instead of the recording's own: NAME.zarr, or none."),
+    ] = None,
     preview: Annotated[bool, typer.Option("--preview", help="Coarse, in a second or two.")] = False,
     workers: Annotated[int | None, typer.Option(help="Processes at once; else one per core.")] = None,
     dask: Annotated[
@@ -89,6 +93,7 @@ def reconstruct(
     Example: [bold]acquire reconstruct run.zarr --out video.zarr --from 52ms --to 57.98ms --nm 3 --tm 1[/]
     """
     from acquire.arrays import open_arrays
+    from acquire.calibrate.choose import choose
     from acquire.cli.reconstruct_request import Asked, prepare
     from acquire.reconstruct import Options
     from acquire.store import open_recording
@@ -101,6 +106,7 @@ def reconstruct(
         )
     open_arrays(device if dask is None else "cpu", dtype)  # a cluster's devices are not here
     opened = open_recording(recording)
+    chosen = choose(opened, calibration)
     asked = Asked(
         first_line=first_line,
         lines=lines,
@@ -114,8 +120,19 @@ def reconstruct(
         ends=ends,
         preview=preview,
         preset=preset,
-        options=Options("balanced", solver, iterations, budget, None, dtype, device),  # type: ignore[arg-type]  # checked there
+        options=Options(
+            "balanced",
+            solver,  # type: ignore[arg-type]  # checked there
+            iterations,
+            budget,
+            None,
+            dtype,  # type: ignore[arg-type]  # checked there
+            device,
+            None if chosen is None else chosen.calibration,
+        ),
     )
+    for doubt in () if chosen is None else chosen.doubts:
+        print_warning(doubt)
     prepared = prepare(opened, asked)
     if prepared.plan is not None and not json:
         _print_plan(prepared.plan)
@@ -194,6 +211,7 @@ def _readable(outcome: Outcome) -> dict[str, Any]:
         else None,
         "trusted": f"frames {first} to {end - 1}" if end > first else f"none: {nothing}",
         "solver": f"{facts['solver']}, {_iterations(facts)}, {facts['seconds']:.1f} s",
+        "corrected": ", ".join(facts["calibration"]["corrected"]) if facts["calibration"] else None,
         "misfit": f"{quality['misfit']:.2%} of the samples' RMS",
         "prediction": None if prediction is None else f"{prediction:.2%} at samples kept from the solver",
         "coverage": f"{quality['coverage']:.2%} of the samples usable",

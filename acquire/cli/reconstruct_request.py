@@ -182,7 +182,13 @@ def _plan(recording: Recording, selection: Selection, asked: Asked) -> Reconstru
             stage_progress("looking for what changes", "--from and --to, for a part") as advance,
             limit_blas(idle_cores()),
         ):
-            return propose(recording, selection, whole=asked.ends == "whole", progress=advance)
+            return propose(
+                recording,
+                selection,
+                whole=asked.ends == "whole",
+                progress=advance,
+                calibration=asked.options.calibration,
+            )
     if asked.plan is not None:
         return load_plan(asked.plan)
     if not asked.segments:

@@ -305,9 +305,18 @@ def _readable(facts: dict[str, Any]) -> dict[str, Any]:
         "at risk": _at_risk(facts["durability"]),
         "lost lines": ", ".join(f"{arm} {count}" for arm, count in facts["lost_lines"].items()),
         "in doubt": _suspect(facts["suspect"]),
+        "calibration": _calibration(facts["calibration"]),
         "simulated": "yes" if facts["simulated"] else "no",
         "written by": f"acquire {facts['versions']['acquire']}",
     }
+
+
+def _calibration(found: dict[str, Any] | None) -> str | None:
+    """Which steps of a calibration the recording carries, and since when the newest is known."""
+    steps = {} if found is None else dict(found.get("steps", {}))
+    if not steps:
+        return None
+    return f"{', '.join(steps)}; {max(str(step.get('made', '')) for step in steps.values())}"
 
 
 def _outage(segment: dict[str, Any] | None) -> str | None:

@@ -8,6 +8,7 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
+from acquire.calibrate.choose import handed_on
 from acquire.daemon.storage import choose_for, storage_settings
 from acquire.daemon.watching import watch_plan
 from acquire.store import RecordingSpec, next_segment
@@ -34,13 +35,14 @@ class Run:
     ) -> None:
         """Nothing is touched yet; ``choose`` finds the codec, where that is ``auto``.
 
-        Raises UsageError for a configuration that cannot work.
+        Raises UsageError for a configuration that cannot work, its calibration included.
         """
         self.run_id = new_run_id(config.name)
         self._config = config
         self._rig = rig
         self._choose = choose
         self._choice: CodecChoice | None = None
+        self._calibration = handed_on(config, rig.layout)
         self._capture = Capture(capture_plan(config, rig, self.run_id), rig.trigger)
 
     @property
@@ -115,7 +117,9 @@ class Run:
             trigger={**asdict(self._rig.trigger.identify()), "settings": config.trigger.model_dump()},
             cameras={arm: self._camera(arm, facts) for arm, facts in self._capture.cameras.items()},
             config=config.model_dump(mode="json"),
-            extra=self._rig.describe() | ({"codec_choice": self._choice.to_attrs()} if self._choice else {}),
+            extra=self._rig.describe()
+            | self._calibration
+            | ({"codec_choice": self._choice.to_attrs()} if self._choice else {}),
             codec=self._codec,
             layout=self._rig.layout,
             **storage_settings(config),

@@ -11,6 +11,7 @@ sub-steps cost nothing more. Without an alignment there is no R.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -39,8 +40,8 @@ class Registration:
     """R on frames (k, n′, n′), in any ``arrays``."""
 
     def __init__(self, alignment: Alignment, size: int, spatial_merge: int, arrays: Arrays = HOST) -> None:
-        matrix = sampling_matrix(alignment, size, spatial_merge)
-        self._forward, self._adjoint = (_Gather(each, arrays) for each in (matrix, matrix.T.tocsr()))
+        pair = _with_transpose(alignment, size, spatial_merge)
+        self._forward, self._adjoint = (_Gather(each, arrays) for each in pair)
 
     def forward(self, frames: Array) -> Array:
         """Arm A's view (k, n′, n′) as arm B sees it."""
@@ -49,6 +50,15 @@ class Registration:
     def adjoint(self, frames: Array) -> Array:
         """Rᵀ, from arm B's view to arm A's."""
         return self._adjoint(frames)
+
+
+@lru_cache(maxsize=8)
+def _with_transpose(
+    alignment: Alignment, size: int, spatial_merge: int
+) -> tuple[sparse.csr_array, sparse.csr_array]:
+    """R and Rᵀ; kept, since a refinement asks for them round after round."""
+    matrix = sampling_matrix(alignment, size, spatial_merge)
+    return matrix, matrix.T.tocsr()
 
 
 def sampling_matrix(alignment: Alignment, size: int, spatial_merge: int = 1) -> sparse.csr_array:

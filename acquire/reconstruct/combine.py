@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire import __version__
+from acquire.calibrate.choose import provenance
 from acquire.errors import AcquireError
 from acquire.recon.segments import Stitcher
 from acquire.reconstruct.times import Times
@@ -201,6 +202,7 @@ def describe_parts(
         "quality": {key: _rms([part["quality"][key] for part in parts]) for key in QUALITY_KEYS},
         "segments": segments,
         "segments_asked": len(request.stretches),
+        "calibration": provenance(options.calibration),
         "versions": {"acquire": __version__},
     }
 

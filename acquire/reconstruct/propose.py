@@ -6,6 +6,7 @@ from collections import deque
 from itertools import groupby, pairwise
 from typing import TYPE_CHECKING
 
+from acquire.calibrate import calibrated
 from acquire.plan_config import ReconstructionPlan, SegmentPlan
 from acquire.recon.auto import TEMPORAL_MERGES, Tempo, tempo
 from acquire.recon.segments import Stretch, Voxels, split
@@ -13,6 +14,7 @@ from acquire.recon.segments import Stretch, Voxels, split
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    from acquire.calibrate import Calibration
     from acquire.reconstruct.select import Selection
     from acquire.store import Recording
 
@@ -34,6 +36,7 @@ def propose(
     *,
     whole: bool = False,
     progress: Callable[[float, int], object] | None = None,
+    calibration: Calibration | None = None,
 ) -> ReconstructionPlan:
     """Sub-segments of neighbouring stretches that are equally fast, each with the reason."""
     stream = selection.stream
@@ -45,7 +48,8 @@ def propose(
         # lines that see nothing else: what the neighbours do is judged with them
         stretch = stretches[number]
         inner = stream.sub_segment(Stretch(stretch.begin, stretch.end, Voxels(1, size)))
-        return tempo(recording.cut(inner.first_line, inner.lines), done)
+        lines = recording.cut(inner.first_line, inner.lines)
+        return tempo(lines if calibration is None else calibrated(lines, calibration), done)
 
     found = list(zip(stretches, _tempos(len(stretches), look, progress), strict=True))
     groups = [list(group) for _, group in groupby(found, key=lambda each: each[1].voxels)]

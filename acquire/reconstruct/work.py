@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from acquire.calibrate import calibrated
 from acquire.recon import reconstruct
 from acquire.recon.judge import POOR_MISFIT
 from acquire.store import open_recording
@@ -15,13 +16,17 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.arrays import Dtype
+    from acquire.calibrate import Calibration
     from acquire.recon import Preset, Progress, Reconstruction, Solver
     from acquire.recon.segments import Grid, SubSegment
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How to solve; see `acquire.recon.reconstruct`. ``budget_s`` is for all that is asked for."""
+    """How to solve; see `acquire.recon.reconstruct`. ``budget_s`` is for all that is asked for.
+
+    ``calibration`` is what lines are read with; None: as the cameras' configuration says.
+    """
 
     preset: Preset = "balanced"
     solver: Solver = "admm"
@@ -30,6 +35,7 @@ class Options:
     bandwidth: float | None = None
     dtype: Dtype = "float32"
     device: str = "cpu"
+    calibration: Calibration | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +72,8 @@ def solve(task: Task, watch: Watch) -> Part:
     """Cut, reconstruct, bring to the grid. Raises what `Recording.cut` and `reconstruct` raise."""
     segment, options, voxels = task.segment, task.options, task.segment.voxels
     lines = open_recording(task.recording).cut(segment.first_line, segment.lines)
+    if options.calibration is not None:
+        lines = calibrated(lines, options.calibration)
 
     def advanced(progress: Progress) -> None:
         watch.advance(1 / progress.iterations)

@@ -120,6 +120,7 @@ class _Root(_Facts):
     ledger: _Ledger
     versions: _Versions
     config: dict[str, Any] = {}
+    calibration: dict[str, Any] | None = None
     host: dict[str, str] = {}
     durability: _Durability | Annotated[dict[str, Any], Field(max_length=0)] = {}
     simulated: bool = False

@@ -72,7 +72,7 @@ def test_lines_are_put_right(tmp_path: Path, view: View) -> None:
     segment = replace(open_recording(path).cut(0, 80), responsivity_dn=(8.0, 8.0))
     put_right = oriented(segment, view)
     picture = build_scene(scene, N, 1e-5).frames(0, 1)[0]
-    swapped = (view.turn_deg == 270) != view.mirrored
+    swapped = view.swapped
     seen = view.seen(picture) if swapped else picture
     seen = seen[:, ::-1] if swapped and view.mirrored else seen
     video = np.broadcast_to(seen, (segment.geometry.span, N, N)).astype(np.float32)

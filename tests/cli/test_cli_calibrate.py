@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from instruments import COLUMNS, NOISE, dots, record, white
 from PIL import Image
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "calibrate"))
-
-from instruments import COLUMNS, NOISE, dots, record, white
+from acquire.store import open_video
 
 Cli = Callable[..., Any]
 OFF = {"kind": "misregistration", "rows": 1.2, "columns": 0.7, "turn_deg": -0.4}
@@ -95,3 +94,41 @@ def test_an_orientation_that_cannot_be_told_is_not_kept(cli: Cli, tmp_path: Path
     assert answer.code == 2
     assert "cannot tell" in answer.err
     assert not (tmp_path / "cal.zarr").exists()
+
+
+def test_a_recording_carries_what_its_rig_names(cli: Cli, taken: dict[str, Path], tmp_path: Path) -> None:
+    cal = tmp_path / "cal.zarr"
+    for step, recording in (("dark", "dark"), ("flat", "flat"), ("align", "target")):
+        assert cli("calibrate", step, taken[recording], "--out", cal, "--json").code == 0
+    carrying = record(tmp_path / "run.zarr", white(0.3, EFFECTS), "target", 80, calibration=str(cal))
+    words = ("--lines", 60, "--iterations", 5, "--json")
+    own = cli("reconstruct", carrying, "--out", tmp_path / "own.zarr", *words)
+    assert own.code == 0, own.err
+    assert own.json["calibration"]["corrected"] == [
+        "offsets per column",
+        "gains per column",
+        "the arms' balance",
+        "arm B laid on arm A",
+    ]
+    none = cli("reconstruct", carrying, "--out", tmp_path / "none.zarr", "--calibration", "none", *words)
+    assert none.json["calibration"] is None
+    other = cli(
+        "reconstruct", taken["target"], "--out", tmp_path / "other.zarr", "--calibration", cal, *words
+    )
+    assert other.json["calibration"] == own.json["calibration"]
+    pictures = [np.asarray(open_video(tmp_path / f"{name}.zarr").video) for name in ("own", "none")]
+    assert np.abs(pictures[0] - pictures[1]).max() > 0.1
+    assert "dark, flat, align" in cli("info", carrying).out
+    assert "arm B lies" in cli("calibrate", "show", carrying).out
+
+
+def test_one_of_another_instrument_is_refused(cli: Cli, taken: dict[str, Path], tmp_path: Path) -> None:
+    cal = tmp_path / "cal.zarr"
+    assert cli("calibrate", "dark", taken["dark"], "--out", cal).code == 0
+    other = record(tmp_path / "other.zarr", white(0.3), "target", 60, **{"cameras.a.serial": "ELSEWHERE"})
+    answer = cli("reconstruct", other, "--out", tmp_path / "v.zarr", "--calibration", cal)
+    assert answer.code == 2
+    assert "serial SIM-A is ELSEWHERE" in answer.err
+    answer = cli("reconstruct", other, "--out", tmp_path / "v.zarr", "--calibration", tmp_path / "no.zarr")
+    assert answer.code == 2
+    assert cli("calibrate", "show", other).code == 2

@@ -1,0 +1,111 @@
+"""Reconstruction with the calibration that a recording carries, with another one, and with none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from instruments import COLUMNS, NOISE, M, N, dots, record, white
+
+from acquire.calibrate import Calibration, calibrated, open_calibration, save_calibration
+from acquire.calibrate.columns import dark, flat
+from acquire.calibrate.exposure import open_exposure
+from acquire.calibrate.target import alignment
+from acquire.config import load_rig
+from acquire.errors import ConfigError
+from acquire.recon import reconstruct
+from acquire.scene_config import LedSceneConfig
+from acquire.sim.scenes import build_scene
+from acquire.store import open_recording
+
+OFF = {"kind": "misregistration", "rows": 2.0, "columns": -1.5, "turn_deg": 0.8}
+EFFECTS = (
+    *NOISE,
+    *COLUMNS,
+    OFF,
+    {"kind": "beam_splitter", "part_a": 0.47},
+    {"kind": "stray_light", "ambient": 0.03},
+)
+
+
+def lit(effects: Any = ()) -> LedSceneConfig:
+    leds = [
+        {"name": "x", "shape": "x", "row": 0.35, "column": 0.35, "size": 0.5},
+        {"name": "o", "shape": "circle", "row": 0.68, "column": 0.66, "size": 0.45},
+    ]
+    for led, hertz in zip(leds, (900.0, 2300.0), strict=True):
+        led["drive"] = {"waveform": "sine", "frequency_hz": hertz, "low": 0.1, "high": 1.0}
+    table = {"kind": "leds", "leds": leds, "system_gain_dn_per_e": 0.1, "effects": list(effects)}
+    return LedSceneConfig.model_validate(table)
+
+
+@pytest.fixture(scope="module")
+def cal(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("cal")
+    first = dark(open_exposure(record(directory / "dark.zarr", white(effects=EFFECTS), "dark", 1024)))
+    known = Calibration(first.instrument).with_step(first)
+    known = known.with_step(
+        flat(open_exposure(record(directory / "flat.zarr", white(effects=EFFECTS), "flat", 1024)), known)
+    )
+    target = record(directory / "target.zarr", dots(directory, EFFECTS), "target", 1024)
+    save_calibration(directory / "cal.zarr", known.with_step(alignment(open_exposure(target), known)))
+    return directory / "cal.zarr"
+
+
+@pytest.fixture(scope="module")
+def run(cal: Path) -> Path:
+    """A recording that carries it."""
+    return record(cal.parent / "run.zarr", lit(EFFECTS), "target", 200, calibration=str(cal))
+
+
+def psnr(video: np.ndarray, segment: Any) -> float:
+    trusted = segment.geometry.trusted_frames(1)
+    fine = build_scene(lit(), N, 1e-5).frames(0, segment.geometry.span)
+    truth = fine.reshape(len(fine), M, 3, M, 3).mean((2, 4))[trusted]
+    return float(10 * np.log10(truth.max() ** 2 / np.mean((video[trusted] - truth) ** 2)))
+
+
+def test_the_copy_is_what_was_measured(cal: Path, run: Path) -> None:
+    carried = Calibration.from_attrs(open_recording(run).attrs["calibration"])
+    known = open_calibration(cal)
+    for name, measured in known.quantities.items():
+        np.testing.assert_allclose(carried.quantities[name].value, measured.value, rtol=1e-5)
+    assert carried.alignment == known.alignment
+    assert carried.steps.keys() == known.steps.keys()
+
+
+def test_calibrated_lines_give_the_picture_back(cal: Path, run: Path, tmp_path: Path) -> None:
+    """Against the same scene with noise only; everything else raises the misfit several times."""
+    segment = open_recording(run).cut(0, 200)
+    noisy = open_recording(record(tmp_path / "noise.zarr", lit(NOISE), "target", 200)).cut(0, 200)
+    known = open_calibration(cal)
+    found = {
+        name: reconstruct(each, 3, 1, iterations=120)
+        for name, each in {
+            "raw": segment,
+            "columns": calibrated(segment, Calibration(known.instrument, known.quantities, known.usable)),
+            "all": calibrated(segment, known),
+            "noise": noisy,
+        }.items()
+    }
+    quality = {name: psnr(result.video, segment) for name, result in found.items()}
+    assert quality["all"] > quality["columns"] + 1 > quality["raw"] + 1
+    assert quality["all"] > quality["noise"] - 5
+    assert found["all"].quality.misfit < 0.5 * found["columns"].quality.misfit
+
+
+def test_one_of_another_instrument_is_not_handed_on(cal: Path, tmp_path: Path) -> None:
+    other = {"cameras.a.serial": "ELSEWHERE", "calibration": str(cal)}
+    with pytest.raises(ConfigError, match="serial SIM-A is ELSEWHERE"):
+        record(tmp_path / "new.zarr", lit(), "target", 60, **other)
+    with pytest.raises(ConfigError, match="does not exist"):
+        record(tmp_path / "new.zarr", lit(), "target", 60, calibration="nowhere.zarr")
+    assert not (tmp_path / "new.zarr").exists()
+
+
+def test_a_rig_file_names_one_beside_itself(cal: Path) -> None:
+    text = (Path(__file__).parents[2] / "configs" / "rig-demo.toml").read_text()
+    (cal.parent / "rig.toml").write_text('calibration = "cal.zarr"\n' + text)
+    assert load_rig(cal.parent / "rig.toml").calibration == cal.resolve()
