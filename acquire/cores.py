@@ -42,6 +42,20 @@ def limit_blas(threads: int) -> threadpool_limits:
     return threadpool_limits(threads, user_api="blas")
 
 
+def slowness() -> float:
+    """How many times longer than on a core of its own this thread takes now; at least 1."""
+    began, used = time.monotonic(), time.thread_time()
+    while time.thread_time() - used < LOOK_S * LOOKS / 2:
+        pass
+    return max(1.0, (time.monotonic() - began) / (LOOK_S * LOOKS / 2))
+
+
+def process_age_s(process: Path = Path("/proc/self")) -> float:
+    """Since a process began; its start is the 22nd field of ``stat``, counted behind the name's bracket."""
+    began = int((process / "stat").read_text(errors="replace").rpartition(")")[2].split()[19])
+    return time.clock_gettime(time.CLOCK_BOOTTIME) - began / os.sysconf("SC_CLK_TCK")
+
+
 @contextmanager
 def limit_threads(threads: int) -> Iterator[None]:
     """The same for BLAS and for compiled loops (numba, where it is loaded), whose threads spin likewise."""

@@ -108,6 +108,7 @@ def _solve(method: Method, segment: Segment, journal: Journal) -> Reconstruction
             budget_s=method.budget_s,
             progress=lambda step: advance(step.iteration, step.iterations),
             solver=method.solver,
+            refuse=False,  # the recording is made: something is shown of it
         )
         note["detail"] = f"{result.iterations} of {result.iterations_asked} iterations"
     return result

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import time
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -21,6 +23,11 @@ if TYPE_CHECKING:
 
 
 QUICKER = "--from and --to (a part), --preview (seconds), --preset fast, --budget SECONDS, or larger voxels"
+
+PROCESSES_FROM = 5.0
+"""Budgets shorter than so many times a process' start are spent in this one."""
+LEAST_S = 1e-3
+SAID_S = 0.05
 
 
 def register(app: typer.Typer) -> None:
@@ -71,7 +78,7 @@ def reconstruct(
         str | None, typer.Option(help="fast, balanced or best; else balanced, or what --budget learned.")
     ] = None,
     solver: Annotated[str, typer.Option(help="admm; twist, the paper's; twist-band.")] = "admm",
-    budget: Annotated[float | None, typer.Option(metavar="SECONDS", help="Stop iterating in time.")] = None,
+    budget: Annotated[float | None, typer.Option(metavar="SECONDS", help="For the whole command.")] = None,
     iterations: Annotated[int | None, typer.Option(help="Instead of the preset's.")] = None,
     dtype: Annotated[str, typer.Option(help="float32 or float64: how exactly it is computed.")] = "float32",
     device: Annotated[str, typer.Option(help="cpu, or gpu: CUDA by way of CuPy.")] = "cpu",
@@ -95,6 +102,7 @@ def reconstruct(
     from acquire.arrays import open_arrays
     from acquire.calibrate.choose import choose
     from acquire.cli.reconstruct_request import Asked, prepare
+    from acquire.cores import process_age_s
     from acquire.reconstruct import Options
     from acquire.store import open_recording
     from acquire.store.delivery import check_new_place
@@ -104,6 +112,7 @@ def reconstruct(
             "reconstruct needs --out, where the video goes",
             possible="--out NAME.zarr; --auto alone shows a plan",
         )
+    began = time.monotonic() - process_age_s()
     open_arrays(device if dask is None else "cpu", dtype)  # a cluster's devices are not here
     opened = open_recording(recording)
     chosen = choose(opened, calibration)
@@ -141,11 +150,12 @@ def reconstruct(
     places = [_beside(out, suffix) for suffix in prepared.requests]
     for place in places:
         check_new_place(place)
-    if preview and workers is None:
-        workers = 1  # processes take longer to start than a preview
+    if workers is None and (preview or (budget is not None and budget < PROCESSES_FROM * process_age_s())):
+        workers = 1  # processes take longer to start than that: as long as this one, or longer
     outcomes = []
-    for place, request in zip(places, prepared.requests.values(), strict=True):
-        outcomes.append(_run(opened, request, place, prepared.options, workers, dask))
+    for number, (place, request) in enumerate(zip(places, prepared.requests.values(), strict=True)):
+        options = _share(prepared.options, time.monotonic() - began, len(places) - number)
+        outcomes.append(_run(opened, request, place, options, (workers, dask), began))
         if outcomes[-1].interrupted:
             break
     _report(outcomes, json=json, brief=preview)
@@ -158,17 +168,26 @@ def _beside(out: str, suffix: str) -> str:
     return re.sub(r"(\.[^./]*)?$", rf"-{suffix}\1", out.rstrip("/"), count=1) if suffix else out
 
 
+def _share(options: Options, elapsed_s: float, videos: int) -> Options:
+    """The budget until the next of so many videos is there, from the command's start on."""
+    if options.budget_s is None:
+        return options
+    left_s = options.budget_s - elapsed_s
+    return replace(options, budget_s=max(elapsed_s + left_s / videos, LEAST_S))
+
+
 def _run(
     recording: Recording,
     request: Request,
     out: str,
     options: Options,
-    workers: int | None,
-    cluster: str | None,
+    where: tuple[int | None, str | None],
+    began: float,
 ) -> Outcome:
+    """``where``: processes, or a cluster; ``began`` is when the budget did."""
     from acquire.reconstruct import Watcher, combine, open_pool
 
-    tasks = len(request.stretches)
+    tasks, (workers, cluster) = len(request.stretches), where
     at_once = workers or (None if options.device == "cpu" else 1)  # one process fills a GPU
     with (
         first_interrupt_asks("finishing the sub-segments under way, as far as they came") as interrupted,
@@ -176,7 +195,7 @@ def _run(
     ):
         watcher = Watcher(tasks, advance, interrupted.is_set)
         with open_pool(tasks, at_once, cluster, watcher) as pool:
-            return combine(recording, request, out, options, pool, watcher)
+            return combine(recording, request, out, options, pool, watcher, began)
 
 
 def _report(outcomes: list[Outcome], *, json: bool, brief: bool) -> None:
@@ -208,10 +227,15 @@ def _readable(outcome: Outcome) -> dict[str, Any]:
         "video": f"{outcome.path}, {' × '.join(map(str, outcome.shape))} (time, row, column)",
         "interrupted": f"holds {done} of {of} sub-segments, {done - trusted} of them broken off"
         if outcome.interrupted
+        else f"the budget ended after {done} of {of} sub-segments"
+        if outcome.cut
         else None,
         "trusted": f"frames {first} to {end - 1}" if end > first else f"none: {nothing}",
         "solver": f"{facts['solver']}, {_iterations(facts)}, {facts['seconds']:.1f} s",
         "corrected": ", ".join(facts["calibration"]["corrected"]) if facts["calibration"] else None,
+        "compiled": f"for {facts['compiled_s']:.1f} s more, once after an installation"
+        if facts["compiled_s"] >= SAID_S
+        else None,
         "misfit": f"{quality['misfit']:.2%} of the samples' RMS",
         "prediction": None if prediction is None else f"{prediction:.2%} at samples kept from the solver",
         "coverage": f"{quality['coverage']:.2%} of the samples usable",

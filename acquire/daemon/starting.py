@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-import time
 from pathlib import Path
+
+from acquire.cores import process_age_s
 
 LONGEST_S = 60.0
 """A daemon that is older than this does not start any more."""
@@ -27,7 +28,7 @@ def may_listen(process: Path, socket: Path) -> bool:
             return False
         given = _socket_of(words, (process / "environ").read_bytes())
         may_be = given is None or Path(given).name == socket.name
-        return may_be and _age_s(process) < LONGEST_S and not _listens(process)
+        return may_be and process_age_s(process) < LONGEST_S and not _listens(process)
     except (OSError, ValueError):
         return False  # it has ended meanwhile
 
@@ -50,9 +51,3 @@ def _listens(process: Path) -> bool:
     rows = [row.split() for row in (process / "net" / "unix").read_text(errors="replace").splitlines()[1:]]
     accepting = {f"socket:[{row[6]}]" for row in rows if row[3] == ACCEPTS and len(row) > 7}
     return any(str(fd.readlink()) in accepting for fd in (process / "fd").iterdir())
-
-
-def _age_s(process: Path) -> float:
-    """Since the process began; its start is the 22nd field of ``stat``, counted behind the name's bracket."""
-    began = int((process / "stat").read_text(errors="replace").rpartition(")")[2].split()[19])
-    return time.clock_gettime(time.CLOCK_BOOTTIME) - began / os.sysconf("SC_CLK_TCK")

@@ -6,7 +6,7 @@ import time
 from collections import deque
 from concurrent.futures import CancelledError, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import groupby
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ from acquire import __version__
 from acquire.calibrate.choose import provenance
 from acquire.errors import AcquireError
 from acquire.recon.segments import Stitcher
+from acquire.reconstruct.budget import Budget
 from acquire.reconstruct.times import Times
 from acquire.reconstruct.work import Task
 from acquire.store import VideoWriter
@@ -35,18 +36,18 @@ if TYPE_CHECKING:
 
 LOOK_S = 0.1
 """How often the one who waits looks at the progress and at Ctrl-C."""
-LEAST_BUDGET_S = 0.05
 QUALITY_KEYS = ("misfit", "prediction", "coverage")
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What was written. ``interrupted``: less than what was asked for."""
+    """What was written. ``interrupted``: less than what was asked for; ``cut``: likewise, by the budget."""
 
     path: Path | str
     shape: tuple[int, int, int]
     interrupted: bool
     provenance: dict[str, Any]
+    cut: bool = False
 
 
 class Watcher:
@@ -73,17 +74,26 @@ class Watcher:
 
 
 def combine(
-    recording: Recording, request: Request, out: Path | str, options: Options, pool: Pool, watcher: Watcher
+    recording: Recording,
+    request: Request,
+    out: Path | str,
+    options: Options,
+    pool: Pool,
+    watcher: Watcher,
+    began: float | None = None,
 ) -> Outcome:
     """Reconstruct the stretches of a request and write their video.
 
     ``out`` is a new path or URL. When the watcher says stop, what was solved so far is written, marked as
-    interrupted; DataError and whatever a sub-segment raises leave nothing.
+    interrupted; DataError and whatever a sub-segment raises leave nothing. The options' budget is wall time
+    from ``began`` (`time.monotonic`; else now) to the video's end; UsageError where it cannot be kept.
     """
-    began, grid = time.monotonic(), request.grid
+    called, grid = time.monotonic(), request.grid
     segments = request.sub_segments()
     place = str(recording) if is_url(str(recording)) else str(recording.path.resolve())
     tasks = [Task(place, segment, grid, options) for segment in segments]
+    budget = Budget(options.budget_s, called if began is None else began, pool.workers)
+    budget.check(tasks, request.stream.geometry(1))
     times, anchor = Times.of(recording), _anchor(recording, request)
     stitcher = Stitcher(grid)
     solved: list[SubSegment] = []
@@ -97,33 +107,40 @@ def combine(
         pixel_unit=None,
         quality=True,
     ) as writer:
-        for part, task, following in _solved(tasks, pool, watcher):
+        for part, task, following in _solved(tasks, pool, watcher, budget):
+            arrived = time.monotonic()
             video, error = stitcher.add(task.segment, (part.video, part.error), following)
             if len(video):
                 begins = grid.edges(slice(writer.frames, writer.frames + len(video)))[:-1]
                 writer.append(video, times.utc_ns(begins, anchor), error)
+            budget.written(video.size, time.monotonic() - arrived, part.facts["compiled_s"])
             solved.append(task.segment)
             done.append(part.facts)  # not the part: memory must not grow with the stream
         if not done:
             raise KeyboardInterrupt  # there is nothing to keep
         facts = describe_parts(recording, request, done, options)
-        facts["state"] = "interrupted" if watcher.stopped else "complete"
-        facts["seconds"] = round(time.monotonic() - began, 3)
+        cut = len(done) < len(tasks) and not watcher.stopped
+        facts["state"] = "interrupted" if cut or watcher.stopped else "complete"
+        facts["seconds"] = round(time.monotonic() - called, 3)
         whole = _whole_stretch([(each, part["trusted"]) for each, part in zip(solved, done, strict=True)])
         facts["trusted"] = _trusted_frames(request, writer.frames, whole)
         writer.finish(facts)
-    return Outcome(out, (writer.frames, grid.side, grid.side), watcher.stopped, facts)
+    return Outcome(out, (writer.frames, grid.side, grid.side), watcher.stopped, facts, cut)
 
 
 def _solved(
-    tasks: Sequence[Task], pool: Pool, watcher: Watcher
+    tasks: Sequence[Task], pool: Pool, watcher: Watcher, budget: Budget
 ) -> Iterator[tuple[Part, Task, SubSegment | None]]:
-    """Solved tasks in order, each with the sub-segment after it; ends early when the watcher stops."""
-    budget, submitted = _Budget(tasks, pool.workers), 0
+    """Solved tasks in order, each with the sub-segment after it, until the watcher or budget ends it."""
+    submitted = 0
     waiting: deque[Future[Part]] = deque()
     for index, task in enumerate(tasks):
         while submitted < len(tasks) and len(waiting) <= pool.workers and not watcher.stopped:
-            waiting.append(pool.submit(budget.limit(tasks[submitted], len(tasks) - index)))
+            if submitted and budget.gone:
+                break
+            after = len(tasks) - submitted - 1
+            undone = after + 1 + sum(not each.done() for each in waiting)
+            waiting.append(pool.submit(budget.limit(tasks[submitted], undone, after)))
             submitted += 1
         if not waiting or (part := _result(waiting, pool, watcher)) is None:
             return
@@ -147,23 +164,6 @@ def _result(waiting: deque[Future[Part]], pool: Pool, watcher: Watcher) -> Part 
         raise AcquireError(
             "a process that solved a sub-segment ended by itself", hint="--workers 1: it may lack memory"
         ) from error
-
-
-class _Budget:
-    """Shares what is left of the time among what is left to solve."""
-
-    def __init__(self, tasks: Sequence[Task], workers: int) -> None:
-        self._workers = workers
-        seconds = tasks[0].options.budget_s
-        self._deadline = None if seconds is None else time.monotonic() + seconds
-
-    def limit(self, task: Task, left: int) -> Task:
-        """The task with its share, where ``left`` are not done; at least a little, so that it ends well."""
-        if self._deadline is None:
-            return task
-        rounds = -(-left // self._workers)
-        share = (self._deadline - time.monotonic()) / rounds
-        return replace(task, options=replace(task.options, budget_s=max(share, LEAST_BUDGET_S)))
 
 
 def _anchor(recording: Recording, request: Request) -> tuple[int, int]:
@@ -199,6 +199,7 @@ def describe_parts(
         "budget_s": options.budget_s,
         "iterations": sum(part["iterations"] for part in parts),
         "iterations_asked": sum(part["iterations_asked"] for part in parts),
+        "compiled_s": round(max(part["compiled_s"] for part in parts), 3),
         "quality": {key: _rms([part["quality"][key] for part in parts]) for key in QUALITY_KEYS},
         "segments": segments,
         "segments_asked": len(request.stretches),

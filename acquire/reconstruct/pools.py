@@ -10,9 +10,10 @@ import signal
 import threading
 from concurrent.futures import Future, ProcessPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
-from acquire.cores import idle_cores, limit_blas, usable_cores
+from acquire.cores import idle_cores, limit_blas, limit_threads, usable_cores
 from acquire.errors import UsageError
 from acquire.reconstruct.work import Part, Task, solve
 
@@ -116,7 +117,8 @@ class Cluster:
         self._lock, self._done = threading.Lock(), 0
 
     def submit(self, task: Task) -> Future[Part]:
-        future: Future[Part] = self._executor.submit(solve, task, _Nobody())
+        elsewhere = replace(task, due=None)  # by another clock
+        future: Future[Part] = self._executor.submit(solve, elsewhere, _Nobody())
         future.add_done_callback(self._count)
         return future
 
@@ -160,7 +162,7 @@ def open_pool(
     cores = usable_cores()
     count = min(tasks, cores if workers is None else workers)
     if count <= 1:
-        with limit_blas(idle_cores()):
+        with limit_threads(idle_cores()):
             yield Here(watch)
         return
     shared = _Shared()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -19,6 +20,9 @@ if TYPE_CHECKING:
     from acquire.calibrate import Calibration
     from acquire.recon import Preset, Progress, Reconstruction, Solver
     from acquire.recon.segments import Grid, SubSegment
+
+LEAST_BUDGET_S = 0.05
+"""With less, a sub-segment is not reconstructed in less time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,12 +44,17 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A sub-segment of a recording, and the grid on which its frames are wanted. Picklable."""
+    """A sub-segment of a recording, and the grid on which its frames are wanted. Picklable.
+
+    ``due`` (`time.monotonic` of this machine) is when it is to be done; where that is not known, the options'
+    budget is for it.
+    """
 
     recording: str
     segment: SubSegment
     grid: Grid
     options: Options
+    due: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,7 +92,7 @@ def solve(task: Task, watch: Watch) -> Part:
         voxels.spatial_merge,
         voxels.temporal_merge,
         options.preset,
-        options.budget_s,
+        options.budget_s if task.due is None else max(task.due - time.monotonic(), LEAST_BUDGET_S),
         advanced,
         solver=options.solver,
         iterations=options.iterations,
@@ -110,6 +119,7 @@ def solve(task: Task, watch: Watch) -> Part:
             "iterations_asked": result.iterations_asked,
             "ended": result.ended,
             "seconds": round(result.seconds, 3),
+            "compiled_s": round(result.compiled_s, 3),
             "masked": result.masked,
             "trusted": why is None,
             "warnings": [*([] if why is None else [why]), *result.warnings],

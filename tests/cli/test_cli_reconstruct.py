@@ -184,7 +184,7 @@ def test_a_budget_takes_what_was_learned(
         lesson["seconds"] = 1.0 if lesson["preset"] == "fast" else 50.0
     document = {"version": 1, "learned": lessons}
     (tmp_path / "cache" / "acquire" / "tradeoff.json").write_text(json.dumps(document))
-    words = ("--nm", 2, "--lines", 100, "--budget", 5, "--dtype", "float64", "--json")
+    words = ("--nm", 2, "--lines", 100, "--budget", 40, "--dtype", "float64", "--json")
     answer = cli("reconstruct", recording, "--out", tmp_path / "v.zarr", *words)
     assert (answer.json["preset"], answer.json["dtype"]) == ("fast", "float64")
     assert answer.json["segments"][0]["parameters"]["dtype"] == "float64"

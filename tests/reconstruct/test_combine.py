@@ -27,6 +27,7 @@ from acquire.reconstruct import (
     in_voxels,
     open_pool,
 )
+from acquire.reconstruct.budget import Budget
 from acquire.scene_config import LedSceneConfig
 from acquire.sim.scenes import build_scene
 from acquire.sim.voxels import truth
@@ -153,6 +154,13 @@ def test_what_was_solved_before_a_stop_is_kept_and_marked(recording_path, reques
     assert len(video.time_ns) == video.video.shape[0] == len(video.quality)
 
 
+@pytest.fixture
+def unrefused(monkeypatch):
+    """Budgets that this machine may be too busy for, or that nobody could keep, are tried anyway."""
+    monkeypatch.setattr(Budget, "check", lambda *_: None)
+
+
+@pytest.mark.usefixtures("unrefused")
 def test_a_budget_is_shared(recording_path, request_of_three, tmp_path):
     options = Options(solver="twist", iterations=100_000, budget_s=1.5)
     outcome = run(recording_path, request_of_three, tmp_path / "v.zarr", options)
@@ -160,6 +168,47 @@ def test_a_budget_is_shared(recording_path, request_of_three, tmp_path):
     assert not outcome.interrupted
 
 
+def test_a_budget_that_began_long_ago_is_refused_and_nothing_written(
+    recording_path, request_of_three, tmp_path
+):
+    recording, began = open_recording(recording_path), time.monotonic() - 30
+    path, options, watcher = tmp_path / "v.zarr", Options(budget_s=20), Watcher(3)
+    refused = pytest.raises(UsageError, match=r"budget of 20 s .*: these 3 sub-segments need at least 3\d s")
+    with open_pool(3, 1) as pool, refused:
+        combine(recording, request_of_three, path, options, pool, watcher, began)
+    assert list(tmp_path.iterdir()) == []
+
+
+class Stalled:
+    """A pool of this process that stalls for ``stall_s`` before the first answer."""
+
+    workers = 1
+
+    def __init__(self, pool, stall_s):
+        self._pool, self._stall_s = pool, stall_s
+
+    def submit(self, task):
+        time.sleep(self._stall_s)
+        self._stall_s = 0.0
+        return self._pool.submit(task)
+
+    def share_done(self):
+        return self._pool.share_done()
+
+
+@pytest.mark.usefixtures("unrefused")
+def test_a_machine_that_gets_busy_leaves_what_is_done_by_then(recording_path, request_of_three, tmp_path):
+    recording, options = open_recording(recording_path), Options(budget_s=3.0)
+    with open_pool(3, 1) as pool:
+        stalled = Stalled(pool, 3.0)
+        outcome = combine(recording, request_of_three, tmp_path / "v.zarr", options, stalled, Watcher(3))
+    facts = open_video(tmp_path / "v.zarr").attrs["provenance"]
+    assert outcome.cut
+    assert (len(facts["segments"]), facts["segments_asked"]) == (1, 3)
+    assert facts["state"] == "interrupted"
+
+
+@pytest.mark.usefixtures("unrefused")
 def test_what_had_too_little_time_to_explain_its_lines_is_not_trusted(
     recording_path, request_of_three, tmp_path
 ):

@@ -140,6 +140,7 @@ class Studio:
             options.budget_s,
             solver=options.solver,
             iterations=options.iterations,
+            refuse=False,
         )
         self.seconds[what] = result.seconds
         return result
