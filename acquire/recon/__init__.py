@@ -4,12 +4,13 @@ from acquire.recon.api import reconstruct
 from acquire.recon.basis import TemporalBasis
 from acquire.recon.denoisers import Denoiser, HaarShrink
 from acquire.recon.request import ITERATIONS, Preset, Solver
-from acquire.recon.result import Progress, Quality, Reconstruction
+from acquire.recon.result import Look, Progress, Quality, Reconstruction
 
 __all__ = [
     "ITERATIONS",
     "Denoiser",
     "HaarShrink",
+    "Look",
     "Preset",
     "Progress",
     "Quality",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from contextlib import nullcontext
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from acquire.recon.judge import frame_error, judge
 from acquire.recon.least import check_budget, least_seconds
 from acquire.recon.problem import pose
 from acquire.recon.request import Preset, Request, Solver, Stop, preset_iterations
-from acquire.recon.result import Progress, Quality, Reconstruction
+from acquire.recon.result import Look, Progress, Quality, Reconstruction
 from acquire.recon.solve import Lit, solve_admm, solve_twist
 
 if TYPE_CHECKING:
@@ -51,6 +52,7 @@ def reconstruct(
     device: str = "cpu",
     stop: Stop | None = None,
     refuse: bool = True,
+    look: Callable[[Look], object] | None = None,
 ) -> Reconstruction:
     """Reconstruct the voxels X′ of a segment at N_m = ``spatial_merge``, T_m = ``temporal_merge`` (Eq. 5).
 
@@ -73,6 +75,7 @@ def reconstruct(
     device : ``"cpu"`` or ``"gpu"``, where iterations are made; see `acquire.arrays`
     stop : asked after every iteration; once set, the best so far is returned
     refuse : a budget that cannot be kept here; else as little as possible is done
+    look : called after iterations, with what the answer would be if it ended there; its time does not count
 
     Raises
     ------
@@ -105,6 +108,8 @@ def reconstruct(
             least_s = least_seconds(segment.geometry, spatial_merge, temporal_merge, solver)
             check_budget(clock, budget_s, least_s)
         problem = pose(segment, spatial_merge, temporal_merge, hold_out=held_out, arrays=arrays)
+        if look is not None:
+            clock.looks = _looking(look, problem, request)
         estimate = _solve(segment, problem, request, clock)
         return _finish(segment, problem, request, estimate, clock)
 
@@ -115,14 +120,23 @@ def _solve(segment: Segment, problem: Problem, request: Request, clock: Iteratio
     return (solve_admm if request.solver == "admm" else solve_twist)(segment, problem, request, clock)
 
 
+def _looking(look: Callable[[Look], object], problem: Problem, request: Request) -> Callable[[Look], object]:
+    """``look`` for videos in scene units."""
+    return lambda seen: look(replace(seen, video=lambda: _scaled(seen.video(), problem, request)))
+
+
+def _scaled(video: NDArray[Any], problem: Problem, request: Request) -> NDArray[Any]:
+    """In scene units, and not negative where the solver knows the sign."""
+    video = video * problem.scale
+    return video if request.solver == "twist" else np.maximum(video, 0, out=video)
+
+
 def _finish(
     segment: Segment, problem: Problem, request: Request, estimate: Estimate, clock: IterationClock
 ) -> Reconstruction:
     T_m = request.temporal_merge
     predicted = estimate.predict()
-    video = estimate.video() * problem.scale
-    if request.solver != "twist":
-        np.maximum(video, 0, out=video)
+    video = _scaled(estimate.video(), problem, request)
     quality = Quality(problem.misfit(predicted), problem.prediction_error(predicted), problem.coverage)
     trusted = segment.geometry.trusted_frames(T_m)
     return Reconstruction(
@@ -131,6 +145,7 @@ def _finish(
         trusted=trusted,
         seconds=clock.seconds,
         compiled_s=clock.compiled_s,
+        processor_s=clock.processor_s,
         iterations=clock.done,
         iterations_asked=clock.iterations,
         solver=request.solver,

@@ -11,10 +11,13 @@ from collections import deque
 from typing import TYPE_CHECKING
 
 from acquire.recon.compiling import compiled_s
-from acquire.recon.result import Progress
+from acquire.recon.result import Look, Progress
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from typing import Any
+
+    from numpy.typing import NDArray
 
     from acquire.recon.request import Stop
 
@@ -33,8 +36,11 @@ class IterationClock:
     """Counts iterations over all stages of a solver and says when they must end, and why (``ended``).
 
     Its time is the wall's since ``began`` (`time.monotonic`; else now), without what compiling took.
-    ``shortcuts`` are sentences about what was left out for want of time.
+    ``shortcuts`` are sentences about what was left out for want of time. ``looks`` is called after iterations
+    of what has a video already; the time it takes does not count.
     """
+
+    looks: Callable[[Look], object] | None = None
 
     def __init__(
         self,
@@ -48,12 +54,18 @@ class IterationClock:
         self.shortcuts: list[str] = []
         self._budget_s, self._progress, self._stop = budget_s, progress, stop
         self._began = time.monotonic() if began is None else began
-        self._compiled_before = compiled_s()
+        self._compiled_before, self._aside_s = compiled_s(), 0.0
+        self._processor_began_s = time.process_time()
         self._lately_s: deque[float] = deque(maxlen=REMEMBERED)
 
     @property
     def seconds(self) -> float:
-        return time.monotonic() - self._began - self.compiled_s
+        return time.monotonic() - self._began - self.compiled_s - self._aside_s
+
+    @property
+    def processor_s(self) -> float:
+        """Of all threads of this process, whatever it compiled."""
+        return time.process_time() - self._processor_began_s
 
     @property
     def compiled_s(self) -> float:
@@ -65,8 +77,12 @@ class IterationClock:
         """The longest iteration of late; 0 before the first."""
         return max(self._lately_s, default=0.0)
 
-    def run(self, most: int, stage: str, share: float = 1.0) -> Iterator[int]:
+    def run(
+        self, most: int, stage: str, share: float = 1.0, video: Callable[[], NDArray[Any]] | None = None
+    ) -> Iterator[int]:
         """Yields before each iteration of a stage that may take ``share`` of the budget.
+
+        ``video`` gives the answer as it is after an iteration, dimensionless, to who looks on.
 
         The very first iteration of all is always made, so that there is something to show.
         """
@@ -81,6 +97,8 @@ class IterationClock:
             expected = self.longest_s
             if self._progress is not None:
                 self._progress(Progress(self.done, self.iterations, self.seconds, stage))
+            if self.looks is not None and video is not None:
+                self._show(self.looks, stage, video)
         if not lately:
             lately.append(expected / FIRST_OF_STAGE)
 
@@ -98,6 +116,12 @@ class IterationClock:
     def converged(self) -> None:
         """Nothing is to be gained from more iterations."""
         self.ended = "converged"
+
+    def _show(self, looks: Callable[[Look], object], stage: str, video: Callable[[], NDArray[Any]]) -> None:
+        wall, processor, seconds = time.monotonic(), time.process_time(), self.seconds
+        looks(Look(self.done, seconds, self.processor_s, stage, video))
+        self._aside_s += time.monotonic() - wall
+        self._processor_began_s += time.process_time() - processor
 
     def _may_go_on(self, expected: float, share: float) -> bool:
         if self.done and self._stop is not None and self._stop.is_set():

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import numpy as np
     from numpy.typing import NDArray
 
@@ -18,6 +20,20 @@ class Progress:
     iterations: int
     seconds: float
     stage: str = "solve"
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """A reconstruction after an iteration, with its wall and processor time so far.
+
+    ``video`` makes what would be the answer if it ended there; it is to be called at once or not at all.
+    """
+
+    iteration: int
+    seconds: float
+    processor_s: float
+    stage: str
+    video: Callable[[], NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +60,7 @@ class Reconstruction:
         alone, whatever lines were lost, samples masked, or the code does; ``quality`` says how well it went.
     time_ns : the begin of each frame
     seconds : wall time, without ``compiled_s``, which compiling took: once after an installation
+    processor_s : of all threads
     iterations : fewer than ``iterations_asked`` where the budget, ``stop`` or the data ended it (``ended``)
     frame_error : (time,) relative RMS residual of the samples that saw each frame; NaN where none did. It is
         no error of the frame, which may be many times larger; see `acquire.recon.judge.frame_error`
@@ -64,4 +81,5 @@ class Reconstruction:
     masked: dict[str, int] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     compiled_s: float = 0.0
+    processor_s: float = 0.0
     parameters: dict[str, Any] = field(default_factory=dict)

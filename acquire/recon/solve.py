@@ -123,7 +123,7 @@ def solve_admm(segment: Segment, problem: Problem, request: Request, clock: Iter
     refined = None if request.denoiser else _refine(segment, problem, request, estimate, clock)
     if refined is not None:
         return refined
-    for _ in clock.run(PLAIN_ITERATIONS - clock.done, "solve"):
+    for _ in clock.run(PLAIN_ITERATIONS - clock.done, "solve", video=estimate.video):
         estimate.solver.step()
     return estimate
 
@@ -154,13 +154,13 @@ def _first_look(
         start = basis.analyze(problem.arrays.asarray(request.initial / problem.scale))
     estimate = begin(start)
     if 1 < frames <= FEW_FRAMES:
-        for _ in clock.run(TRIAL, "first look", FIRST_LOOK_SHARE):
+        for _ in clock.run(TRIAL, "first look", FIRST_LOOK_SHARE, estimate.video):
             estimate.solver.step()
         if problem.prediction_error(estimate.predict()) < EXPLAINED:
             estimate = begin(estimate.solver.theta, explained=True)
     for look in (FIRST_LOOK, LONGER_LOOK):
         most = min(look, -(-4 * request.iterations // 5))
-        for _ in clock.run(most - clock.done, "first look", FIRST_LOOK_SHARE):
+        for _ in clock.run(most - clock.done, "first look", FIRST_LOOK_SHARE, estimate.video):
             estimate.solver.step()
         if find_patterns(host(estimate.solver.theta), beyond_doubt=True):
             break
@@ -183,7 +183,7 @@ def _refine(
     merges = (request.spatial_merge, request.temporal_merge)
     refinement = Refinement(segment, problem, basis, found, merges)
     best, kept, idle = np.inf, refinement.found, 0
-    for _ in clock.run(clock.iterations - clock.done, "refine"):
+    for _ in clock.run(clock.iterations - clock.done, "refine", video=refinement.video):
         refinement.step()
         if not refinement.at_round_end:
             continue
@@ -219,9 +219,10 @@ def solve_twist(segment: Segment, problem: Problem, request: Request, clock: Ite
         parameters,
         basis if banded else None,
     )
-    for _ in clock.run(request.iterations, "solve"):
+    estimate = InBand(solver, operator, basis, problem, parameters)
+    for _ in clock.run(request.iterations, "solve", video=estimate.video):
         solver.step()
-    return InBand(solver, operator, basis, problem, parameters)
+    return estimate
 
 
 class Lit:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from itertools import pairwise
 
 import numba
 import numpy as np
@@ -11,8 +12,8 @@ import pytest
 from acquire.errors import UsageError
 from acquire.geometry import Geometry
 from acquire.lines import Segment
+from acquire.recon import Look, Solver, reconstruct
 from acquire.recon import clock as clocks
-from acquire.recon import reconstruct
 from acquire.recon.clock import IterationClock
 
 
@@ -23,6 +24,9 @@ class Wall:
         self.now = 100.0
 
     def monotonic(self) -> float:
+        return self.now
+
+    def process_time(self) -> float:
         return self.now
 
 
@@ -97,6 +101,34 @@ def test_a_budget_is_kept_by_the_wall() -> None:
     assert result.ended == "budget"
     assert 0.4 < took_s <= 1.1 * 0.8 + 0.3
     assert result.seconds <= took_s
+
+
+@pytest.mark.parametrize("solver", ["admm", "twist"])
+def test_looking_on_shows_the_answer_to_be_and_takes_no_time(solver: Solver) -> None:
+    seen: list[Look] = []
+    videos: list[np.ndarray] = []
+
+    def look(now: Look) -> None:
+        seen.append(now)
+        videos.append(now.video())
+        time.sleep(0.1)
+
+    result = reconstruct(segment(Geometry(20, 3, 120)), 3, 1, solver=solver, iterations=8, look=look)
+    assert [each.iteration for each in seen] == list(range(1, 9))
+    assert all(0 < one.seconds < other.seconds for one, other in pairwise(seen))
+    assert 0 < seen[-1].processor_s <= result.processor_s
+    np.testing.assert_allclose(videos[-1], result.video, rtol=1e-5, atol=1e-4)
+    plain = reconstruct(segment(Geometry(20, 3, 120)), 3, 1, solver=solver, iterations=8)
+    np.testing.assert_allclose(plain.video, result.video, rtol=1e-5, atol=1e-4)
+
+
+def test_who_looks_on_takes_none_of_the_budget(wall: Wall) -> None:
+    clock = IterationClock(1000, 5.0)
+    clock.looks = lambda _: setattr(wall, "now", wall.now + 2.0)
+    for _ in clock.run(30, "solve", video=lambda: np.zeros((1, 1, 1))):
+        wall.now += 0.1
+    assert (clock.done, clock.ended) == (30, "done")
+    assert clock.seconds == pytest.approx(3.0)
 
 
 def test_a_budget_that_cannot_be_kept_is_refused_with_what_can() -> None:
