@@ -44,6 +44,9 @@ def arm(
         bool,
         typer.Option("--force", help="Even where this host is too slow, or the store of uploads refuses."),
     ] = False,
+    code: Annotated[
+        str, typer.Option(help="What the light follows: rig, its code; dark, it stays off; steady, on.")
+    ] = "rig",
     socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
@@ -57,7 +60,7 @@ def arm(
     Example: [bold]acquire arm[/]
     """
     with _daemon(socket) as daemon:
-        _show(daemon.arm(force=force), json)
+        _show(daemon.arm(force=force, code=code), json)  # type: ignore[arg-type]  # checked there
 
 
 def start(

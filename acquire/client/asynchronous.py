@@ -14,7 +14,7 @@ from pydantic import BaseModel
 from acquire.client import core
 from acquire.client.core import Call, EventReader, Target
 from acquire.daemon.facts import Health, News, Rings, Setup, Version
-from acquire.daemon.messages import CapacityStatus, Status
+from acquire.daemon.messages import CapacityStatus, LightCode, Status
 from acquire.daemon.peer import connect
 from acquire.errors import NoDaemonError
 
@@ -47,9 +47,11 @@ class AsyncClient:
     async def __aexit__(self, *_: object) -> None:
         """A call has its own connection: nothing is left to be closed."""
 
-    async def arm(self, *, force: bool = False, request_id: str | None = None) -> Status:
-        """idle → armed."""
-        return await self.call(core.arm(force=force, request_id=request_id))
+    async def arm(
+        self, *, force: bool = False, code: LightCode = "rig", request_id: str | None = None
+    ) -> Status:
+        """idle → armed; the light follows ``code``."""
+        return await self.call(core.arm(force=force, code=code, request_id=request_id))
 
     async def start(
         self,

@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from acquire.client import core
 from acquire.client.core import Call, EventReader, Target
 from acquire.daemon.facts import Health, News, Rings, Setup, Version
-from acquire.daemon.messages import CapacityStatus, Status
+from acquire.daemon.messages import CapacityStatus, LightCode, Status
 from acquire.daemon.peer import connect
 from acquire.daemon.starting import is_one_starting
 from acquire.daemon.states import State
@@ -74,9 +74,12 @@ class Client:
 
     # ---- commands
 
-    def arm(self, *, force: bool = False, request_id: str | None = None) -> Status:
-        """idle → armed: cameras and trigger run, nothing is written. ``force``: however slow the host."""
-        return self._do(core.arm(force=force, request_id=request_id))
+    def arm(self, *, force: bool = False, code: LightCode = "rig", request_id: str | None = None) -> Status:
+        """idle → armed: cameras and trigger run, nothing is written. ``force``: however slow the host.
+
+        ``code``: what the light follows; ``"dark"`` is off and ``"steady"`` on, as calibration needs it.
+        """
+        return self._do(core.arm(force=force, code=code, request_id=request_id))
 
     def start(
         self,

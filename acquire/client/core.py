@@ -23,6 +23,7 @@ from acquire.daemon.facts import News
 from acquire.daemon.messages import (
     ArmRequest,
     ErrorMessage,
+    LightCode,
     MarkRequest,
     StartRequest,
     Status,
@@ -142,8 +143,8 @@ def command(
     return Call("POST", name, answer, body, request_id=request_id or secrets.token_hex(16))
 
 
-def arm(*, force: bool, request_id: str | None) -> Call[Status]:
-    return command("arm", Status, request("arm", ArmRequest, force=force), request_id)
+def arm(*, force: bool, code: LightCode, request_id: str | None) -> Call[Status]:
+    return command("arm", Status, request("arm", ArmRequest, force=force, code=code), request_id)
 
 
 def start(path: Path | str | None, request_id: str | None, **budget: Any) -> Call[Status]:

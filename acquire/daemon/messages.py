@@ -36,8 +36,17 @@ class Message(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+LightCode = Literal["rig", "dark", "steady"]
+"""What the light follows in a run: the rig's code, or off, or on, as calibration asks for."""
+
+
 class ArmRequest(Message):
     """How to arm."""
+
+    code: LightCode = Field(
+        default="rig",
+        description="what the light follows: the rig's code; 'dark': it stays off; 'steady': it stays on",
+    )
 
     force: bool = Field(
         default=False,

@@ -9,6 +9,7 @@ from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from acquire.calibrate.choose import handed_on
+from acquire.config import ConstantCodeConfig
 from acquire.daemon.storage import choose_for, storage_settings
 from acquire.daemon.watching import watch_plan
 from acquire.store import RecordingSpec, next_segment
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from acquire.config import RigConfig
+    from acquire.daemon.messages import LightCode
     from acquire.rig import Rig
     from acquire.store import Codec, CodecChoice
     from acquire.stream import CaptureStatus, Window
@@ -134,6 +136,14 @@ class Run:
         }
         lines = self._capture.poll().lines.get(arm, {})
         return {**calibration, **facts, "clock": lines.get("clock", {})}
+
+
+def with_code(config: RigConfig, code: LightCode) -> RigConfig:
+    """The rig with another code for its light."""
+    if code == "rig":
+        return config
+    constant = ConstantCodeConfig(kind="constant", value=0 if code == "dark" else 1)
+    return config.model_copy(update={"code": constant})
 
 
 def worker_modules(rig: Rig) -> tuple[str, ...]:

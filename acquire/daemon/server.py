@@ -21,8 +21,9 @@ from acquire.daemon.connections import ApiServer, raise_descriptor_limit
 from acquire.daemon.control import build_app
 from acquire.daemon.ending import END_S, LastResort, leave
 from acquire.daemon.endpoint import Endpoint
+from acquire.daemon.messages import LightCode
 from acquire.daemon.notify import notify
-from acquire.daemon.plan import Run, worker_modules
+from acquire.daemon.plan import Run, with_code, worker_modules
 from acquire.daemon.proof import Proof
 from acquire.daemon.salvage import Salvage
 from acquire.daemon.service import Service
@@ -69,7 +70,11 @@ def serve(config: RigConfig) -> int:
         uploads = Uploads(config.recording.upload_to, _journal(config, "uploads"))
         uploads.begin()
         proof = Proof(config)
-        service = Service(config, lambda: Run(config, rig, proof.choose), proof, salvage, uploads, troubles)
+
+        def open_run(code: LightCode = "rig") -> Run:
+            return Run(with_code(config, code), rig, proof.choose)
+
+        service = Service(config, open_run, proof, salvage, uploads, troubles)
         code = asyncio.run(Daemon(service, endpoint).run())
         last_resort = LastResort(endpoint.remove)
         last_resort.within(END_S)  # for devices that do not let go

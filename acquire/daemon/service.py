@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from acquire.config import RigConfig
-    from acquire.daemon.messages import CapacityStatus, RecoveryStatus, StartRequest
+    from acquire.daemon.messages import CapacityStatus, LightCode, RecoveryStatus, StartRequest
     from acquire.stream import Window
     from acquire.stream.messages import Note
     from acquire.stream.ring import RingShape
@@ -64,6 +64,12 @@ class Run(Protocol):
     def close(self) -> None: ...
 
 
+class OpenRun(Protocol):
+    """Makes the next run, whose light follows ``code``."""
+
+    def __call__(self, code: LightCode = "rig") -> Run: ...
+
+
 class Prove(Protocol):
     """What the service needs of `acquire.daemon.proof.Proof`."""
 
@@ -78,7 +84,7 @@ class Service:
     def __init__(
         self,
         config: RigConfig,
-        open_run: Callable[[], Run],
+        open_run: OpenRun,
         prove: Prove | None = None,
         salvage: Salvage | None = None,
         uploads: Uploads | None = None,
@@ -146,7 +152,7 @@ class Service:
             self._uploads.prove(force=request.force)
             if self._prove is not None:
                 self._capacity = self._prove(force=request.force, tell=self._tell)
-            run = self._open_run()
+            run = self._open_run() if request.code == "rig" else self._open_run(request.code)
             run.arm(self._tell)
             self._run, self._seen, self._rates = run, CaptureStatus(), Rates()
             self.armed_since = datetime.now(UTC)

@@ -10,7 +10,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, assert_never
 
 from acquire.codes import ConstantCode
-from acquire.config import load_scene
+from acquire.config import find, load_scene
 from acquire.lines import ARMS
 from acquire.sim import rtl
 from acquire.sim.clock import Wire
@@ -46,9 +46,9 @@ class SimulatedDevices:
 
     def __init__(self, config: RigConfig) -> None:
         self.config = config
-        self._scene = load_scene(config.scene_file()) if config.needs_scene else None
-        if self._scene is not None:
-            _check_scene(config, self._scene)
+        self._scene: SceneConfig | None = None
+        self._read: tuple[int, int] | None = None
+        self._look_at_scene()
         self._wire = Wire()
         self._pins = PinPage() if config.trigger.driver == "rtl" else None
         self._gentl, self._gige = GentlArms(config), GigeArms(config)
@@ -83,6 +83,19 @@ class SimulatedDevices:
             simulation.replay_gate,
         )
 
+    def _look_at_scene(self) -> None:
+        """What is before the cameras now: a scene's file may change between runs, as what is on a bench does.
+
+        Raises ConfigError and UsageError as the class does.
+        """
+        if not self.config.needs_scene:
+            return
+        place = find(self.config.scene_file(), kind="scene").stat()
+        if self._read != (place.st_mtime_ns, place.st_ino):
+            scene = load_scene(self.config.scene_file())
+            _check_scene(self.config, scene)
+            self._scene, self._read = scene, (place.st_mtime_ns, place.st_ino)
+
     def _sensor(self, arm: str) -> CameraOpener:
         """The model of the arm's camera, in the process that opens it."""
         parts = {arm: self._part(arm) for arm in ARMS}
@@ -95,6 +108,7 @@ class SimulatedDevices:
 
     def _part(self, arm: str) -> SimulatedCameraOpener:
         config = self.config
+        self._look_at_scene()
         assert self._scene is not None
         optics = SimulatedOptics(arm, config.geometry, self._scene)
         camera = config.cameras.arm(arm)

@@ -1,0 +1,173 @@
+"""The guided calibration on a running daemon: what is before the cameras is changed as it asks for it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from live_daemon import COMMAND, Daemon, acquire
+
+from acquire.calibrate import calibration_of, open_calibration
+from acquire.client import SEALED
+from acquire.store import open_recording
+
+M, S = 16, 3
+N = M * S
+EFFECTS = """
+[[effects]]
+kind = "misregistration"
+rows = 1.4
+columns = -0.8
+turn_deg = 0.5
+[[effects]]
+kind = "beam_splitter"
+part_a = 0.47
+[[effects]]
+kind = "prnu"
+prnu = 0.01
+[[effects]]
+kind = "shot_noise"
+[[effects]]
+kind = "read_noise"
+sigma_e = 20.0
+[[effects]]
+kind = "column_offsets"
+sigma_dn = 2.0
+"""
+WHITE = """
+kind = "leds"
+[[leds]]
+name = "all"
+shape = "square"
+row = 0.5
+column = 0.5
+size = 1.0
+drive = { waveform = "constant", level = 0.5 }
+"""
+DOT = """
+[[leds]]
+name = "{number}"
+shape = "square"
+row = {row}
+column = {column}
+size = {size}
+drive = {{ waveform = "constant" }}
+"""
+SETTINGS = (
+    f"geometry.stages={M}",
+    f"geometry.substeps={S}",
+    "trigger.substep_ticks=9000",
+    *(f"cameras.{arm}.black_level_dn=20.0" for arm in "ab"),
+    *(f"cameras.{arm}.responsivity_dn=10.0" for arm in "ab"),
+)
+
+
+def target() -> str:
+    """Bright squares of 2 to 6 fine pixels, anywhere."""
+    rng = np.random.default_rng(1)
+    dots = [
+        DOT.format(number=k, row=rng.uniform(0.12, 0.88), column=rng.uniform(0.12, 0.88), size=size / N)
+        for k, size in enumerate(rng.uniform(2, 6, 24))
+    ]
+    return 'kind = "leds"' + "".join(dots)
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[tuple[Daemon, Callable[[str], None]]]:
+    """A daemon, and what puts a scene before its cameras."""
+
+    def put(scene: str) -> None:
+        fresh = tmp_path / "fresh.toml"
+        fresh.write_text(scene + EFFECTS)
+        fresh.replace(tmp_path / "scene.toml")
+
+    put(WHITE)
+    daemon = Daemon(tmp_path, *SETTINGS, f"simulation.scene='{tmp_path}/scene.toml'")
+    try:
+        yield daemon, put
+    finally:
+        daemon.close()
+
+
+def test_dark_flat_target_by_hand(bench: tuple[Daemon, Callable[[str], None]], tmp_path: Path) -> None:
+    daemon, put = bench
+    words = ["calibrate", "all", "--out", str(tmp_path / "cal.zarr"), "--lines", "384"]
+    guided = subprocess.Popen(
+        [*COMMAND, *words],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,
+        env=os.environ | {"ACQUIRE_SOCKET": str(daemon.socket)},
+    )
+    assert guided.stdin is not None
+    assert guided.stderr is not None
+    said = ""
+    for line in guided.stderr:
+        said += line
+        if "Put a target in" in line:
+            put(target())
+        if "Enter goes on" in line:
+            guided.stdin.write("\n")
+            guided.stdin.flush()
+    out = guided.communicate(timeout=300)[0]
+    assert guided.returncode == 0, said
+    assert "DN per electron" in out
+    assert "turn 90" in out
+    known = open_calibration(tmp_path / "cal.zarr")
+    assert list(known.steps) == ["dark", "flat", "transfer", "orientation", "align"]
+    assert known.alignment is not None
+    assert known.alignment.alignment.rows == pytest.approx(1.4, abs=0.15)
+    assert known.alignment.alignment.columns == pytest.approx(-0.8, abs=0.15)
+    balance = known.value("balance")
+    assert balance is not None
+    assert balance[0] / 2 == pytest.approx(0.47, abs=0.01)
+    taken = [open_recording(path) for path in sorted((tmp_path / "calibration-recordings").iterdir())]
+    assert [each.attrs["code"]["kind"] for each in taken] == ["constant", "constant", "prbs"]
+    with daemon.client() as client:
+        assert client.status().state == "idle"
+    daemon.close()
+    _handed_on(tmp_path)
+
+
+def _handed_on(home: Path) -> None:
+    """A daemon whose rig names the calibration gives every recording a copy."""
+    scene, cal = f"simulation.scene='{home}/scene.toml'", f"calibration='{home}/cal.zarr'"
+    daemon = Daemon(home, *SETTINGS, scene, cal)
+    try:
+        with daemon.client() as client:
+            client.arm()
+            client.start(home / "run.zarr", lines=64)
+            client.wait(SEALED, timeout_s=120)
+        carried = calibration_of(open_recording(home / "run.zarr"))
+        assert carried is not None
+        assert carried.alignment == open_calibration(home / "cal.zarr").alignment
+        assert daemon("verify", home / "run.zarr").code == 0
+    finally:
+        daemon.close()
+
+
+def test_what_goes_wrong_leaves_the_instrument_as_it_was(
+    bench: tuple[Daemon, Callable[[str], None]], tmp_path: Path
+) -> None:
+    """Without a dark, a flat says nothing; and where nobody can press Enter, nothing is recorded."""
+    daemon, _ = bench
+    cal = tmp_path / "c.zarr"
+    with daemon.client() as client:
+        client.arm()
+        answer = daemon("calibrate", "all", "--only", "flat", "--yes", "--lines", 64, "--out", cal)
+        assert answer.code == 2
+        assert "offsets of the columns first" in answer.err
+        assert client.status().state == "armed"
+        before = client.status().run_id
+        answer = daemon("calibrate", "all", "--out", cal)
+        assert answer.code == 4
+        assert "nobody is there" in answer.err
+        assert client.status().run_id == before
+    assert not cal.exists()
+    assert acquire("calibrate", "all", "--only", "lunch", "--out", cal).code == 2
