@@ -1,0 +1,255 @@
+"""One arm's lines as a Gaussian process: what a code and a geometry say of them, in closed form.
+
+Scene light is taken to be Gaussian, with a covariance that is a product over rows, columns and time::
+
+    x(r, c, t) = u + Σ_k cos_k(t)·θ_k(r, c),    cov θ_k = a_k·exp(−|Δr|/ℓ)·exp(−|Δc|/ℓ)
+
+Lines are linear in it, the same map F for every pixel of both arms, so that their covariance is
+G(line, line') ⊗ exp(−|Δc|/ℓ) + noise: two small eigendecompositions give the likelihood of all samples, the
+most likely scene, and what each arm alone foretells of the other, without an iteration. Level u and scale are
+fitted. No such prior makes a good picture; but lines that a code did not make are unlikely under any of them,
+and that is what is asked here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+
+SLOW, FAST = 16, 128
+"""Cosines that are seen row by row, and those seen in few rows."""
+FAST_ROWS = 16
+BLOCK_LINES = 24
+"""Evidence is counted in blocks of lines, whose spread is its uncertainty."""
+SMALLEST = 1e-30
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """``length``: ℓ as a share of the picture; a_k = ``change``/(1 + (k/``fast``)²) beside a_0 = 1;
+    ``noise``: variance of a sample's noise beside that of its light."""
+
+    length: float
+    change: float
+    fast: float
+    noise: float
+
+    @property
+    def spectrum(self) -> Floats:
+        """a_k (FAST,)."""
+        k = np.arange(1, FAST)
+        return np.concatenate([[1.0], self.change / (1 + (k / self.fast) ** 2)])
+
+
+LADDER = tuple(
+    Prior(length, change, fast, 1e-3)
+    for length in (0.02, 0.06, 0.2)
+    for change, fast in ((1e-4, 1.0), (0.03, 3.0), (0.3, 3.0), (1.0, 3.0), (0.03, 40.0), (0.3, 40.0))
+)
+"""From a fine still to all that is smooth and fast; the noise of each is the best of `NOISES`."""
+NOISES = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
+
+
+def correlation(count: int, length: float) -> Floats:
+    """exp(−|Δ|/ℓ) of ``count`` neighbours that tile the picture."""
+    at = (np.arange(count) + 0.5) / count
+    return np.exp(-np.abs(at[:, None] - at) / length)
+
+
+class Response:
+    """F: what lines see of each row block and cosine, if ``code`` (T,) is what was shone.
+
+    ``rows`` are fine rows of the scene, ``substeps`` those of a line, ``lines`` how many, ``blocks`` the
+    row blocks.
+    """
+
+    def __init__(self, code: Floats, rows: int, substeps: int, lines: int, blocks: int) -> None:
+        self.lines, self.blocks = lines, blocks
+        k = np.arange(FAST)[:, None]
+        cosines = np.sqrt(2) * np.cos(np.pi * k * (np.arange(len(code)) + 0.5) / len(code))
+        cosines[0] = 1
+        lit = (cosines * code).T
+        summed = _window_sums(lit, substeps)
+        running = np.concatenate([np.zeros((1, FAST)), np.cumsum(summed, axis=0)])
+        first = (np.arange(lines) * substeps)[:, None]
+        # float32: the products with these are where the time goes, and the noise is far above its rounding
+        self.slow = _block_sums(running[:, :SLOW], first, rows, blocks).astype(np.float32)
+        self.fast = _block_sums(running[:, SLOW:], first, rows, min(blocks, FAST_ROWS)).astype(np.float32)
+        self.flat: Floats = self.slow[:, :, 0].sum(1, dtype=np.float64)
+
+    def covariance(self, prior: Prior) -> Floats:
+        """G (line, line)."""
+        total = np.zeros((self.lines, self.lines), np.float32)
+        for factor, weights in (
+            (self.slow, prior.spectrum[:SLOW]),
+            (self.fast, prior.spectrum[SLOW:]),
+        ):
+            near = correlation(factor.shape[1], prior.length).astype(np.float32)
+            smoothed = (near @ factor) * weights.astype(np.float32)
+            total += smoothed.reshape(self.lines, -1) @ factor.reshape(self.lines, -1).T
+        return total.astype(np.float64)
+
+
+def _window_sums(values: Floats, width: int) -> Floats:
+    running = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
+    return np.asarray(running[width:] - running[:-width])
+
+
+def _block_sums(running: Floats, first: NDArray[np.int64], rows: int, blocks: int) -> Floats:
+    """(line, block, cosine) of running sums in time: row r is exposed r sub-steps after a line's first."""
+    edges = np.linspace(0, rows, blocks + 1).round().astype(np.int64)
+    return np.diff(running[first + edges], axis=1)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fit:
+    """One arm under a model: ``level`` u, ``scale`` (variance), log likelihood ``blocks`` by blocks of lines.
+
+    ``modes`` are the lines about their level in the covariance's eigenvectors; ``told``: the amount of what
+    somebody foretold.
+    """
+
+    modes: Floats
+    level: float
+    scale: float
+    blocks: Floats
+    told: float = 0.0
+
+    @property
+    def evidence(self) -> float:
+        return float(self.blocks.sum())
+
+
+@dataclass(frozen=True, eq=False)
+class Model:
+    """Lines (line, pixel) of either arm under a response and a prior."""
+
+    response: Response
+    prior: Prior
+    _vectors: Floats = field(repr=False)
+    _values: Floats = field(repr=False)
+    _pixel_vectors: Floats = field(repr=False)
+    _pixel_values: Floats = field(repr=False)
+    _unit: float = 1.0
+
+    @classmethod
+    def of(cls, response: Response, prior: Prior, pixels: int) -> Model:
+        covariance = response.covariance(prior)
+        unit = max(float(np.trace(covariance)) / len(covariance), SMALLEST)
+        values, vectors = np.linalg.eigh(covariance / unit)
+        across = np.linalg.eigh(correlation(pixels, prior.length))
+        return cls(response, prior, vectors, np.maximum(values, 0), across[1], across[0], unit)
+
+    def with_noise(self, noise: float) -> Model:
+        prior = Prior(self.prior.length, self.prior.change, self.prior.fast, noise)
+        kept = self._vectors, self._values, self._pixel_vectors, self._pixel_values, self._unit
+        changed = Model(self.response, prior, *kept)
+        changed.__dict__["_level"] = self._level  # modes do not depend on the noise
+        return changed
+
+    @cached_property
+    def _variance(self) -> Floats:
+        return self._values[:, None] * self._pixel_values + self.prior.noise
+
+    @cached_property
+    def _level(self) -> Floats:
+        """A uniform steady scene's lines, as modes."""
+        return self.modes(np.broadcast_to(self.response.flat[:, None], (self.response.lines, self.pixels)))
+
+    @property
+    def pixels(self) -> int:
+        return len(self._pixel_values)
+
+    def modes(self, lines: Floats) -> Floats:
+        return np.asarray(self._vectors.T @ lines @ self._pixel_vectors)
+
+    def fit(self, lines: Floats) -> Fit:
+        """The likelihood of ``lines``."""
+        return self._explained(self.modes(lines), [self._level])
+
+    def informed(self, fit: Fit, foretold: Floats) -> Fit:
+        """The same lines where part is ``foretold`` by somebody, believed as far as that is worth it."""
+        better = self._explained(fit.modes, [self._level, self.modes(foretold)])
+        return better if better.told > 0 else fit
+
+    def _explained(self, modes: Floats, regressors: list[Floats]) -> Fit:
+        amounts, _ = self.regress(modes, regressors)
+        rest = modes - sum(amount * each for amount, each in zip(amounts, regressors, strict=True))
+        scale = max(float((rest**2 / self._variance).mean()), SMALLEST)
+        told = float(amounts[1]) if len(amounts) > 1 else 0.0
+        return Fit(rest, float(amounts[0]), scale, self._blocks(rest, scale), told)
+
+    def evidence(self, modes: Floats) -> float:
+        """Log likelihood of lines given as modes."""
+        level, weighted = self._level, self._level / self._variance
+        rest = modes - float((weighted * modes).sum() / (weighted * level).sum()) * level
+        scale = max(float((rest**2 / self._variance).mean()), SMALLEST)
+        return -0.5 * float(rest.size * (1 + np.log(scale)) + np.log(self._variance).sum())
+
+    def regress(self, modes: Floats, regressors: list[Floats]) -> tuple[Floats, Floats]:
+        """Amounts of ``regressors`` that explain ``modes`` best, and their covariance for a scale of 1."""
+        weighted = [each / self._variance for each in regressors]
+        normal = np.array([[float((a * b).sum()) for b in regressors] for a in weighted])
+        inverse = np.linalg.inv(normal + SMALLEST * np.eye(len(normal)))
+        amounts = inverse @ np.array([float((a * modes).sum()) for a in weighted])
+        return amounts.astype(np.float64), inverse.astype(np.float64)
+
+    def _blocks(self, rest: Floats, scale: float) -> Floats:
+        """Log likelihood, shared among blocks of lines by their part in the quadratic form."""
+        lines = self.response.lines
+        values, pulled = self._vectors @ rest, self._vectors @ (rest / self._variance)
+        per_line = (values * pulled).sum(1) / scale
+        constant = (np.log(self._variance).sum() + rest.size * np.log(scale)) / lines
+        edges = np.linspace(0, lines, max(1, round(lines / BLOCK_LINES)) + 1).round().astype(int)
+        return np.asarray(-0.5 * np.add.reduceat(per_line + constant, edges[:-1]))
+
+    def scene(self, fit: Fit) -> NDArray[np.float32]:
+        """The most likely slow scene (row block, cosine, pixel), in units of the lines per sub-step."""
+        pulled = self._vectors @ (fit.modes / self._variance) / self._unit
+        pulled = (pulled * self._pixel_values) @ self._pixel_vectors.T
+        back = np.tensordot(self.response.slow, pulled.astype(np.float32), axes=(0, 0))
+        near = correlation(self.response.blocks, self.prior.length).astype(np.float32)
+        scene = np.tensordot(near, back, axes=1)
+        scene *= self.prior.spectrum[:SLOW, None]
+        scene[:, 0] += fit.level
+        return np.asarray(scene)
+
+    def foretell(self, scene: NDArray[np.float32]) -> Floats:
+        """Lines (line, pixel) of a scene (row block, cosine, pixel)."""
+        factor = self.response.slow.reshape(self.response.lines, -1)
+        return np.asarray(factor @ scene.reshape(factor.shape[1], -1), np.float64)
+
+    def constant(self, lines: Floats) -> tuple[float, float]:
+        """What every sample has that follows no code, and its standard error."""
+        modes = self.modes(lines)
+        amounts, covariance = self.regress(modes, [self._level, self.modes(np.ones_like(lines))])
+        rest = modes - amounts[0] * self._level - amounts[1] * self.modes(np.ones_like(lines))
+        scale = float((rest**2 / self._variance).mean())
+        return float(amounts[1]), float(np.sqrt(scale * covariance[1, 1]))
+
+    def level_error(self, fit: Fit) -> float:
+        """Standard error of a fit's level."""
+        return float(np.sqrt(fit.scale * self.regress(fit.modes, [self._level])[1][0, 0]))
+
+
+def best_model(response: Response, arms: list[Floats]) -> Model:
+    """With the prior of the ladder under which the lines of all ``arms`` are likeliest."""
+    best: tuple[float, Model] | None = None
+    for step in LADDER:
+        model = Model.of(response, step, arms[0].shape[1])
+        modes = [model.modes(arm) for arm in arms]
+        for noise in NOISES:
+            noisy = model.with_noise(noise)
+            total = sum(noisy.evidence(each) for each in modes)
+            if best is None or total > best[0]:
+                best = (total, noisy)
+    assert best is not None
+    return best[1]

@@ -1,0 +1,132 @@
+"""What is said of lines, tried against them: the truth is found, or nothing is claimed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from acquire.codes import mix_seed, prbs
+from acquire.forward import DualArm
+from acquire.geometry import Geometry
+from acquire.lines import Segment
+from acquire.recon.hypotheses import AS_BUILT, TURNS, Hypothesis, Turn, Witness, compare
+from acquire.recon.search import Inquiry, Standing, inquire
+
+GEOMETRY = Geometry(24, 3, 120)
+
+
+def lit_by(seed: int, start: int = 0, geometry: Geometry = GEOMETRY) -> np.ndarray:
+    return prbs(31, mix_seed(seed, 31), start, geometry.span)
+
+
+def recorded(scene_seed: int = 1, *, texture: float = 3.0) -> Segment:
+    """A textured still before which a bright disc passes, with a camera's noise."""
+    rng, n = np.random.default_rng(scene_seed), GEOMETRY.size
+    ground = gaussian_filter(rng.standard_normal((n, n)), texture, mode="wrap")
+    ground = 0.5 + 0.2 * ground / ground.std()
+    y, x = np.mgrid[:n, :n] / n
+    video = np.stack(
+        [
+            np.where(np.hypot(y - 0.4, x - 0.1 - 0.8 * t / GEOMETRY.span) < 0.12, 1.0, np.clip(ground, 0, 1))
+            for t in range(GEOMETRY.span)
+        ]
+    ).astype(np.float32)
+    code = lit_by(scene_seed)
+    exact = DualArm(GEOMETRY, code).forward(video)
+    lines = exact + rng.standard_normal(exact.shape) * 0.01 * exact.max()
+    return Segment(
+        lines=lines,
+        mask=np.ones(GEOMETRY.lines_shape, bool),
+        code=code,
+        geometry=GEOMETRY,
+        time_ns=np.arange(GEOMETRY.lines, dtype=np.int64) * 30_000,
+    )
+
+
+def found(segment: Segment) -> Inquiry:
+    return inquire(Witness(segment))
+
+
+def test_what_is_right_is_left_alone() -> None:
+    inquiry = found(recorded())
+    assert inquiry.standing is Standing.RIGHT
+    assert inquiry.best is inquiry.said
+
+
+def test_a_late_code_is_named_to_the_substep() -> None:
+    segment = recorded()
+    for late in (1, 3):
+        inquiry = found(replace(segment, code=lit_by(1, late)))
+        assert inquiry.standing is Standing.NAMED
+        assert inquiry.best.hypothesis == Hypothesis(late=(late, late))
+
+
+def test_an_inverted_code_is_named() -> None:
+    segment = recorded()
+    inquiry = found(replace(segment, code=1 - segment.code))
+    assert inquiry.standing is Standing.NAMED
+    assert inquiry.best.hypothesis == Hypothesis(inverted=True)
+
+
+def test_another_runs_code_explains_nothing() -> None:
+    assert found(replace(recorded(), code=lit_by(77))).standing is Standing.UNEXPLAINED
+
+
+def test_turned_arms_are_named() -> None:
+    segment = recorded()
+    a, b = segment.lines
+    turned = {
+        Turn(pixels=True): np.stack([a, b[:, ::-1]]),
+        Turn(rows=True): np.stack([a[:, ::-1], b]),
+        Turn(rows=True, pixels=True): np.stack([b, a]),
+    }
+    for turn, lines in turned.items():
+        inquiry = found(replace(segment, lines=lines))
+        assert inquiry.standing is Standing.NAMED
+        assert inquiry.best.hypothesis == Hypothesis(turn=turn)
+
+
+def test_another_number_of_substeps_is_named() -> None:
+    four = Geometry(24, 4, 120)
+    inquiry = found(replace(recorded(), geometry=four, code=lit_by(1, geometry=four)))
+    assert inquiry.standing is Standing.NAMED
+    assert inquiry.best.hypothesis == Hypothesis(substeps=3)
+
+
+def test_lost_samples_do_not_matter() -> None:
+    segment = recorded()
+    segment.mask[:, 40:43] = False
+    segment.mask[0, :, 7] = False
+    segment.lines[~segment.mask] = 0
+    assert found(segment).standing is Standing.RIGHT
+
+
+def test_of_a_uniform_scene_nothing_is_claimed() -> None:
+    """Mirrored it is itself."""
+    segment = recorded()
+    flat = DualArm(GEOMETRY, segment.code).forward(
+        np.ones((GEOMETRY.span, GEOMETRY.size, GEOMETRY.size), np.float32)
+    )
+    flat += np.random.default_rng(3).standard_normal(flat.shape).astype(np.float32)
+    assert found(replace(segment, lines=flat)).standing is not Standing.NAMED
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_turns_undo_themselves(turn: Turn) -> None:
+    scene = np.random.default_rng(0).random((5, 2, 5)).astype(np.float32)
+    assert (turn.to_a(turn.to_b(scene)) == scene).all()
+
+
+def test_arm_b_is_built_as_the_forward_model_says() -> None:
+    """Rows of arm B are the scene's columns from right to left."""
+    scene = np.arange(9, dtype=np.float32).reshape(3, 1, 3)
+    assert (AS_BUILT.to_b(scene)[:, 0] == scene[:, 0].T[::-1]).all()
+
+
+def test_evidence_is_compared_with_its_spread() -> None:
+    more, errors = compare(np.array([2.0, 3.0, 4.0]), np.zeros(3))
+    assert more == 9
+    assert errors == pytest.approx(9 / np.sqrt(3))
