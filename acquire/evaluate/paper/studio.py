@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.config import RigConfig, load_plan, load_rig, load_scene
+from acquire.effect_config import ReadNoise, ShotNoise
 from acquire.evaluate.metrics import psnr, ssim
 from acquire.recon import reconstruct
 from acquire.recon.segments import Voxels
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
     from acquire.sim.scene import Scene
     from acquire.store import Recording
 
+FULL_WELL_E, READ_NOISE_E = 1e4, 10.0
+"""Of an ordinary camera: electrons of the brightest sample, and of the noise in the dark."""
 TRUE_PEAK = 1.0
 """Light of the scenes at their brightest."""
 
@@ -112,21 +115,34 @@ class Studio:
     say: Callable[[str], object] = lambda _: None
     seconds: dict[str, float] = field(default_factory=dict)
 
-    def record(self, scene_name: str, lines: int, *, interline: bool = False) -> Recording:
-        """A new recording of a built-in scene with its rig, and this studio's exposure code.
+    def record(
+        self, scene_name: str, lines: int, *, interline: bool = False, gain_dn_per_e: float | None = None
+    ) -> Recording:
+        """A recording of a built-in scene with its rig, and this studio's exposure code; made once.
 
-        ``interline`` looks at it with whole steps of charge instead, the baseline of Fig. 6.
+        ``interline`` looks at it with whole steps of charge instead, the baseline of Fig. 6; with
+        ``gain_dn_per_e`` by a camera that has shot noise and `READ_NOISE_E`.
         """
         name = f"{scene_name}-interline" if interline else scene_name
+        name += "" if gain_dn_per_e is None else "-noisy"
+        if (self.directory / f"{name}.zarr").exists():
+            return open_recording(self.directory / f"{name}.zarr")
         self.say(f"recording {name}")
         scene = load_scene(scene_name)
         if interline:
             optics = OpticsConfig(layout="interline")
             scene = scene.model_copy(update={"optics": optics, "rig": "rig-interline"})
+        if gain_dn_per_e is not None:
+            noise = (ShotNoise(kind="shot_noise"), ReadNoise(kind="read_noise", sigma_e=READ_NOISE_E))
+            scene = scene.model_copy(update={"effects": noise, "system_gain_dn_per_e": gain_dn_per_e})
         rig = load_rig(scene.rig, {"code.seed": self.seed})
         path = self.directory / f"{name}.zarr"
         simulate(rig, scene, path, lines)
         return open_recording(path)
+
+    def gain(self, segment: Segment) -> float:
+        """DN per electron of a camera whose full well is the brightest sample of ``segment``."""
+        return float((segment.lines.max() - np.min(segment.black_level_dn)) / FULL_WELL_E)
 
     def solve(self, segment: Segment, spatial_merge: int, temporal_merge: int, what: str) -> Reconstruction:
         """Reconstruct a segment by the studio's options; the time it takes is noted under ``what``."""
