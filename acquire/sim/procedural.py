@@ -1,0 +1,348 @@
+"""Procedural scenes that nothing was tuned on, as an ordinary camera records them.
+
+    bullet    a small dark block crosses a bright textured still
+    splash    a blob deforms and throws drops
+    shock     a thin ring expands on dark ground
+    disc      a checkered disc turns
+    text      letters scroll
+    spark     a flash of 12 sub-steps before a textured still
+    flame     smooth texture flickers and rises
+    flicker   everything's brightness changes while something moves
+    runner    a jointed figure crosses textured ground
+    traffic   boxes pass each other on a textured road
+    leds      three lamps behind masks, sinusoids of 5, 2.5 and 1 kHz at 100 kHz, and one that is steady
+    leds_dot  the same, and a dot that moves
+    fastled   lamps of 20 kHz and 1 kHz
+    still     a textured still
+
+Sizes are shares of the picture, times shares of the span, so that a scene is the same at any M, S and L_R;
+only the lamps blink in sub-steps. The noise is that of a camera of 12 bits whose brightest sample is
+``full_well_e``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image as Pil
+from PIL import ImageDraw, ImageFont
+from scipy.ndimage import gaussian_filter
+
+from acquire.codes import mix_seed, prbs
+from acquire.forward import DualArm, merge_video
+from acquire.geometry import Geometry
+from acquire.lines import Segment
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from numpy.typing import NDArray
+
+    Image = NDArray[Any]
+
+TOP_DN = 3700.0
+"""The brightest sample: 90 % of 12 bits."""
+SUBSTEP_HZ = 100e3
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Noise of EMVA 1288's linear model; ``full_well_e`` electrons make the brightest sample."""
+
+    full_well_e: float = 1e4
+    read_noise_e: float = 10.0
+
+
+CLEAN = Camera(np.inf, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """A segment, and the light (T, n, n) that it is of."""
+
+    segment: Segment
+    light: NDArray[np.float32]
+
+    def truth(self, spatial_merge: int, temporal_merge: int) -> NDArray[np.float32]:
+        """The voxels that a reconstruction should give, frames of the trusted interval."""
+        video = merge_video(self.light, spatial_merge, temporal_merge)
+        return np.asarray(video[self.segment.geometry.trusted_frames(temporal_merge)], np.float32)
+
+
+class Stage:
+    """Coordinates (0 to 1) and random texture of a picture of n × n; every scene draws on one."""
+
+    def __init__(self, n: int, span: int, seed: int) -> None:
+        self.n, self.span, self.rng = n, span, np.random.default_rng(seed)
+        self.y, self.x = np.meshgrid(*[(np.arange(n) + 0.5) / n] * 2, indexing="ij")
+
+    def texture(self, *scales: float) -> Image:
+        """Smooth noise of several scales (shares of the picture), from 0 to 1."""
+        total = sum(
+            gaussian_filter(self.rng.standard_normal((self.n, self.n)), scale * self.n, mode="wrap") * scale
+            for scale in scales
+        )
+        low, high = np.quantile(np.asarray(total), [0.01, 0.99])
+        return np.clip((total - low) / (high - low), 0, 1).astype(np.float32)
+
+    def inside(self, distance: Any) -> Image:
+        """1 where a signed distance (shares of the picture) is negative, one pixel soft."""
+        return np.clip(0.5 - distance * self.n, 0, 1).astype(np.float32)
+
+    def ball(self, y: float, x: float, radius: float) -> Image:
+        return self.inside(np.hypot(self.y - y, self.x - x) - radius)
+
+    def box(self, y: float, x: float, height: float, width: float) -> Image:
+        return self.inside(np.maximum(abs(self.y - y) - height / 2, abs(self.x - x) - width / 2))
+
+    def limb(self, y: float, x: float, angle: float, length: float, width: float) -> Image:
+        """A rounded line from (y, x), ``angle`` from straight down."""
+        dy, dx = self.y - y, self.x - x
+        along = np.clip(dy * np.cos(angle) + dx * np.sin(angle), 0, length)
+        return self.inside(np.hypot(dy - along * np.cos(angle), dx - along * np.sin(angle)) - width / 2)
+
+    @cached_property
+    def ground(self) -> Image:
+        return 0.35 + 0.65 * self.texture(0.008, 0.03, 0.1)
+
+
+def _over(ground: Image, mask: Image, value: float | Image) -> Image:
+    return ground * (1 - mask) + mask * value
+
+
+def bullet(s: Stage) -> Callable[[int, float], Image]:
+    row = s.rng.uniform(0.3, 0.7)
+    return lambda _t, tau: _over(s.ground, s.box(row, -0.05 + 1.1 * tau, 0.052, 0.094), 0.05)
+
+
+def splash(s: Stage) -> Callable[[int, float], Image]:
+    angle, far = np.arctan2(s.y - 0.55, s.x - 0.5), np.hypot(s.y - 0.55, s.x - 0.5)
+    phases, drops = (
+        s.rng.uniform(0, 2 * np.pi, 4),
+        s.rng.uniform([-0.5, 0.5, 0.015], [0.5, 1.1, 0.04], (7, 3)),
+    )
+
+    def frame(_t: int, tau: float) -> Image:
+        rim = (
+            0.14
+            + 0.1 * tau
+            + sum(
+                0.035 * tau**0.5 * np.sin((k + 2) * angle + phases[k] + 4 * tau * (-1) ** k) for k in range(4)
+            )
+        )
+        image = 0.04 + 0.8 * s.inside(far - rim)
+        for sideways, up, radius in drops:
+            y = 0.5 - up * 0.6 * tau + 0.5 * tau**2
+            image = np.maximum(image, 0.9 * s.ball(y, 0.5 + sideways * tau, radius))
+        return np.asarray(image, np.float32)
+
+    return frame
+
+
+def shock(s: Stage) -> Callable[[int, float], Image]:
+    y, x = s.rng.uniform(0.4, 0.6, 2)
+    far = np.hypot(s.y - y, s.x - x)
+    return lambda _t, tau: 0.03 + 0.9 * s.inside(abs(far - 0.08 - 0.4 * tau**0.8) - 0.012)
+
+
+def disc(s: Stage) -> Callable[[int, float], Image]:
+    far, angle, start = np.hypot(s.y - 0.5, s.x - 0.5), np.arctan2(s.y - 0.5, s.x - 0.5), s.rng.uniform(0, 6)
+    mask, rings = s.inside(far - 0.4), np.floor(far / 0.1)
+    turns = s.rng.uniform(0.5, 0.8)
+
+    def frame(_t: int, tau: float) -> Image:
+        field = np.sin(6 * (angle + start - 2 * np.pi * turns * tau)) * (-1.0) ** rings
+        return _over(np.float32(0.1) * np.ones_like(mask), mask, 0.35 + 0.25 * np.clip(field * 8, -1, 1))
+
+    return frame
+
+
+def text(s: Stage) -> Callable[[int, float], Image]:
+    n, letters = s.n, "".join(s.rng.choice(list("ABCDEFGHKLMNPRSTXYZ0123456789"), 14))
+    sheet = Pil.new("L", (3 * n, n))
+    draw, font = ImageDraw.Draw(sheet), ImageFont.load_default(size=n // 4)
+    for row in range(3):
+        draw.text((n // 20, row * n // 3 + n // 40), letters[row * 4 :] + letters, fill=255, font=font)
+    wide = np.asarray(sheet, np.float32) / 255
+    speed = s.rng.uniform(0.35, 0.55)
+
+    def frame(_t: int, tau: float) -> Image:
+        whole, part = divmod(speed * n * tau, 1)
+        views = [wide[:, int(whole) + k : int(whole) + k + n] for k in (0, 1)]
+        return np.float32(0.05) + np.float32(0.9) * ((1 - part) * views[0] + part * views[1]).astype(
+            np.float32
+        )
+
+    return frame
+
+
+def spark(s: Stage) -> Callable[[int, float], Image]:
+    begin, (y, x) = int(s.rng.uniform(0.42, 0.58) * s.span), s.rng.uniform(0.3, 0.7, 2)
+    flash = np.exp(-((s.y - y) ** 2 + (s.x - x) ** 2) / 2 / 0.07**2).astype(np.float32)
+    return lambda t, _tau: 0.5 * s.ground + (2.0 * flash if begin <= t < begin + 12 else np.float32(0))
+
+
+def flame(s: Stage) -> Callable[[int, float], Image]:
+    fields = [
+        gaussian_filter(s.rng.standard_normal((3 * s.n, s.n)), s.n * k, mode="wrap") for k in (0.05, 0.1)
+    ]
+    fields = [field / field.std() for field in fields]
+    body = np.exp(-((s.x - 0.5) ** 2) / 2 / (0.05 + 0.2 * s.y) ** 2) * np.clip(1.3 * s.y, 0, 1)
+
+    def frame(_t: int, tau: float) -> Image:
+        rise = [int(speed * s.n * tau) for speed in (1.2, 0.8)]
+        waves = sum(np.roll(field, -step, axis=0)[: s.n] for field, step in zip(fields, rise, strict=True))
+        breath = 1 + 0.15 * np.sin(2 * np.pi * 5 * tau)
+        return (0.02 + body * breath / (1 + np.exp(-1.2 * waves))).astype(np.float32)
+
+    return frame
+
+
+def flicker(s: Stage) -> Callable[[int, float], Image]:
+    rate = s.rng.uniform(9, 15)
+
+    def frame(_t: int, tau: float) -> Image:
+        image = _over(s.ground, s.ball(0.5, 0.15 + 0.7 * tau, 0.12), 0.1)
+        return image * np.float32(0.6 + 0.4 * np.sin(2 * np.pi * rate * tau))
+
+    return frame
+
+
+def runner(s: Stage) -> Callable[[int, float], Image]:
+    def frame(_t: int, tau: float) -> Image:
+        x, swing, image = 0.1 + 0.8 * tau, 0.7 * np.sin(2 * np.pi * 3 * tau), s.ground * 0.6
+        for angle in (swing, -swing):
+            image = _over(image, s.limb(0.55, x, angle, 0.25, 0.05), 0.08)
+            image = _over(image, s.limb(0.33, x, -1.2 * angle, 0.18, 0.04), 0.95)
+        image = _over(image, s.limb(0.3, x, 0.0, 0.26, 0.1), 0.9)
+        return _over(image, s.ball(0.21, x, 0.06), 0.75)
+
+    return frame
+
+
+def traffic(s: Stage) -> Callable[[int, float], Image]:
+    cars = s.rng.uniform([0.0, -1, 0.1], [1, 1, 1.0], (6, 3))
+
+    def frame(_t: int, tau: float) -> Image:
+        image = s.ground * 0.7
+        for lane, (start, speed, grey) in enumerate(cars):
+            x = (start + 0.6 * np.sign(speed) * (0.4 + abs(speed)) * tau) % 1.3 - 0.15
+            image = _over(image, s.box((lane + 0.6) / 6.3, x, 0.09, 0.2), grey)
+            image = _over(image, s.box((lane + 0.6) / 6.3, x, 0.05, 0.08), 1 - grey)
+        return image
+
+    return frame
+
+
+def _lamps(s: Stage, hertz: tuple[float, ...]) -> Callable[[int, float], Image]:
+    shapes = [s.ball(0.27, 0.27, 0.16), s.box(0.27, 0.73, 0.24, 0.28), s.ball(0.73, 0.27, 0.17)]
+    shapes[2] = shapes[2] * (1 - s.ball(0.73, 0.27, 0.08))
+    steady = s.box(0.68, 0.73, 0.06, 0.3) + s.box(0.8, 0.73, 0.06, 0.3)
+    phases = s.rng.uniform(0, 2 * np.pi, len(hertz))
+
+    def frame(t: int, __tau: float) -> Image:
+        image = 0.6 * steady if len(hertz) > 2 else np.zeros_like(steady)
+        for shape, rate, phase in zip(shapes, hertz, phases, strict=False):
+            image = image + shape * np.float32(0.5 + 0.5 * np.sin(2 * np.pi * rate * t / SUBSTEP_HZ + phase))
+        return image
+
+    return frame
+
+
+def leds(s: Stage) -> Callable[[int, float], Image]:
+    return _lamps(s, (5e3, 2.5e3, 1e3))
+
+
+def leds_dot(s: Stage) -> Callable[[int, float], Image]:
+    lamps = _lamps(s, (5e3, 2.5e3, 1e3))
+    return lambda t, tau: _over(lamps(t, tau), s.ball(0.5, 0.1 + 0.8 * tau, 0.05), 0.8)
+
+
+def fastled(s: Stage) -> Callable[[int, float], Image]:
+    return _lamps(s, (20e3, 1e3))
+
+
+def still(s: Stage) -> Callable[[int, float], Image]:
+    sharp = (s.texture(0.006, 0.02, 0.07) > 0.5).astype(np.float32)
+    image = 0.15 + 0.7 * gaussian_filter(sharp, 0.5)
+    return lambda _t, _tau: image
+
+
+SCENES = {
+    f.__name__: f
+    for f in (
+        bullet,
+        splash,
+        shock,
+        disc,
+        text,
+        spark,
+        flame,
+        flicker,
+        runner,
+        traffic,
+        leds,
+        leds_dot,
+        fastled,
+        still,
+    )
+}
+
+
+def light(name: str, seed: int, n: int, span: int) -> NDArray[np.float32]:
+    """The scene (span, n, n)."""
+    frame = SCENES[name](Stage(n, span, seed))
+    video = np.empty((span, n, n), np.float32)
+    for t in range(span):
+        video[t] = frame(t, t / (span - 1))
+    return video
+
+
+def record(
+    name: str,
+    seed: int,
+    *,
+    stages: int = 64,
+    substeps: int = 3,
+    lines: int = 263,
+    camera: Camera = Camera(),
+) -> Recorded:
+    """The scene as recorded under code ``seed``; scene and noise are of the same seed."""
+    geometry = Geometry(stages, substeps, lines)
+    code = prbs(31, mix_seed(seed, 31), 0, geometry.span)
+    video = light(name, seed, geometry.size, geometry.span)
+    exact = DualArm(geometry, code).forward(video).astype(np.float64)
+    return Recorded(expose(exact, geometry, code, camera, seed), video)
+
+
+def expose(
+    exact: NDArray[np.float64], geometry: Geometry, code: NDArray[np.uint8], camera: Camera, seed: int
+) -> Segment:
+    """Y of Eq. (1) as 12-bit lines of a camera."""
+    rng, top = np.random.default_rng([seed, 1]), exact.max()
+    if np.isfinite(camera.full_well_e):
+        electrons = rng.poisson(
+            exact * (camera.full_well_e / top)
+        ) + camera.read_noise_e * rng.standard_normal(exact.shape)
+        lines = np.rint(electrons * (TOP_DN / camera.full_well_e) + BLACK_DN)
+    else:
+        lines = np.rint(exact * (TOP_DN / top) + BLACK_DN)
+    pixels = np.clip(lines, 0, 4095).astype(np.uint16)
+    time_ns = (np.arange(geometry.lines) * round(1e9 * geometry.substeps / SUBSTEP_HZ)).astype(np.int64)
+    return Segment(
+        lines=pixels,
+        mask=(pixels < 4095),
+        code=code,
+        geometry=geometry,
+        time_ns=time_ns,
+        substep_ns=1e9 / SUBSTEP_HZ,
+        black_level_dn=BLACK_DN,
+        responsivity_dn=TOP_DN / top,
+    )
+
+
+BLACK_DN = 100.0
+"""So that noise about darkness is not cut off."""
