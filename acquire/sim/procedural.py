@@ -86,11 +86,11 @@ class Stage:
             for scale in scales
         )
         low, high = np.quantile(np.asarray(total), [0.01, 0.99])
-        return np.clip((total - low) / (high - low), 0, 1).astype(np.float32)
+        return np.asarray(np.clip((total - low) / (high - low), 0, 1), np.float32)
 
     def inside(self, distance: Any) -> Image:
         """1 where a signed distance (shares of the picture) is negative, one pixel soft."""
-        return np.clip(0.5 - distance * self.n, 0, 1).astype(np.float32)
+        return np.asarray(np.clip(0.5 - distance * self.n, 0, 1), np.float32)
 
     def ball(self, y: float, x: float, radius: float) -> Image:
         return self.inside(np.hypot(self.y - y, self.x - x) - radius)
@@ -106,7 +106,7 @@ class Stage:
 
     @cached_property
     def ground(self) -> Image:
-        return 0.35 + 0.65 * self.texture(0.008, 0.03, 0.1)
+        return np.asarray(0.35 + 0.65 * self.texture(0.008, 0.03, 0.1))
 
 
 def _over(ground: Image, mask: Image, value: float | Image) -> Image:
@@ -196,7 +196,7 @@ def flame(s: Stage) -> Callable[[int, float], Image]:
         rise = [int(speed * s.n * tau) for speed in (1.2, 0.8)]
         waves = sum(np.roll(field, -step, axis=0)[: s.n] for field, step in zip(fields, rise, strict=True))
         breath = 1 + 0.15 * np.sin(2 * np.pi * 5 * tau)
-        return (0.02 + body * breath / (1 + np.exp(-1.2 * waves))).astype(np.float32)
+        return np.asarray(0.02 + body * breath / (1 + np.exp(-1.2 * waves)), np.float32)
 
     return frame
 
