@@ -110,7 +110,7 @@ class Stage:
 
 
 def _over(ground: Image, mask: Image, value: float | Image) -> Image:
-    return ground * (1 - mask) + mask * value
+    return np.asarray(ground * (1 - mask) + mask * value)
 
 
 def bullet(s: Stage) -> Callable[[int, float], Image]:
