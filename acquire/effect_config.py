@@ -91,13 +91,41 @@ class TriggerJitter(FrozenModel):
 
 
 class Misregistration(FrozenModel):
-    """The image of one arm lies off by fractions of a fine pixel (bilinear), or is turned."""
+    """The image of one arm lies off by fractions of a fine pixel (bilinear), is turned, or is larger."""
 
     kind: Literal["misregistration"]
     arm: Literal["a", "b"] = "b"
     rows: float = Field(default=0.0, ge=-64, le=64, description="fine pixels downwards, in arm A's view")
     columns: float = Field(default=0.0, ge=-64, le=64, description="fine pixels to the right")
     turn_deg: float = Field(default=0.0, ge=-45, le=45, description="counter-clockwise about the centre")
+    magnification: float = Field(default=1.0, ge=0.5, le=2, description="about the centre")
+    beyond: Literal["dark", "edge"] = Field(
+        default="dark", description="what lies beyond the field: nothing, or what is at its edge"
+    )
+
+
+class LensDistortion(FrozenModel):
+    """The lens of one arm, or of both, is not true: radial, of the third order, bilinear."""
+
+    kind: Literal["lens_distortion"]
+    arm: Literal["a", "b", "both"] = "both"
+    part: float = Field(
+        ge=-0.2,
+        le=0.2,
+        description="of half the field, by which the middle of a side is seen too far out; below 0: in",
+    )
+
+
+class Vignetting(FrozenModel):
+    """Less light far from the axis of an arm's lens."""
+
+    kind: Literal["vignetting"]
+    arm: Literal["a", "b", "both"] = "both"
+    loss: Part = Field(description="of the light, as far from the axis as a corner is from the middle")
+    rows: float = Field(
+        default=0.0, ge=-1024, le=1024, description="fine pixels of the axis below the middle"
+    )
+    columns: float = Field(default=0.0, ge=-1024, le=1024, description="fine pixels to its right")
 
 
 class PointSpread(FrozenModel):
@@ -163,6 +191,17 @@ class FullWell(FrozenModel):
     capacity_e: Positive = Field(description="μ_e.sat")
 
 
+class ColumnDefects(FrozenModel):
+    """Columns that are hot (electrons that nothing lit) or dead (none), at places drawn by the seed."""
+
+    kind: Literal["column_defects"]
+    hot: int = Field(default=0, ge=0, le=2**16, description="columns of each arm")
+    hot_e: float = Field(
+        default=1000.0, gt=0, le=MOST_DN, description="mean electrons of a hot column's line"
+    )
+    dead: int = Field(default=0, ge=0, le=2**16, description="columns of each arm")
+
+
 class ReadNoise(FrozenModel):
     """Temporal dark noise: N(0, σ_d) electrons per sample."""
 
@@ -176,6 +215,24 @@ class ColumnOffsets(FrozenModel):
     kind: Literal["column_offsets"]
     sigma_dn: Positive
     channels: int = Field(default=4, ge=1, le=2**16, description="columns c, c + channels … share one")
+
+
+class Drift(FrozenModel):
+    """Offset and gain move with time, as a camera does that warms up."""
+
+    kind: Literal["drift"]
+    hours: float = Field(default=0.0, ge=0, le=1e5, description="since it was as configured, at line 0")
+    offset_dn_per_hour: float = Field(default=0.0, ge=-MOST_DN, le=MOST_DN)
+    gain_per_hour: float = Field(default=0.0, ge=-1, le=1, description="as a part of 1")
+
+
+class AdcNonlinearity(FrozenModel):
+    """A converter whose line bends: right at black and at white, off between."""
+
+    kind: Literal["adc_nonlinearity"]
+    bow: float = Field(
+        ge=-0.2, le=0.2, description="of the range, by which the middle of it is read too high"
+    )
 
 
 class Adc(FrozenModel):
@@ -207,6 +264,8 @@ EffectConfig = Annotated[
     | LedRiseFall
     | TriggerJitter
     | Misregistration
+    | LensDistortion
+    | Vignetting
     | PointSpread
     | StrayLight
     | BeamSplitter
@@ -215,9 +274,12 @@ EffectConfig = Annotated[
     | Dsnu
     | DarkCurrent
     | ShotNoise
+    | ColumnDefects
     | FullWell
     | ReadNoise
+    | Drift
     | ColumnOffsets
+    | AdcNonlinearity
     | Adc
     | DroppedLines
     | DuplicatedLines,

@@ -29,6 +29,8 @@ PARAMETERS = {
     "led_rise_fall": {"rise_s": 3e-6, "fall_s": 5e-6},
     "trigger_jitter": {"sigma_s": 1e-6},
     "misregistration": {"arm": "a", "rows": 0.4},
+    "lens_distortion": {"part": 0.06},
+    "vignetting": {"loss": 0.3},
     "psf": {"sigma_pixels": 1.2},
     "stray_light": {"veil": 0.05, "ambient": 0.02},
     "beam_splitter": {"part_a": 0.45},
@@ -37,9 +39,12 @@ PARAMETERS = {
     "shot_noise": {},
     "dark_current": {"electrons_per_s": 5e6},
     "dsnu": {"dsnu_e": 40.0},
+    "column_defects": {"hot": 1, "hot_e": 300.0, "dead": 1},
     "full_well": {"capacity_e": 600.0},
     "read_noise": {"sigma_e": 60.0},
     "column_offsets": {"sigma_dn": 4.0, "channels": 4},
+    "drift": {"hours": 2.0, "offset_dn_per_hour": 3.0, "gain_per_hour": 0.01},
+    "adc_nonlinearity": {"bow": 0.03},
     "adc": {"bits": 8},
     "dropped_lines": {"rate": 0.02},
     "duplicated_lines": {"rate": 0.02},
@@ -345,6 +350,86 @@ def test_misregistration_shifts_by_fractions_of_a_pixel_and_turns():
     np.testing.assert_allclose(turned, expected, atol=0.1)
     other = bench(spot(effects("misregistration"))).camera("b", LIT)
     assert other.stages == ()
+
+
+def test_an_image_may_be_larger_and_the_scene_go_on_beyond_the_field():
+    point = np.zeros((1, N, N), np.float32)
+    point[0, 4, 12] = 1  # 7.5 above the middle, half a pixel to the right
+    (stage,) = (
+        bench(flat(listed=effects("misregistration", rows=0.0, magnification=1.2))).camera("a", LIT).stages
+    )
+    seen = stage.run(point)[0]
+    rows, columns = np.indices(seen.shape) - (N - 1) / 2
+    assert (seen * rows).sum() / seen.sum() == pytest.approx(1.2 * -7.5, abs=0.05)
+    assert (seen * columns).sum() / seen.sum() == pytest.approx(1.2 * 0.5, abs=0.05)
+    assert seen.sum() == pytest.approx(1.2**2, rel=0.1)
+    shifted = {"rows": 3.0, "columns": 0.0}
+    for beyond, light in (("dark", 0.0), ("edge", 1.0)):
+        (stage,) = (
+            bench(flat(listed=effects("misregistration", beyond=beyond, **shifted))).camera("a", LIT).stages
+        )
+        white = stage.run(np.ones((1, N, N), np.float32))[0]
+        np.testing.assert_allclose(white[:3], light)
+        np.testing.assert_allclose(white[3:], 1.0)
+
+
+@pytest.mark.parametrize("part", [0.06, -0.06])
+def test_a_lens_shows_the_middle_of_a_side_too_far_out_or_in(part):
+    half, middle = N / 2, (N - 1) / 2
+    scene = np.zeros((1, N, N), np.float32)
+    scene[0, 11:13, 20] = 1  # 8.5 to the right of the middle
+    (stage,) = bench(flat(listed=effects("lens_distortion", part=part))).camera("b", LIT).stages
+    seen = stage.run(scene)[0]
+    out = (seen * np.arange(N)).sum() / seen.sum() - middle
+    assert out * (1 - part * (out**2 + 0.25) / half**2) == pytest.approx(8.5, abs=0.06)
+    assert np.sign(out - 8.5) == np.sign(part)
+    assert bench(flat(listed=effects("lens_distortion", arm="a"))).camera("b", LIT).stages == ()
+
+
+def test_vignetting_takes_its_part_at_the_corners():
+    (stage,) = bench(flat(listed=effects("vignetting", loss=0.3))).camera("a", LIT).stages
+    left = stage.run(np.ones((1, N, N), np.float32))[0]
+    corner = ((N - 1) / 2) ** 2 / (N / 2) ** 2
+    assert left[0, 0] == pytest.approx(1 - 0.3 * corner)
+    assert left[N // 2, 0] == pytest.approx(1 - 0.15 * corner, abs=1e-3)
+    (stage,) = (
+        bench(flat(listed=effects("vignetting", loss=1.0, rows=9.0, columns=9.0))).camera("a", LIT).stages
+    )
+    off = stage.run(np.ones((1, N, N), np.float32))[0]
+    assert off[0, 0] == 0
+    assert np.unravel_index(off.argmax(), off.shape) in {(20, 20), (20, 21), (21, 20), (21, 21)}
+
+
+def test_hot_columns_add_electrons_and_dead_ones_have_none():
+    listed = effects("column_defects", hot=2, hot_e=300.0, dead=1)
+    seen, plain = electrons(flat(0.5, listed)), electrons(flat(0.5))
+    added = seen.mean(axis=0) - plain.mean(axis=0)
+    assert np.count_nonzero(np.abs(added) > 100) == 3
+    hot = added > 100
+    np.testing.assert_allclose(added[hot], 300, atol=6)
+    np.testing.assert_allclose(seen[:, hot].std(axis=0), np.sqrt(300), rtol=0.1)
+    assert np.count_nonzero(seen.max(axis=0) == 0) == 1
+    again = electrons(flat(0.1, listed)).mean(axis=0) - electrons(flat(0.1)).mean(axis=0)
+    np.testing.assert_array_equal(again > 100, hot)
+
+
+def test_drift_moves_offset_and_gain_hour_by_hour():
+    listed = effects("drift", hours=2.0, offset_dn_per_hour=3.0, gain_per_hour=0.01)
+    assert read(flat(0.0, listed)).pixels.mean() == pytest.approx(306.0, abs=0.51)
+    assert read(flat(1.0, listed)).pixels.mean() == pytest.approx(306.0 + 1.02 * FLAT, abs=1.01)
+    lines_per_hour = round(3600 / (S * DT))
+    later = read(flat(1.0, listed), count=8, first=lines_per_hour).pixels
+    assert later.mean() == pytest.approx(309.0 + 1.03 * FLAT, abs=1.01)
+
+
+def test_a_bent_converter_is_right_at_both_ends():
+    listed, white = effects("adc_nonlinearity", bow=0.03), 65535 - 300
+    for level, part in ((0.0, 0.0), (0.5, 0.5 * FLAT * 60 / white)):
+        straight = 300 + part * white
+        bent = read(flat(level, listed), responsivity_dn=60.0).pixels.mean()
+        assert bent == pytest.approx(straight + 4 * 0.03 * white * part * (1 - part), abs=1.01)
+    top = read(flat(1.0, listed), responsivity_dn=white / FLAT).pixels
+    assert top.mean() == pytest.approx(65535, abs=1)
 
 
 def test_the_point_spread_has_its_sigma_and_keeps_the_light():

@@ -3,10 +3,10 @@
 Stages run in the order of the physics, which is the order of this table, whatever the order of the list::
 
     light    code_errors ▸ pwm ▸ led_nonlinearity ▸ led_rise_fall ▸ trigger_jitter   what lights a sub-step
-    image    misregistration ▸ psf ▸ stray_light (veil)                               frames, or masks once
+    image    misregistration ▸ lens_distortion ▸ vignetting ▸ psf ▸ stray_light (veil)   frames, or masks once
     signal   beam_splitter ▸ stray_light (ambient) ▸ cti                              expected lines, Eq. (1)
-    charge   prnu ▸ shot_noise ▸ dark_current ▸ dsnu ▸ full_well ▸ read_noise         electrons
-    readout  column_offsets ▸ adc                                                     DN
+    charge   prnu ▸ shot_noise ▸ dark_current ▸ dsnu ▸ column_defects ▸ full_well ▸ read_noise     electrons
+    readout  drift ▸ column_offsets ▸ adc_nonlinearity ▸ adc                          DN
     stream   dropped_lines ▸ duplicated_lines                                           lines as delivered
 
 The module of an effect is imported when a scene lists it. Every effect draws from streams of its own
@@ -31,6 +31,8 @@ _MODULES = {
     "led_rise_fall": "light",
     "trigger_jitter": "light",
     "misregistration": "image",
+    "lens_distortion": "lens",
+    "vignetting": "lens",
     "psf": "image",
     "stray_light": "image",
     "beam_splitter": "signal",
@@ -39,9 +41,12 @@ _MODULES = {
     "shot_noise": "charge",
     "dark_current": "charge",
     "dsnu": "charge",
+    "column_defects": "charge",
     "full_well": "charge",
     "read_noise": "charge",
+    "drift": "readout",
     "column_offsets": "readout",
+    "adc_nonlinearity": "readout",
     "adc": "readout",
     "dropped_lines": "stream",
     "duplicated_lines": "stream",

@@ -56,6 +56,23 @@ def dsnu(effect: config.Dsnu, setting: Setting) -> list[Stage]:
     return [Stage("dsnu", "charge", run)]
 
 
+def column_defects(effect: config.ColumnDefects, setting: Setting) -> list[Stage]:
+    """Hot columns: + Poisson(hot_e). Dead columns: μ_e ← 0. Which ones is drawn once; a column is one of
+    either. With more than there are columns, all are hot, and what is left over is forgotten.
+    """
+    order = pattern("column_defects", setting).permutation(setting.pixels)
+    hot, dead = order[: effect.hot], order[effect.hot : effect.hot + effect.dead]
+
+    def run(electrons: NDArray[Any], first_line: int) -> NDArray[Any]:
+        marred = electrons.copy()
+        stream = draws("column_defects", setting, first_line // TILE_LINES)
+        marred[:, hot] += stream.poisson(effect.hot_e, (len(electrons), len(hot)))
+        marred[:, dead] = 0
+        return marred
+
+    return [Stage("column_defects", "charge", run)]
+
+
 def full_well(effect: config.FullWell, setting: Setting) -> list[Stage]:  # noqa: ARG001
     """No more than μ_e.sat electrons."""
 

@@ -6,10 +6,11 @@ for every frame.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from acquire.alignment import Alignment
 from acquire.sim.effects.base import Setting, Stage
 
 if TYPE_CHECKING:
@@ -19,20 +20,23 @@ if TYPE_CHECKING:
 
 
 def misregistration(effect: config.Misregistration, setting: Setting) -> list[Stage]:
-    """The image of ``arm`` turned about its middle and shifted, bilinear; dark comes in from outside."""
+    """The image of ``arm`` magnified and turned about its middle, then shifted, bilinear; from outside comes
+    in what is ``beyond``. The map is that of `acquire.alignment.Alignment`.
+    """
     if setting.arm != effect.arm:
         return []
     from scipy.ndimage import affine_transform
 
-    angle = np.deg2rad(effect.turn_deg)
-    back = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    alignment = Alignment(effect.rows, effect.columns, effect.turn_deg, effect.magnification)
+    back = np.linalg.inv(alignment.matrix)
+    mode: Literal["nearest", "constant"] = "nearest" if effect.beyond == "edge" else "constant"
     middle = np.full(2, (setting.scene.size - 1) / 2)
     offset = middle - back @ (middle + np.array([effect.rows, effect.columns]))
 
     def run(frames: NDArray[np.float32]) -> NDArray[np.float32]:
         moved = np.empty_like(frames)
         for frame, out in zip(frames, moved, strict=True):
-            affine_transform(frame, back, offset, output=out, order=1, mode="constant")
+            affine_transform(frame, back, offset, output=out, order=1, mode=mode)
         return moved
 
     return [Stage("misregistration", "image", run)]

@@ -14,6 +14,23 @@ if TYPE_CHECKING:
     from acquire import effect_config as config
 
 
+SECONDS_PER_HOUR = 3600.0
+
+
+def drift(effect: config.Drift, setting: Setting) -> list[Stage]:
+    """DN ← black + (DN − black)·(1 + g·t) + o·t, t in hours: ``hours`` at line 0, and the lines' time."""
+    black, line_s = setting.black_level_dn, setting.substeps * setting.substep_s
+
+    def run(dn: NDArray[Any], first_line: int) -> NDArray[Any]:
+        line = first_line + np.arange(len(dn))[:, None]
+        hours = effect.hours + line * line_s / SECONDS_PER_HOUR
+        gain = 1 + effect.gain_per_hour * hours
+        moved: NDArray[Any] = black + (dn - black) * gain + effect.offset_dn_per_hour * hours
+        return moved
+
+    return [Stage("drift", "readout", run)]
+
+
 def column_offsets(effect: config.ColumnOffsets, setting: Setting) -> list[Stage]:
     """+ N(0, σ) DN, fixed per read-out channel; pixel c is read by channel c modulo their number."""
     channel = effect.sigma_dn * pattern("column_offsets", setting).standard_normal(effect.channels)
@@ -23,6 +40,18 @@ def column_offsets(effect: config.ColumnOffsets, setting: Setting) -> list[Stage
         return dn + offset
 
     return [Stage("column_offsets", "readout", run)]
+
+
+def adc_nonlinearity(effect: config.AdcNonlinearity, setting: Setting) -> list[Stage]:
+    """DN ← DN + 4·bow·w·x·(1 − x), with x = (DN − black)/w inside the range w from black to white."""
+    black, white = setting.black_level_dn, setting.white_dn - setting.black_level_dn
+
+    def run(dn: NDArray[Any], first_line: int) -> NDArray[Any]:  # noqa: ARG001
+        part = np.clip((dn - black) / white, 0, 1)
+        bent: NDArray[Any] = dn + 4 * effect.bow * white * part * (1 - part)
+        return bent
+
+    return [Stage("adc_nonlinearity", "readout", run)]
 
 
 def adc(effect: config.Adc, setting: Setting) -> list[Stage]:
