@@ -9,6 +9,7 @@ The way of the data is one direction::
 The layers, top to bottom; imports point downwards only (checked by the tests)::
 
     cli                              commands: one file per group
+    web                              the operator's page, a process of its own
     client                           the service from a script, blocking or awaited
     daemon        evaluate           the capture service · metrics, report
     rig           reconstruct        config -> devices · recording -> video

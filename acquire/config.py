@@ -26,6 +26,7 @@ from acquire.reading import read_regular
 from acquire.recording_config import USUAL_CHUNK_BYTES, RecordingConfig, usual_chunk_lines, usual_tag_chunks
 from acquire.scene_config import SceneConfig, SceneFile, VideoSceneConfig, anchored
 from acquire.text import shortened, shown
+from acquire.web_config import WebConfig
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -174,6 +175,7 @@ class RigConfig(FrozenModel):
     check: CheckConfig = CheckConfig()
     control: ControlConfig = Field(default_factory=ControlConfig)
     simulation: SimulationConfig = SimulationConfig()
+    web: WebConfig | None = Field(default=None, description="absent: the daemon starts no page")
     _origin: str = PrivateAttr("")
 
     @property

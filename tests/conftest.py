@@ -41,6 +41,9 @@ POOL_THREADS = re.compile(r"asyncio_\d+|zarr|fsspec|pydevd|AnyIO worker thread")
 KEPT_FILES = re.compile(r"/mpl-data/fonts/")
 """Files that libraries keep open for reuse."""
 
+KEPT_PROCESSES = re.compile(r"/chromium")
+"""Of a browser that the tests of a module share, and that ends with it: its helpers come and go."""
+
 FIRST_PAUSE_S = 0.01
 
 Found = dict[str, str]
@@ -140,12 +143,21 @@ def children() -> Found:
     for number in descendants(os.getpid()):
         try:
             child = psutil.Process(number)
+            if _is_kept(child):
+                continue
             found[f"process {child.pid} {child.create_time()}"] = (
                 f"process {child.pid} ({' '.join(child.cmdline())[-120:]}), {child.status()}"
             )
         except psutil.NoSuchProcess:
             continue  # gone while it was looked at: not left behind
     return found
+
+
+def _is_kept(child: psutil.Process) -> bool:
+    try:
+        return KEPT_PROCESSES.search(child.exe()) is not None
+    except psutil.Error:  # a zombie has no program any more, and is looked at as any other
+        return False
 
 
 def descendants(pid: int) -> Iterator[int]:

@@ -37,6 +37,12 @@ def _have_aravis() -> bool:
     return True
 
 
+def _lacks_browser() -> str | None:
+    if which("chromium") is None:
+        return "Debian's chromium"
+    return "the package playwright" if importlib.util.find_spec("playwright") is None else None
+
+
 def _have_gpu() -> bool:
     try:
         open_arrays("gpu")
@@ -58,6 +64,7 @@ def _can_mount() -> bool:
 NEEDS = {
     "needs_aravis": "loads Aravis' shared library",
     "needs_gige_camera": "runs Aravis' GigE Vision camera on loopback",
+    "needs_chromium": "drives the operator's page in a browser",
     "needs_compiler": "builds the simulated GenTL producer",
     "needs_dask": "spreads work over a Dask cluster",
     "needs_gpu": "computes on CUDA",
@@ -80,6 +87,7 @@ def find_missing() -> dict[str, str]:
     lacks: dict[str, str | bool | None] = {
         "needs_aravis": not _have_aravis() and "Aravis' library",
         "needs_gige_camera": not (_have_aravis() and which(FAKE_GIGE)) and f"Aravis and {FAKE_GIGE}",
+        "needs_chromium": _lacks_browser(),
         "needs_compiler": not (compiler() and _HAVE_GENICAM) and "a C compiler and the genicam package",
         "needs_dask": importlib.util.find_spec("distributed") is None and "dask.distributed",
         "needs_gpu": not _have_gpu() and "CuPy and a GPU",

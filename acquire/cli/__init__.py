@@ -33,6 +33,7 @@ from acquire.cli import (
     simulate,
     tradeoff,
     trigger,
+    web,
 )
 from acquire.cli.interrupts import interrupts_answered
 from acquire.cli.output import json_asked, print_error, say
@@ -42,6 +43,7 @@ from acquire.errors import EXIT_INTERRUPTED, AcquireError, DeviceError, UsageErr
 MODULES = (
     demo,
     serve,
+    web,
     control,
     recordings,
     reconstruct,

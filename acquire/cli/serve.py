@@ -52,11 +52,11 @@ def serve(
     write_log(logging.INFO)
     logging.getLogger("uvicorn").setLevel(logging.WARNING)
     if owned:
-        threading.Thread(target=_end_with_owner, name="acquire-owner", daemon=True).start()
+        threading.Thread(target=end_with_owner, name="acquire-owner", daemon=True).start()
     raise typer.Exit(run_daemon(rig))
 
 
-def _end_with_owner() -> None:
+def end_with_owner() -> None:
     """The other end of standard input is closed by its owner's end, also by a kill."""
     import os
     import signal

@@ -110,7 +110,9 @@ class Listener(socket.socket):
 class Connection(H11Protocol):
     """One client. uvicorn ends what is idle after an answer; the rest is ended here."""
 
-    def __init__(self, *args: Any, on_lost: Callable[[], None], **options: Any) -> None:
+    most_connections = MOST_CONNECTIONS
+
+    def __init__(self, *args: Any, on_lost: Callable[[], None] = lambda: None, **options: Any) -> None:
         super().__init__(*args, **options)
         self._on_lost = on_lost
         self._timer: asyncio.TimerHandle | None = None
@@ -125,7 +127,7 @@ class Connection(H11Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         self._wait(REQUEST_S)
-        if len(self.connections) > MOST_CONNECTIONS:
+        if len(self.connections) > self.most_connections:
             self._make_room()
 
     def data_received(self, data: bytes) -> None:
@@ -171,7 +173,7 @@ class Connection(H11Protocol):
         longest = min(idle, key=lambda one: one._waiting_since or 0.0)
         self.connections.discard(longest)
         longest.transport.abort()
-        log.warning("more than %d connections: the longest idle one is closed", MOST_CONNECTIONS)
+        log.warning("more than %d connections: the longest idle one is closed", self.most_connections)
 
 
 class ApiServer(uvicorn.Server):

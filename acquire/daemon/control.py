@@ -47,7 +47,7 @@ def build_app(service: Service, run: Run) -> FastAPI:
     return app
 
 
-def new_app(description: str) -> FastAPI:
+def new_app(description: str, **options: Any) -> FastAPI:
     """An API without routes: what it refuses with, and how much it reads."""
     app = FastAPI(
         title="acquire",
@@ -59,6 +59,7 @@ def new_app(description: str) -> FastAPI:
         },
         docs_url=None,  # the pages would load scripts from elsewhere
         redoc_url=None,
+        **options,
     )
     app.add_middleware(BoundedBody)
     _add_errors(app)

@@ -23,6 +23,7 @@ from acquire.daemon.ending import END_S, LastResort, leave
 from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.messages import LightCode
 from acquire.daemon.notify import notify
+from acquire.daemon.page import Page
 from acquire.daemon.plan import Run, with_code, worker_modules
 from acquire.daemon.proof import Proof
 from acquire.daemon.salvage import Salvage
@@ -75,7 +76,11 @@ def serve(config: RigConfig) -> int:
             return Run(with_code(config, code), rig, proof.choose)
 
         service = Service(config, open_run, proof, salvage, uploads, troubles)
-        code = asyncio.run(Daemon(service, endpoint).run())
+        page = Page(config, endpoint.path)
+        try:
+            code = asyncio.run(Daemon(service, endpoint, page).run())
+        finally:
+            page.close()
         last_resort = LastResort(endpoint.remove)
         last_resort.within(END_S)  # for devices that do not let go
     last_resort.cancel()
@@ -90,8 +95,9 @@ def _journal(config: RigConfig, what: str) -> Path:
 class Daemon:
     """One service on one endpoint, for the life of an event loop in the main thread."""
 
-    def __init__(self, service: Service, endpoint: Endpoint) -> None:
+    def __init__(self, service: Service, endpoint: Endpoint, page: Page | None = None) -> None:
         self._service = service
+        self._page = page
         self._endpoint = endpoint
         self._troubles = service.troubles
         self._devices = ThreadPoolExecutor(1, thread_name_prefix="devices")
@@ -129,6 +135,8 @@ class Daemon:
     async def _supervise(self, serving: asyncio.Task[None]) -> None:
         while not (self._ending.is_set() or serving.done()):
             try:
+                if self._page is not None:
+                    self._page.look()
                 nursery()  # another one, where it has died: the next run must find it warm
                 await self._in_device_thread(self._service.supervise)
             except Exception as error:  # noqa: BLE001 - a defect in one look must not end the service

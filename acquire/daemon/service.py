@@ -44,6 +44,8 @@ RECOVERY_S = 20.0
 """How long the end of a recording waits for parts of it that are being recovered; they are in any case."""
 POLL_S = 0.05
 ARM = ArmRequest()
+TOLD = ("mark", "input", "threshold")
+"""Kinds of events that are news; what the check of the code notes is told by its verdict."""
 
 log = logging.getLogger("acquire.daemon")
 
@@ -344,7 +346,8 @@ class Service:
         """Do at an event what the rig asks for."""
         assert self._run is not None
         log.info("event: %s at line %d%s", note.kind, note.line, f": {note.text}" if note.text else "")
-        self.news.tell(note.kind, note.text or note.kind, line=note.line)
+        if note.kind in TOLD:
+            self.news.tell(note.kind, note.text or note.kind, line=note.line)
         if not self._order.covers(note):
             return
         take = self._take

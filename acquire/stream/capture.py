@@ -472,6 +472,8 @@ class Capture:
             self._final = self._look(self._supervisor) if self._supervisor else CaptureStatus()
             for counters in self._counters.values():
                 counters.close()
+            for lines in self._rings.values():
+                lines.discard()
             for ring in (*self._rings.values(), self._tags):
                 if ring is not None:
                     ring.close()

@@ -1,0 +1,102 @@
+"""``acquire web``: the operator's page in the foreground, or its address with the token."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from acquire.cli.output import say
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from acquire.web_config import WebConfig
+
+
+def register(app: typer.Typer) -> None:
+    app.command(rich_help_panel="Capture")(web)
+
+
+def web(
+    config: Annotated[
+        str | None,
+        typer.Option("--config", "-c", metavar="FILE", help="Rig file with [web]; else its defaults."),
+    ] = None,
+    socket: Annotated[
+        Path | None, typer.Option("--socket", envvar="ACQUIRE_SOCKET", help="The daemon's control socket.")
+    ] = None,
+    host: Annotated[str | None, typer.Option(help="Address to listen on, instead of web.host.")] = None,
+    port: Annotated[int | None, typer.Option(help="Port to listen on, instead of web.port.")] = None,
+    link: Annotated[
+        bool, typer.Option("--link", help="Print the page's address with the token, and end.")
+    ] = False,
+    viewer: Annotated[
+        bool, typer.Option("--viewer", help="With --link: the token of those who only look.")
+    ] = False,
+    given: Annotated[str | None, typer.Option("--given", hidden=True, help="Set by the daemon.")] = None,
+    owned: Annotated[
+        bool, typer.Option("--owned", hidden=True, help="End as on SIGTERM when standard input is closed.")
+    ] = False,
+) -> None:
+    """Serve the operator's page for the daemon of this host, until SIGTERM or Ctrl-C.
+
+    `acquire serve` does so by itself where the rig has [web]. Nobody waits for the page: the capture goes on
+    whatever becomes of it. Who opens it needs a token, which --link prints; other hosts reach it by
+    `ssh -L 8300:127.0.0.1:8300 HOST`, or with a certificate (web.host, web.certificate, web.key).
+
+    Example: [bold]acquire web --link[/]
+    """
+    import logging
+    import threading
+
+    from acquire.cli.serve import end_with_owner
+    from acquire.logs import write_log
+    from acquire.web.server import directory_of, serve_page
+    from acquire.web.server import link as link_of
+
+    where, directory, settings = _settings(config, socket, given, host, port)
+    if link:
+        say(link_of(settings, where, "viewer" if viewer else "operator"))
+        return
+    write_log(logging.INFO)
+    logging.getLogger("uvicorn").setLevel(logging.WARNING)
+    if owned:
+        threading.Thread(target=end_with_owner, name="acquire-owner", daemon=True).start()
+    serve_page(where, directory or directory_of(where), settings)
+
+
+def _settings(
+    config: str | None, socket: Path | None, given: str | None, host: str | None, port: int | None
+) -> tuple[Path, Path | None, WebConfig]:
+    """Socket, directory of the recordings where it is known, and how to listen."""
+    import json
+
+    from acquire.config import load_rig
+    from acquire.place import default_socket
+    from acquire.web_config import WebConfig
+
+    if given is not None:
+        facts = json.loads(given)
+        settings = WebConfig.model_validate_json(json.dumps(facts["web"]))
+        return Path(facts["socket"]), Path(facts["directory"]), settings
+    rig = None if config is None else load_rig(config)
+    settings = (rig.web if rig else None) or WebConfig()
+    changes = {key: value for key, value in (("host", host), ("port", port)) if value is not None}
+    if changes:
+        settings = _changed(settings, changes)
+    where = socket or (rig.control.socket if rig else default_socket())
+    return where.absolute(), rig.recording.directory.absolute() if rig else None, settings
+
+
+def _changed(settings: WebConfig, changes: Mapping[str, object]) -> WebConfig:
+    """Validated anew: another host may need a certificate. Raises UsageError."""
+    from pydantic import ValidationError
+
+    from acquire.errors import UsageError
+
+    try:
+        return type(settings).model_validate({**settings.model_dump(), **changes})
+    except ValidationError as error:
+        raise UsageError(error.errors()[0]["msg"].removeprefix("Value error, ")) from error

@@ -1,0 +1,93 @@
+"""The operator's page, started where the rig has ``[web]``: a process of its own that nobody waits for.
+
+It ends when its standard input does, which the daemon holds, however that ends. One that ends by itself is
+started anew, after growing waits.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import subprocess
+import sys
+import time
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from acquire.config import RigConfig
+
+FIRST_WAIT_S, MOST_WAIT_S = 0.5, 30.0
+LIVED_S = 60.0
+"""One that lived for so long is started anew at once when it ends."""
+END_S = 5.0
+
+log = logging.getLogger("acquire.daemon")
+
+
+class Page:
+    """For one thread; `look` never waits."""
+
+    def __init__(self, config: RigConfig, socket: Path) -> None:
+        """Nothing is started yet, and nothing ever where the rig has no ``[web]``."""
+        self._words: list[str] | None = None
+        if config.web is not None:
+            given = {
+                "socket": str(socket),
+                "directory": str(config.recording.directory.absolute()),
+                "web": config.web.model_dump(mode="json"),
+            }
+            words = [sys.executable, "-m", "acquire", "web", "--owned", "--given", json.dumps(given)]
+            self._words = words
+        self._process: subprocess.Popen[bytes] | None = None
+        self._begun_s = self._not_before_s = 0.0
+        self._wait_s = FIRST_WAIT_S
+
+    def look(self) -> None:
+        """Start it, or anew where it has ended."""
+        now_s = time.monotonic()
+        if self._words is None or now_s < self._not_before_s:
+            return
+        if self._process is not None:
+            code = self._process.poll()
+            if code is None:
+                return
+            log.warning("the operator's page has ended (%s); it is started anew", code)
+            self._forget()
+            self._wait_s = (
+                FIRST_WAIT_S if now_s - self._begun_s > LIVED_S else min(MOST_WAIT_S, 2 * self._wait_s)
+            )
+            self._not_before_s = now_s + self._wait_s
+            return
+        self._begun_s = now_s
+        try:
+            self._process = subprocess.Popen(  # noqa: S603 - ourselves
+                self._words, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, start_new_session=True
+            )
+        except OSError as error:
+            log.error("the operator's page cannot be started: %s", error)  # noqa: TRY400
+            self._not_before_s = now_s + MOST_WAIT_S
+
+    @property
+    def pid(self) -> int | None:
+        return None if self._process is None else self._process.pid
+
+    def close(self) -> None:
+        """End it: by its standard input, then by force. Idempotent."""
+        process = self._process
+        if process is None:
+            return
+        self._forget()
+        try:
+            process.wait(END_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+
+    def _forget(self) -> None:
+        if self._process is not None and self._process.stdin is not None:
+            with contextlib.suppress(OSError):
+                self._process.stdin.close()
+        self._process = None

@@ -1,0 +1,89 @@
+"""A look at a ring from outside the capture: from any process of the same user, read-only, and nobody waits.
+
+What the memory is mapped for cannot be written through it, so that no defect of who looks can harm a line;
+its place in the ring is its own business and not in the ring. Slow or dead, it costs nobody anything: when
+the run ends, its owner empties the memory (`Ring.discard`), whoever still has it mapped.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+from typing import TYPE_CHECKING
+
+from acquire.errors import DeviceError
+from acquire.stream.ring import Ring, RingShape
+from acquire.stream.shared import SharedBytes
+
+if TYPE_CHECKING:
+    from acquire.stream.ring import RingBlock
+
+
+class ForeignBytes(SharedBytes):
+    """Memory of another process, by the path that it tells; for reading only."""
+
+    def __init__(self, path: str, size: int) -> None:
+        """Raises DeviceError where it is not there any more, or not ours to read."""
+        self.name, self.size = path, size
+        try:
+            self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        except OSError as error:
+            raise DeviceError(
+                f"the lines cannot be looked at: {path}: {error.strerror}",
+                hint="be the daemon's user, on its host, with no fewer capabilities than it has",
+            ) from error
+        if os.fstat(self._fd).st_size != size:
+            os.close(self._fd)
+            raise DeviceError(f"the lines cannot be looked at: {path} is not the memory of this ring")
+        try:
+            self.map = mmap.mmap(self._fd, size, flags=mmap.MAP_SHARED, prot=mmap.PROT_READ)
+        except BaseException:
+            os.close(self._fd)
+            raise
+
+
+class Peek:
+    """Follows one ring from its newest block on.
+
+    ::
+
+        while (block := peek.next()) is not None:
+            result = look_at(block)
+            if peek.took():            # the block was whole until now
+                keep(result)
+    """
+
+    def __init__(self, name: str, path: str, shape: RingShape) -> None:
+        """Raises DeviceError where the memory cannot be had."""
+        self._ring = Ring(name, shape, ForeignBytes(path, shape.size))
+        self._number = self._ring.head
+        self.lapped = 0
+        """Blocks that came and went unseen."""
+
+    def next(self) -> RingBlock | None:
+        """The next block, or None when there is none now; the same one until `took`."""
+        slots = self._ring.shape.slots
+        while (head := self._ring.head) > self._number:
+            waiting = head - self._number
+            block = self._ring.read(self._number) if waiting < slots else None
+            if block is not None:
+                return block
+            self._skip(max(1, waiting - slots // 2))
+        return None
+
+    def took(self) -> bool:
+        """Go on to the next; says whether the block was whole all the while. If not, it was not seen."""
+        whole = self._ring.is_whole(self._number)
+        if whole:
+            self._number += 1
+        else:
+            self._skip(1)
+        return whole
+
+    def close(self) -> None:
+        """Let go of the memory; views of blocks must be gone. Idempotent."""
+        self._ring.close()
+
+    def _skip(self, blocks: int) -> None:
+        self.lapped += blocks
+        self._number += blocks

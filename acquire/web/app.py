@@ -1,0 +1,230 @@
+"""The page's web application: the daemon's API below /api, recordings and jobs, and the page's files."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
+
+from fastapi import APIRouter, FastAPI, Query, Request, Response
+from fastapi.responses import FileResponse, StreamingResponse
+from starlette.staticfiles import StaticFiles
+
+from acquire.daemon.answers import Answers
+from acquire.daemon.control import new_app
+from acquire.daemon.messages import ErrorMessage
+from acquire.daemon.routes import NO_STORE, routes
+from acquire.errors import UsageError
+from acquire.web.guard import Guard
+from acquire.web.hub import Hub
+from acquire.web.jobs import Jobs
+from acquire.web.library import Library
+from acquire.web.live import Live
+from acquire.web.messages import (
+    HoldRequest,
+    JobFacts,
+    JobRequest,
+    RecordingDetail,
+    RecordingFacts,
+    Session,
+    SessionRequest,
+    VideoFacts,
+)
+from acquire.web.page_stream import Pages
+from acquire.web.passing import Passing
+from acquire.web.tokens import COOKIE, Tokens
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator, Callable
+
+STATIC = Path(__file__).parent / "static"
+MOST_READING = 32
+"""Requests that wait for the thread that reads."""
+WHY_REFUSED: dict[int | str, dict[str, Any]] = {
+    401: {"model": ErrorMessage, "description": "the token is missing or wrong"},
+    403: {"model": ErrorMessage, "description": "the token is for looking only, or the page is not ours"},
+    421: {"model": ErrorMessage, "description": "asked for by a name that is not ours"},
+    429: {"model": ErrorMessage, "description": "too many requests, or wrong tokens"},
+}
+PNG: dict[int | str, dict[str, Any]] = {
+    200: {"description": "PNG", "content": {"image/png": {"schema": {"type": "string", "format": "binary"}}}}
+}
+BYTES: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "bytes",
+        "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+    }
+}
+
+log = logging.getLogger("acquire.web")
+T = TypeVar("T")
+
+
+class Reading:
+    """One thread for whatever waits for the disk, and so many that wait for it."""
+
+    def __init__(self) -> None:
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="reading")
+        self._waiting = 0
+
+    async def __call__(self, work: Callable[[], T]) -> T:
+        if self._waiting >= MOST_READING:
+            raise UsageError("too much is being read already", hint="again in a moment")
+        self._waiting += 1
+        try:
+            return await asyncio.get_running_loop().run_in_executor(self._thread, work)
+        finally:
+            self._waiting -= 1
+
+
+def build_page(
+    socket: Path, directory: Path, tokens: Tokens, names: frozenset[str], *, secure: bool
+) -> Guard:
+    """The application of the page for the daemon on ``socket``, whose recordings lie in ``directory``.
+
+    Must be called while the event loop runs that serves it. ``secure``: by https only.
+    """
+    hub = Hub(socket, Live)
+    library, reading = Library(directory), Reading()
+    jobs = Jobs(directory, library)
+    app = new_app(
+        "The instrument's page: the daemon's API, recordings, videos and jobs.",
+        openapi_url="/api/openapi.json",
+        lifespan=_life(hub, jobs),
+    )
+    api = APIRouter(prefix="/api", responses=WHY_REFUSED)
+    api.include_router(routes(Passing(hub), Answers()))
+    _add_stream(api, Pages(hub))
+    _add_recordings(api, library, reading)
+    _add_jobs(api, jobs)
+    guard = Guard(app, tokens, names)
+    _add_session(api, guard, tokens, secure=secure)
+    app.include_router(api)
+    _add_files(app)
+    return guard
+
+
+def _life(hub: Hub, jobs: Jobs) -> Any:
+    @asynccontextmanager
+    async def life(_: FastAPI) -> AsyncIterator[None]:
+        tasks = [asyncio.create_task(hub.run()), asyncio.create_task(jobs.run())]
+        try:
+            yield
+        finally:
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    return life
+
+
+def _add_session(api: APIRouter, guard: Guard, tokens: Tokens, *, secure: bool) -> None:
+    @api.post("/session", summary="A token for a cookie")
+    async def enter(request: Request, asked: SessionRequest, response: Response) -> Session:
+        address = request.client.host if request.client else ""
+        role = guard.role_of_token(asked.token, address)
+        if role is None:
+            raise UsageError("the token is wrong, or too many wrong ones came", hint="acquire web --link")
+        response.set_cookie(
+            COOKIE, tokens.cookie(role), httponly=True, samesite="strict", secure=secure, path="/api"
+        )
+        log.info("%s enters from %s", role, address)
+        return Session(role=role)
+
+    @api.delete("/session", summary="Leave")
+    async def leave(response: Response) -> dict[str, bool]:
+        response.delete_cookie(COOKIE, path="/api")
+        return {"left": True}
+
+    @api.get("/whoami", summary="Who is asking")
+    async def who(request: Request) -> Session:
+        role = guard.role_of(request)
+        assert role is not None
+        return Session(role=role)
+
+
+def _add_stream(api: APIRouter, pages: Pages) -> None:
+    @api.get(
+        "/live",
+        summary="State, news and pictures for a page (acquire.web.frames)",
+        responses=BYTES,
+        response_class=Response,
+    )
+    async def live(pictures: Annotated[bool, Query()] = True) -> StreamingResponse:
+        stream = pages.open(pictures=pictures)
+        return StreamingResponse(stream, media_type="application/octet-stream", headers=NO_STORE)
+
+
+def _add_recordings(api: APIRouter, library: Library, reading: Reading) -> None:
+    @api.get("/recordings", summary="Recordings, the newest first")
+    async def recordings() -> list[RecordingFacts]:
+        return await reading(library.recordings)
+
+    @api.get("/recordings/{name}", summary="A recording, with events, gaps and holds")
+    async def recording(name: str) -> RecordingDetail:
+        return await reading(lambda: library.recording(name))
+
+    @api.get(
+        "/recordings/{name}/picture",
+        summary="Both arms over the whole length",
+        responses=PNG,
+        response_class=Response,
+    )
+    async def picture(name: str) -> Response:
+        content = await reading(lambda: library.picture(name))
+        return Response(content, media_type="image/png", headers=NO_STORE)
+
+    @api.post("/recordings/{name}/hold", summary="Keep lines from being deleted by retention")
+    async def hold(name: str, asked: HoldRequest) -> RecordingDetail:
+        await reading(lambda: library.hold(name, asked))
+        return await reading(lambda: library.recording(name))
+
+    @api.get("/videos", summary="Reconstructed videos, the newest first")
+    async def videos() -> list[VideoFacts]:
+        return await reading(library.videos)
+
+    @api.get("/videos/{name}", summary="A video, with the range that it is shown in")
+    async def video(name: str) -> VideoFacts:
+        return await reading(lambda: library.video(name))
+
+    @api.get(
+        "/videos/{name}/frames",
+        summary="Frames, 8 bits a pixel, one after the other",
+        responses=BYTES,
+        response_class=Response,
+    )
+    async def frames(
+        name: str, first: Annotated[int, Query(ge=0)] = 0, count: Annotated[int, Query(ge=1, le=4096)] = 1
+    ) -> Response:
+        content = await reading(lambda: library.frames(name, first, count))
+        return Response(content, media_type="application/octet-stream", headers=NO_STORE)
+
+    @api.get("/cuts/{name}", summary="A stretch that was cut", responses=BYTES, response_class=Response)
+    async def cut(name: str) -> FileResponse:
+        path = await reading(lambda: library.path_of(name, ".npz"))
+        return FileResponse(path, media_type="application/octet-stream", filename=name)
+
+
+def _add_jobs(api: APIRouter, jobs: Jobs) -> None:
+    @api.get("/jobs", summary="Jobs, the newest first")
+    async def list_jobs() -> list[JobFacts]:
+        return jobs.list()
+
+    @api.post("/jobs", summary="Reconstruct, preview or cut a stretch of a recording")
+    async def add(asked: JobRequest) -> JobFacts:
+        return jobs.add(asked)
+
+    @api.delete("/jobs/{number}", summary="End a job")
+    async def stop(number: int) -> JobFacts:
+        return await jobs.stop(number)
+
+
+def _add_files(app: FastAPI) -> None:
+    @app.get("/", include_in_schema=False)
+    async def index() -> FileResponse:
+        return FileResponse(STATIC / "index.html", headers={"Cache-Control": "no-cache"})
+
+    app.mount("/static", StaticFiles(directory=STATIC), name="static")

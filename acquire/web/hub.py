@@ -1,0 +1,157 @@
+"""The page's one subscription to the daemon: its latest status, its news, and whether it is there at all.
+
+Every page reads from here; how many there are costs the daemon nothing. One that gives no sign of life is
+told to the pages within `LOST_S`, and is asked for again until it is back.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections import deque
+from typing import TYPE_CHECKING
+
+from acquire.client import AsyncClient, EventReader
+from acquire.daemon.facts import Health, News, Setup
+from acquire.daemon.health import health_of
+from acquire.daemon.messages import Status
+from acquire.daemon.states import State
+from acquire.errors import AcquireError, NoDaemonError
+from acquire.web.frames import json_message, message
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from acquire.web.live import Live
+
+STATUS_S = 0.5
+LOST_S = 1.5
+"""Without a word from the daemon; it sends a status every `STATUS_S`."""
+RETRY_S = 0.25
+MOST_NEWS = 500
+"""Kept for pages that are opened later."""
+
+log = logging.getLogger("acquire.web")
+
+
+class Hub:
+    """For one event loop; `run` is its life."""
+
+    def __init__(self, socket: Path, make_live: Callable[[Callable[[], None]], Live]) -> None:
+        self.client = AsyncClient(socket)
+        self._loop = asyncio.get_running_loop()
+        self.live = make_live(self._wake_from_thread)
+        self.status: Status | None = None
+        self.setup: Setup | None = None
+        self.connected = False
+        self.why = "the daemon has not answered yet"
+        self._heard_s = time.monotonic()
+        self._armed_s = time.monotonic()
+        self._news: deque[tuple[int, bytes]] = deque(maxlen=MOST_NEWS)
+        self._count = 0
+        self._version = 0
+        self._run_id: str | None = None
+        self._waiting: set[asyncio.Event] = set()
+
+    async def run(self) -> None:
+        """Follow the daemon until cancelled."""
+        self.live.begin()
+        reader = EventReader()
+        watch = asyncio.create_task(self._watch())
+        try:
+            while True:
+                try:
+                    await self._follow(reader)
+                except (AcquireError, OSError) as error:
+                    self._lose(error)
+                await asyncio.sleep(RETRY_S)
+        finally:
+            watch.cancel()
+            self.live.close()
+
+    # ---- for pages
+
+    @property
+    def version(self) -> int:
+        """Rises with every change of what `state_message` tells."""
+        return self._version
+
+    def state_message(self) -> bytes:
+        """The latest status with its judgement; or that there is none."""
+        if not self.connected or self.status is None:
+            return message({"type": "link", "connected": False, "why": self.why})
+        facts = f'{{"status":{self.status.model_dump_json()},"health":{self.health().model_dump_json()}}}'
+        return json_message("state", facts)
+
+    def health(self) -> Health:
+        """Raises NoDaemonError where the daemon is not there."""
+        if not self.connected or self.status is None or self.setup is None:
+            raise NoDaemonError(self.why, hint="acquire serve")
+        return health_of(self.status, self.setup.line_rate_hz, time.monotonic() - self._armed_s)
+
+    def news_after(self, number: int) -> tuple[int, list[bytes]]:
+        """Messages from place ``number`` on, as far as they are kept, and the next place."""
+        return self._count, [one for k, one in self._news if k >= number]
+
+    def listen(self) -> asyncio.Event:
+        """Set whenever there is something new, until `forget`."""
+        event = asyncio.Event()
+        self._waiting.add(event)
+        return event
+
+    def forget(self, event: asyncio.Event) -> None:
+        self._waiting.discard(event)
+
+    # ---- the daemon
+
+    async def _follow(self, reader: EventReader) -> None:
+        self.setup = await self.client.setup()
+        async for one in self.client.follow(reader, history=True, status_s=STATUS_S):
+            self._heard_s = time.monotonic()
+            if isinstance(one, News):
+                self._news.append((self._count, json_message("news", one.model_dump_json())))
+                self._count += 1
+            else:
+                await self._take(one)
+            self._wake()
+
+    async def _take(self, status: Status) -> None:
+        if not self.connected:
+            log.info("connected to the daemon (process %d)", status.pid)
+        self.connected, self.status = True, status
+        self._version += 1
+        if status.run_id != self._run_id:
+            self._run_id = status.run_id
+            self._armed_s = time.monotonic()
+            self.live.show(None if status.run_id is None else await self.client.rings(), self.setup)
+
+    async def _watch(self) -> None:
+        """A daemon that hangs sends nothing, and its connection does not break."""
+        while True:
+            await asyncio.sleep(RETRY_S)
+            if self.connected and time.monotonic() - self._heard_s > LOST_S:
+                self._lose(NoDaemonError(f"the daemon has not said anything for {LOST_S:g} s"))
+
+    def _lose(self, error: Exception) -> None:
+        if self.connected:
+            log.warning("%s", error)
+        self.connected, self._run_id = False, None
+        self.why = error.message if isinstance(error, AcquireError) else str(error)
+        self._version += 1
+        self.live.show(None, None)
+        self._wake()
+
+    def _wake(self) -> None:
+        for event in self._waiting:
+            event.set()
+
+    def _wake_from_thread(self) -> None:
+        if not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self._wake)
+
+    @property
+    def is_recording(self) -> bool:
+        """Something is being written: what else wants the disk or the processors stands back."""
+        return self.status is not None and self.status.state in (State.RECORDING, State.DRAINING)

@@ -1,0 +1,270 @@
+"""Recordings and videos of one directory, for a page: facts, pictures, frames. By name, never by path.
+
+A name is an entry of the directory itself that is a directory, or a file, and no link: nothing outside it can
+be reached. One thread of its own reads, so that a slow disk keeps nothing else waiting.
+"""
+
+from __future__ import annotations
+
+import stat
+from collections import OrderedDict
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from PIL import Image
+
+from acquire.errors import AcquireError, PlaceError, UsageError
+from acquire.lines import ARMS, LineFlag
+from acquire.store import Recording, format_of, hold, open_recording, open_video
+from acquire.store.camera_stream import DAMAGE
+from acquire.store.shortfall import first_shortfall, missing_segments
+from acquire.text import shortened
+from acquire.web.messages import (
+    EventFacts,
+    GapFacts,
+    HoldFacts,
+    HoldRequest,
+    RecordingDetail,
+    RecordingFacts,
+    VideoFacts,
+)
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.store import VideoFile
+
+MOST_LISTED = 500
+"""Recordings in a list: the newest."""
+MOST_EVENTS = 1000
+MOST_PICTURES = 64
+PICTURE_ROWS, PICTURE_COLUMNS = 96, 128
+"""Of one arm, in a recording's picture."""
+STRETCH_LINES = 8
+"""Looked at for one row."""
+MOST_FRAME_BYTES = 4 * 2**20
+SAMPLED_FRAMES = 24
+"""By which a video's range is found."""
+VIDEO = "acquire-video/"
+LOST_COLOUR = (200, 0, 140)
+
+
+class Library:
+    """See the module. For one thread at a time."""
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+        self._pictures: OrderedDict[tuple[Any, ...], bytes] = OrderedDict()
+        self._facts: OrderedDict[tuple[Any, ...], RecordingFacts] = OrderedDict()
+        self._ranges: OrderedDict[str, tuple[float, float]] = OrderedDict()
+
+    def path_of(self, name: str, suffix: str = ".zarr") -> Path:
+        """Raises PlaceError for what is no entry of the directory, or a link."""
+        path = self._directory / name
+        odd = not name.endswith(suffix) or "\0" in name or name in (".", "..") or Path(name).name != name
+        try:
+            mode = None if odd else path.lstat().st_mode
+        except OSError:
+            mode = None
+        kind = stat.S_ISDIR if suffix == ".zarr" else stat.S_ISREG
+        if mode is None or not kind(mode):
+            raise PlaceError(
+                f"there is no {shortened(name)} among the recordings", possible="/api/recordings"
+            )
+        return path
+
+    def recordings(self) -> list[RecordingFacts]:
+        """The newest first."""
+        return [self._known_facts(path) for path in self._entries(video=False)]
+
+    def recording(self, name: str) -> RecordingDetail:
+        """Raises PlaceError and DataError."""
+        path = self.path_of(name)
+        opened = open_recording(path)
+        return RecordingDetail(
+            **_facts(path, opened).model_dump(),
+            event_list=[
+                EventFacts(kind=one.kind, line=one.line, text=one.text)
+                for one in opened.events[-MOST_EVENTS:]
+            ],
+            gap_list=[
+                GapFacts(arm=one.arm, first_line=one.first_line, count=one.count, cause=one.cause)
+                for one in opened.gaps[-MOST_EVENTS:]
+            ],
+            hold_list=[
+                HoldFacts(first_line=int(first), count=int(count), why=str(why[0]) if why else "")
+                for first, count, *why in opened.attrs.get("holds", [])
+            ],
+        )
+
+    def hold(self, name: str, request: HoldRequest) -> None:
+        hold(self.path_of(name), request.first_line, request.lines, request.why)
+
+    def picture(self, name: str) -> bytes:
+        """Both arms, time downwards, as PNG. Raises PlaceError and DataError."""
+        path = self.path_of(name)
+        opened = open_recording(path)
+        key = (name, opened.state, opened.lines, opened.attrs.get("run_id"))
+        if key not in self._pictures:
+            _remember(self._pictures, key, _png(_overview(opened)), MOST_PICTURES)
+        return self._pictures[key]
+
+    def videos(self) -> list[VideoFacts]:
+        """The newest first."""
+        return [self._video_facts(path) for path in self._entries(video=True)]
+
+    def video(self, name: str) -> VideoFacts:
+        """With the range that it is shown in. Raises PlaceError and DataError."""
+        path = self.path_of(name)
+        video = open_video(path)
+        if name not in self._ranges:
+            _remember(self._ranges, name, _range(video), MOST_PICTURES)
+        low, high = self._ranges[name]
+        return _of_video(name, video).model_copy(update={"low": low, "high": high})
+
+    def frames(self, name: str, first: int, count: int) -> bytes:
+        """Frames of 8 bits one after the other: as many as there are, and fit into an answer."""
+        facts, video = self.video(name), open_video(self.path_of(name))
+        most = max(1, MOST_FRAME_BYTES // (facts.rows * facts.columns))
+        if not 0 <= first < facts.frames:
+            raise UsageError(f"frame {first} of {name}", possible=f"0 to {facts.frames - 1}")
+        values = np.asarray(video.video[first : first + min(count, most)], np.float32)
+        scaled = np.nan_to_num((values - facts.low) * (255 / max(facts.high - facts.low, 1e-12)))
+        content: bytes = np.clip(scaled, 0, 255).astype(np.uint8).tobytes()
+        return content
+
+    def _entries(self, *, video: bool) -> list[Path]:
+        found = []
+        try:
+            entries = list(self._directory.iterdir())
+        except OSError as error:
+            raise PlaceError(f"{self._directory}: {error.strerror}") from error
+        for path in entries:
+            try:
+                mode = path.lstat()
+                if path.suffix == ".zarr" and stat.S_ISDIR(mode.st_mode) and _is_video(path) is video:
+                    found.append((mode.st_mtime_ns, path))
+            except OSError:
+                continue
+        return [path for _, path in sorted(found, reverse=True)[:MOST_LISTED]]
+
+    def _known_facts(self, path: Path) -> RecordingFacts:
+        try:
+            changed = (path / "zarr.json").stat().st_mtime_ns
+        except OSError:
+            changed = 0
+        key = (path.name, changed)
+        if (known := self._facts.get(key)) is None:
+            try:
+                known = _facts(path, open_recording(path))
+            except AcquireError as error:
+                return RecordingFacts(name=path.name, error=shortened(error.message, 300))
+            except (*DAMAGE, MemoryError) as error:
+                return RecordingFacts(name=path.name, error=f"cannot be read: {shortened(error, 300)}")
+            if known.state == "sealed":
+                _remember(self._facts, key, known, 2 * MOST_LISTED)
+        return known
+
+    def _video_facts(self, path: Path) -> VideoFacts:
+        try:
+            return _of_video(path.name, open_video(path))
+        except AcquireError as error:
+            return VideoFacts(name=path.name, error=shortened(error.message, 300))
+
+
+def _remember(cache: OrderedDict[Any, Any], key: Any, value: Any, most: int) -> None:
+    cache[key] = value
+    while len(cache) > most:
+        cache.popitem(last=False)
+
+
+def _is_video(path: Path) -> bool:
+    try:
+        return (format_of(path) or "").startswith(VIDEO)
+    except AcquireError:
+        return False  # listed among the recordings, with what is wrong with it
+
+
+def _facts(path: Path, opened: Recording) -> RecordingFacts:
+    info = opened.info()
+    shortfall = first_shortfall(opened)
+    damage = next(missing_segments(opened), None) if shortfall is None else str(shortfall)
+    return RecordingFacts(
+        name=path.name,
+        run_id=info["run_id"],
+        state=info["state"],
+        condition=info["run_condition"],
+        end_reason=info["end_reason"],
+        first_line=info["first_line"],
+        lines=info["lines"],
+        duration_s=info["duration_s"],
+        line_rate_hz=info["line_rate_hz"],
+        bytes=info["bytes"],
+        start_ns=info["start_ns"],
+        lost_lines=info["lost_lines"],
+        events=info["events"],
+        held=bool(info["holds"]) or any((path / ".holds").glob("*")),
+        uploaded=(opened.attrs.get("config", {}).get("recording") or {}).get("upload_to"),
+        damage=damage,
+    )
+
+
+def _overview(opened: Recording) -> NDArray[np.uint8]:
+    """(row, column, colour): arm a, a line between, arm b."""
+    parts = [_arm_overview(opened, arm) for arm in ARMS]
+    between = np.full((parts[0].shape[0], 4, 3), 128, np.uint8)
+    return np.concatenate([parts[0], between, parts[1]], axis=1)
+
+
+def _arm_overview(opened: Recording, arm: str) -> NDArray[np.uint8]:
+    stream, white = opened.camera(arm), float(opened.attrs["cameras"][arm]["white_dn"])
+    rows = min(PICTURE_ROWS, max(1, opened.lines))
+    columns = min(PICTURE_COLUMNS, stream.pixels)
+    edges = np.arange(columns) * stream.pixels // columns
+    picture = np.zeros((PICTURE_ROWS, columns, 3), np.uint8)
+    kept = opened.kept_rows()
+    for row in range(rows if opened.lines else 0):
+        start = row * opened.lines // rows
+        stop = min(opened.lines, start + STRETCH_LINES)
+        if not any(start in rows for rows in kept):
+            picture[row] = LOST_COLOUR
+            continue
+        lines, flags = stream.read("lines", start, stop), stream.read("flags", start, stop)
+        missing = (flags & LineFlag.MISSING) != 0
+        if missing.all():
+            picture[row] = LOST_COLOUR
+            continue
+        brightest = np.maximum.reduceat(lines[~missing].max(axis=0).astype(np.float64), edges)
+        picture[row] = np.clip(brightest * (255 / white), 0, 255).astype(np.uint8)[:, None]
+    return picture[: max(rows, 1)]
+
+
+def _png(picture: NDArray[np.uint8]) -> bytes:
+    file = BytesIO()
+    Image.fromarray(picture).save(file, "PNG")
+    return file.getvalue()
+
+
+def _of_video(name: str, video: VideoFile) -> VideoFacts:
+    frames, rows, columns = video.video.shape
+    trusted = (video.attrs.get("provenance") or {}).get("trusted")
+    return VideoFacts(
+        name=name,
+        frames=frames,
+        rows=rows,
+        columns=columns,
+        interval_ns=video.interval_ns,
+        start_ns=int(video.time_ns[0]) if len(video.time_ns) else None,
+        trusted=(int(trusted[0]), int(trusted[1])) if trusted else None,
+    )
+
+
+def _range(video: VideoFile) -> tuple[float, float]:
+    """Of frames over the whole length, but for the darkest and brightest of a thousand pixels."""
+    frames = video.video.shape[0]
+    step = max(1, frames // SAMPLED_FRAMES)
+    values = np.stack([np.asarray(video.video[k], np.float32) for k in range(0, frames, step)])
+    low, high = np.nanquantile(values, (0.001, 0.999))
+    return (float(low), float(high)) if high > low else (float(low), float(low) + 1.0)

@@ -1,0 +1,64 @@
+"""The daemon's API as the page's process offers it: passed on, and logged with who asked."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from acquire.client import core
+from acquire.daemon.messages import Status
+from acquire.daemon.stream import news_text, status_text
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from acquire.daemon.facts import Health, Rings, Setup, Version
+    from acquire.daemon.messages import ArmRequest, CapacityStatus, MarkRequest, StartRequest
+    from acquire.web.hub import Hub
+
+
+class Passing:
+    """See the module; the methods are those of `acquire.daemon.routes.Api`."""
+
+    def __init__(self, hub: Hub) -> None:
+        self._hub = hub
+        self._client = hub.client
+
+    async def status(self) -> Status:
+        return await self._client.status()
+
+    async def arm(self, request: ArmRequest) -> Status:
+        return await self._client.call(core.command("arm", Status, request))
+
+    async def start(self, request: StartRequest) -> Status:
+        return await self._client.call(core.command("start", Status, request))
+
+    async def mark(self, request: MarkRequest) -> Status:
+        return await self._client.call(core.command("mark", Status, request))
+
+    async def stop(self) -> Status:
+        return await self._client.stop()
+
+    async def disarm(self) -> Status:
+        return await self._client.disarm()
+
+    async def measure(self) -> CapacityStatus:
+        return await self._client.measure()
+
+    async def health(self) -> Health:
+        return self._hub.health()
+
+    async def version(self) -> Version:
+        return await self._client.version()
+
+    async def setup(self) -> Setup:
+        return await self._client.setup()
+
+    async def rings(self) -> Rings:
+        return await self._client.rings()
+
+    async def events(
+        self, last_id: str | None, status_s: float | None, *, history: bool
+    ) -> AsyncIterator[str]:
+        reader = core.EventReader(last_id)
+        async for one in self._client.follow(reader, history=history, status_s=status_s):
+            yield status_text(one) if isinstance(one, Status) else news_text(one)

@@ -1,0 +1,138 @@
+"""The page's process: it listens, serves until a signal, and stands back for those who capture."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import socket as sockets
+import ssl
+from typing import TYPE_CHECKING
+
+import uvicorn
+
+from acquire.client import Client
+from acquire.daemon.connections import Connection, raise_descriptor_limit
+from acquire.errors import NoDaemonError, UsageError
+from acquire.web.app import build_page
+from acquire.web.tokens import Tokens, load_tokens
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from acquire.web_config import WebConfig
+
+NICE = 10
+IDLE_S = 5
+GRACE_S = 1
+MOST_CONNECTIONS = 64
+
+log = logging.getLogger("acquire.web")
+
+
+def serve_page(socket: Path, directory: Path, config: WebConfig) -> None:
+    """Serve the page of the daemon on ``socket`` until SIGTERM or SIGINT.
+
+    Raises UsageError for an address, certificate or token file that cannot be used.
+    """
+    os.nice(NICE)
+    raise_descriptor_limit()
+    tokens = load_tokens(config.token_path(socket))
+    context = _tls(config)
+    with contextlib.closing(_listen(config)) as listener:
+        log.info("the operator's page: %s (the token: acquire web --link)", address_of(config, listener))
+        asyncio.run(_serve(socket, directory, tokens, config, listener, context))
+
+
+async def _serve(
+    socket: Path,
+    directory: Path,
+    tokens: Tokens,
+    config: WebConfig,
+    listener: sockets.socket,
+    context: ssl.SSLContext | None,
+) -> None:
+    page = build_page(socket, directory, tokens, names_of(config), secure=context is not None)
+    settings = uvicorn.Config(
+        page,
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        http=BoundedConnection,
+        ws="none",
+        timeout_keep_alive=IDLE_S,
+        timeout_graceful_shutdown=GRACE_S,
+        lifespan="on",
+    )
+    settings.load()
+    settings.ssl = context
+    await uvicorn.Server(settings).serve(sockets=[listener])
+
+
+class BoundedConnection(Connection):
+    """As the daemon's: a request and a reader have so much time, and there are only so many connections."""
+
+    most_connections = MOST_CONNECTIONS
+
+
+def names_of(config: WebConfig) -> frozenset[str]:
+    """By which the page may be asked for, lower case."""
+    loopback = {"localhost", "127.0.0.1", "::1"} if config.is_loopback else set()
+    anywhere = {sockets.gethostname().lower()} if config.host in ("0.0.0.0", "::") else set()  # noqa: S104
+    return frozenset({config.host.lower(), *map(str.lower, config.names), *loopback, *anywhere})
+
+
+def address_of(config: WebConfig, listener: sockets.socket | None = None) -> str:
+    """The page's URL, as a browser on this host asks for it."""
+    port = config.port if listener is None else listener.getsockname()[1]
+    host = config.names[0] if config.names else config.host
+    host = f"[{host}]" if ":" in host else host
+    return f"{'https' if config.certificate else 'http'}://{host}:{port}/"
+
+
+def link(config: WebConfig, socket: Path, role: str) -> str:
+    """The URL with a token, behind a #, where browsers keep it to themselves."""
+    tokens = load_tokens(config.token_path(socket))
+    return f"{address_of(config)}#token={tokens.operator if role == 'operator' else tokens.viewer}"
+
+
+def directory_of(socket: Path) -> Path:
+    """Where the daemon's recordings lie. Raises NoDaemonError."""
+    from pathlib import Path as Directory
+
+    found = Client(socket).status().disk
+    if found is None:
+        raise NoDaemonError("the daemon has not looked at its disk yet", hint="again in a moment")
+    return Directory(found.directory)
+
+
+def _listen(config: WebConfig) -> sockets.socket:
+    family = sockets.AF_INET6 if ":" in config.host else sockets.AF_INET
+    listener = sockets.socket(family, sockets.SOCK_STREAM)
+    listener.setsockopt(sockets.SOL_SOCKET, sockets.SO_REUSEADDR, 1)
+    try:
+        listener.bind((config.host, config.port))
+        listener.listen(128)
+    except (OSError, UnicodeError) as error:
+        listener.close()
+        why = error.strerror if isinstance(error, OSError) else "no such host"
+        raise UsageError(
+            f"the page cannot listen on {config.host}:{config.port}: {why}",
+            hint="another web.port, or 0 for any that is free",
+        ) from error
+    return listener
+
+
+def _tls(config: WebConfig) -> ssl.SSLContext | None:
+    if config.certificate is None:
+        return None
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    try:
+        context.load_cert_chain(config.certificate, config.key)
+    except (OSError, ssl.SSLError) as error:
+        raise UsageError(
+            f"web.certificate {config.certificate} and its key cannot be used: {error}", possible="PEM files"
+        ) from error
+    return context

@@ -1,0 +1,44 @@
+// The first hour of every instrument: one camera large, how sharp it is, how bright, where its light falls.
+
+import { Waterfall } from "./waterfall.js";
+import { $, make, percent } from "./words.js";
+
+export class Aim {
+  #fall; #peak = 0; #smooth = null; #profile; #focus = make("output"); #best = make("output"); #white = make("output");
+
+  constructor() {
+    const canvas = make("canvas", { role: "img", "aria-label": "The camera that is aimed" });
+    this.#profile = make("canvas", { className: "histogram", role: "img", "aria-label": "Brightest value of each pixel" });
+    this.#fall = new Waterfall(canvas, 480);
+    this.#fall.clear();
+    $("aim-view").replaceChildren(make("div", { className: "fall" }, make("div", { className: "scale", "aria-hidden": "true" }, make("span", {}, "−5 s"), make("span", {}, "now")), canvas), this.#profile);
+    $("aim-numbers").replaceChildren(make("h2", {}, "Focus"), this.#focus, make("h2", {}, "Best so far"), this.#best, make("h2", {}, "Saturated pixels"), this.#white,
+      make("p", { className: "hint" }, "Focus is the contrast between neighbouring pixels of the brightest light, in percent of it. Turn the lens until it falls again, and go back to the best."));
+    $("aim-arm").addEventListener("change", () => this.#forget());
+    $("aim-reset").addEventListener("click", () => this.#forget());
+  }
+
+  rows(header, body) {
+    if ($("aim").hidden || header.arm !== $("aim-arm").value) return;
+    this.#fall.add(header, body);
+    const { rows, columns } = header, high = body.subarray(rows + rows * columns), profile = new Float64Array(columns);
+    for (let row = 0; row < rows; row++) for (let x = 0; x < columns; x++) profile[x] = Math.max(profile[x], high[row * columns + x]);
+    let steps = 0, light = 1e-9;
+    for (let x = 1; x < columns; x++) { steps += Math.abs(profile[x] - profile[x - 1]); light += profile[x]; }
+    const focus = 100 * steps / light;
+    this.#smooth = this.#smooth === null ? focus : 0.85 * this.#smooth + 0.15 * focus;
+    this.#peak = Math.max(this.#peak, this.#smooth);
+    this.#focus.textContent = this.#smooth.toFixed(1);
+    this.#best.textContent = this.#peak.toFixed(1);
+    this.#white.textContent = percent(header.saturated / Math.max(1, header.histogram.reduce((sum, n) => sum + n, 0)));
+    this.#draw(profile);
+  }
+
+  #forget() { this.#peak = 0; this.#smooth = null; this.#fall.clear(); }
+
+  #draw(profile) {
+    const canvas = this.#profile, width = (canvas.width = canvas.clientWidth || 300), height = (canvas.height = canvas.clientHeight || 70), context = canvas.getContext("2d");
+    context.fillStyle = getComputedStyle(canvas).color;
+    profile.forEach((value, x) => context.fillRect((x * width) / profile.length, height - (value / 255) * height, Math.max(1, width / profile.length - 1), (value / 255) * height));
+  }
+}

@@ -1,0 +1,82 @@
+// The page: who is there, which screen, which key; the rest is in the modules.
+
+import { Aim } from "./aim.js";
+import { Band } from "./band.js";
+import { showHealth, showSetup } from "./facts.js";
+import { Link, ask } from "./link.js";
+import { Recordings } from "./recordings.js";
+import { Watch } from "./watch.js";
+import { $ } from "./words.js";
+
+const SCREENS = ["watch", "aim", "recordings", "health", "setup"];
+const link = new Link(), band = new Band(), watch = new Watch(fail), aim = new Aim(), recordings = new Recordings(fail);
+let operator = false, setup = null, latest = null;
+
+function fail(text) { $("error").textContent = text; $("error").hidden = !text; }
+
+async function enter(token) {
+  await ask("POST", "session", { token });
+  await admitted();
+}
+
+async function admitted() {
+  const { role } = await ask("GET", "whoami");
+  operator = role === "operator";
+  await ask("GET", "setup").then((facts) => { setup = facts; }, () => {});
+  watch.enter(operator, setup); recordings.enter(operator);
+  $("enter").close();
+  screen();
+}
+
+/** What stands behind # is a token, which is taken out of the address at once, or a screen. */
+function screen() {
+  const asked = location.hash.replace("#/", ""), shown = SCREENS.includes(asked) ? asked : "watch";
+  for (const name of SCREENS) $(name).hidden = name !== shown;
+  for (const anchor of document.querySelectorAll("nav a")) if (anchor.dataset.screen === shown) anchor.setAttribute("aria-current", "page"); else anchor.removeAttribute("aria-current");
+  if (shown === "recordings") recordings.show();
+  if (shown === "setup") ask("GET", "setup").then((facts) => { setup = facts; showSetup(setup, latest?.status); }, (error) => fail(error.message));
+  if (latest) showHealth(latest.status, latest.health, fail, operator);
+}
+
+link.addEventListener("begun", () => { if (!setup) admitted().catch(() => {}); });
+link.addEventListener("locked", () => { if (!$("enter").open) $("enter").showModal(); });
+link.addEventListener("silent", ({ detail }) => band.stale(`No word from the page's server for ${Math.round(detail)} s.`));
+link.addEventListener("link", ({ detail }) => band.stale(`The page's server has no daemon: ${detail.header.why}`));
+link.addEventListener("news", ({ detail }) => watch.news(detail.header.news));
+link.addEventListener("rows", ({ detail }) => { watch.rows(detail.header, detail.body); aim.rows(detail.header, detail.body); });
+link.addEventListener("state", ({ detail }) => {
+  latest = detail.header.state;
+  band.show(latest.status, latest.health);
+  watch.show(latest.status);
+  showHealth(latest.status, latest.health, fail, operator);
+  if (!setup) admitted().catch(() => {});
+});
+
+addEventListener("hashchange", screen);
+addEventListener("keydown", (event) => {
+  if (event.ctrlKey || event.metaKey || event.altKey || document.querySelector("dialog[open]") || event.target.closest("input, select, textarea")) return;
+  if (event.key === "?") { $("keys").showModal(); return; }
+  const number = SCREENS[Number(event.key) - 1];
+  if (number) { location.hash = `/${number}`; return; }
+  const onButton = event.target.closest("button, a") && [" ", "Enter"].includes(event.key);
+  if (onButton || event.repeat) return;
+  const taken = $("recordings").hidden ? watch.key(event.key.toLowerCase()) : recordings.key(event.key);
+  if (taken) event.preventDefault();
+});
+addEventListener("keyup", (event) => { if (event.key.toLowerCase() === "s") watch.releaseStop(); });
+$("help").onclick = () => $("keys").showModal();
+$("theme").onclick = () => {
+  const dark = document.documentElement.dataset.theme ?? (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light");
+  localStorage.setItem("theme", document.documentElement.dataset.theme = dark === "dark" ? "light" : "dark");
+};
+$("enter").addEventListener("cancel", (event) => event.preventDefault());
+$("enter").querySelector("form").addEventListener("submit", (event) => {
+  event.preventDefault();
+  enter($("token").value).then(() => { $("token").value = ""; }, (error) => { $("enter-error").textContent = error.message; });
+});
+
+if (localStorage.getItem("theme")) document.documentElement.dataset.theme = localStorage.getItem("theme");
+const token = /^#token=([\w-]+)$/.exec(location.hash);
+if (token) { history.replaceState(null, "", "#/watch"); await enter(token[1]).catch((error) => fail(error.message)); }
+screen();
+link.run();

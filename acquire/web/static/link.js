@@ -1,0 +1,77 @@
+// One stream from the page's server: state, news and rows. It is opened again for ever, and silence is told.
+
+const decoder = new TextDecoder();
+export const SILENT_MS = 2000;
+
+/** Split a stream of bytes into messages: see acquire/web/frames.py. */
+export class Messages {
+  #rest = new Uint8Array(0);
+
+  /** The messages that are complete with these bytes, as [header, body]. */
+  take(bytes) {
+    const all = new Uint8Array(this.#rest.length + bytes.length);
+    all.set(this.#rest); all.set(bytes, this.#rest.length);
+    const view = new DataView(all.buffer), found = [];
+    let at = 0;
+    while (all.length - at >= 8) {
+      const head = view.getUint32(at, true), body = view.getUint32(at + 4, true);
+      if (all.length - at < 8 + head + body) break;
+      found.push([JSON.parse(decoder.decode(all.subarray(at + 8, at + 8 + head))), all.subarray(at + 8 + head, at + 8 + head + body)]);
+      at += 8 + head + body;
+    }
+    this.#rest = all.slice(at);
+    return found;
+  }
+}
+
+export class Link extends EventTarget {
+  #heard = performance.now();
+  #abort = null;
+
+  /** Follow for ever. Hidden pages get no pictures; one that is shown again gets them at once. */
+  async run() {
+    document.addEventListener("visibilitychange", () => this.#abort?.abort());
+    setInterval(() => this.#watch(), 250);
+    for (;;) {
+      try { await this.#follow(); }
+      catch (error) { if (error.name !== "AbortError") console.info(`stream: ${error.message}`); }
+      await new Promise((done) => setTimeout(done, 300));
+    }
+  }
+
+  async #follow() {
+    this.#abort = new AbortController();
+    const pictures = document.visibilityState === "visible";
+    const answer = await fetch(`/api/live?pictures=${pictures}`, { signal: this.#abort.signal });
+    if (answer.status === 401) { this.dispatchEvent(new Event("locked")); return; }
+    if (!answer.ok) throw new Error(`HTTP ${answer.status}`);
+    this.dispatchEvent(new Event("begun"));
+    const messages = new Messages(), reader = answer.body.getReader();
+    for (;;) {
+      const { done, value } = await reader.read();
+      if (done) return;
+      for (const [header, body] of messages.take(value)) {
+        this.#heard = performance.now();
+        this.dispatchEvent(new CustomEvent(header.type, { detail: { header, body } }));
+      }
+    }
+  }
+
+  #watch() {
+    const silent = performance.now() - this.#heard;
+    if (silent > SILENT_MS) this.dispatchEvent(new CustomEvent("silent", { detail: silent / 1000 }));
+  }
+}
+
+/** Ask the API; throws an Error in the server's words. */
+export async function ask(method, path, body) {
+  const headers = { "Request-Id": `${Date.now()}-${Math.random().toString(36).slice(2)}` };
+  if (body !== undefined) headers["Content-Type"] = "application/json";
+  let answer;
+  try { answer = await fetch(`/api/${path}`, { method, headers, body: body === undefined ? undefined : JSON.stringify(body) }); }
+  catch { throw new Error("The page's server does not answer."); }
+  const facts = (answer.headers.get("content-type") ?? "").includes("json") ? await answer.json() : null;
+  if (answer.ok) return facts;
+  const words = [facts?.message ?? `HTTP ${answer.status}`, facts?.possible && `possible: ${facts.possible}`, facts?.hint && `try: ${facts.hint}`];
+  throw new Error(words.filter(Boolean).join("; "));
+}

@@ -1,0 +1,71 @@
+// A video frame by frame: read in batches of 8-bit frames, drawn to a canvas; frames not sampled in full are marked.
+
+import { ask } from "./link.js";
+import { $, count, make, quantity } from "./words.js";
+
+const BATCH = 64, MOST_BATCHES = 8;
+
+export class Player {
+  #fail; #video = null; #frame = 0; #batches = new Map(); #timer = null; #canvas; #slider; #text; #play; #speed;
+
+  constructor(fail) { this.#fail = fail; }
+
+  async open(name) {
+    this.#stop(); this.#batches.clear(); this.#fail("");
+    try { this.#video = await ask("GET", `videos/${encodeURIComponent(name)}`); }
+    catch (error) { this.#fail(error.message); return; }
+    const video = this.#video;
+    this.#canvas = make("canvas", { width: video.columns, height: video.rows, role: "img", "aria-label": name });
+    this.#slider = make("input", { type: "range", min: 0, max: video.frames - 1, value: 0, "aria-label": "Frame", oninput: () => this.#show(Number(this.#slider.value)) });
+    this.#text = make("p", { id: "frame-text" });
+    this.#play = make("button", { id: "play", onclick: () => this.toggle() }, "Play");
+    this.#speed = make("select", { "aria-label": "Frames per second" }, ...[5, 12, 25, 50].map((fps) => make("option", { selected: fps === 25, value: fps }, `${fps} frames/s`)));
+    $("player").replaceChildren(make("h2", {}, name), this.#canvas, this.#slider, this.#text, make("div", { className: "fields" },
+      make("button", { "aria-label": "One frame back", id: "back", onclick: () => this.step(-1) }, "◀"), this.#play, make("button", { "aria-label": "One frame on", id: "on", onclick: () => this.step(1) }, "▶"), this.#speed));
+    await this.#show(0);
+    this.#canvas.scrollIntoView({ block: "nearest" });
+  }
+
+  key(key) {
+    if (!this.#video) return false;
+    if (key === " ") { this.toggle(); return true; }
+    if (key === "ArrowLeft" || key === "ArrowRight") { this.step(key === "ArrowLeft" ? -1 : 1); return true; }
+    return false;
+  }
+
+  step(frames) { this.#stop(); return this.#show((this.#frame + frames + this.#video.frames) % this.#video.frames); }
+
+  toggle() {
+    if (this.#timer) { this.#stop(); return; }
+    this.#play.textContent = "Pause";
+    const next = async () => {
+      await this.#show((this.#frame + 1) % this.#video.frames);
+      if (this.#timer) this.#timer = setTimeout(next, 1000 / Number(this.#speed.value));
+    };
+    this.#timer = setTimeout(next, 0);
+  }
+
+  #stop() { clearTimeout(this.#timer); this.#timer = null; if (this.#play) this.#play.textContent = "Play"; }
+
+  async #show(frame) {
+    const video = this.#video, size = video.rows * video.columns, batch = Math.floor(frame / BATCH);
+    try { await this.#load(batch); } catch (error) { this.#stop(); this.#fail(error.message); return; }
+    const bytes = this.#batches.get(batch).subarray((frame - batch * BATCH) * size, (frame - batch * BATCH + 1) * size);
+    const image = new ImageData(video.columns, video.rows);
+    for (let i = 0; i < size; i++) image.data.set([bytes[i], bytes[i], bytes[i], 255], 4 * i);
+    this.#canvas.getContext("2d").putImageData(image, 0, 0);
+    this.#frame = frame;
+    this.#slider.value = frame;
+    const trusted = !video.trusted || (frame >= video.trusted[0] && frame < video.trusted[1]);
+    this.#text.textContent = `Frame ${count(frame + 1)} of ${count(video.frames)}, ${quantity((frame * video.interval_ns) / 1e9, "s")} after the first${trusted ? "" : " – not sampled in full: not to be trusted"}`;
+    this.#text.className = trusted ? "" : "warning";
+  }
+
+  async #load(batch) {
+    if (this.#batches.has(batch)) return;
+    const answer = await fetch(`/api/videos/${encodeURIComponent(this.#video.name)}/frames?first=${batch * BATCH}&count=${BATCH}`);
+    if (!answer.ok) throw new Error((await answer.json()).message);
+    this.#batches.set(batch, new Uint8Array(await answer.arrayBuffer()));
+    while (this.#batches.size > MOST_BATCHES) this.#batches.delete(this.#batches.keys().next().value);
+  }
+}

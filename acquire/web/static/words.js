@@ -1,0 +1,42 @@
+// Numbers as people read them, and elements as programs make them: text only, never markup of strangers.
+
+export const $ = (id) => document.getElementById(id);
+
+/** An element with properties and children; strings become text. */
+export function make(name, properties = {}, ...children) {
+  const element = document.createElement(name);
+  for (const [key, value] of Object.entries(properties)) {
+    if (key.startsWith("aria-") || key === "role" || key.startsWith("data-")) element.setAttribute(key, value);
+    else element[key] = value;
+  }
+  element.append(...children.filter((child) => child !== null && child !== undefined));
+  return element;
+}
+
+/** Replace what is below an element, only where its text changes: a list that is read out stays where it is. */
+export function fill(element, key, build) {
+  if (element.dataset.key === key) return;
+  element.dataset.key = key;
+  element.replaceChildren(...build());
+}
+
+export const count = (value) => Number(value).toLocaleString("en").replaceAll(",", "\u202f");
+
+export function quantity(value, unit) {
+  for (const [factor, prefix] of [[1e12, "T"], [1e9, "G"], [1e6, "M"], [1e3, "k"]])
+    if (Math.abs(value) >= factor) return `${Number((value / factor).toPrecision(3))}\u202f${prefix}${unit}`;
+  for (const [factor, prefix] of [[1, ""], [1e-3, "m"], [1e-6, "µ"], [1e-9, "n"]])
+    if (Math.abs(value) >= factor) return `${Number((value / factor).toPrecision(3))}\u202f${prefix}${unit}`;
+  return `0\u202f${unit}`;
+}
+
+export function duration(seconds) {
+  if (!(seconds < 1e12)) return "–";
+  for (const [name, length] of [["days", 86400], ["h", 3600], ["min", 60]])
+    if (seconds >= 2 * length) return `${Number((seconds / length).toPrecision(3))}\u202f${name}`;
+  return `${seconds < 10 ? seconds.toFixed(1) : Math.round(seconds)}\u202fs`;
+}
+
+export const clock = (text) => new Date(text).toLocaleTimeString("en-GB");
+export const day = (ns) => new Date(Number(ns) / 1e6).toLocaleString("en-GB");
+export const percent = (part) => `${(100 * part).toFixed(part > 0 && part < 0.1 ? 1 : 0)}\u202f%`;

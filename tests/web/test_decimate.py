@@ -1,0 +1,109 @@
+"""Few rows stand for many lines: their extremes, in the trigger's numbering, whatever the blocks were."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from acquire.web.decimate import (
+    BINS,
+    LOST,
+    MOST_COLUMNS,
+    MOST_UNSEEN_ROWS,
+    SEEN,
+    UNSEEN,
+    Decimator,
+    Rows,
+    Scale,
+)
+
+WHITE = 4095
+
+
+def lines(first: int, count: int, width: int = 8) -> NDArray[np.uint16]:
+    rng = np.random.default_rng(first)
+    return rng.integers(0, WHITE + 1, (count, width), dtype=np.uint16)
+
+
+def put(decimator: Decimator, first: int, pixels: NDArray[np.uint16], *, lost: bool = False) -> None:
+    chosen = decimator.sampled_lines(first, len(pixels))
+    decimator.add(first, len(pixels), chosen, pixels[chosen - first], lost=lost)
+
+
+def rows_of(decimator: Decimator) -> Rows:
+    found = decimator.take()
+    assert found is not None
+    return found
+
+
+@given(st.lists(st.integers(1, 40), min_size=1, max_size=12), st.integers(1, 9), st.integers(0, 50))
+def test_rows_are_the_extremes_of_their_lines_however_they_are_cut_into_blocks(
+    cuts: list[int], step: int, first: int
+) -> None:
+    pixels = lines(7, sum(cuts))
+    decimator = Decimator(Scale(step, 1, WHITE), 8)
+    at, found = 0, []
+    for count in cuts:
+        put(decimator, first + at, pixels[at : at + count])
+        at += count
+        found.append(decimator.take())
+    put(decimator, first + at, pixels[:1])
+    put(decimator, first + at + step, pixels[:1])
+    found.append(decimator.take())
+    numbers = (first + np.arange(at)) // step
+    rows = [(one.first + k, one.low[k], one.high[k]) for one in found if one for k in range(len(one.kind))]
+    assert [number for number, _, _ in rows] == list(range(rows[0][0], rows[-1][0] + 1))
+    for number, low, high in rows:
+        if number < numbers[-1]:
+            mine = pixels[numbers == number].astype(np.uint32)
+            np.testing.assert_array_equal(low, mine.min(axis=0) * 255 // WHITE)
+            np.testing.assert_array_equal(high, mine.max(axis=0) * 255 // WHITE)
+
+
+@pytest.mark.parametrize(("lost", "kind"), [(True, LOST), (False, UNSEEN)])
+def test_a_gap_is_shown_as_rows_that_say_what_it_is(lost: bool, kind: int) -> None:
+    decimator = Decimator(Scale(4, 1, WHITE), 8)
+    put(decimator, 0, lines(0, 8))
+    put(decimator, 20, lines(20, 12), lost=lost)
+    rows = rows_of(decimator)
+    assert rows.kind.tolist() == [SEEN, SEEN, kind, kind, kind, SEEN, SEEN]
+    assert not rows.high[2:5].any()
+
+
+def test_a_long_pause_is_bounded() -> None:
+    decimator = Decimator(Scale(1, 1, WHITE), 8)
+    put(decimator, 0, lines(0, 8))
+    put(decimator, 10**9, lines(1, 8))
+    assert len(rows_of(decimator).kind) <= MOST_UNSEEN_ROWS + 16
+
+
+def test_many_pixels_become_few_columns_without_losing_an_extreme() -> None:
+    decimator = Decimator(Scale(1, 1, WHITE), 4640)
+    pixels = np.zeros((2, 4640), np.uint16)
+    pixels[0, 4639] = WHITE
+    put(decimator, 0, pixels)
+    rows = rows_of(decimator)
+    assert rows.low.shape[1] == MOST_COLUMNS
+    assert rows.high[0, -1] == 255
+    assert rows.high[0, :-1].max() == 0
+
+
+def test_the_histogram_counts_what_was_looked_at() -> None:
+    decimator = Decimator(Scale(2, 2, WHITE), 8)
+    pixels = np.full((8, 8), WHITE, np.uint16)
+    pixels[:, 0] = 0
+    put(decimator, 0, pixels)
+    rows = rows_of(decimator)
+    assert (rows.histogram[0], rows.histogram[BINS - 1], rows.histogram.sum()) == (4, 28, 32)
+    assert rows.saturated == 28
+
+
+@pytest.mark.parametrize(("rate_hz", "line_bytes"), [(1000.0, 128), (33_333.0, 128), (1e5, 4640), (6e5, 54)])
+def test_what_is_looked_at_is_bounded(rate_hz: float, line_bytes: int) -> None:
+    scale = Scale.of(rate_hz, line_bytes, 255)
+    assert rate_hz / scale.step <= 1000
+    looked_at = rate_hz / scale.stride * line_bytes
+    assert looked_at < 16e6 + rate_hz / scale.step * line_bytes

@@ -1,0 +1,197 @@
+"""Who may do what: by name, origin, token, role and rate; and nothing outside the recordings' directory."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import stat
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from starlette.applications import Starlette
+from starlette.responses import PlainTextResponse
+from starlette.routing import Route
+
+from acquire.config import load_rig
+from acquire.errors import ConfigError, PlaceError, UsageError
+from acquire.web import guard as guard_module
+from acquire.web.guard import Buckets, Guard
+from acquire.web.library import Library
+from acquire.web.server import address_of, link, names_of
+from acquire.web.tokens import COOKIE, Tokens, load_tokens
+from acquire.web_config import WebConfig
+
+TOKENS = Tokens("o" * 32, "v" * 32)
+OPERATOR = {"Authorization": f"Bearer {TOKENS.operator}"}
+VIEWER = {"Authorization": f"Bearer {TOKENS.viewer}"}
+
+
+async def _answer(_: object) -> PlainTextResponse:
+    return PlainTextResponse("in")
+
+
+def ask(method: str, path: str, *requests: dict[str, str]) -> list[httpx.Response]:
+    """One request after the other, with these headers."""
+    route = Route("/{rest:path}", _answer, methods=["GET", "POST"])
+    app = Guard(Starlette(routes=[route]), TOKENS, frozenset({"127.0.0.1"}))
+
+    async def work() -> list[httpx.Response]:
+        transport = httpx.ASGITransport(app)  # type: ignore[arg-type]
+        async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1:8300") as client:
+            return [await client.request(method, path, headers=headers) for headers in requests]
+
+    return asyncio.run(work())
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "headers", "code"),
+    [
+        ("GET", "/", {}, 200),
+        ("GET", "/static/app.js", {}, 200),
+        ("GET", "/api/status", {}, 401),
+        ("GET", "/api/status", {"Authorization": "Bearer x"}, 401),
+        ("GET", "/api/status", {"Authorization": f"Basic {TOKENS.operator}"}, 401),
+        ("GET", "/api/status", VIEWER, 200),
+        ("GET", "/api/status", {"Cookie": f"{COOKIE}={TOKENS.cookie('viewer')}"}, 200),
+        ("GET", "/api/status", {"Cookie": f"{COOKIE}={TOKENS.viewer}"}, 401),
+        ("POST", "/api/arm", VIEWER, 403),
+        ("POST", "/api/arm", {"Cookie": f"{COOKIE}={TOKENS.cookie('viewer')}"}, 403),
+        ("POST", "/api/arm", OPERATOR, 200),
+        ("POST", "/api/arm", {**OPERATOR, "Origin": "http://127.0.0.1:8300"}, 200),
+        ("POST", "/api/arm", {**OPERATOR, "Origin": "http://evil.example"}, 403),
+        ("POST", "/api/arm", {**OPERATOR, "Origin": "null"}, 403),
+        ("POST", "/api/arm", {**OPERATOR, "Sec-Fetch-Site": "cross-site"}, 403),
+        ("POST", "/api/arm", {**OPERATOR, "Sec-Fetch-Site": "same-site"}, 403),
+        ("POST", "/api/session", {"Origin": "http://evil.example"}, 403),
+        ("GET", "/api/status", {**OPERATOR, "Host": "evil.example"}, 421),
+        ("GET", "/", {"Host": "evil.example:8300"}, 421),
+        ("GET", "/api/healthz", {}, 200),
+    ],
+)
+def test_who_may_do_what(method: str, path: str, headers: dict[str, str], code: int) -> None:
+    (answer,) = ask(method, path, headers)
+    assert answer.status_code == code
+    assert "frame-ancestors 'none'" in answer.headers["content-security-policy"]
+    if code != 200:
+        assert answer.json()["message"]
+        assert TOKENS.operator not in answer.text
+
+
+def test_guessing_is_slow(caplog: pytest.LogCaptureFixture) -> None:
+    guesses = [{"Authorization": f"Bearer guess-{k}"} for k in range(8)]
+    codes = [one.status_code for one in ask("GET", "/api/status", *guesses, OPERATOR)]
+    assert codes == [401] * 5 + [429] * 4
+    assert "guess" not in caplog.text
+    assert "a wrong token from" in caplog.text
+
+
+def test_requests_of_one_address_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guard_module, "REQUESTS", (3.0, 0.0))
+    codes = [one.status_code for one in ask("GET", "/api/status", *[OPERATOR] * 5)]
+    assert codes == [200, 200, 200, 429, 429]
+
+
+def test_buckets_fill_again_and_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 0.0
+    buckets = Buckets(2, 1.0, lambda: now)
+    assert [buckets.take("a") for _ in range(3)] == [True, True, False]
+    now = 1.0
+    assert [buckets.take("a") for _ in range(2)] == [True, False]
+    monkeypatch.setattr(guard_module, "MOST_ADDRESSES", 10)
+    for k in range(100):
+        buckets.take(str(k))
+    assert len(buckets._buckets) == 10
+
+
+def test_tokens_are_made_once_for_their_owner_alone(tmp_path: Path) -> None:
+    path = tmp_path / "tokens"
+    made = load_tokens(path)
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert load_tokens(path).operator == made.operator
+    assert made.operator not in repr(made)
+    assert made.role_of_token(made.viewer) == "viewer"
+    assert made.role_of_token("") is None
+    assert made.role_of_cookie(made.cookie("operator")) == "operator"
+
+
+@pytest.mark.parametrize("content", ["", "{}", "[]", json.dumps({"operator": "x", "viewer": "y"}), "\0"])
+def test_a_file_that_is_none_of_ours_is_refused(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "tokens"
+    path.write_text(content)
+    path.chmod(0o600)
+    with pytest.raises(UsageError, match="not one of ours"):
+        load_tokens(path)
+
+
+def test_tokens_that_others_can_read_are_none(tmp_path: Path) -> None:
+    path = tmp_path / "tokens"
+    load_tokens(path)
+    path.chmod(0o640)
+    with pytest.raises(UsageError, match="can be read by others"):
+        load_tokens(path)
+    path.unlink()
+    path.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(UsageError, match="tokens"):
+        load_tokens(path)
+    assert not (tmp_path / "elsewhere").exists()
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"host": "0.0.0.0"}, "can be reached from elsewhere"),
+        ({"certificate": "c.pem"}, "belong together"),
+        ({"port": 99999}, "less than or equal to 65535"),
+    ],
+)
+def test_the_page_is_closed_to_strangers_unless_said(settings: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        load_rig("rig-demo", {f"web.{key}": value for key, value in settings.items()})
+
+
+def test_names_and_addresses(tmp_path: Path) -> None:
+    plain = WebConfig(port=1)
+    assert names_of(plain) == {"127.0.0.1", "localhost", "::1"}
+    named = WebConfig(host="10.0.0.2", names=("Lab",), plain=True)
+    assert names_of(named) == {"10.0.0.2", "lab"}
+    assert address_of(WebConfig(host="::1", port=2)) == "http://[::1]:2/"
+    told = link(plain, tmp_path / "c.sock", "viewer")
+    assert told.startswith("http://127.0.0.1:1/#token=")
+    assert (
+        load_tokens(plain.token_path(tmp_path / "c.sock")).role_of_token(told.partition("=")[2]) == "viewer"
+    )
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../outside.zarr",
+        "..",
+        ".",
+        "",
+        "a/b.zarr",
+        "/etc/passwd",
+        "link.zarr",
+        "file.zarr",
+        "\0.zarr",
+        "x.zarr\0",
+    ],
+)
+def test_nothing_outside_the_directory_is_served(tmp_path: Path, name: str) -> None:
+    inside = tmp_path / "inside"
+    (tmp_path / "outside.zarr").mkdir()
+    inside.mkdir()
+    (inside / "link.zarr").symlink_to(tmp_path / "outside.zarr")
+    (inside / "file.zarr").write_text("x")
+    (inside / "cut.npz").symlink_to("/etc/passwd")
+    library = Library(inside)
+    for suffix in (".zarr", ".npz"):
+        with pytest.raises(PlaceError, match="among the recordings"):
+            library.path_of(name, suffix)
+    with pytest.raises(PlaceError, match="among the recordings"):
+        library.path_of("cut.npz", ".npz")
+    assert library.recordings() == []
+    (tmp_path / "outside.zarr").rename(inside / "odd.zarr")
+    assert [one.error is None for one in library.recordings()] == [False]

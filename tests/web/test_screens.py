@@ -1,0 +1,245 @@
+"""Every state as an operator sees it, in both themes and three widths: what the band says, and that all fits.
+
+With ACQUIRE_SCREENSHOTS=DIRECTORY the pictures are kept, to be looked at.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+from fake_run import FakeRun, rig_config
+from page_server import PageServer
+from served import api
+
+from acquire.client import Client
+from acquire.daemon.endpoint import Endpoint
+from acquire.daemon.messages import DiskStatus
+from acquire.daemon.service import Service
+from acquire.errors import CameraError
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+pytestmark = pytest.mark.needs_chromium
+
+WIDTHS = (1280, 1024, 400)
+SEEN_MS = 60_000
+SCREENSHOTS = os.environ.get("ACQUIRE_SCREENSHOTS")
+
+
+class Instrument:
+    """A service whose capture path is the test's, and its API on the socket that the page's process asks."""
+
+    def __init__(self, home: Path, server: PageServer) -> None:
+        self.run, self.server = FakeRun(), server
+        self.service = Service(rig_config(home), lambda: self.run)
+        self._stack = contextlib.ExitStack()
+        socket = home / "c.sock"
+        endpoint = self._stack.enter_context(contextlib.closing(Endpoint(socket)))
+        self._stack.enter_context(api(self.service, endpoint))
+        self.client = Client(socket)
+
+    def see(self, **changes: Any) -> None:
+        self.run.see(**changes)
+        self.service.supervise()
+
+    def close(self) -> None:
+        """Nobody answers any more."""
+        self._stack.close()
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("page")
+
+
+@pytest.fixture(scope="module")
+def server(home: Path) -> Iterator[PageServer]:
+    with contextlib.closing(PageServer(home / "c.sock", home)) as made:
+        yield made
+
+
+@pytest.fixture
+def instrument(home: Path, server: PageServer) -> Iterator[Instrument]:
+    """One daemon after the other, for one and the same page."""
+    with contextlib.closing(Instrument(home, server)) as made:
+        yield made
+
+
+@pytest.fixture
+def page(browser: Browser, instrument: Instrument) -> Iterator[Page]:
+    context = browser.new_context(viewport={"width": 1280, "height": 900}, color_scheme="light")
+    page = context.new_page()
+    problems: list[str] = []
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.goto(instrument.server.link)
+    page.wait_for_selector("body[data-level=idle]:not([data-stale])", timeout=SEEN_MS)
+    yield page
+    context.close()
+    assert problems == []
+
+
+def arm(instrument: Instrument) -> None:
+    instrument.client.arm()
+    instrument.service.supervise()
+
+
+def record(instrument: Instrument) -> None:
+    arm(instrument)
+    instrument.client.start(Path("/d/x.zarr"), lines=1_000_000)
+    instrument.see(recorded_lines=250_000, committed_lines=240_000)
+
+
+def lose(instrument: Instrument) -> None:
+    record(instrument)
+    lines = {arm: {**counts, "lost": {"camera": 123}} for arm, counts in instrument.run.seen.lines.items()}
+    instrument.see(lines=lines)
+
+
+def fail(instrument: Instrument) -> None:
+    arm(instrument)
+    instrument.see(fault="camera b does not answer any more")
+
+
+def fill_disk(instrument: Instrument) -> None:
+    record(instrument)
+    directory = Path("/d")
+    full = DiskStatus(
+        directory=directory, free_bytes=10**9, reserve_bytes=0, bytes_per_s=4e6, seconds_to_full=240.0
+    )
+
+    class Disk:
+        status = full
+
+        def look(self, *, recording: bool) -> None: ...
+        def close(self) -> None: ...
+
+    instrument.service._disk = Disk()  # type: ignore[assignment]
+    instrument.service.supervise()
+
+
+def go_silent(instrument: Instrument) -> None:
+    arm(instrument)
+    instrument.close()
+
+
+STATES: dict[str, tuple[Callable[[Instrument], None], str, str, str]] = {
+    "idle": (lambda _: None, "idle", "", "Nothing is armed"),
+    "armed": (arm, "armed", "", "nothing is lost"),
+    "recording": (record, "recording", "", "nothing is lost"),
+    "lost": (lose, "lost", "lines lost", "246 lines were lost"),
+    "faulted": (fail, "fault", "fault", "camera b does not answer"),
+    "disk nearly full": (fill_disk, "degraded", "degraded", "the disk is full in 4 min"),
+    "stale": (go_silent, "", "no news", "has no daemon"),
+}
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_every_state_is_told_in_words_and_fits(name: str, page: Page, instrument: Instrument) -> None:
+    enter, level, word, sentence = STATES[name]
+    enter(instrument)
+    wanted = f"[data-level={level}]" if level else "[data-stale]"
+    page.wait_for_selector(f"body{wanted}", timeout=SEEN_MS)
+    page.locator("#sentence", has_text=sentence).wait_for(timeout=SEEN_MS)
+    assert word in page.inner_text(".word").lower()
+    for theme in ("light", "dark"):
+        page.emulate_media(color_scheme=theme)  # type: ignore[arg-type]
+        for width in WIDTHS:
+            page.set_viewport_size({"width": width, "height": 900})
+            wide = page.evaluate("document.documentElement.scrollWidth")
+            assert wide <= width, f"{name} is {wide} px wide where {width} are to be had"
+            if SCREENSHOTS:
+                file = f"{name.replace(' ', '-')}-{theme}-{width}.png"
+                page.screenshot(path=Path(SCREENSHOTS) / file, full_page=width == 400)
+
+
+def test_a_loss_stays_until_it_is_acknowledged(page: Page, instrument: Instrument) -> None:
+    lose(instrument)
+    page.wait_for_selector("body[data-level=lost]", timeout=SEEN_MS)
+    instrument.run.see(recording=False, done=True)
+    instrument.client.stop()
+    instrument.client.disarm()
+    page.wait_for_selector("body[data-state=idle][data-level=lost]", timeout=SEEN_MS)
+    assert page.inner_text("#lost") == "246"
+    page.click("#acknowledge")
+    page.wait_for_selector("body[data-state=idle][data-level=idle]", timeout=SEEN_MS)
+
+
+def test_all_can_be_reached_and_done_by_key(page: Page, instrument: Instrument) -> None:
+    page.keyboard.press("?")
+    assert page.locator("#keys").is_visible()
+    page.keyboard.press("Escape")
+    for key, name in (("2", "aim"), ("3", "recordings"), ("4", "health"), ("5", "setup"), ("1", "watch")):
+        page.keyboard.press(key)
+        page.wait_for_selector(f"#{name}:not([hidden])")
+    page.keyboard.press("a")
+    page.wait_for_selector("#record:enabled", timeout=SEEN_MS)
+    page.keyboard.press("r")
+    page.wait_for_selector("#stop:enabled", timeout=SEEN_MS)
+    page.keyboard.press("m")
+    page.locator("#events", has_text="mark").wait_for(timeout=SEEN_MS)
+    page.keyboard.press("s")  # a tap does not end a recording
+    assert "stop" not in instrument.run.names
+    page.wait_for_selector("#stop:enabled", timeout=SEEN_MS)
+    page.keyboard.down("s")
+    page.wait_for_selector("#disarm:enabled", timeout=SEEN_MS)
+    page.keyboard.up("s")
+    page.keyboard.press("d")
+    page.wait_for_selector("body[data-state=idle]", timeout=SEEN_MS)
+
+
+def test_everything_has_a_name_for_who_cannot_see_it(page: Page) -> None:
+    unnamed = page.evaluate(
+        """[...document.querySelectorAll("button, input, select, a, canvas, section, dialog")].filter((one) =>
+           !(one.getAttribute("aria-label") || one.getAttribute("aria-labelledby") ||
+             one.textContent.trim() || one.labels?.length)).map((one) => one.outerHTML)"""
+    )
+    assert unnamed == []
+    assert page.get_attribute("#error", "role") == "alert"
+    assert page.get_attribute("#told", "aria-live") == "polite"
+
+
+def test_what_is_refused_is_told_in_the_daemons_words(page: Page, instrument: Instrument) -> None:
+    instrument.run.refuse["arm"] = CameraError("camera b is not plugged in", hint="plug it in")
+    page.keyboard.press("a")
+    page.locator("#error", has_text="camera b is not plugged in").wait_for(timeout=SEEN_MS)
+    assert "try: plug it in" in page.inner_text("#error")
+
+
+def test_a_viewer_looks_and_a_stranger_is_asked(browser: Browser, instrument: Instrument) -> None:
+    with contextlib.closing(browser.new_context()) as context:
+        page = context.new_page()
+        page.goto(instrument.server.address)
+        page.wait_for_selector("#enter[open]", timeout=SEEN_MS)
+        page.fill("#token", "wrong")
+        page.keyboard.press("Enter")
+        page.locator("#enter-error", has_text="token is wrong").wait_for(timeout=SEEN_MS)
+        page.fill("#token", instrument.server.viewer)
+        page.keyboard.press("Enter")
+        page.wait_for_selector("body[data-level=idle]", timeout=SEEN_MS)
+        assert page.is_disabled("#arm")
+        assert instrument.server.viewer not in page.url
+        (cookie,) = context.cookies()
+        assert (cookie["httpOnly"], cookie["sameSite"]) == (True, "Strict")
+        assert instrument.server.viewer not in str(cookie)
+    log = instrument.server.log.read_text()
+    assert "enters from 127.0.0.1" in log
+    assert instrument.server.viewer not in log
+
+
+def test_nothing_is_loaded_from_elsewhere(browser: Browser, instrument: Instrument) -> None:
+    asked: list[str] = []
+    with contextlib.closing(browser.new_context()) as context:
+        page = context.new_page()
+        page.on("request", lambda request: asked.append(request.url))
+        page.goto(instrument.server.link)
+        page.wait_for_selector("body[data-level=idle]", timeout=SEEN_MS)
+        for key in "2345":
+            page.keyboard.press(key)
+    assert len(asked) > 10
+    assert [url for url in asked if not url.startswith((instrument.server.address, "data:"))] == []
