@@ -17,6 +17,12 @@ N = M * S
 LIGHT = {"dark": 0, "flat": 1, "target": None}
 NOISE = ({"kind": "shot_noise"}, {"kind": "read_noise", "sigma_e": 25.0})
 COLUMNS = ({"kind": "prnu", "prnu": 0.02}, {"kind": "column_offsets", "sigma_dn": 2.0, "channels": 6})
+ALL = (
+    *NOISE,
+    *COLUMNS,
+    {"kind": "beam_splitter", "part_a": 0.46},
+    {"kind": "misregistration", "rows": 1.5, "columns": -1.0, "turn_deg": 0.5},
+)
 RIG = {
     "geometry.stages": M,
     "geometry.substeps": S,

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from acquire.calibrate.apply import check_fits
 from acquire.calibrate.columns import dark, flat
+from acquire.calibrate.field import mended
 from acquire.calibrate.target import alignment, orientation
 
 if TYPE_CHECKING:
@@ -69,7 +70,11 @@ def check(exposure: Exposure, known: Calibration, *, covered: bool = False) -> C
         return Check(tuple(_columns(found, known, "offset_dn", "DN")), doubts)
     if exposure.code_value == 1:
         found = flat(exposure, known)
-        return Check((*_columns(found, known, "gain", "1"), *_balance(found, known)), doubts)
+        seen = found
+        if known.alignment is not None:
+            corrected = mended(known.with_step(found), known.alignment.alignment)
+            seen = replace(found, quantities={**found.quantities, **corrected})
+        return Check((*_columns(seen, known, "gain", "1"), *_balance(found, known)), doubts)
     seen = orientation(exposure, known)
     believed = known.orientation or "turn 90"
     if seen.orientation is None or seen.orientation != believed:

@@ -24,6 +24,7 @@ from acquire.calibrate.checks import (
 )
 from acquire.calibrate.exposure import moments, unseen
 from acquire.errors import UsageError
+from acquire.lines import ARMS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -128,6 +129,7 @@ def flat(
         "smooth": smooth,
         "part_a": round(float(balance[0] / balance.sum()), 6),
         "optics_hide_columns": listed(trusted | ~usable),
+        "edge_response": _responses(shape / level, edges),
     }
     warnings = (*dim(exposure, light), *drift(found), *left_out(usable, "response"))
     return Finding("flat", exposure.instrument, quantities, usable, facts=facts, warnings=warnings)
@@ -153,6 +155,14 @@ def _dark_edges(shape: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArra
         for order in (slice(None, most), slice(None, -most - 1, -1)):
             out[order] = np.logical_and.accumulate(low[order])
     return dark
+
+
+def _responses(shape: NDArray[np.float64], edges: NDArray[np.bool_]) -> dict[str, dict[str, float]]:
+    """Arm → column at the edge → its response beside the arm's mean."""
+    return {
+        arm: {str(column): round(float(row[column]), 6) for column in np.flatnonzero(dark)}
+        for arm, row, dark in zip(ARMS, shape, edges, strict=True)
+    }
 
 
 def _profile(response: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -10,6 +10,7 @@ import numpy as np
 from acquire.calibrate.align import Match, align
 from acquire.calibrate.apply import calibrated
 from acquire.calibrate.calibration import Finding, Measured
+from acquire.calibrate.field import mended
 from acquire.calibrate.orientation import (
     CLEAR,
     LEAST_CORRELATION,
@@ -98,7 +99,10 @@ def alignment(exposure: Exposure, known: Calibration) -> Finding:
         )
     shift = correlations(still_a.blocks(S), still_b.blocks(S))[MODEL][1]
     match = align(still_a, still_b, geometry, (S * shift[0], S * shift[1]))
-    quantities = _balance(known, match)
+    quantities = mended(known, match.found.alignment)
+    ends = bool(quantities)
+    if not ends:
+        quantities = _balance(known, match)
     facts = {
         **exposure.facts(),
         "lines": len(segment.time_ns),
@@ -108,10 +112,15 @@ def alignment(exposure: Exposure, known: Calibration) -> Finding:
         "brightness": round(match.brightness, 5),
     }
     warnings = []
-    if quantities:
+    if ends:
+        warnings.append(
+            "the flat's light ends at the field's edge, beyond which arm B looks: gain and balance are "
+            "corrected; a larger white scene is better"
+        )
+    elif quantities:
         warnings.append(
             f"over the field that both arms see, arm B is {match.brightness - 1:+.1%} brighter than the flat "
-            "says, whose light does not reach beyond the field: the balance is corrected"
+            "says: the balance is corrected"
         )
     return Finding(
         "align",

@@ -6,18 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from instruments import COLUMNS, NOISE, dots, record, white
+from instruments import ALL, dots, record, white
 
 from acquire.calibrate import Calibration
 from acquire.calibrate.columns import dark, flat
 from acquire.calibrate.exposure import open_exposure
-
-ALL = (
-    *NOISE,
-    *COLUMNS,
-    {"kind": "beam_splitter", "part_a": 0.46},
-    {"kind": "misregistration", "rows": 1.5, "columns": -1.0, "turn_deg": 0.5},
-)
 
 
 @pytest.fixture(scope="session")

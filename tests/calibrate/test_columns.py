@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import ALL
-from instruments import COLUMNS, NOISE, columns_truth, record, white
+from instruments import ALL, COLUMNS, NOISE, columns_truth, record, white
 
 from acquire.calibrate import Calibration
 from acquire.calibrate.columns import ambient, dark, flat

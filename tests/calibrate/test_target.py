@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from instruments import NOISE, N, S, dots, record, white
+from instruments import COLUMNS, NOISE, N, S, columns_truth, dots, record, white
 
-from acquire.calibrate import Calibration, calibrated
+from acquire.calibrate import Calibration, Measured, calibrated
+from acquire.calibrate.columns import dark, flat
 from acquire.calibrate.exposure import instrument_of, open_exposure
 from acquire.calibrate.orientation import MODEL, VIEWS, View, oriented
 from acquire.calibrate.still import stills
@@ -111,14 +113,55 @@ def test_shift_and_turn_to_some_hundredths(tmp_path: Path, off: dict[str, float]
         assert error < 8 * found.uncertainty[name]
 
 
-def test_light_that_both_arms_see_mends_the_balance(recordings: dict[str, Path], known: Calibration) -> None:
-    """The flat's light ends at the field's edge, which arm B does not see whole: its part looks smaller."""
+def test_a_flat_that_ends_at_the_fields_edge_is_put_right(
+    recordings: dict[str, Path], known: Calibration
+) -> None:
+    """Arm B looks beyond it: its part looks smaller, and its turn gives the gains a slope."""
     found = alignment(open_exposure(recordings["target"]), known)
-    flats, both = known.value("balance"), found.quantities["balance"].value
-    assert flats is not None
-    truth = 0.54 / 0.46
-    assert abs(both[1] / both[0] - truth) < 0.5 * abs(flats[1] / flats[0] - truth)
-    assert "balance is corrected" in found.warnings[0]
+    assert "light ends at the field's edge" in found.warnings[0]
+    truth = columns_truth(white(effects=[COLUMNS[0]]))
+    light = np.stack([truth[arm] - 20.0 for arm in ("a", "b")]) * np.array([[0.92], [1.08]])
+    inner = slice(2, -2)
+
+    def errors(quantities: Mapping[str, Measured]) -> tuple[float, float]:
+        gain, balance = quantities["gain"].value[1, inner], quantities["balance"].value
+        own, ratio = light[1, inner] / light[1, inner].mean(), light[1, inner].mean() / light[0, inner].mean()
+        return float((gain / gain.mean() - own).std()), abs(balance[1] / balance[0] / ratio - 1)
+
+    gain, balance = errors(known.quantities)
+    assert gain > 0.006
+    assert balance > 0.01
+    gain, balance = errors(found.quantities)
+    assert gain < 0.003
+    assert balance < 0.003
+
+
+def test_a_flat_that_goes_on_beyond_the_field_stays(tmp_path: Path) -> None:
+    off = {"kind": "misregistration", "rows": 1.5, "columns": -1.0, "turn_deg": 0.5, "beyond": "edge"}
+    effects = [*NOISE, *COLUMNS, {"kind": "beam_splitter", "part_a": 0.46}, off]
+    plain = white(effects=effects)
+    scenes = {"dark": plain, "flat": plain, "target": dots(tmp_path, effects)}
+    taken = {
+        name: open_exposure(record(tmp_path / f"{name}.zarr", scene, name)) for name, scene in scenes.items()
+    }
+    first = dark(taken["dark"])
+    calibration = Calibration(first.instrument).with_step(first)
+    calibration = calibration.with_step(flat(taken["flat"], calibration))
+    found = alignment(taken["target"], calibration)
+    assert found.quantities == {}
+    assert found.warnings == ()
+    assert found.alignment is not None
+    assert found.alignment.alignment.rows == pytest.approx(1.5, abs=0.06)
+
+
+def test_light_that_both_arms_see_mends_the_balance(tmp_path: Path, known: Calibration) -> None:
+    """A splitter that has moved since the flat: the target says so."""
+    effects = [*NOISE, *COLUMNS, {"kind": "beam_splitter", "part_a": 0.5}]
+    path = record(tmp_path / "target.zarr", dots(tmp_path, effects), "target")
+    found = alignment(open_exposure(path), known)
+    balance = found.quantities["balance"].value
+    assert balance[0] / 2 == pytest.approx(0.5, abs=0.004)
+    assert "the balance is corrected" in found.warnings[0]
 
 
 def test_another_orientation_than_believed_is_told(tmp_path: Path) -> None:
