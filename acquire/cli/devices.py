@@ -38,14 +38,15 @@ def devices(
 
     Example: [bold]acquire devices --config rig-demo[/]
     """
-    rows = list(_of_rig(config) if config else _of_host())
+    rows = list(of_rig(config) if config else _of_host())
     if json:
         print_json(rows)
         return
     print_table(COLUMNS, [[row[column] for column in COLUMNS] for row in rows])
 
 
-def _of_rig(config: str) -> Iterator[dict[str, Any]]:
+def of_rig(config: str) -> Iterator[dict[str, Any]]:
+    """Trigger and cameras of a rig file, opened one after the other; what each lacks. Raises ConfigError."""
     from acquire.camera.look import facts
     from acquire.config import load_rig
     from acquire.rig import Rig

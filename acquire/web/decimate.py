@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 MOST_ROWS_PER_S = 1000
 MOST_COLUMNS = 512
-BYTES_PER_S = 8e6
+BYTES_PER_S = 4e6
 """Of pixels that are looked at, per arm."""
 MOST_SAMPLES = 16
 """Lines that are looked at for one row."""

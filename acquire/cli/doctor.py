@@ -1,0 +1,83 @@
+"""``acquire doctor``: what this host lacks for capturing, and what to do about it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from acquire.cli.output import JsonFlag, print_json, print_table, say
+from acquire.errors import AcquireError, DeviceError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from acquire.config import RigConfig
+    from acquire.daemon.doctor import Finding
+
+WORDS = {"good": "good", "warning": "WARNING", "bad": "BAD"}
+
+
+def register(app: typer.Typer) -> None:
+    app.command(rich_help_panel="Rig")(doctor)
+
+
+def doctor(
+    config: Annotated[
+        str | None,
+        typer.Option("--config", "-c", metavar="FILE", help="Rig file: its devices and needs are looked at."),
+    ] = None,
+    socket: Annotated[
+        Path | None, typer.Option("--socket", envvar="ACQUIRE_SOCKET", help="The daemon's control socket.")
+    ] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Look at kernel limits, disk, memory, real-time rights, clock, devices, ports and versions.
+
+    Says for each what to do; changes nothing. Devices of the rig are opened, unless a daemon is running.
+    Ends with 5 where something is bad.
+
+    Example: [bold]acquire doctor --config rig-demo[/]
+    """
+    from acquire.config import load_rig
+    from acquire.daemon.doctor import examine
+
+    rig = None if config is None else load_rig(config)
+    running = _running(socket, rig)
+    findings = [*examine(rig, running), *(_devices(config) if config and running is None else ())]
+    if json:
+        print_json([asdict(one) for one in findings])
+    else:
+        print_table(("what", "", "found"), [(one.name, WORDS[one.level], one.text) for one in findings])
+        for one in findings:
+            if one.level != "good" and one.todo:
+                say(f"{one.name}: {one.todo}")
+    if any(one.level == "bad" for one in findings):
+        raise typer.Exit(DeviceError.exit_code)
+
+
+def _running(socket: Path | None, rig: RigConfig | None) -> str | None:
+    """Version of the daemon that listens, if one does."""
+    from acquire.client import Client
+
+    try:
+        return Client(socket or (rig.control.socket if rig else None)).status().version
+    except AcquireError:
+        return None
+
+
+def _devices(config: str) -> Iterator[Finding]:
+    from acquire.cli.devices import of_rig
+    from acquire.daemon.doctor import Finding
+
+    try:
+        for row in of_rig(config):
+            ready = row["state"] == "ready"
+            name = f"{row['model']} {row['serial']} {row['firmware']}".strip()
+            text = f"{name or 'it'} is ready" if ready else row["state"]
+            todo = "" if ready else "acquire devices lists what this host shows"
+            yield Finding(row["device"], "good" if ready else "bad", text, todo)
+    except AcquireError as error:
+        yield Finding("devices", "bad", error.message, error.hint)

@@ -1,0 +1,295 @@
+"""Is this host fit to capture? One finding per thing, and what to do about it. Nothing is changed.
+
+Limits are judged for what the rig needs, where one is given: a host that only simulates lacks nothing.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import resource
+import shutil
+import socket
+import sys
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from acquire import __version__
+from acquire.cores import usable_cores
+from acquire.lines import ARMS
+from acquire.stream.shared import available_bytes
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from acquire.config import RigConfig
+
+Level = Literal["good", "warning", "bad"]
+LEAST_DESCRIPTORS = 4096
+GIGE_RECEIVE_BYTES = 32 * 2**20
+"""Of a socket's buffer: packets of a tenth of a second at 10 Gbit/s, in part."""
+USB_BUFFER_MB = 1000
+DISK_GB = 50.0
+"""Less than this is soon full."""
+SPARE_MEMORY = 1.5
+"""Of what the rings take, for the rest of the capture."""
+NETWORK_DISKS = ("nfs", "nfs4", "cifs", "smb3", "fuse.sshfs", "9p", "ceph")
+_TIME_ERROR = 5
+_STA_UNSYNC = 0x40
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What was looked at, how it is, and what to do where it is not good."""
+
+    name: str
+    level: Level
+    text: str
+    todo: str = ""
+
+
+def examine(rig: RigConfig | None, running: str | None) -> Iterator[Finding]:
+    """All findings about the host, one after the other; devices are looked at elsewhere.
+
+    ``running`` is the version of the daemon that runs here, if one does.
+    """
+    yield _python()
+    yield _foreign_package()
+    yield _descriptors()
+    yield _processors()
+    yield _governor()
+    yield _realtime(rig)
+    yield _memory(rig)
+    yield from _disk(Path() if rig is None else rig.recording.directory)
+    yield _clock()
+    yield from _network(rig)
+    yield from _usb(rig)
+    yield from _producers(rig)
+    yield from _port(rig)
+    yield _daemon(running)
+
+
+def _python() -> Finding:
+    text = f"acquire {__version__} on Python {sys.version.split()[0]}, numpy {np.__version__}"
+    return Finding("versions", "good", text)
+
+
+def _foreign_package() -> Finding:
+    """PyPI has another distribution that installs a package `acquire`; side by side they break each other."""
+    owners = set(metadata.packages_distributions().get("acquire", ()))
+    others = sorted(owners - {"tdi-acquire"})
+    if not others:
+        return Finding("package", "good", "no other distribution installs a package `acquire`")
+    return Finding(
+        "package",
+        "bad",
+        f"{', '.join(others)} installs a package `acquire`, too: the one hides the other",
+        f"pip uninstall {' '.join(others)}, and install tdi-acquire anew; or an environment for each",
+    )
+
+
+def _descriptors() -> Finding:
+    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if hard == resource.RLIM_INFINITY or hard >= LEAST_DESCRIPTORS:
+        return Finding("descriptors", "good", f"a process may have {'any number' if hard < 0 else hard}")
+    return Finding(
+        "descriptors",
+        "warning",
+        f"a process may have {hard} only",
+        "LimitNOFILE=65536 in the unit, or nofile in /etc/security/limits.d/",
+    )
+
+
+def _processors() -> Finding:
+    cores = usable_cores()
+    if cores >= 4:
+        return Finding("processors", "good", f"{cores} can be used")
+    return Finding(
+        "processors", "warning", f"{cores} can be used: enough to simulate", "four or more for two cameras"
+    )
+
+
+def _governor() -> Finding:
+    files = sorted(Path("/sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq/scaling_governor"))
+    found = {_read(path) for path in files}
+    slow = sorted(found - {"performance", "schedutil", ""})
+    if not slow:
+        return Finding(
+            "frequency", "good", f"governor {', '.join(sorted(found)) or 'not told by this kernel'}"
+        )
+    return Finding(
+        "frequency",
+        "warning",
+        f"governor {', '.join(slow)}: slow to wake",
+        "cpupower frequency-set -g performance",
+    )
+
+
+def _realtime(rig: RigConfig | None) -> Finding:
+    soft, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
+    allowed = soft != 0 or os.geteuid() == 0
+    wanted = rig is not None and rig.stream.realtime
+    if allowed:
+        return Finding("real time", "good", "this user may run grabbers in real time")
+    level: Level = "bad" if wanted else "warning"
+    why = ", and stream.realtime asks for it" if wanted else "; without it, others may delay them"
+    todo = "LimitRTPRIO=1 in the unit (acquire install-service), or rtprio in /etc/security/limits.d/"
+    return Finding("real time", level, f"this user may not run grabbers in real time{why}", todo)
+
+
+def _memory(rig: RigConfig | None) -> Finding:
+    there = available_bytes()
+    if rig is None:
+        return Finding("memory", "good", f"{there / 1e9:.1f} GB can be had")
+    line_bytes = rig.geometry.stages * np.dtype(rig.cameras.a.dtype).itemsize
+    rings = len(ARMS) * rig.ring_slots * rig.stream.block_lines * line_bytes
+    text = f"{there / 1e9:.1f} GB can be had, the rings take {rings / 1e9:.2f} GB"
+    if there > SPARE_MEMORY * rings:
+        return Finding("memory", "good", text)
+    return Finding("memory", "bad", text, "a smaller stream.ring_seconds, or end other programs")
+
+
+def _disk(directory: Path) -> Iterator[Finding]:
+    path = directory.absolute()
+    if not path.is_dir():
+        yield Finding("disk", "bad", f"{path} is no directory", f"mkdir -p {path}, or recording.directory")
+        return
+    if not os.access(path, os.W_OK | os.X_OK):
+        yield Finding("disk", "bad", f"{path} is not ours to write", f"chown or chmod {path}")
+        return
+    free_gb, kind = shutil.disk_usage(path).free / 1e9, _file_system(path)
+    text = f"{path}: {free_gb:.0f} GB free on {kind or 'a file system that is not told'}"
+    if kind in NETWORK_DISKS:
+        yield Finding(
+            "disk", "warning", f"{text}: it waits for a network", "a local disk, and recording.upload_to"
+        )
+    elif free_gb < DISK_GB:
+        yield Finding("disk", "warning", text, "remove recordings, or set recording.retention")
+    else:
+        yield Finding("disk", "good", text)
+
+
+def _file_system(path: Path) -> str:
+    """The type of the mount that has the longest name above the path."""
+    best, kind = "", ""
+    for line in _read(Path("/proc/self/mounts")).splitlines():
+        _, place, found, *_ = line.split(" ")
+        inside = str(path) == place or str(path).startswith(place.rstrip("/") + "/")
+        if inside and len(place) >= len(best):
+            best, kind = place, found
+    return kind
+
+
+class _Timex(ctypes.Structure):
+    """The head of struct timex; the rest is room for what the kernel writes."""
+
+    _fields_ = (
+        ("modes", ctypes.c_uint),
+        ("offset", ctypes.c_long),
+        ("freq", ctypes.c_long),
+        ("maxerror", ctypes.c_long),
+        ("esterror", ctypes.c_long),
+        ("status", ctypes.c_int),
+        ("rest", ctypes.c_byte * 256),
+    )
+
+
+def _clock() -> Finding:
+    timex = _Timex()
+    state = ctypes.CDLL(None).adjtimex(ctypes.byref(timex))
+    if state < 0:
+        return Finding("clock", "warning", "the kernel does not say whether the clock is set by others")
+    if state == _TIME_ERROR or timex.status & _STA_UNSYNC:
+        return Finding(
+            "clock",
+            "warning",
+            "the host's clock is not synchronised: UTC in recordings is what it says",
+            "chrony or systemd-timesyncd; the lines' own times come from the trigger",
+        )
+    return Finding("clock", "good", f"synchronised, within {timex.maxerror / 1000:.1f} ms")
+
+
+def _uses(rig: RigConfig | None, *drivers: str) -> bool:
+    return rig is not None and any(rig.cameras.arm(arm).driver in drivers for arm in ARMS)
+
+
+def _network(rig: RigConfig | None) -> Iterator[Finding]:
+    """GigE Vision loses packets where a socket's buffer is small."""
+    if not _uses(rig, "aravis"):
+        return
+    most = int(_read(Path("/proc/sys/net/core/rmem_max")) or 0)
+    text = f"a socket may buffer {most / 2**20:.1f} MiB"
+    if most >= GIGE_RECEIVE_BYTES:
+        yield Finding("network", "good", text)
+    else:
+        yield Finding("network", "warning", text, f"sysctl -w net.core.rmem_max={GIGE_RECEIVE_BYTES}")
+
+
+def _usb(rig: RigConfig | None) -> Iterator[Finding]:
+    path = Path("/sys/module/usbcore/parameters/usbfs_memory_mb")
+    if not _uses(rig, "aravis", "harvesters") or not path.exists():
+        return
+    most = int(_read(path) or 0)
+    if most == 0 or most >= USB_BUFFER_MB:
+        yield Finding("usb", "good", f"usbfs may use {'any memory' if most == 0 else f'{most} MB'}")
+    else:
+        todo = f"echo {USB_BUFFER_MB} > {path}, or usbcore.usbfs_memory_mb={USB_BUFFER_MB} at boot"
+        yield Finding("usb", "warning", f"usbfs may use {most} MB, too little for USB3 cameras", todo)
+
+
+def _producers(rig: RigConfig | None) -> Iterator[Finding]:
+    if not _uses(rig, "harvesters"):
+        return
+    assert rig is not None
+    given = [rig.cameras.arm(arm).cti for arm in ARMS if rig.cameras.arm(arm).cti]
+    places = os.environ.get("GENICAM_GENTL64_PATH", "").split(os.pathsep)
+    found = [str(path) for place in places if place for path in Path(place).glob("*.cti")]
+    missing = [path for path in given if not Path(path).is_file()]
+    if missing:
+        yield Finding(
+            "producer", "bad", f"{', '.join(missing)} is not there", "cameras.a.cti: the maker's GenTL file"
+        )
+    elif given or found:
+        yield Finding("producer", "good", ", ".join(given or found))
+    else:
+        yield Finding(
+            "producer",
+            "bad",
+            "no GenTL producer: GENICAM_GENTL64_PATH names no directory with one",
+            "install the camera maker's driver, or set cameras.a.cti",
+        )
+
+
+def _port(rig: RigConfig | None) -> Iterator[Finding]:
+    if rig is None or rig.web is None or rig.web.port == 0:
+        return
+    family = socket.AF_INET6 if ":" in rig.web.host else socket.AF_INET
+    with socket.socket(family) as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((rig.web.host, rig.web.port))
+        except OSError as error:
+            text = f"{rig.web.host}:{rig.web.port}: {error.strerror}"
+            yield Finding("page", "warning", text, "another web.port, unless it is the page that is running")
+            return
+    yield Finding("page", "good", f"{rig.web.host}:{rig.web.port} is free")
+
+
+def _daemon(running: str | None) -> Finding:
+    if running is None:
+        return Finding("daemon", "good", "none is running")
+    if running != __version__:
+        text = f"the one that runs is acquire {running}, and this is {__version__}"
+        return Finding("daemon", "warning", text, "start it anew")
+    return Finding("daemon", "good", f"acquire {running} is running")
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8", errors="replace").strip()
+    except OSError:
+        return ""

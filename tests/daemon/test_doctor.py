@@ -1,0 +1,87 @@
+"""What a host lacks is named, with what to do; what the rig does not need is no lack."""
+
+from __future__ import annotations
+
+import json
+import resource
+import socket
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+from fake_run import rig_config
+
+from acquire.config import RigConfig
+from acquire.daemon import doctor
+from acquire.daemon.doctor import Finding, examine
+
+
+def found(rig: RigConfig | None, name: str, running: str | None = None) -> Finding:
+    (one,) = [one for one in examine(rig, running) if one.name == name]
+    return one
+
+
+def test_every_lack_says_what_to_do(tmp_path: Path) -> None:
+    for one in examine(rig_config(tmp_path), None):
+        assert one.text
+        assert one.level == "good" or one.todo or one.name == "clock"
+
+
+def test_a_foreign_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    owners = {"acquire": ["tdi-acquire", "acquire-imaging"]}
+    monkeypatch.setattr(metadata, "packages_distributions", lambda: owners)
+    one = found(None, "package")
+    assert (one.level, "pip uninstall acquire-imaging" in one.todo) == ("bad", True)
+
+
+def test_limits_are_judged_by_what_the_rig_asks_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    limits = {resource.RLIMIT_RTPRIO: (0, 0), resource.RLIMIT_NOFILE: (256, 256)}
+    monkeypatch.setattr(doctor.resource, "getrlimit", limits.__getitem__)
+    monkeypatch.setattr(doctor.os, "geteuid", lambda: 1000)
+    assert found(rig_config(tmp_path), "real time").level == "warning"
+    assert found(rig_config(tmp_path, **{"stream.realtime": True}), "real time").level == "bad"
+    assert "LimitNOFILE" in found(None, "descriptors").todo
+
+
+def test_memory_is_held_against_the_rings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert found(rig_config(tmp_path), "memory").level == "good"
+    monkeypatch.setattr(doctor, "available_bytes", lambda: 10**6)
+    assert found(rig_config(tmp_path), "memory").level == "bad"
+
+
+def test_the_disk_is_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert found(rig_config(tmp_path), "disk").level in ("good", "warning")
+    assert "no directory" in found(rig_config(tmp_path / "none"), "disk").text
+    monkeypatch.setattr(doctor, "_file_system", lambda _: "nfs4")
+    assert "waits for a network" in found(rig_config(tmp_path), "disk").text
+
+
+def test_a_port_that_is_taken_and_a_daemon_of_another_version(tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        rig = rig_config(tmp_path, **{"web.port": taken.getsockname()[1]})
+        assert found(rig, "page").level == "warning"
+    assert found(None, "daemon", "0.0.9").level == "warning"
+
+
+def test_producers_of_cameras_are_looked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = {f"cameras.{arm}.{key}": value for arm in "ab" for key, value in (("driver", "harvesters"),)}
+    rig = rig_config(tmp_path, **settings)
+    monkeypatch.setenv("GENICAM_GENTL64_PATH", str(tmp_path))
+    assert found(rig, "producer").level == "bad"
+    (tmp_path / "maker.cti").touch()
+    assert found(rig, "producer").level == "good"
+
+
+def test_the_command_opens_the_devices_and_ends_with_5_for_what_is_bad(tmp_path: Path) -> None:
+    words = [sys.executable, "-m", "acquire", "doctor", "--json", "--socket", str(tmp_path / "none.sock")]
+    ended = subprocess.run(
+        [*words, "--config", "rig-demo"], capture_output=True, text=True, timeout=300, check=False
+    )
+    names = {one["name"]: one["level"] for one in json.loads(ended.stdout)}
+    assert {"trigger", "camera a", "camera b"} <= set(names)
+    assert names["trigger"] == "good"
+    assert ended.returncode == (5 if "bad" in names.values() else 0)

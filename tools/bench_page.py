@@ -1,0 +1,241 @@
+"""What the operator's page costs the capture, and how quick it is: with clients and without, in one run.
+
+``python tools/bench_page.py --out DIR`` runs a daemon with cameras of stored lines and the page's process. It
+records without any client, then with five that follow the live picture, of which one never reads; says what
+was lost, how late the grabbers' blocks were, and what the page's process took; then it opens the page in
+Debian's chromium, where that and playwright are installed: the first picture, and how late the state is told.
+``--small`` is 2 x 512 px x 33 klines/s, whose pictures are 2 x 1 MB/s; else it is 928 MB/s in all.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import json
+import re
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from shutil import rmtree, which
+from typing import Any
+
+import psutil
+
+from acquire.capacity.latency import Latencies, TimedOpener
+from acquire.client import Client
+from acquire.config import RigConfig, load_rig
+from acquire.daemon.endpoint import Endpoint
+from acquire.daemon.plan import Run, worker_modules
+from acquire.daemon.server import Daemon
+from acquire.daemon.service import Service
+from acquire.rig import Rig
+from acquire.stream.nursery import warm_up
+from acquire.web.tokens import load_tokens
+
+CLIENTS = 4
+"""That read; one more does not."""
+COMMON: dict[str, Any] = {
+    "cameras.a.driver": "pattern",
+    "cameras.b.driver": "pattern",
+    "cameras.a.pixel_format": "Mono8",
+    "cameras.b.pixel_format": "Mono8",
+    "recording.codec": "none",
+    "check.enable": False,
+}
+FULL = {
+    "geometry.stages": 4096,
+    "geometry.substeps": 1,
+    "trigger.substep_ticks": 794,
+    "stream.block_lines": 1024,
+}
+SMALL = {"geometry.stages": 512}
+
+
+class TimedRig:
+    """A rig whose cameras note how late their blocks are."""
+
+    def __init__(self, rig: Rig) -> None:
+        self._rig = rig
+        self.latencies = {arm: Latencies() for arm in "ab"}
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._rig, name)
+
+    def openers(self) -> dict[str, Any]:
+        return {arm: TimedOpener(opener, self.latencies[arm]) for arm, opener in self._rig.openers().items()}
+
+
+def rig_of(directory: Path, *, small: bool) -> RigConfig:
+    changes = COMMON | (SMALL if small else FULL)
+    ring: dict[str, Any] = {} if small else {"stream.ring_slots": 64}
+    config = load_rig("rig-demo", {**changes, **ring, "recording.directory": str(directory)})
+    return (
+        config
+        if small
+        else config.model_copy(
+            update={"stream": config.stream.model_copy(update={"ring_seconds": None, "ring_slots": 64})}
+        )
+    )
+
+
+@contextlib.contextmanager
+def daemon(config: RigConfig, socket_path: Path) -> Iterator[TimedRig]:
+    """A daemon in a thread of this process; its workers are processes as ever."""
+    with contextlib.closing(Endpoint(socket_path)) as endpoint, Rig(config) as plain:
+        rig = TimedRig(plain)
+        warm_up(*worker_modules(plain), "acquire.capacity.latency")
+        service = Service(config, lambda _="rig": Run(config, rig))  # type: ignore[arg-type,misc]
+        served = Daemon(service, endpoint)
+        served._take_signals = lambda: None  # type: ignore[method-assign]
+        thread = threading.Thread(target=asyncio.run, args=(served.run(),))
+        thread.start()
+        yield rig
+        served._ending.set()
+        thread.join()
+
+
+@contextlib.contextmanager
+def page(socket_path: Path, directory: Path) -> Iterator[tuple[psutil.Process, str]]:
+    given = {"socket": str(socket_path), "directory": str(directory), "web": {"port": 0}}
+    words = [sys.executable, "-m", "acquire", "web", "--owned", "--given", json.dumps(given)]
+    log = directory / "web.log"
+    with log.open("wb") as file:
+        process = subprocess.Popen(words, stdin=subprocess.PIPE, stderr=file)
+    while not (found := re.findall(r"page: http://127.0.0.1:(\d+)/", log.read_text())):
+        time.sleep(0.05)
+    token = load_tokens(socket_path.with_name(socket_path.name + ".tokens")).operator
+    yield psutil.Process(process.pid), f"http://127.0.0.1:{found[0]}/#token={token}"
+    process.communicate()
+
+
+class Follower:
+    """Follows the live picture; ``reads``: or stands still from the first byte on."""
+
+    def __init__(self, address: str, *, reads: bool) -> None:
+        port, token = re.findall(r":(\d+)/#token=(\S+)", address)[0]
+        self.bytes = 0
+        self._socket = socket.create_connection(("127.0.0.1", int(port)))
+        head = f"GET /api/live HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nAuthorization: Bearer {token}\r\n\r\n"
+        self._socket.sendall(head.encode())
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        if reads:
+            self._thread.start()
+
+    def _read(self) -> None:
+        with contextlib.suppress(OSError):
+            while part := self._socket.recv(2**18):
+                self.bytes += len(part)
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
+
+
+def take(client: Client, rig: TimedRig, directory: Path, name: str, seconds: float) -> dict[str, Any]:
+    """One recording: what was lost, and the latencies of its blocks."""
+    for latencies in rig.latencies.values():
+        latencies.clear()
+    path = directory / f"{name}.zarr"
+    client.start(path)
+    time.sleep(seconds)
+    late = {arm: one.percentiles_ms() for arm, one in rig.latencies.items()}
+    status = client.stop()
+    assert status.last is not None
+    rmtree(path)
+    lost = sum(sum(arm.lost.values()) for arm in status.arms.values())
+    rate = min(arm.rate_hz for arm in status.arms.values())
+    p999 = max(one["p99.9"] for one in late.values())
+    p50 = max(one["p50"] for one in late.values())
+    return {
+        "lost": lost,
+        "condition": status.last.condition,
+        "lines": status.last.lines,
+        "rate_hz": rate,
+        "p50_ms": p50,
+        "p99.9_ms": p999,
+    }
+
+
+def cores(process: psutil.Process, seconds: float) -> float:
+    before = sum(process.cpu_times()[:2])
+    time.sleep(seconds)
+    return (sum(process.cpu_times()[:2]) - before) / seconds
+
+
+def browse(address: str, client: Client) -> dict[str, float]:
+    """Seconds to the first picture, and from a mark to its place on the page."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=which("chromium"), args=["--no-sandbox", "--disable-gpu"]
+        )
+        context = browser.new_context()
+        tab = context.new_page()
+        tab.goto(address)
+        tab.wait_for_selector("#disarm:enabled")
+        tab.locator(".none").first.wait_for(state="hidden")
+        begun_s = time.perf_counter()
+        tab.goto(address.partition("#")[0])
+        tab.locator(".none").first.wait_for(state="hidden")
+        found = {"first_picture_s": time.perf_counter() - begun_s}
+        late = []
+        for k in range(10):
+            tab.evaluate(
+                """text => { const events = document.getElementById("events");
+                   window.seen = new Promise((done) => { new MutationObserver((_, one) => {
+                     if (events.textContent.includes(text)) { one.disconnect(); done(Date.now()); }
+                   }).observe(events, {childList: true, subtree: true}); }); }""",
+                f"bench {k}.",
+            )
+            sent_s = time.time()
+            client.mark(f"bench {k}.")
+            late.append(tab.evaluate("window.seen") / 1000 - sent_s)
+        browser.close()
+    return found | {"state_median_s": sorted(late)[5], "state_max_s": max(late)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--out", type=Path, default=Path(tempfile.gettempdir()))
+    parser.add_argument("--small", action="store_true")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory(dir=options.out) as place:
+        directory = Path(place)
+        config = rig_of(directory, small=options.small)
+        with (
+            daemon(config, directory / "c.sock") as rig,
+            page(directory / "c.sock", directory) as (process, address),
+        ):
+            client = Client(directory / "c.sock")
+            client.arm(force=True)
+            time.sleep(2)
+            print("without clients:", take(client, rig, directory, "alone", options.seconds))
+            followers = [Follower(address, reads=k < CLIENTS) for k in range(CLIENTS + 1)]
+            time.sleep(2)
+            print(
+                f"with {CLIENTS + 1}, one of them stopped:",
+                take(client, rig, directory, "followed", options.seconds),
+            )
+            mb_s = max(one.bytes for one in followers) / (options.seconds + 2) / 1e6
+            print(f"pictures: {mb_s:.2f} MB/s to each; page's process {cores(process, 5.0):.3f} cores")
+            for one in followers[1:]:
+                one.close()
+            time.sleep(1)
+            print(f"with one client: {cores(process, 5.0):.3f} cores")
+            followers[0].close()
+            if which("chromium"):
+                print("browser:", browse(address, client))
+            client.disarm()
+
+
+if __name__ == "__main__":
+    main()
