@@ -1,0 +1,67 @@
+"""``acquire diagnose``: is a recording what it says it is?"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, say
+from acquire.cli.recordings import PlaceArgument
+
+if TYPE_CHECKING:
+    from acquire.recon.diagnosis import Diagnosis
+
+WRONG = 1
+"""Exit code where something is not as the recording says."""
+
+
+def register(app: typer.Typer) -> None:
+    app.command(rich_help_panel="Recordings")(diagnose)
+
+
+def diagnose(
+    recording: PlaceArgument,
+    first_line: Annotated[int | None, typer.Option(help="The trigger's number; else the middle.")] = None,
+    lines: Annotated[int | None, typer.Option(help="How many lines; else some hundreds.")] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Hold a recording's lines against its code, geometry and orientation, and say what is wrong.
+
+    Tried are: the code inverted, late or early by sub-steps and lines, or another run's; arms swapped or
+    mirrored; other sub-steps per line; a stuck arm, black level, ambient light, gains, too little light.
+    The table says how much likelier each is than what the recording says (log likelihood), in standard
+    errors, and how many times better the arms agree than under wrong codes. Exit 1 where something is wrong.
+
+    Example: [bold]acquire diagnose run.zarr[/]
+    """
+    from acquire.reconstruct.diagnose import diagnose_recording, stretch
+    from acquire.store import open_recording
+
+    opened = open_recording(recording)
+    first, count = stretch(opened, first_line, lines)
+    found = diagnose_recording(opened, first, count)
+    if json:
+        print_json({"recording": str(opened), "first_line": first, "lines": count, **found.to_dict()})
+    else:
+        _print(found, first, count)
+    if found.wrong:
+        raise typer.Exit(WRONG)
+
+
+def _print(found: Diagnosis, first: int, count: int) -> None:
+    facts = {"lines": f"{first} to {first + count - 1}", "verdict": f"{found.standing}: {found.sentence}"}
+    print_facts(facts | {f"also ({each.kind})": each.words for each in found.suspicions})
+    if not found.rows:
+        return
+    say()
+    rows = [
+        (
+            f"{row.likelier:+.0f}" if row.likelier else "0",
+            f"{row.errors:+.1f}" if row.likelier else "",
+            f"{row.agreement:.1f}" if row.agreement else "",
+            row.name,
+        )
+        for row in found.rows
+    ]
+    print_table(("likelier by", "errors", "agreement", "hypothesis"), rows)

@@ -1,0 +1,117 @@
+"""What is wrong with lines whatever their code: arms that stand still, light without a code, little light.
+
+Measured under the hypothesis that explains the lines best, in units of the scene, each with its error.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.lines import Segment
+    from acquire.recon.gaussian import Model
+    from acquire.recon.hypotheses import Hypothesis, Witness
+
+    Floats = NDArray[np.float64]
+
+SURE = 5.0
+"""Standard errors beyond which something is so."""
+CONSTANT_SHARE, CONSTANT_ERROR = 0.03, 0.02
+"""Of an arm's mean light: less that follows no code costs little, and what is not known as well as this is
+not told, since a scene that changes smoothly looks much like it."""
+RATIO = 0.05
+FEW_ELECTRONS = 100.0
+"""A sample's mean light over its noise, squared: what shot noise alone would leave of so many electrons."""
+STUCK_SHARE = 0.5
+NOISE_STEPS = (0.1, 0.18, 0.32, 0.56, 1.0, 1.8, 3.2, 5.6, 10.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Suspicion:
+    """``kind`` for programs, ``words`` for people."""
+
+    kind: str
+    words: str
+
+
+def unusable(segment: Segment) -> list[Suspicion]:
+    """What leaves nothing to ask: no samples, arms that stand still, no code."""
+    found = []
+    samples = segment.samples(np.float64)
+    for arm, lines, mask in zip("ab", samples, segment.mask, strict=True):
+        if not mask.any():
+            found.append(Suspicion("no_samples", f"arm {arm} has no sample that can be used"))
+            continue
+        still = (np.ptp(np.where(mask, lines, lines[mask].mean()), axis=0) == 0) | ~mask.any(0)
+        if still.mean() > STUCK_SHARE and segment.geometry.lines > 1:
+            words = f"arm {arm} is stuck: {still.mean():.0%} of its columns are the same in every line"
+            found.append(Suspicion("stuck", words))
+    if segment.code.min() == segment.code.max():
+        found.append(
+            Suspicion(
+                "constant_code",
+                f"the code is {int(segment.code[0])} throughout: lines cannot be held against it",
+            )
+        )
+    return found
+
+
+def suspicions(witness: Witness, hypothesis: Hypothesis) -> list[Suspicion]:
+    """Black level, ambient light, gains, too little light, if this is the case."""
+    views = [witness.view(hypothesis, arm) for arm in (0, 1)]
+    found = []
+    levels = []
+    for name, lines, view, arm in zip("ab", witness.arms, views, (0, 1), strict=True):
+        mean = float(lines.mean())
+        found += _constant(name, lines, view.model, mean)
+        found += _little_light(name, lines, view.model, mean)
+        levels.append((view.fits[arm].level, view.model.level_error(view.fits[arm])))
+    return found + _ratio(levels)
+
+
+def _constant(name: str, lines: Floats, model: Model, mean: float) -> list[Suspicion]:
+    if mean < 0:
+        words = f"arm {name} is darker than its black level on the mean: the black level is too high"
+        return [Suspicion("black_level", words)]
+    value, error = model.constant(lines)
+    if error > CONSTANT_ERROR * mean or abs(value) < max(SURE * error, CONSTANT_SHARE * mean):
+        return []
+    share = f"{abs(value) / mean:.0%} ± {error / mean:.0%}"
+    if value < 0:
+        words = f"arm {name} lacks {share} of its mean light in every sample: the black level is too high"
+    else:
+        words = f"{share} of arm {name}'s mean light follows no code: ambient light, or too low a black level"
+    return [Suspicion("black_level", words)]
+
+
+def _little_light(name: str, lines: Floats, model: Model, mean: float) -> list[Suspicion]:
+    modes = model.modes(lines)
+    noisy = max(
+        (model.with_noise(model.prior.noise * step) for step in NOISE_STEPS),
+        key=lambda each: each.evidence(modes),
+    )
+    sigma = float(np.sqrt(noisy.fit(lines).scale * noisy.prior.noise))
+    electrons = (max(mean, 0) / max(sigma, 1e-30)) ** 2
+    if electrons >= FEW_ELECTRONS:
+        return []
+    words = (
+        f"arm {name} has too little light: its noise is {sigma / max(mean, 1e-30):.0%} of its mean, as if a "
+        f"sample had {electrons:.0f} electrons"
+    )
+    return [Suspicion("little_light", words)]
+
+
+def _ratio(levels: list[tuple[float, float]]) -> list[Suspicion]:
+    (a, a_error), (b, b_error) = levels
+    if min(a, b) <= 0:
+        return []
+    ratio, error = b / a, float(b / a * np.hypot(a_error / a, b_error / b))
+    if abs(ratio - 1) < max(SURE * error, RATIO):
+        return []
+    words = f"arm b sees {ratio:.2f} ± {error:.2f} times the light of arm a: gains or beam splitter"
+    return [Suspicion("gain_ratio", words)]
