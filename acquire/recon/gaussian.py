@@ -24,8 +24,9 @@ if TYPE_CHECKING:
 
     Floats = NDArray[np.float64]
 
-SLOW, FAST = 16, 128
-"""Cosines that are seen row by row, and those seen in few rows."""
+FINE, SLOW, FAST = 4, 16, 128
+"""Cosines that are seen in fine rows, in rows as wide as pixels, and in few: sharp edges that stand still
+would look like a delay if they lay between blocks."""
 FAST_ROWS = 16
 BLOCK_LINES = 24
 """Evidence is counted in blocks of lines, whose spread is its uncertainty."""
@@ -67,12 +68,12 @@ def correlation(count: int, length: float) -> Floats:
 class Response:
     """F: what lines see of each row block and cosine, if ``code`` (T,) is what was shone.
 
-    ``rows`` are fine rows of the scene, ``substeps`` those of a line, ``lines`` how many, ``blocks`` the
-    row blocks.
+    ``rows`` are fine rows of the scene, ``substeps`` those of a line, ``lines`` how many, ``pixels`` those
+    of a line, and ``finer`` row blocks to each of them are the finest.
     """
 
-    def __init__(self, code: Floats, rows: int, substeps: int, lines: int, blocks: int) -> None:
-        self.lines, self.blocks = lines, blocks
+    def __init__(self, code: Floats, rows: int, substeps: int, lines: int, pixels: int, finer: int) -> None:
+        self.lines, self.pixels, self.finer = lines, pixels, finer
         k = np.arange(FAST)[:, None]
         cosines = np.sqrt(2) * np.cos(np.pi * k * (np.arange(len(code)) + 0.5) / len(code))
         cosines[0] = 1
@@ -81,19 +82,19 @@ class Response:
         running = np.concatenate([np.zeros((1, FAST)), np.cumsum(summed, axis=0)])
         first = (np.arange(lines) * substeps)[:, None]
         # float32: the products with these are where the time goes, and the noise is far above its rounding
-        self.slow = _block_sums(running[:, :SLOW], first, rows, blocks).astype(np.float32)
-        self.fast = _block_sums(running[:, SLOW:], first, rows, min(blocks, FAST_ROWS)).astype(np.float32)
-        self.flat: Floats = self.slow[:, :, 0].sum(1, dtype=np.float64)
+        tiers = ((0, FINE, pixels * finer), (FINE, SLOW, pixels), (SLOW, FAST, min(pixels, FAST_ROWS)))
+        self.tiers = [
+            (slice(begin, end), _block_sums(running[:, begin:end], first, rows, blocks).astype(np.float32))
+            for begin, end, blocks in tiers
+        ]
+        self.flat: Floats = self.tiers[0][1][:, :, 0].sum(1, dtype=np.float64)
 
     def covariance(self, prior: Prior) -> Floats:
         """G (line, line)."""
         total = np.zeros((self.lines, self.lines), np.float32)
-        for factor, weights in (
-            (self.slow, prior.spectrum[:SLOW]),
-            (self.fast, prior.spectrum[SLOW:]),
-        ):
+        for cosines, factor in self.tiers:
             near = correlation(factor.shape[1], prior.length).astype(np.float32)
-            smoothed = (near @ factor) * weights.astype(np.float32)
+            smoothed = (near @ factor) * prior.spectrum[cosines].astype(np.float32)
             total += smoothed.reshape(self.lines, -1) @ factor.reshape(self.lines, -1).T
         return total.astype(np.float64)
 
@@ -212,20 +213,26 @@ class Model:
         return np.asarray(-0.5 * np.add.reduceat(per_line + constant, edges[:-1]))
 
     def scene(self, fit: Fit) -> NDArray[np.float32]:
-        """The most likely slow scene (row block, cosine, pixel), in units of the lines per sub-step."""
+        """The most likely slow scene (fine row, cosine, pixel), in units of the lines per sub-step."""
         pulled = self._vectors @ (fit.modes / self._variance) / self._unit
-        pulled = (pulled * self._pixel_values) @ self._pixel_vectors.T
-        back = np.tensordot(self.response.slow, pulled.astype(np.float32), axes=(0, 0))
-        near = correlation(self.response.blocks, self.prior.length).astype(np.float32)
-        scene = np.tensordot(near, back, axes=1)
-        scene *= self.prior.spectrum[:SLOW, None]
-        scene[:, 0] += fit.level
-        return np.asarray(scene)
+        pulled = ((pulled * self._pixel_values) @ self._pixel_vectors.T).astype(np.float32)
+        parts = []
+        for cosines, factor in self.response.tiers[:2]:
+            near = correlation(factor.shape[1], self.prior.length).astype(np.float32)
+            part = np.tensordot(near, np.tensordot(factor, pulled, axes=(0, 0)), axes=1)
+            part *= self.prior.spectrum[cosines, None].astype(np.float32)
+            parts.append(np.repeat(part, self.response.pixels * self.response.finer // len(part), axis=0))
+        parts[0][:, 0] += np.float32(fit.level)
+        return np.concatenate(parts, axis=1)
 
     def foretell(self, scene: NDArray[np.float32]) -> Floats:
-        """Lines (line, pixel) of a scene (row block, cosine, pixel)."""
-        factor = self.response.slow.reshape(self.response.lines, -1)
-        return np.asarray(factor @ scene.reshape(factor.shape[1], -1), np.float64)
+        """Lines (line, pixel) of a scene (fine row, cosine, pixel)."""
+        total = np.zeros((self.response.lines, scene.shape[2]), np.float32)
+        for cosines, factor in self.response.tiers[:2]:
+            blocks = factor.shape[1]
+            part = scene[:, cosines].reshape(blocks, len(scene) // blocks, -1, scene.shape[2]).mean(1)
+            total += factor.reshape(len(factor), -1) @ part.reshape(-1, scene.shape[2])
+        return total.astype(np.float64)
 
     def constant(self, lines: Floats) -> tuple[float, float]:
         """What every sample has that follows no code, and its standard error."""

@@ -33,6 +33,8 @@ MOST_LINES = 320
 """From the segment's middle: more cost more and tell little more."""
 MOST_PIXELS = 64
 """More are averaged to as many."""
+MOST_BLOCKS = 192
+"""Of rows: fine rows as far as these."""
 UNKNOWN_BIT = 0.5
 
 
@@ -47,7 +49,7 @@ class Turn:
 
     def to_b(self, scene: Scene) -> Scene:
         """Arm A's scene (row, cosine, pixel) as arm B sees it."""
-        seen = scene.transpose(2, 1, 0)[::-1] if self.across else scene
+        seen = _transposed(scene)[::-1] if self.across else scene
         seen = seen[::-1] if self.rows else seen
         return seen[:, :, ::-1] if self.pixels else seen
 
@@ -55,7 +57,15 @@ class Turn:
         """Arm B's as arm A sees it."""
         seen = scene[:, :, ::-1] if self.pixels else scene
         seen = seen[::-1] if self.rows else seen
-        return seen[::-1].transpose(2, 1, 0) if self.across else seen
+        return _transposed(seen[::-1]) if self.across else seen
+
+
+def _transposed(scene: Scene) -> Scene:
+    """Rows, which are as many times finer, for pixels, whose light is held over them."""
+    rows, cosines, pixels = scene.shape
+    finer = rows // pixels
+    merged = scene.reshape(pixels, finer, cosines, pixels).mean(1, dtype=np.float32)
+    return np.asarray(np.repeat(merged.transpose(2, 1, 0), finer, axis=0))
 
 
 AS_BUILT = Turn()
@@ -109,15 +119,25 @@ class Witness:
         self.first, self.arms = prepared_lines(segment)
         self.lines, self.pixels = self.arms[0].shape
         self._view = lru_cache(maxsize=64)(self._make_view)
-        self.prior: Prior | None = None
+        self._prior: Prior | None = None
 
     def settle(self, hypothesis: Hypothesis = Hypothesis()) -> Prior:
         """From now on everything is judged under the prior that suits this hypothesis best."""
         said = (hypothesis.inverted, hypothesis.late[0], hypothesis.substeps or self.substeps, 0)
         response = self._response(*said)
-        self.prior = best_model(response, list(self.arms)).prior
+        found = best_model(response, list(self.arms)).prior
+        self.prior = found
+        return found
+
+    @property
+    def prior(self) -> Prior | None:
+        """What everything is judged under; None before anything was settled."""
+        return self._prior
+
+    @prior.setter
+    def prior(self, prior: Prior) -> None:
+        self._prior = prior
         self._view.cache_clear()
-        return self.prior
 
     def evidence(self, hypothesis: Hypothesis) -> Evidence:
         views = [self.view(hypothesis, arm) for arm in (0, 1)]
@@ -143,7 +163,9 @@ class Witness:
         code = self._bits(substeps * self.first - late, span).astype(np.float64)
         if strange:
             code = np.random.default_rng(strange).integers(0, 2, span).astype(np.float64)
-        return Response(1 - code if inverted else code, rows, substeps, self.lines, self.pixels)
+        finer = max(1, min(rows, MOST_BLOCKS) // self.pixels)
+        lit = 1 - code if inverted else code
+        return Response(lit, rows, substeps, self.lines, self.pixels, finer)
 
 
 class View:

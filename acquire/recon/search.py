@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from acquire.recon.gaussian import Prior
 from acquire.recon.hypotheses import TURNS, Evidence, Hypothesis, Witness, compare
 
 if TYPE_CHECKING:
@@ -27,7 +28,9 @@ LEAST_CONTRAST = 10.0
 VERIFIED_ALONE, VERIFIED, BEYOND = 5.0, 2.0, 3.0
 """Agreement of the arms at which a code is believed; less is enough where it also explains each arm's lines
 better than wrong codes do, by so many of their standard deviations."""
-OTHER_SUBSTEPS = (3, 2, 4, 1, 5, 6)
+OTHER_SUBSTEPS = (1, 2, 3, 4, 5, 6)
+USUAL = Prior(0.06, 0.3, 3.0, 1e-2)
+"""Under which they are looked through, before the best has a prior that suits it."""
 APART = 15.0
 """Log likelihood by which delays that differ between the arms have to be better than a common one."""
 CLEAR, CLEAR_SHARE, CLEAR_ERRORS = 12.0, 0.11, 0.3
@@ -92,13 +95,13 @@ def inquire(witness: Witness) -> Inquiry:
     inquiry = _inquire(witness, None)
     if inquiry.standing is not Standing.UNEXPLAINED:
         return inquiry
-    for substeps in OTHER_SUBSTEPS:
-        if substeps == witness.substeps:
-            continue
-        other = _inquire(witness, substeps)
-        explained = other.best.agreement >= VERIFIED_ALONE and not other.best.hypothesis.inverted
-        if explained and _better(other.best, inquiry.best)[0] > CLEAR:
-            return replace(other, standing=Standing.NAMED, said=inquiry.said)
+    others = [Hypothesis(substeps=each) for each in OTHER_SUBSTEPS if each != witness.substeps]
+    witness.prior = USUAL
+    substeps = max(others, key=lambda each: _contrast(witness, each).contrast).substeps
+    other = _inquire(witness, substeps)
+    explained = other.best.agreement >= VERIFIED_ALONE and not other.best.hypothesis.inverted
+    if explained and _better(other.best, inquiry.best)[0] > CLEAR:
+        return replace(other, standing=Standing.NAMED, said=inquiry.said)
     return inquiry
 
 

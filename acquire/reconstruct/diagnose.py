@@ -65,7 +65,7 @@ def _farther(recording: Recording, stream: Stream, found: Diagnosis) -> Diagnosi
         stages=segment.geometry.stages,
         substeps=segment.geometry.substeps,
         code=code_from_attrs(recording.attrs["code"]),
-        white_dn=int(np.iinfo(segment.lines.dtype).max) if segment.lines.dtype.kind == "u" else 1,
+        white_dn=int(segment.lines.max()),
         registration=dict.fromkeys(ARMS, 0),
     )
     findings = judge.look(first, _sights(segment))

@@ -1,0 +1,92 @@
+"""Recordings that are not what they say: made by the simulator, told by `acquire diagnose`'s function."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from acquire.config import load_rig
+from acquire.effect_config import CodeErrors, EffectConfig, StrayLight
+from acquire.recon.diagnosis import Diagnosis
+from acquire.recon.hypotheses import Hypothesis, Turn
+from acquire.recon.search import Standing
+from acquire.reconstruct.diagnose import diagnose_recording, stretch
+from acquire.scene_config import ArmOptics, ConstantDrive, LedConfig, LedSceneConfig, OpticsConfig, SineDrive
+from acquire.simulate import simulate
+from acquire.store import open_recording
+
+LINES = 150
+Told = Callable[..., Diagnosis]
+
+
+@pytest.fixture
+def told(tmp_path: Path) -> Told:
+    """Simulate a recording with a fault and ask what it is."""
+    rig = load_rig("rig-demo", {"geometry.stages": 24, "geometry.substeps": 2})
+    leds = (
+        LedConfig(
+            name="slow",
+            shape="square",
+            row=0.25,
+            column=0.3,
+            size=0.3,
+            drive=SineDrive(waveform="sine", frequency_hz=200.0, low=0.3),
+        ),
+        LedConfig(
+            name="still",
+            shape="square",
+            row=0.75,
+            column=0.6,
+            size=0.2,
+            drive=ConstantDrive(waveform="constant", level=0.9),
+        ),
+    )
+
+    def tell(*effects: EffectConfig, b: ArmOptics | None = None, lines: int = LINES) -> Diagnosis:
+        optics = OpticsConfig() if b is None else OpticsConfig(b=b)
+        scene = LedSceneConfig(kind="leds", leds=leds, optics=optics, effects=effects)
+        simulate(rig, scene, tmp_path / "run.zarr", lines)
+        return diagnose_recording(open_recording(tmp_path / "run.zarr"), None, None)
+
+    return tell
+
+
+def test_what_is_as_it_says(told: Told) -> None:
+    found = told()
+    assert found.standing is Standing.RIGHT
+    assert not found.sentences
+    assert found.rows[0].name == "as said"
+
+
+def test_light_that_is_late(told: Told) -> None:
+    """The recording has the code's bits before the segment: no sub-step need be guessed."""
+    found = told(CodeErrors(kind="code_errors", late_substeps=3))
+    assert found.standing is Standing.NAMED
+    assert found.hypothesis == Hypothesis(late=(3, 3))
+    assert "3 sub-steps late" in found.sentence
+
+
+def test_light_that_is_later_than_the_search_reaches(told: Told) -> None:
+    found = told(CodeErrors(kind="code_errors", late_substeps=60), lines=2500)
+    assert found.standing is Standing.NAMED, found.sentence
+    assert "60 sub-steps late" in found.sentence
+
+
+def test_an_arm_that_is_mirrored(told: Told) -> None:
+    found = told(b=ArmOptics(turn_deg=270, mirror=True))
+    assert found.standing is Standing.NAMED
+    assert found.hypothesis is not None
+    assert found.hypothesis.turn == Turn(pixels=True)
+
+
+def test_light_that_no_code_switches_is_no_news_of_the_code(told: Told) -> None:
+    found = told(StrayLight(kind="stray_light", ambient=0.2))
+    assert found.standing in (Standing.RIGHT, Standing.UNCLEAR)
+
+
+def test_the_middle_of_a_long_recording_is_looked_at(recording_path: Path) -> None:
+    recording = open_recording(recording_path)
+    assert stretch(recording, None, None) == (recording.first_line + 40, 320)
+    assert stretch(recording, recording.first_line + 5, 30) == (recording.first_line + 5, 30)
