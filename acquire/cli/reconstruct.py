@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from acquire.cli.interrupts import first_interrupt_asks
-from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, print_warning, say
+from acquire.cli.output import JsonFlag, note, print_facts, print_json, print_table, print_warning, say
 from acquire.cli.progress import stage_progress
 from acquire.cli.recordings import PlaceArgument
 from acquire.errors import EXIT_INTERRUPTED, UsageError
 
 if TYPE_CHECKING:
+    from acquire.cli.reconstruct_request import Prepared
     from acquire.plan_config import ReconstructionPlan
     from acquire.reconstruct import Options, Outcome, Request
     from acquire.store import Recording
@@ -143,8 +144,8 @@ def reconstruct(
     for doubt in () if chosen is None else chosen.doubts:
         print_warning(doubt)
     prepared = prepare(opened, asked)
-    if prepared.plan is not None and not json:
-        _print_plan(prepared.plan)
+    if not json:
+        _print_prepared(prepared)
     if out is None:
         return
     places = [_beside(out, suffix) for suffix in prepared.requests]
@@ -264,6 +265,13 @@ def _print_segments(segments: list[dict[str, Any]]) -> None:
     print_table(
         ("segment", "voxels", "sub-steps kept", "lines", "iterations", "seconds", "misfit", "trusted"), rows
     )
+
+
+def _print_prepared(prepared: Prepared) -> None:
+    if prepared.learned:
+        note(f"preset {prepared.options.preset}: {prepared.learned}")
+    if prepared.plan is not None:
+        _print_plan(prepared.plan)
 
 
 def _print_plan(plan: ReconstructionPlan) -> None:

@@ -13,7 +13,7 @@ from acquire.config import check_plan, load_plan
 from acquire.cores import idle_cores, limit_blas
 from acquire.errors import UsageError
 from acquire.recon.segments import Stretch, Voxels
-from acquire.reconstruct.learned import choose, recall
+from acquire.reconstruct.learned import Choice, choose, recall
 from acquire.reconstruct.select import Selection, along_plan, by_lines, by_time, in_glimpses, in_voxels
 from acquire.store.files import check_new_path
 
@@ -57,11 +57,14 @@ class Asked:
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """A request for each video, by what is added to its name; the plan where there is one."""
+    """A request for each video, by what is added to its name; the plan where there is one; ``learned`` says
+    why the preset was preferred.
+    """
 
     requests: dict[str, Request]
     options: Options
     plan: ReconstructionPlan | None = None
+    learned: str = ""
 
 
 def prepare(recording: Recording, asked: Asked) -> Prepared:
@@ -69,20 +72,19 @@ def prepare(recording: Recording, asked: Asked) -> Prepared:
     prepared = _requests(recording, asked)
     if asked.preview:
         return prepared
-    preset = asked.preset or _learned(prepared) or prepared.options.preset
-    options = replace(prepared.options, preset=preset)  # type: ignore[arg-type]  # checked where it is used
-    return replace(prepared, options=options)
+    learned = Choice(asked.preset, "") if asked.preset else _learned(prepared)
+    options = replace(prepared.options, preset=learned.preset or prepared.options.preset)  # type: ignore[arg-type]  # checked where it is used
+    return replace(prepared, options=options, learned=learned.why)
 
 
-def _learned(prepared: Prepared) -> str | None:
-    """The preset that gets furthest in the budget, as `acquire tradeoff` found out; None where it did not."""
+def _learned(prepared: Prepared) -> Choice:
+    """The preset that gets furthest in the budget, as `acquire tradeoff` found out, or why there is none."""
     options = prepared.options
-    if options.budget_s is None:
-        return None
     known = [each for each in recall() if each.solver == options.solver]
+    if options.budget_s is None or not known:
+        return Choice(None, "")
     grids = [request.grid for request in prepared.requests.values()]
-    found = choose(known, options.budget_s, sum(grid.frames * grid.side**2 for grid in grids))
-    return None if found is None else found.preset
+    return choose(known, options.budget_s, sum(grid.frames * grid.side**2 for grid in grids))
 
 
 def _requests(recording: Recording, asked: Asked) -> Prepared:

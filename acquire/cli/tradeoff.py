@@ -6,23 +6,31 @@ import itertools
 import os
 import shlex
 import sys
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from statistics import median
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from acquire.cli.output import JsonFlag, print_json, print_table, say
 from acquire.cli.places import new_directory
 from acquire.cli.progress import stage_progress, told
+from acquire.errors import UsageError
 
 if TYPE_CHECKING:
+    from acquire.evaluate.cases import Case
     from acquire.evaluate.tradeoff import Run
+    from acquire.recon.segments import Voxels
     from acquire.reconstruct.learned import Learned
     from acquire.simulate import Study
     from acquire.store import Recording
 
 LINES, FIRST_LINE = 263, 200
+APART = 67
+"""Lines from one repeat to the next."""
+LONGEST_S = 60.0
 
 
 def register(app: typer.Typer) -> None:
@@ -30,47 +38,60 @@ def register(app: typer.Typer) -> None:
 
 
 def tradeoff(
-    source: Annotated[str, typer.Argument(metavar="SCENE|RECORDING", help="A scene file, or NAME.zarr.")],
+    sources: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="SCENE|RECORDING", help="Repeatable: scene files, NAME.zarr, or splash, bullet, flame …"
+        ),
+    ],
     out: Annotated[Path, typer.Option(metavar="DIR", help="New directory.")] = Path("acquire-tradeoff"),
+    full_well: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ELECTRONS", help="Of splash …: repeatable, or clean; else 1e4."),
+    ] = None,
     voxels: Annotated[list[str] | None, typer.Option(metavar="NMxTM", help="Repeatable; else 3x1.")] = None,
     solver: Annotated[list[str] | None, typer.Option(help="Repeatable; else every solver.")] = None,
     preset: Annotated[list[str] | None, typer.Option(help="Repeatable; else fast and balanced.")] = None,
-    dtype: Annotated[list[str] | None, typer.Option(help="Repeatable; else float32 and float64.")] = None,
+    dtype: Annotated[list[str] | None, typer.Option(help="Repeatable; else float32.")] = None,
+    repeats: Annotated[int, typer.Option(min=1, max=20, help="Runs of each kind, for the band.")] = 3,
     first_line: Annotated[int | None, typer.Option(help="Of the segment.")] = None,
     lines: Annotated[int, typer.Option(help="How many lines, L_R.")] = LINES,
-    budget: Annotated[float | None, typer.Option(metavar="SECONDS", help="No run longer than this.")] = None,
+    budget: Annotated[
+        float, typer.Option(metavar="SECONDS", help="No run longer than this; what it cuts is marked.")
+    ] = LONGEST_S,
     learn: Annotated[bool, typer.Option(help="Keep it for --budget of acquire reconstruct.")] = True,
     json: JsonFlag = False,
 ) -> None:
-    """Draw accuracy against wall time for every solver, preset, dtype and kind of voxels, step by step.
+    """Draw accuracy against wall and processor time for every solver, preset and kind of voxels, on one page.
 
-    Example: [bold]acquire tradeoff scene-leds --voxels 3x1 --voxels 3x4[/]
+    Example: [bold]acquire tradeoff scene-leds splash bullet --full-well clean --full-well 1e4[/]
     """
-    from acquire.arrays import DTYPES, open_arrays
+    from acquire.arrays import open_arrays
     from acquire.cli.reconstruct_request import parse_voxels
-    from acquire.cores import idle_cores, limit_blas
-    from acquire.evaluate.tradeoff import Judge, measure, table
+    from acquire.evaluate.tradeoff import table
     from acquire.evaluate.tradeoff_page import write_page
     from acquire.recon import ITERATIONS
     from acquire.recon.request import preset_iterations
     from acquire.reconstruct.learned import remember
 
-    kinds = [parse_voxels(text) for text in voxels or ["3x1"]]
-    presets = tuple(preset or ("fast", "balanced"))
-    solvers = solver or list(ITERATIONS)
-    for each in solvers:
-        for kind in presets:
-            preset_iterations(each, kind)
-    dtypes = [open_arrays("cpu", each).dtype for each in dtype or DTYPES]
+    kinds = tuple(parse_voxels(text) for text in voxels or ["3x1"])
+    asked = list(
+        itertools.product(solver or ITERATIONS, preset or ("fast", "balanced"), dtype or ("float32",))
+    )
+    for each, kind, exact in asked:
+        preset_iterations(each, kind)
+        open_arrays("cpu", exact)
+    if not budget > 0:
+        raise UsageError(f"a budget of {budget:g} s is out of range", possible="more than 0")
     with new_directory(out):
-        recording, study = _opened(source, out, (first_line or FIRST_LINE) + lines)
-        segment = recording.cut(_first(recording, first_line, lines), lines)
-        judge, runs = Judge.of(recording, segment), []
-        for shape, each, exact in itertools.product(kinds, solvers, dtypes):
-            with stage_progress(f"{each} {shape} {exact}") as advance, limit_blas(idle_cores()):
-                runs.append(measure(judge, each, shape, presets, budget, advance, dtype=exact))  # type: ignore[arg-type]
-        command = f"acquire {shlex.join(sys.argv[1:])}"
-        page = write_page(runs, study, out, Path(source).stem, command, datetime.now(UTC))
+        cases, effects = _cases(sources, out, full_well or [], (first_line, lines, repeats))
+        runs, truths = _measure(cases, repeats, kinds, asked, budget)
+        heading = {
+            "title": ", ".join(Path(source).stem for source in sources),
+            "command": f"acquire {shlex.join(sys.argv[1:])}",
+            "notes": _notes(cases, repeats),
+        }
+        page = write_page(runs, truths, effects, out, heading, datetime.now(UTC))
     kept = remember(_lessons(runs)) if learn else None
     if json:
         print_json({"page": str(page), "learned": kept and str(kept), "rows": table(runs)})
@@ -80,6 +101,66 @@ def tradeoff(
     say(f"page     {page}")
     if kept is not None:
         say(f"learned  {kept}")
+
+
+def _measure(
+    cases: list[Case],
+    repeats: int,
+    kinds: tuple[Voxels, ...],
+    asked: list[tuple[str, str, str]],
+    longest_s: float,
+) -> tuple[list[Run], dict[tuple[str, Voxels], Any]]:
+    """Every run, and the true frames beside those that are shown."""
+    from acquire.cores import idle_cores, limit_threads
+    from acquire.evaluate.tradeoff import measure
+
+    runs, truths = [], {}
+    for case, repeat in itertools.product(cases, range(repeats)):
+        with told() as tell:
+            tell(f"preparing {case.name}")
+            judge = case.judge(repeat)
+        for voxels, (solver, preset, exact) in itertools.product(kinds, asked):
+            what = f"{case.name}: {solver} {preset} {voxels}, {repeat + 1} of {repeats}"
+            with stage_progress(what) as advance, limit_threads(idle_cores()):
+                run = measure(judge, solver, voxels, preset, longest_s, advance, dtype=exact)  # type: ignore[arg-type]  # checked before
+            runs.append(replace(run, case=case.name, repeat=repeat))
+            if repeat == 0:
+                true = judge.truth(voxels)
+                truths[case.name, voxels] = None if true is None else true[judge.picked(voxels)].copy()
+    return runs, truths
+
+
+def _notes(cases: list[Case], repeats: int) -> list[str]:
+    from acquire.cores import usable_cores
+
+    differ = dict.fromkeys(case.repeats for case in cases)
+    notes = [f"{repeats} repeats: {each}." for each in differ] if repeats > 1 else ["One run of each kind."]
+    notes.append(
+        f"On {usable_cores()} cores, as busy as they were: wall time depends on that, processor time hardly."
+    )
+    return notes
+
+
+def _cases(
+    sources: list[str], out: Path, full_well: list[str], asked: tuple[int | None, int, int]
+) -> tuple[list[Case], Study | None]:
+    """What is measured on; what the effects of the first scene that has any are worth."""
+    from acquire.evaluate.cases import full_wells, of_recording, procedural
+    from acquire.sim.procedural import SCENES
+
+    (first_line, lines, repeats), cases, effects = asked, [], None
+    wells = full_wells(full_well or ["1e4"])
+    for source in dict.fromkeys(sources):
+        if source in SCENES:
+            cases += [procedural(source, each, lines) for each in wells]
+            continue
+        most = (first_line or FIRST_LINE) + lines + (repeats - 1) * APART
+        recording, found = _opened(source, out, most)
+        effects = effects or found
+        first = _first(recording, first_line, lines)
+        recording.cut(first, lines)  # lines that are not there are refused before anything is measured
+        cases.append(of_recording(Path(source).stem, recording, first, lines, APART))
+    return cases, effects
 
 
 def _first(recording: Recording, first_line: int | None, lines: int) -> int:
@@ -97,67 +178,63 @@ def _opened(source: str, out: Path, lines: int) -> tuple[Recording, Study | None
     if "://" in source or os.path.isdir(source):  # noqa: PTH112  # Path's raises for an impossible name
         recording = open_recording(source)
         return recording, None
-    scene = load_scene(source)
+    scene, place = load_scene(source), out / f"{Path(source).stem}.zarr"
     rig = load_rig(scene.rig)
     with told() as tell:
         tell(f"recording {source}")
-        simulate(rig, scene, out / "recording.zarr", lines)
+        simulate(rig, scene, place, lines)
         if not scene.effects:
-            return open_recording(out / "recording.zarr"), None
+            return open_recording(place), None
         tell("leaving out one effect after the other")
-        return open_recording(out / "recording.zarr"), study(bench_of(rig, scene), rig.code.build())
+        return open_recording(place), study(bench_of(rig, scene), rig.code.build())
 
 
 def _lessons(runs: list[Run]) -> list[Learned]:
+    """What the repeats reached that ended by themselves: one that was cut says nothing of its preset."""
+    from acquire.evaluate.tradeoff_figures import in_series
     from acquire.reconstruct.learned import Learned
 
-    return [
-        Learned(
-            run.solver,
-            preset,
-            run.voxels.spatial_merge,
-            run.voxels.temporal_merge,
-            run.voxel_count,
-            point.seconds,
-            point.psnr_db,
-        )
-        for run in runs
-        for point in run.points
-        for preset in point.presets
-        if point.psnr_db is not None and run.dtype == "float32"  # what --budget chooses among
-    ]
+    lessons = []
+    for case, voxels in dict.fromkeys((run.case, run.voxels) for run in runs):
+        own = [run for run in runs if (run.case, run.voxels) == (case, voxels)]
+        for (solver, preset, exact), repeats in in_series(own).items():
+            reached = [run.end.psnr_db for run in repeats if run.end.psnr_db is not None]
+            if exact != "float32" or not reached or any(run.cut for run in repeats):
+                continue
+            seconds = median(run.end.seconds for run in repeats)
+            merges, count = (voxels.spatial_merge, voxels.temporal_merge), repeats[0].voxel_count
+            lessons.append(Learned(solver, preset, *merges, count, case, seconds, median(reached)))
+    return lessons
 
 
 def _print(runs: list[Run]) -> None:
+    """Where each run ended, and what the time bought, in words."""
+    from acquire.evaluate.knees import sentences
+    from acquire.evaluate.tradeoff_figures import in_series
+
     def text(value: float | None, digits: int) -> str:
         return "-" if value is None else f"{value:.{digits}f}"
 
     rows = [
         (
+            run.case,
             str(run.voxels),
             run.solver,
-            run.dtype,
-            ", ".join(point.presets),
-            str(point.iterations),
-            text(point.seconds, 2),
-            text(point.psnr_db, 2),
-            text(point.ssim, 3),
-            text(point.amplitude_error, 3),
-            text(point.frequency_error_hz, 2),
+            run.preset,
+            f"{run.end.iterations}{' (cut)' if run.cut else ''}",
+            text(run.end.seconds, 1),
+            text(run.end.processor_s, 1),
+            text(run.end.psnr_db, 1),
+            text(run.end.ssim, 2),
+            text(run.end.amplitude_error, 3),
+            text(run.end.frequency_error_hz, 1),
         )
         for run in runs
-        for point in run.points
     ]
-    titles = (
-        "voxels",
-        "solver",
-        "dtype",
-        "preset",
-        "iterations",
-        "seconds",
-        "PSNR",
-        "SSIM",
-        "amplitude",
-        "Hz off",
-    )
-    print_table(titles, rows)
+    titles = ("case", "voxels", "solver", "preset", "iterations", "wall s", "processor s")
+    print_table((*titles, "PSNR", "SSIM", "amplitude", "Hz off"), rows)
+    for case, voxels in dict.fromkeys((run.case, run.voxels) for run in runs):
+        own = [run for run in runs if (run.case, run.voxels) == (case, voxels)]
+        for repeats in in_series(own).values():
+            for sentence in sentences(repeats):
+                say(f"{case}, {voxels}: {sentence}")

@@ -1,11 +1,14 @@
-"""What accuracy costs in time: every solver, preset and kind of voxels, iteration by iteration.
+"""What accuracy costs in time: every solver, preset and kind of voxels, answer by answer of one and the same
+run.
 
-A solver is asked for more and more iterations; every answer is a whole one, with set-up and finish in its
-time. Against the truth where it is known (simulated recordings), else by the samples it predicts.
+Whoever looks on sees what the answer would be if the run ended there, with the wall and processor time so
+far, set-up and all, but without the time of looking. Against the truth where it is known (simulated
+recordings), else by the samples it predicts.
 """
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -14,8 +17,8 @@ import numpy as np
 from acquire.config import RigConfig
 from acquire.evaluate.curves import compare_curve, region_mean
 from acquire.evaluate.metrics import psnr, ssim
+from acquire.forward import merge_video
 from acquire.recon import reconstruct
-from acquire.recon.request import preset_iterations
 from acquire.scene_config import SceneFile, SineDrive
 from acquire.sim.leds import LedScene
 from acquire.sim.scene import Scene
@@ -29,56 +32,77 @@ if TYPE_CHECKING:
 
     from acquire.arrays import Dtype
     from acquire.lines import Segment
-    from acquire.recon import Preset, Reconstruction, Solver
+    from acquire.recon import Look, Preset, Solver
     from acquire.recon.segments import Voxels
     from acquire.store import Recording
 
-FEWEST_ITERATIONS = 4
-SSIM_WINDOW = 11
+APART = 1.15
+"""An answer is looked at when so many times as long has passed as at the last."""
+CUT = ("budget", "stopped")
+DIMMER = 0.5
+"""How much light that is missing counts against light that is there, for the frame that is shown."""
+SSIM_WINDOW, SSIM_FRAMES = 11, 64
+"""Frames that SSIM is the mean of, evenly spaced."""
 COVERED = 0.9
 """Voxels of an LED's mask that are followed for amplitude and frequency."""
 
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """How good the answer after ``iterations`` was. ``None``: not known, or not a quantity of this scene.
+    """How good the answer after ``iterations`` was, and what it took. ``None``: unknown, or not its matter.
 
-    ``amplitude_error`` is that of the swings over time, relative; ``frequency_error_hz`` the largest among
-    the scene's sinusoids; ``prediction`` the error at samples that the solver did not see. ``presets`` are
-    those that end here.
+    ``seconds`` are the wall's, ``processor_s`` those of all threads. ``amplitude_error`` is that of the
+    swings over time, relative; ``frequency_error_hz`` the largest among the scene's sinusoids; ``prediction``
+    the error at samples that the solver did not see, of the last answer. ``frame`` is one frame, to look at.
     """
 
     iterations: int
     seconds: float
+    processor_s: float = 0.0
+    stage: str = ""
     psnr_db: float | None = None
     ssim: float | None = None
     amplitude_error: float | None = None
     frequency_error_hz: float | None = None
     prediction: float | None = None
-    presets: tuple[str, ...] = ()
+    frame: NDArray[np.float32] | None = field(default=None, compare=False, repr=False)
 
 
 @dataclass(frozen=True, slots=True)
 class Run:
-    """One solver in one dtype on one kind of voxels, asked for more and more iterations."""
+    """One reconstruction, from its first answer to its last; ``ended`` says what ended it.
+
+    ``case`` names what was reconstructed, with its noise; ``repeat`` counts runs that differ in nothing that
+    was asked for.
+    """
 
     solver: Solver
     voxels: Voxels
     dtype: str
     voxel_count: int
     points: tuple[Point, ...]
+    preset: str = "balanced"
+    case: str = ""
+    repeat: int = 0
+    ended: str = "done"
 
     @property
     def end(self) -> Point:
         return self.points[-1]
 
+    @property
+    def cut(self) -> bool:
+        """It did not end by itself: what it reached is not what the solver can do."""
+        return self.ended in CUT
+
 
 @dataclass(slots=True)
 class Judge:
-    """Compares videos of a segment with the truth, where there is one."""
+    """Compares videos of a segment with the truth, where there is one: a scene, or ``light`` (T, n, n)."""
 
     segment: Segment
     scene: Scene | None
+    light: NDArray[np.float32] | None = None
     _truths: dict[Voxels, NDArray[np.float32]] = field(default_factory=dict)
 
     @classmethod
@@ -97,30 +121,42 @@ class Judge:
 
     def truth(self, voxels: Voxels) -> NDArray[np.float32] | None:
         """The true voxels of `frames`."""
-        if self.scene is None:
+        if self.scene is None and self.light is None:
             return None
         if voxels not in self._truths:
-            geometry = self.segment.geometry
-            first = geometry.substeps * self.segment.first_line
-            whole = truth(self.scene, first, geometry.span, voxels.spatial_merge, voxels.temporal_merge)
+            geometry, merges = self.segment.geometry, (voxels.spatial_merge, voxels.temporal_merge)
+            if self.light is not None:
+                whole = np.asarray(merge_video(self.light, *merges), np.float32)
+            else:
+                assert self.scene is not None
+                whole = truth(self.scene, geometry.substeps * self.segment.first_line, geometry.span, *merges)
             self._truths[voxels] = whole[self.frames(voxels)]
         return self._truths[voxels]
 
-    def point(self, result: Reconstruction, voxels: Voxels) -> Point:
-        """How good a reconstruction is."""
-        prediction = None if np.isnan(result.quality.prediction) else result.quality.prediction
-        found = Point(result.iterations, result.seconds, prediction=prediction)
-        true = self.truth(voxels)
+    def judged(self, point: Point, video: NDArray[Any], voxels: Voxels) -> Point:
+        """``point`` with how good its video is."""
+        shown, true = video[self.frames(voxels)], self.truth(voxels)
+        point = replace(point, frame=np.array(shown[self.picked(voxels)], np.float32))
         if true is None:
-            return found
-        shown = result.video[self.frames(voxels)]
+            return point
+        some, peak = slice(None, None, max(1, len(true) // SSIM_FRAMES)), float(true.max())
         return replace(
-            found,
+            point,
             psnr_db=psnr(shown, true),
-            ssim=None if min(true.shape[1:]) < SSIM_WINDOW else ssim(shown, true),
+            ssim=None if min(true.shape[1:]) < SSIM_WINDOW else ssim(shown[some], true[some], peak),
             amplitude_error=amplitude_error(shown, true),
             frequency_error_hz=self._frequency_error(shown, voxels),
         )
+
+    def picked(self, voxels: Voxels) -> int:
+        """The frame that is shown: where the truth is farthest from its mean, rather brighter; or the middle."""
+        true = self.truth(voxels)
+        if true is None:
+            frames = self.segment.geometry.video_shape(1, voxels.temporal_merge)[0]
+            return len(range(*self.frames(voxels).indices(frames))) // 2
+        first = len(true) // 4
+        away = true[first : max(3 * first, first + 1)] - true.mean(axis=0)
+        return first + int(np.argmax(np.square(np.where(away > 0, away, DIMMER * away)).sum(axis=(1, 2))))
 
     def _frequency_error(self, shown: NDArray[Any], voxels: Voxels) -> float | None:
         if not isinstance(self.scene, LedScene) or self.scene.size % voxels.spatial_merge:
@@ -153,51 +189,51 @@ def measure(
     judge: Judge,
     solver: Solver,
     voxels: Voxels,
-    presets: Sequence[Preset] = ("fast", "balanced"),
+    preset: Preset = "balanced",
     longest_s: float | None = None,
-    progress: Callable[[int, int], object] | None = None,
+    progress: Callable[[int, int], None] | None = None,
     *,
     dtype: Dtype = "float32",
 ) -> Run:
-    """Reconstruct with more and more iterations, up to the presets'; each answer is a whole one.
+    """Reconstruct once, and look at the answer on the way: at each the time so far, without that of looking.
 
-    The series ends early when a run takes ``longest_s``, or when more iterations change nothing.
+    A run is cut where it takes ``longest_s``.
     """
-    limits = {preset: preset_iterations(solver, preset) for preset in presets}
-    counts = _counts(limits.values())
     points: list[Point] = []
-    result = None
-    for number, count in enumerate(counts):
-        result = reconstruct(
-            judge.segment,
-            voxels.spatial_merge,
-            voxels.temporal_merge,
-            budget_s=longest_s,
-            solver=solver,
-            iterations=count,
-            dtype=dtype,
-        )
-        ended = result.ended != "done"
-        reached = tuple(
-            preset for preset, most in limits.items() if most == count or (ended and most > count)
-        )
-        points.append(replace(judge.point(result, voxels), presets=reached))
-        if progress is not None:
-            progress(number + 1, len(counts))
-        if ended:
-            break
-    assert result is not None
-    return Run(solver, voxels, dtype, int(result.video.size), tuple(points))
 
+    def look(now: Look) -> None:
+        if points and now.seconds < APART * points[-1].seconds:
+            return
+        begun = time.monotonic(), time.process_time()
+        video = now.video()
+        made_s = time.monotonic() - begun[0], time.process_time() - begun[1]  # it is part of an answer
+        at = Point(now.iteration, now.seconds + made_s[0], now.processor_s + made_s[1], now.stage)
+        points.append(judge.judged(at, video, voxels))
 
-def _counts(limits: Iterable[int]) -> list[int]:
-    """Iterations that are asked for: the presets', and halves of the largest down to a few."""
-    wanted = set(limits)
-    count = max(wanted)
-    while count > FEWEST_ITERATIONS:
-        wanted.add(count)
-        count //= 2
-    return sorted(wanted)
+    result = reconstruct(
+        judge.segment,
+        voxels.spatial_merge,
+        voxels.temporal_merge,
+        preset,
+        longest_s,
+        None if progress is None else lambda step: progress(step.iteration, step.iterations),
+        solver=solver,
+        dtype=dtype,
+        refuse=False,
+        look=look,
+    )
+    prediction = None if np.isnan(result.quality.prediction) else result.quality.prediction
+    last = Point(result.iterations, result.seconds, result.processor_s, "end", prediction=prediction)
+    earlier = (each for each in points if each.seconds < last.seconds)
+    return Run(
+        solver,
+        voxels,
+        dtype,
+        int(result.video.size),
+        (*earlier, judge.judged(last, result.video, voxels)),
+        preset,
+        ended=result.ended,
+    )
 
 
 def pareto(runs: Iterable[Run]) -> list[tuple[Run, Point]]:
@@ -215,27 +251,33 @@ def pareto(runs: Iterable[Run]) -> list[tuple[Run, Point]]:
 
 def table(runs: Sequence[Run]) -> list[dict[str, Any]]:
     """Every answer as a flat row."""
+    kinds = dict.fromkeys((run.case, run.voxels) for run in runs)
     fronts = {
-        (id(run), point.iterations)
-        for voxels in {run.voxels for run in runs}
-        for run, point in pareto(run for run in runs if run.voxels == voxels)
+        id(point)
+        for kind in kinds
+        for _, point in pareto(run for run in runs if (run.case, run.voxels) == kind)
     }
     return [
         {
+            "case": run.case,
             "spatial_merge": run.voxels.spatial_merge,
             "temporal_merge": run.voxels.temporal_merge,
             "solver": run.solver,
+            "preset": run.preset,
             "dtype": run.dtype,
+            "repeat": run.repeat,
             "voxels": run.voxel_count,
             "iterations": point.iterations,
-            "preset": " ".join(point.presets),
+            "stage": point.stage,
+            "ended": run.ended if point is run.end else None,
             "seconds": round(point.seconds, 4),
+            "processor_s": round(point.processor_s, 4),
             "psnr_db": point.psnr_db,
             "ssim": point.ssim,
             "amplitude_error": point.amplitude_error,
             "frequency_error_hz": point.frequency_error_hz,
             "prediction": point.prediction,
-            "pareto": (id(run), point.iterations) in fronts,
+            "pareto": id(point) in fronts,
         }
         for run in runs
         for point in run.points

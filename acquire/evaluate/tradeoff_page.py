@@ -1,126 +1,132 @@
-"""The trade-off on one page: curves of accuracy against time with the Pareto front, and the table."""
+"""The trade-off on one page: what time buys, in words, curves and frames, and the table."""
 
 from __future__ import annotations
 
 import csv
 import json
+from functools import partial
+from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
-from matplotlib.ticker import FuncFormatter, LogFormatter, MaxNLocator
 
-from acquire.evaluate.figures import DPI, HIGHLIGHT, SOLVER_COLOURS, STYLE
+from acquire.evaluate.figures import DPI, SOLVER_COLOURS, STYLE
+from acquire.evaluate.knees import sentences
 from acquire.evaluate.paper.drawing import canvas
 from acquire.evaluate.report import fill_template
-from acquire.evaluate.tradeoff import pareto, table
+from acquire.evaluate.tradeoff import table
+from acquire.evaluate.tradeoff_figures import METRICS, THEMES, curves, frames, in_series, known
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from datetime import datetime
     from pathlib import Path
 
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from numpy.typing import NDArray
 
-    from acquire.evaluate.tradeoff import Point, Run
+    from acquire.evaluate.tradeoff import Run
+    from acquire.evaluate.tradeoff_figures import Theme
     from acquire.recon.segments import Voxels
     from acquire.simulate import Study
 
-METRICS = (
-    ("psnr_db", "PSNR (dB)", False),
-    ("ssim", "SSIM", False),
-    ("amplitude_error", "amplitude error", True),
-    ("frequency_error_hz", "frequency error (Hz)", True),
-)
-"""Name, label, and whether its axis is logarithmic."""
-MARKERS = {"fast": "o", "balanced": "s", "best": "D"}
+    Truths = Mapping[tuple[str, Voxels], NDArray[Any] | None]
+
+QUANTITIES = ("seconds", "processor_s", "psnr_db", "ssim", "amplitude_error", "frequency_error_hz")
 
 
 def write_page(
-    runs: Sequence[Run], study: Study | None, directory: Path, title: str, command: str, when: datetime
+    runs: Sequence[Run],
+    truths: Truths,
+    study: Study | None,
+    directory: Path,
+    heading: dict[str, Any],
+    when: datetime,
 ) -> Path:
-    """Write ``index.html``, ``tradeoff.csv``, ``tradeoff.json`` and the pictures into ``directory``."""
+    """Write ``index.html``, ``tradeoff.csv``, ``tradeoff.json`` and the pictures into ``directory``.
+
+    ``truths`` are the true frames beside those that runs show; ``heading`` has ``title``, ``command`` and
+    ``notes``, sentences about all of it.
+    """
     rows = table(runs)
     facts: dict[str, Any] = {
-        "title": title,
-        "command": command,
+        **heading,
         "when": when.isoformat(timespec="seconds"),
         "rows": rows,
         "study": _study_facts(study),
+        "sections": [],
     }
+    pictures: dict[str, Path] = {}
+    for number, (case, voxels) in enumerate(dict.fromkeys((run.case, run.voxels) for run in runs)):
+        own = [run for run in runs if (run.case, run.voxels) == (case, voxels)]
+        drawn = _draw(own, truths.get((case, voxels)), directory, f"case-{number}", pictures)
+        facts["sections"].append(
+            {
+                "case": case,
+                "voxels": str(voxels),
+                "sentences": [text for repeats in in_series(own).values() for text in sentences(repeats)],
+                "ends": [_end(repeats) for repeats in in_series(own).values()],
+                "pictures": drawn,
+            }
+        )
     text = json.dumps(facts, indent=1, allow_nan=False, ensure_ascii=False)
     (directory / "tradeoff.json").write_text(text + "\n", encoding="utf-8")
     with (directory / "tradeoff.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, fieldnames=list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
-    pictures = {}
-    with mpl.rc_context(STYLE):
-        drawings = {f"curves-{voxels}": _curves(runs, voxels) for voxels in _kinds(runs)}
-        if study is not None and study.effects:
-            drawings["effects"] = _effects(study)
-        for name, drawing in drawings.items():
-            pictures[name] = directory / f"{name}.png"
-            drawing.savefig(pictures[name], dpi=DPI)
-    ends = [row for row in rows if row["preset"]]
-    facts |= {"ends": ends, "kinds": [str(voxels) for voxels in _kinds(runs)]}
+    if study is not None and study.effects:
+        pictures["effects"] = directory / "effects.png"
+        with mpl.rc_context(STYLE):
+            _effects(study).savefig(pictures["effects"], dpi=DPI)
     page = directory / "index.html"
     page.write_text(fill_template("tradeoff.html.j2", facts, pictures), encoding="utf-8")
     return page
 
 
-def _kinds(runs: Sequence[Run]) -> list[Voxels]:
-    return list(dict.fromkeys(run.voxels for run in runs))
+def _draw(
+    runs: Sequence[Run],
+    truth: NDArray[Any] | None,
+    directory: Path,
+    prefix: str,
+    pictures: dict[str, Path],
+) -> list[dict[str, str]]:
+    """Pictures of one case in one kind of voxels, in light and dark; their names and what they show."""
+    best = max((run for run in runs if run.repeat == 0), key=lambda run: run.end.psnr_db or 0.0)
+    metrics = [metric for metric in METRICS if known(runs, metric)]
+    made: list[dict[str, str]] = []
+
+    def save(name: str, what: str, draw: Callable[[Theme], Figure]) -> None:
+        made.append({"name": f"{prefix}-{name}", "what": what})
+        for suffix, theme in THEMES.items():
+            place = pictures[f"{prefix}-{name}{suffix}"] = directory / f"{prefix}-{name}{suffix}.png"
+            draw(theme).savefig(place, dpi=DPI)
+
+    for metric in metrics[:1]:
+        save(metric.name, f"{metric.label} over wall time", partial(curves, runs, metric, "seconds"))
+    save("frames", f"one frame on the way: {best.solver}, {best.preset}", partial(frames, best, truth))
+    for metric in metrics[:1]:
+        save("processor", f"{metric.label} over processor time", partial(curves, runs, metric, "processor_s"))
+    for metric in metrics[1:]:
+        save(metric.name, f"{metric.label} over wall time", partial(curves, runs, metric, "seconds"))
+    return made
 
 
-def _curves(runs: Sequence[Run], voxels: Voxels) -> Figure:
-    """All metrics over time for one kind of voxels; a curve per solver and dtype, and the front."""
-    own = [run for run in runs if run.voxels == voxels]
-    shown = [each for each in METRICS if any(getattr(run.end, each[0]) is not None for run in own)]
-    figure = canvas(3.1 * -(-len(shown) // 2) + 0.4)
-    axes = figure.subplots(-(-len(shown) // 2), 2, squeeze=False).ravel()
-    colours = {
-        run.solver: SOLVER_COLOURS[i] for i, run in enumerate({run.solver: run for run in own}.values())
+def _end(repeats: Sequence[Run]) -> dict[str, Any]:
+    """Where the repeats of a series ended: the median of each quantity, and lowest and highest."""
+    first = repeats[0]
+    found: dict[str, Any] = {
+        "solver": first.solver,
+        "preset": first.preset,
+        "dtype": first.dtype,
+        "repeats": len(repeats),
+        "cut": sum(run.cut for run in repeats),
+        "iterations": round(median(run.end.iterations for run in repeats)),
     }
-    for ax, (name, label, logarithmic) in zip(axes, shown, strict=False):
-        for run in own:
-            _curve(ax, run, name, colours[run.solver])
-        ax.set(xscale="log", ylabel=label, xlabel="wall time (s)", yscale="log" if logarithmic else "linear")
-        ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        ax.xaxis.set_minor_formatter(LogFormatter(minor_thresholds=(1.5, 0.5)))
-        if not logarithmic:
-            ax.yaxis.set_major_locator(MaxNLocator(6))
-    _front(axes[0], pareto(own))
-    for ax in axes[len(shown) :]:
-        ax.set_visible(False)
-    handles, labels = axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=min(5, len(labels)))
-    return figure
-
-
-def _curve(ax: Axes, run: Run, name: str, colour: str) -> None:
-    points = [
-        (point.seconds, getattr(point, name)) for point in run.points if getattr(point, name) is not None
-    ]
-    if not points:
-        return
-    times, values = ([each[i] for each in points] for i in (0, 1))
-    single = run.dtype == "float32"
-    label = run.solver if single else f"{run.solver}, {run.dtype}"
-    ax.plot(times, values, ".-" if single else ".:", color=colour, lw=1.4, ms=4, label=label)
-    filled = colour if single else "white"
-    for point in run.points:
-        if point.presets and getattr(point, name) is not None:
-            marker = MARKERS.get(point.presets[-1], "o")
-            ax.plot(point.seconds, getattr(point, name), marker, color=colour, ms=7, mfc=filled)
-
-
-def _front(ax: Axes, front: list[tuple[Run, Point]]) -> None:
-    if not front:
-        return
-    times = [point.seconds for _, point in front]
-    values = [point.psnr_db or 0.0 for _, point in front]
-    ax.step(times, values, where="post", color=HIGHLIGHT, lw=6, alpha=0.45, zorder=0, label="Pareto front")
+    for name in QUANTITIES:
+        values = [value for run in repeats if (value := getattr(run.end, name)) is not None]
+        found[name] = {"median": median(values), "low": min(values), "high": max(values)} if values else None
+    return found
 
 
 def _effects(study: Study) -> Figure:

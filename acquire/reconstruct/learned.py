@@ -1,30 +1,47 @@
-"""What a trade-off found out on this machine, kept for `--budget`: which preset gets furthest in a time."""
+"""What trade-offs found out on this machine, kept for `--budget`: which preset gets furthest in a time.
+
+Of one scene a preset says little: what is best for lamps that blink loses where things move. So a preset is
+preferred only by what several scenes say, the same for each preset; runs that a budget cut say nothing.
+"""
 
 from __future__ import annotations
 
 import json
 import os
+from collections import defaultdict
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from statistics import fmean
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-VERSION = 1
+VERSION = 2
+FEWEST_SCENES = 3
+"""With fewer in common, presets are not ranked."""
 
 
 @dataclass(frozen=True, slots=True)
 class Learned:
-    """A preset of a solver reached ``psnr_db`` in ``seconds`` for so many voxels."""
+    """A solver's preset reached ``psnr_db`` in ``seconds`` for so many voxels of a scene and its noise."""
 
     solver: str
     preset: str
     spatial_merge: int
     temporal_merge: int
     voxels: int
+    scene: str
     seconds: float
     psnr_db: float
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """The preset that is preferred, or None; ``why`` says by what, or why none is."""
+
+    preset: str | None
+    why: str
 
 
 def learned_path() -> Path:
@@ -54,19 +71,45 @@ def recall(path: Path | None = None) -> list[Learned]:
         return []
 
 
-def choose(known: Sequence[Learned], budget_s: float, voxels: int, workers: int = 1) -> Learned | None:
-    """The best that ends within ``budget_s`` for ``voxels`` voxels, times scaled from the nearest size.
+def choose(known: Sequence[Learned], budget_s: float, voxels: int, workers: int = 1) -> Choice:
+    """The best on average that ends within ``budget_s`` for ``voxels`` voxels, of one solver's presets.
 
-    None when nothing is known, or when nothing known is fast enough.
+    Times are scaled from the nearest size; presets are compared on the scenes that all of them were tried on.
     """
     if not known:
-        return None
+        return Choice(None, "nothing was learned yet: acquire tradeoff, with several scenes")
     nearest = min(known, key=lambda each: abs(each.voxels - voxels)).voxels
-    of_size = [each for each in known if each.voxels == nearest]
+    by_preset: dict[str, dict[str, Learned]] = defaultdict(dict)
+    for each in known:
+        if each.voxels == nearest:
+            by_preset[each.preset][each.scene] = each
+    scenes = sorted(set.intersection(*(set(each) for each in by_preset.values())))
+    if len(scenes) < FEWEST_SCENES:
+        seen = (
+            f"{len(scenes)} scene{'' if len(scenes) == 1 else 's'} ({', '.join(scenes) or 'none in common'})"
+        )
+        return Choice(
+            None, f"what was learned is of {seen}, and {FEWEST_SCENES} are needed to prefer a preset"
+        )
     scale = voxels / nearest / max(1, workers)
-    in_time = [each for each in of_size if each.seconds * scale <= budget_s]
-    return max(in_time, key=lambda each: each.psnr_db, default=None)
+    in_time = {
+        preset: fmean(tried[scene].psnr_db for scene in scenes)
+        for preset, tried in by_preset.items()
+        if max(tried[scene].seconds for scene in scenes) * scale <= budget_s
+    }
+    if not in_time:
+        return Choice(None, f"no preset ended in that time on {len(scenes)} scenes")
+    return Choice(
+        max(in_time, key=in_time.__getitem__), f"learned from {len(scenes)} scenes: {', '.join(scenes)}"
+    )
 
 
-def _case(each: Learned) -> tuple[str, str, int, int, int]:
-    return (each.solver, each.preset, each.spatial_merge, each.temporal_merge, each.voxels)
+def _case(each: Learned) -> tuple[str, str, int, int, int, str]:
+    return (
+        each.solver,
+        each.preset,
+        each.spatial_merge,
+        each.temporal_merge,
+        each.voxels,
+        each.scene,
+    )

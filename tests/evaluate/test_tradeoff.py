@@ -1,15 +1,19 @@
-"""The trade-off: what is measured on the way, the front, the page and the table."""
+"""The trade-off: what is measured on the way of one run, the front, the page and the table."""
 
 from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from datetime import UTC, datetime
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
 from acquire.config import load_rig
+from acquire.errors import UsageError
+from acquire.evaluate.cases import full_wells, procedural
 from acquire.evaluate.tradeoff import Judge, Point, Run, amplitude_error, measure, pareto, table
 from acquire.evaluate.tradeoff_page import write_page
 from acquire.recon.segments import Voxels
@@ -18,6 +22,7 @@ from acquire.simulate import simulate
 from acquire.store import open_recording
 
 VOXELS = Voxels(2, 1)
+HEADING = {"title": "one LED", "command": "acquire tradeoff", "notes": ["Two repeats."]}
 
 
 @pytest.fixture(scope="module")
@@ -31,20 +36,51 @@ def judge(tmp_path_factory):
     return Judge.of(recording, recording.cut(20, 120))
 
 
-def test_more_and_more_iterations_up_to_the_presets(judge):
-    run = measure(judge, "admm", VOXELS)
-    counts = [point.iterations for point in run.points]
-    assert counts == sorted(counts)
-    assert {preset for point in run.points for preset in point.presets} == {"fast", "balanced"}
-    assert run.end.psnr_db > run.points[0].psnr_db
+@pytest.fixture(scope="module")
+def run(judge):
+    return measure(judge, "admm", VOXELS)
+
+
+def test_one_run_is_looked_at_on_its_way(run):
+    assert all(one.seconds < other.seconds for one, other in pairwise(run.points))
+    assert all(one.processor_s <= other.processor_s for one, other in pairwise(run.points))
+    assert all(one.iterations <= other.iterations for one, other in pairwise(run.points))
+    assert len(run.points) > 3
+    assert run.points[0].iterations == 1
+    assert run.end.psnr_db > run.points[0].psnr_db + 10
     assert run.end.frequency_error_hz < 60
     assert 0 <= run.end.amplitude_error < 0.5
+    assert not run.cut
+
+
+def test_a_run_that_its_budget_ends_is_cut(judge):
+    short = measure(judge, "twist", VOXELS, "best", 0.2)
+    assert short.cut
+    assert not replace(short, ended="converged").cut
 
 
 def test_a_real_recording_has_no_truth(judge):
-    run = measure(Judge(judge.segment, None), "admm", VOXELS, ("fast",))
-    assert run.end.psnr_db is None
-    assert 0 < run.end.prediction < 1
+    blind = measure(Judge(judge.segment, None), "admm", VOXELS, "fast")
+    assert blind.end.psnr_db is None
+    assert 0 < blind.end.prediction < 1
+    assert blind.end.frame is not None
+
+
+def test_procedural_scenes_differ_from_repeat_to_repeat_and_have_their_truth():
+    case = procedural("splash", 1e4, 40)
+    one, other = case.judge(0), case.judge(1)
+    assert case.name == "splash, 10000 electrons at the brightest"
+    assert not np.array_equal(one.segment.code, other.segment.code)
+    true = one.truth(Voxels(6, 1))
+    assert true.shape[1:] == (32, 32)
+    assert 0 <= one.picked(Voxels(6, 1)) < len(true)
+    np.testing.assert_allclose(true.mean(), one.light.mean(), rtol=0.3)
+
+
+def test_full_wells_are_electrons_or_clean():
+    assert full_wells(["1e4", "clean"]) == [1e4, np.inf]
+    with pytest.raises(UsageError, match="full well 'dirty'"):
+        full_wells(["dirty"])
 
 
 def test_amplitudes_that_are_half_are_wrong_by_half():
@@ -54,7 +90,7 @@ def test_amplitudes_that_are_half_are_wrong_by_half():
 
 
 def point(iterations, seconds, decibel):
-    return Point(iterations, seconds, decibel)
+    return Point(iterations, seconds, psnr_db=decibel)
 
 
 def test_the_front_is_what_nothing_reaches_sooner():
@@ -68,15 +104,22 @@ def test_the_front_is_what_nothing_reaches_sooner():
     assert [row["pareto"] for row in table([slow, fast])] == [True, True, True, False]
 
 
-def test_page_and_table_say_the_same(judge, tmp_path):
-    run, exact = (measure(judge, "admm", VOXELS, ("fast",), dtype=kind) for kind in ("float32", "float64"))
-    page = write_page([run, exact], None, tmp_path, "one LED", "acquire tradeoff", datetime.now(UTC))
+def test_page_and_table_say_the_same(judge, run, tmp_path):
+    cut = replace(run, repeat=1, ended="budget")
+    exact = replace(run, dtype="float64", case="another")
+    true = judge.truth(VOXELS)[judge.picked(VOXELS)]
+    page = write_page([run, cut, exact], {("", VOXELS): true}, None, tmp_path, HEADING, datetime.now(UTC))
     text = page.read_text()
-    assert "data:image/png" in text
-    assert f"{run.end.psnr_db:.2f}" in text
+    assert text.count("<picture>") == 2 * 6  # PSNR by two clocks, frames, SSIM, amplitude, frequency
+    assert text.count('prefers-color-scheme: dark)"><img') == 2 * 6
+    assert "cut, 1 of 2" in text
+    assert "cut by its budget after" in text
+    assert f"{run.end.psnr_db:.1f}" in text
     with (tmp_path / "tradeoff.csv").open() as file:
         rows = list(csv.DictReader(file))
-    both = [*run.points, *exact.points]
-    assert [float(row["psnr_db"]) for row in rows] == [each.psnr_db for each in both]
-    assert [row["dtype"] for row in rows] == ["float32"] * len(run.points) + ["float64"] * len(exact.points)
-    assert json.loads((tmp_path / "tradeoff.json").read_text())["rows"][-1]["preset"] == "fast"
+    every = [*run.points, *cut.points, *exact.points]
+    assert [float(row["psnr_db"]) for row in rows] == [each.psnr_db for each in every]
+    assert [row["ended"] for row in rows].count("budget") == 1
+    document = json.loads((tmp_path / "tradeoff.json").read_text())
+    assert document["rows"][-1]["dtype"] == "float64"
+    assert [part["case"] for part in document["sections"]] == ["", "another"]

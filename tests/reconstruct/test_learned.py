@@ -1,28 +1,56 @@
-"""What a trade-off taught is used by a budget."""
+"""What trade-offs taught is used by a budget, as far as several scenes say it."""
 
 from __future__ import annotations
 
 from acquire.reconstruct.learned import Learned, choose, recall, remember
 
-FAST = Learned("admm", "fast", 3, 1, 1000, 2.0, 25.0)
-GOOD = Learned("admm", "balanced", 3, 1, 1000, 8.0, 32.0)
+SCENES = ("leds", "splash", "bullet")
+
+
+def tried(preset: str, seconds: float, *psnr_db: float) -> list[Learned]:
+    return [
+        Learned("admm", preset, 3, 1, 1000, scene, seconds, value)
+        for scene, value in zip(SCENES, psnr_db, strict=False)
+    ]
+
+
+FAST = tried("fast", 2.0, 25.0, 22.0, 24.0)
+GOOD = tried("balanced", 8.0, 32.0, 22.5, 23.5)
 
 
 def test_the_best_that_ends_in_time():
-    known = [FAST, GOOD]
-    assert choose(known, 10.0, 1000) == GOOD
-    assert choose(known, 5.0, 1000) == FAST
-    assert choose(known, 5.0, 500) == GOOD  # half the voxels take half the time
-    assert choose(known, 1.0, 1000) is None
-    assert choose([], 1.0, 1000) is None
+    known = [*FAST, *GOOD]
+    assert choose(known, 10.0, 1000).preset == "balanced"
+    assert choose(known, 5.0, 1000).preset == "fast"
+    assert choose(known, 5.0, 500).preset == "balanced"  # half the voxels take half the time
+    assert choose(known, 1.0, 1000).preset is None
+    assert "leds" in choose(known, 10.0, 1000).why
+    assert "nothing was learned" in choose([], 1.0, 1000).why
+
+
+def test_one_scene_alone_says_nothing_of_others():
+    one = [*tried("fast", 2.0, 25.0), *tried("balanced", 8.0, 32.0)]
+    chosen = choose(one, 10.0, 1000)
+    assert chosen.preset is None
+    assert "1 scene (leds), and 3 are needed" in chosen.why
+
+
+def test_presets_are_compared_on_the_same_scenes():
+    easy = [*FAST, *(Learned("admm", "fast", 3, 1, 1000, f"easy {n}", 2.0, 60.0) for n in range(5))]
+    assert choose([*easy, *GOOD], 10.0, 1000).preset == "balanced"
+
+
+def test_the_slowest_scene_says_what_fits():
+    slow = [*GOOD[:2], Learned("admm", "balanced", 3, 1, 1000, "bullet", 12.0, 23.5)]
+    assert choose([*FAST, *slow], 10.0, 1000).preset == "fast"
 
 
 def test_lessons_are_kept_and_replaced(tmp_path):
     path = tmp_path / "cache" / "t.json"
     assert recall(path) == []
-    remember([FAST], path)
-    better = Learned("admm", "fast", 3, 1, 1000, 1.0, 26.0)
-    remember([better, GOOD], path)
-    assert sorted(recall(path), key=lambda each: each.seconds) == [better, GOOD]
+    remember(FAST, path)
+    better = Learned("admm", "fast", 3, 1, 1000, "leds", 1.0, 26.0)
+    remember([better, *GOOD], path)
+    assert set(recall(path)) == {better, *FAST[1:], *GOOD}
     path.write_text("{")
     assert recall(path) == []

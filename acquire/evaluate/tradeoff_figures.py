@@ -1,0 +1,194 @@
+"""Pictures of a trade-off: narrow enough for a telephone, in light and in dark.
+
+Axes hold at least what matters, so that a difference of a tenth of a decibel looks like one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+
+from acquire.evaluate.figures import STYLE, bare
+from acquire.evaluate.knees import Clock, band, plain
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from matplotlib.axes import Axes
+    from numpy.typing import NDArray
+
+    from acquire.evaluate.tradeoff import Point, Run
+
+    Series = tuple[str, str, str]
+
+WIDTH_IN, HEIGHT_IN = 4.4, 3.3
+CLOCKS: dict[Clock, str] = {"seconds": "wall time (s)", "processor_s": "processor time, all threads (s)"}
+LINES = {"fast": ":", "balanced": "-", "best": "--"}
+MARKERS = {"fast": "o", "balanced": "s", "best": "D"}
+FRAMES = 5
+LEAST_OCTAVES, MANY_OCTAVES = 2.0, 3.5
+"""Of time: what an axis shows at least, and beyond which it has fewer ticks."""
+
+
+class Theme(NamedTuple):
+    """Colours of a picture, to be read on the page's card."""
+
+    style: Any
+    solvers: tuple[str, ...]
+    soft: str
+
+
+LIGHT = Theme(dict(STYLE), ("#0072b2", "#d55e00", "#009e73", "#cc79a7"), "#52606d")
+_DARK_INK, _DARK_SOFT = "#e4e9ef", "#a3b0be"
+DARK = Theme(
+    STYLE
+    | dict.fromkeys(("text.color", "axes.labelcolor", "xtick.color", "ytick.color"), _DARK_INK)
+    | dict.fromkeys(("figure.facecolor", "savefig.facecolor", "axes.facecolor"), "#1b222b")
+    | {"axes.edgecolor": _DARK_SOFT, "grid.color": "#303a46"},
+    ("#56b4e9", "#e69f00", "#2fcf9f", "#e6a3cc"),
+    _DARK_SOFT,
+)
+THEMES = {"": LIGHT, "-dark": DARK}
+"""What is added to a picture's name."""
+
+
+@dataclass(frozen=True, slots=True)
+class Metric:
+    """A quantity of a `Point`: its label, what an axis shows at least, a floor where it is logarithmic."""
+
+    name: str
+    label: str
+    least: tuple[float, float]
+    """Lowest and highest, or for decibels the span that is shown."""
+    floor: float | None = None
+    scale: float = 1.0
+
+
+METRICS = (
+    Metric("psnr_db", "PSNR (dB)", (0.0, 12.0)),
+    Metric("ssim", "SSIM", (0.0, 1.0)),
+    Metric("amplitude_error", "amplitude error (%)", (1.0, 100.0), 0.1, 100.0),
+    Metric("frequency_error_hz", "frequency error (Hz)", (1.0, 100.0), 0.1),
+)
+DECIBELS = METRICS[0]
+
+
+def known(runs: Sequence[Run], metric: Metric) -> bool:
+    return any(getattr(run.end, metric.name) is not None for run in runs)
+
+
+def in_series(runs: Sequence[Run]) -> dict[Series, list[Run]]:
+    """Repeats together."""
+    found: dict[Series, list[Run]] = {}
+    for run in runs:
+        found.setdefault((run.solver, run.preset, run.dtype), []).append(run)
+    return found
+
+
+def curves(runs: Sequence[Run], metric: Metric, clock: Clock, theme: Theme) -> Figure:
+    """A quantity over time: the median of the repeats, their band, and where each run ended."""
+    with mpl.rc_context(theme.style):
+        figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), layout="constrained")
+        ax = figure.subplots()
+        solvers: list[str] = list(dict.fromkeys(run.solver for run in runs))
+        for series, repeats in in_series(runs).items():
+            _curve(ax, repeats, metric, clock, theme.solvers[solvers.index(series[0]) % len(theme.solvers)])
+        _time_axis(ax, CLOCKS[clock])
+        _value_axis(ax, metric)
+        for line, solver in zip(theme.solvers, solvers, strict=False):
+            ax.plot([], [], color=line, lw=2.2, label=solver)
+        figure.legend(*ax.get_legend_handles_labels(), loc="outside upper left", ncols=len(solvers))
+        return figure
+
+
+def _curve(ax: Axes, repeats: list[Run], metric: Metric, clock: Clock, colour: str) -> None:
+    found = band(repeats, metric.name, clock)
+    if found is None:
+        return
+    low, middle, high = (_shown(values, metric) for values in (found.low, found.middle, found.high))
+    run = repeats[0]
+    ax.fill_between(found.times_s, low, high, color=colour, alpha=0.2, lw=0)
+    exact = run.dtype != "float32"
+    ax.plot(
+        found.times_s, middle, LINES.get(run.preset, "-"), color=colour, lw=1.0 if exact else 1.8, zorder=3
+    )
+    for each in repeats:
+        value = getattr(each.end, metric.name)
+        if value is None:
+            continue
+        marker = "x" if each.cut else MARKERS.get(each.preset, "o")
+        at = getattr(each.end, clock), _shown(np.array([value]), metric)[0]
+        ax.plot(*at, marker, color=colour, ms=6.5, mew=2, mfc="none" if exact else colour, zorder=4)
+
+
+def _shown(values: NDArray[np.float64], metric: Metric) -> NDArray[np.float64]:
+    scaled = values * metric.scale
+    return scaled if metric.floor is None else np.maximum(scaled, metric.floor)
+
+
+def _time_axis(ax: Axes, label: str) -> None:
+    ax.set_xscale("log")
+    low, high = ax.get_xlim()
+    middle, octaves = np.sqrt(low * high), max(float(np.log2(high / low)), LEAST_OCTAVES)
+    ax.set(xlim=(middle / 2 ** (octaves / 2), middle * 2 ** (octaves / 2)), xlabel=label)
+    ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if octaves > MANY_OCTAVES else (1, 1.5, 2, 3, 5, 7)))
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    ax.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _value_axis(ax: Axes, metric: Metric) -> None:
+    ax.set_ylabel(metric.label)
+    low, high = ax.get_ylim()
+    least_low, least_high = metric.least
+    if metric is DECIBELS:
+        missing = max(0.0, least_high - (high - low)) / 2
+        ax.set_ylim(low - missing, high + missing)
+        ax.yaxis.set_major_locator(MaxNLocator(6, steps=[1, 2, 5, 10]))
+        return
+    if metric.floor is None:
+        ax.set_ylim(min(low, least_low), max(high, least_high))
+        return
+    ax.set_yscale("log")
+    ax.set_ylim(min(max(low, metric.floor), least_low) / 1.3, max(high, least_high) * 1.3)
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    ax.yaxis.set_minor_formatter(NullFormatter())
+
+
+def frames(run: Run, truth: NDArray[Any] | None, theme: Theme) -> Figure:
+    """One frame as it was after more and more time of one run, and as it is in truth."""
+    points = _spread(run.points)
+    last = run.end.frame
+    assert last is not None
+    peak = float(np.quantile(last if truth is None else truth, 0.999)) or 1.0
+    with mpl.rc_context(theme.style):
+        figure = Figure(figsize=(WIDTH_IN, 3.5), layout="constrained")
+        axes = figure.subplots(2, 3).ravel()
+        for ax in axes:
+            bare(ax)
+            ax.set_visible(False)
+        shown = [(point.frame, _caption(point)) for point in points]
+        for ax, (frame, title) in zip(axes, [*shown, (truth, "truth")], strict=False):
+            if frame is None:
+                continue
+            ax.set_visible(True)
+            ax.imshow(frame, cmap="gray", vmin=0, vmax=peak, interpolation="nearest")
+            ax.set_title(title, fontsize=9.5, loc="left")
+        return figure
+
+
+def _spread(points: Sequence[Point]) -> list[Point]:
+    """At most five, evenly over the logarithm of the time, the first and the last among them."""
+    wanted = np.geomspace(points[0].seconds, points[-1].seconds, FRAMES)
+    times = np.array([each.seconds for each in points])
+    places = {int(np.argmin(np.abs(np.log(times / at)))) for at in wanted}
+    return [points[place] for place in sorted(places)]
+
+
+def _caption(point: Point) -> str:
+    quality = "" if point.psnr_db is None else f": {point.psnr_db:.0f} dB"
+    return f"{plain(point.seconds)} s{quality}"
