@@ -149,7 +149,7 @@ class Judge:
         )
 
     def picked(self, voxels: Voxels) -> int:
-        """The frame that is shown: where the truth is far from its mean, rather brighter; or the middle one."""
+        """The frame to show: where the truth is far from its mean, rather brighter; else the middle one."""
         true = self.truth(voxels)
         if true is None:
             frames = self.segment.geometry.video_shape(1, voxels.temporal_merge)[0]
