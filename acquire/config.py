@@ -25,6 +25,7 @@ from acquire.plan_config import ReconstructionPlan
 from acquire.reading import read_regular
 from acquire.recording_config import USUAL_CHUNK_BYTES, RecordingConfig, usual_chunk_lines, usual_tag_chunks
 from acquire.scene_config import SceneConfig, SceneFile, VideoSceneConfig, anchored
+from acquire.service_config import HooksConfig, ServiceConfig
 from acquire.text import shortened, shown
 from acquire.web_config import WebConfig
 
@@ -175,6 +176,8 @@ class RigConfig(FrozenModel):
     check: CheckConfig = CheckConfig()
     control: ControlConfig = Field(default_factory=ControlConfig)
     simulation: SimulationConfig = SimulationConfig()
+    service: ServiceConfig = ServiceConfig()
+    hooks: HooksConfig = HooksConfig()
     web: WebConfig | None = Field(default=None, description="absent: the daemon starts no page")
     _origin: str = PrivateAttr("")
 

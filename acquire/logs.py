@@ -6,9 +6,13 @@ it came besides is told once the minute is over. So the log can neither be forge
 
 from __future__ import annotations
 
+import json
 import logging
+import os
+import sys
 import time
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
 from acquire.text import visible
@@ -44,6 +48,32 @@ class OneLine(logging.Formatter):
         return "\n".join(lines)
 
 
+class JsonLine(OneLine):
+    """One JSON object in one line, for programs."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        facts: dict[str, object] = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "logger": record.name,
+            "process": record.process,
+            "message": visible(record.getMessage())[:MOST_CHARACTERS],
+        }
+        if record.exc_info:
+            told = self.formatException(record.exc_info).splitlines()[-MOST_TRACEBACK_LINES:]
+            facts["traceback"] = [visible(line)[:MOST_CHARACTERS] for line in told]
+        return json.dumps(facts)
+
+
+def is_journal(file: int) -> bool:
+    """Whether a descriptor leads to systemd's journal, as JOURNAL_STREAM says of it."""
+    try:
+        found = os.fstat(file)
+    except OSError:
+        return False
+    return os.environ.get("JOURNAL_STREAM") == f"{found.st_dev}:{found.st_ino}"
+
+
 @dataclass(slots=True)
 class _Count:
     began_s: float
@@ -77,9 +107,12 @@ class Bounded(logging.Filter):
 
 
 def write_log(level: int) -> None:
-    """Log to stderr from now on, in this process, what is at least of this level."""
+    """Log to stderr from now on, in this process, what is at least of this level.
+
+    For people; and as JSON where stderr is systemd's journal, which gives its own time to every entry.
+    """
     handler = logging.StreamHandler()
-    handler.setFormatter(OneLine())
+    handler.setFormatter(JsonLine() if is_journal(sys.stderr.fileno()) else OneLine())
     handler.addFilter(Bounded(lambda text: handler.emit(_entry(text))))
     logging.basicConfig(level=level, handlers=[handler])
 

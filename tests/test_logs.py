@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import logging
+import subprocess
+import sys
 
 from acquire.logs import MOST_CHARACTERS, REPEATS, WINDOW_S, Bounded, OneLine
 
@@ -49,3 +52,23 @@ def test_kinds_without_number_are_bounded_too() -> None:
     bounded = Bounded(told.append, lambda: 0.0)
     assert all(bounded.filter(record(f"kind {i}")) for i in range(5000))
     assert len(bounded._counts) <= 256
+
+
+def test_under_systemd_the_log_is_json() -> None:
+    """Where JOURNAL_STREAM names stderr; it says the same, with the same bounds."""
+    code = (
+        "import logging, os, sys\n"
+        "found = os.fstat(2); os.environ['JOURNAL_STREAM'] = f'{found.st_dev}:{found.st_ino}'\n"
+        "from acquire.logs import write_log\n"
+        "write_log(logging.INFO); log = logging.getLogger('acquire.daemon')\n"
+        "log.info('a %s', 'new\\nline')\n"
+        "try: 1 / 0\n"
+        "except ZeroDivisionError: log.exception('oh')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=True
+    )
+    first, second = map(json.loads, done.stderr.splitlines())
+    assert (first["level"], first["logger"], first["message"]) == ("info", "acquire.daemon", r"a new\nline")
+    assert second["traceback"][-1].startswith("ZeroDivisionError")
+    assert first["time"].endswith("+00:00")

@@ -17,10 +17,12 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, TypeVar
 
+from acquire.daemon.beginning import begin
 from acquire.daemon.connections import ApiServer, raise_descriptor_limit
 from acquire.daemon.control import build_app
 from acquire.daemon.ending import END_S, LastResort, leave
 from acquire.daemon.endpoint import Endpoint
+from acquire.daemon.hooks import Hooks
 from acquire.daemon.messages import LightCode
 from acquire.daemon.notify import notify
 from acquire.daemon.page import Page
@@ -77,10 +79,8 @@ def serve(config: RigConfig) -> int:
 
         service = Service(config, open_run, proof, salvage, uploads, troubles)
         page = Page(config, endpoint.path)
-        try:
+        with contextlib.closing(page), contextlib.closing(Hooks(config.hooks, service.news, config.name)):
             code = asyncio.run(Daemon(service, endpoint, page).run())
-        finally:
-            page.close()
         last_resort = LastResort(endpoint.remove)
         last_resort.within(END_S)  # for devices that do not let go
     last_resort.cancel()
@@ -117,9 +117,11 @@ class Daemon:
             log.info("listening on %s (process %d)", self._endpoint.path, os.getpid())
             notify("READY=1")
         watchdog = asyncio.create_task(self._feed_watchdog())
+        beginning = asyncio.create_task(begin(self._service.config.service, self._service, self._command))
         try:
             await self._supervise(serving)
         finally:
+            beginning.cancel()
             await self._end(serving)
             watchdog.cancel()
             self._last_resort.cancel()

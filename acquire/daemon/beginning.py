@@ -1,0 +1,49 @@
+"""What the daemon does by itself once it has started: `[service] begin`.
+
+A daemon that came back after a crash arms, or records, as the rig says. What refuses is told and tried again;
+whoever gives a command of their own takes over, and nothing is tried any more.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from typing import TYPE_CHECKING
+
+from acquire.daemon.messages import ArmRequest, StartRequest
+from acquire.daemon.states import State
+from acquire.errors import AcquireError
+
+if TYPE_CHECKING:
+    from collections.abc import Awaitable, Callable
+
+    from acquire.daemon.service import Service
+    from acquire.service_config import ServiceConfig
+
+log = logging.getLogger("acquire.daemon")
+
+
+async def begin(
+    config: ServiceConfig, service: Service, run: Callable[[Callable[[], None]], Awaitable[None]]
+) -> None:
+    """Arm, and record, as ``config`` says; ``run`` carries out what is to be done in the devices' thread."""
+    if config.begin == "idle":
+        return
+    log.info("service.begin: %s", config.begin)
+    while service.status().state is State.IDLE and not await _is_done(config, service, run):
+        await asyncio.sleep(config.retry_s)
+
+
+async def _is_done(
+    config: ServiceConfig, service: Service, run: Callable[[Callable[[], None]], Awaitable[None]]
+) -> bool:
+    try:
+        await run(lambda: service.arm(ArmRequest()))
+        if config.begin == "recording":
+            await run(lambda: service.start(StartRequest()))
+    except AcquireError as error:
+        text = f"service.begin: {error}; tried again in {config.retry_s:g} s"
+        log.warning("%s", text)
+        service.news.tell("waiting", text, level="warning")
+        return False
+    return True

@@ -1,0 +1,95 @@
+"""Whom the daemon tells by itself: a command or a webhook, at a fault, lost lines, a disk that fills.
+
+A thread of its own tells one after the other. It listens to the news as anybody does: what is slow or hangs
+is given up after its time, and what happened meanwhile is told afterwards, as far as the log still has it.
+"""
+
+from __future__ import annotations
+
+import logging
+import subprocess
+import threading
+import urllib.request
+from typing import TYPE_CHECKING
+
+from acquire.daemon.states import State
+
+if TYPE_CHECKING:
+    from acquire.daemon.facts import News
+    from acquire.daemon.news import NewsLog
+    from acquire.service_config import HooksConfig
+
+END_S = 2.0
+MOST_AT_ONCE = 20
+"""News that are told one by one; of more the latest."""
+
+log = logging.getLogger("acquire.daemon")
+
+
+class Hooks:
+    """Nothing is started where nobody is to be told."""
+
+    def __init__(self, config: HooksConfig, news: NewsLog, rig: str) -> None:
+        self._config, self._news, self._rig = config, news, rig
+        self._last_id = news.last_id
+        self._happened = threading.Event()
+        self._ended = False
+        self._thread = threading.Thread(target=self._run, name="hooks", daemon=True)
+        if config.command or config.webhook:
+            news.listen(self._happened.set)
+            self._thread.start()
+
+    def close(self) -> None:
+        """Tell what is still to be told, for a moment. Idempotent."""
+        self._ended = True
+        self._happened.set()
+        self._news.forget(self._happened.set)
+        if self._thread.is_alive():
+            self._thread.join(END_S)
+
+    def _run(self) -> None:
+        while True:
+            self._happened.wait()
+            self._happened.clear()
+            found = self._news.after(self._last_id)
+            self._last_id = found[-1].id if found else self._last_id
+            for news in [one for one in found if self._concerns(one)][-MOST_AT_ONCE:]:
+                self._tell(news)
+            if self._ended:
+                return
+
+    def _concerns(self, news: News) -> bool:
+        fault = news.kind == "state" and news.state is State.FAULTED and news.level == "error"
+        return ("fault" if fault else news.kind) in self._config.on
+
+    def _tell(self, news: News) -> None:
+        text = news.model_copy(update={"text": f"{self._rig}: {news.text}"}).model_dump_json().encode()
+        if self._config.command:
+            self._call(text)
+        if self._config.webhook:
+            self._post(self._config.webhook, text)
+
+    def _call(self, text: bytes) -> None:
+        words, limit_s = list(self._config.command), self._config.timeout_s
+        try:
+            done = subprocess.run(  # noqa: S603 - the rig's own words
+                words,
+                input=text,
+                stdout=subprocess.DEVNULL,
+                timeout=limit_s,
+                check=False,
+                start_new_session=True,
+            )
+        except (OSError, subprocess.TimeoutExpired) as error:
+            log.warning("hook %s: %s", words[0], error)
+            return
+        if done.returncode:
+            log.warning("hook %s ended with exit code %d", words[0], done.returncode)
+
+    def _post(self, url: str, text: bytes) -> None:
+        request = urllib.request.Request(url, text, {"Content-Type": "application/json"})  # noqa: S310 - http, checked
+        try:
+            with urllib.request.urlopen(request, timeout=self._config.timeout_s):  # noqa: S310
+                return
+        except OSError as error:
+            log.warning("hook %s: %s", url, error)

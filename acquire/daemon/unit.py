@@ -1,0 +1,127 @@
+"""The daemon as a service of systemd: when it is ready, when it hangs, what it needs and what not."""
+
+from __future__ import annotations
+
+import grp
+import os
+import pwd
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from acquire.config import RigConfig
+
+WATCHDOG_S = 30
+"""Without a word from the daemon, which gives one twice a second, systemd ends and restarts it."""
+STOP_S = 60
+"""Beyond what sealing a recording may take (`recording.seal_timeout_s`)."""
+UNIT = "acquire.service"
+SOCKET = "/run/acquire/acquire.sock"
+"""Of the host's service, unless the rig says otherwise."""
+RULES = "70-acquire.rules"
+
+UDEV = """\
+# The sync trigger and USB3 Vision cameras belong to the group `plugdev`: no root is needed to use them.
+SUBSYSTEM=="usb", ENV{ID_USB_INTERFACES}=="*:ef0500:*", MODE="0660", GROUP="plugdev", TAG+="uaccess"
+SUBSYSTEM=="usb", ATTR{idVendor}=="1209", MODE="0660", GROUP="plugdev", TAG+="uaccess"
+SUBSYSTEM=="tty", ATTRS{idVendor}=="0403", MODE="0660", GROUP="plugdev", TAG+="uaccess"
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where the unit goes, and for whom: the host, or one user."""
+
+    user: bool
+    directory: Path
+
+    @classmethod
+    def of(cls, *, user: bool) -> Place:
+        if user:
+            home = os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config"
+            return cls(True, Path(home) / "systemd/user")
+        return cls(False, Path("/etc/systemd/system"))
+
+
+def unit_text(rig: RigConfig, config: Path, *, user: bool, account: str | None = None) -> str:
+    """The unit for a rig file. ``account``: who runs the host's service; absent: who asks."""
+    recordings = rig.recording.directory.absolute()
+    stop_s = round(rig.recording.seal_timeout_s) + STOP_S
+    command = f"{sys.executable} -m acquire serve --config {_quoted(config.absolute())}"
+    who = account or pwd.getpwuid(os.geteuid()).pw_name
+    service = [
+        "Type=notify",
+        "NotifyAccess=main",
+        f"ExecStart={command}",
+        *([] if user else [f"User={who}", *_groups(), "RuntimeDirectory=acquire"]),
+        *([] if user else ["RuntimeDirectoryMode=0700", "Environment=XDG_RUNTIME_DIR=/run/acquire"]),
+        f"WorkingDirectory={_quoted(recordings)}",
+        f"WatchdogSec={WATCHDOG_S}",
+        "Restart=on-failure",
+        "RestartSec=1",
+        "KillMode=mixed",
+        f"TimeoutStopSec={stop_s}",
+        f"TimeoutStartSec={STOP_S}",
+        "OOMPolicy=continue",
+        "LimitNOFILE=65536",
+        "LimitRTPRIO=1",
+        "LimitNICE=-15",
+        *(_hardening(recordings, rig) if not user else ["NoNewPrivileges=yes", "UMask=0077"]),
+    ]
+    wanted = "default.target" if user else "multi-user.target"
+    return "\n".join(
+        [
+            "[Unit]",
+            f"Description=acquire, the capture service of rig {rig.name}",
+            *([] if user else ["After=network.target time-sync.target"]),
+            "StartLimitIntervalSec=60",
+            "StartLimitBurst=10",
+            "",
+            "[Service]",
+            *service,
+            "",
+            "[Install]",
+            f"WantedBy={wanted}",
+            "",
+        ]
+    )
+
+
+def _hardening(recordings: Path, rig: RigConfig) -> list[str]:
+    """What the service does not need it cannot do. (Not MemoryDenyWriteExecute: the simulator compiles.)"""
+    writable = {recordings, rig.control.socket.absolute().parent}
+    return [
+        "OOMScoreAdjust=-500",
+        "NoNewPrivileges=yes",
+        "UMask=0077",
+        "ProtectSystem=strict",
+        f"ReadWritePaths={' '.join(f'-{_quoted(path)}' for path in sorted(writable))}",
+        "ProtectHome=read-only",
+        "ProtectKernelTunables=yes",
+        "ProtectKernelModules=yes",
+        "ProtectKernelLogs=yes",
+        "ProtectControlGroups=yes",
+        "ProtectClock=yes",
+        "ProtectHostname=yes",
+        "RestrictSUIDSGID=yes",
+        "RestrictNamespaces=yes",
+        "LockPersonality=yes",
+        "RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK AF_PACKET",
+        "SystemCallArchitectures=native",
+        "CapabilityBoundingSet=",
+    ]
+
+
+def _groups() -> list[str]:
+    """Those of this host whose members may use ports and USB devices."""
+    here = {group.gr_name for group in grp.getgrall()}
+    names = [name for name in ("dialout", "plugdev") if name in here]
+    return [f"SupplementaryGroups={' '.join(names)}"] if names else []
+
+
+def _quoted(path: Path) -> str:
+    """As systemd reads words: % is its own, and spaces part them."""
+    text = str(path).replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%")
+    return f'"{text}"' if " " in text or '"' in text else text

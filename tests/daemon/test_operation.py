@@ -1,0 +1,145 @@
+"""What keeps a service in its place in the host: hooks, unit, alert rules."""
+
+from __future__ import annotations
+
+import configparser
+import http.server
+import json
+import re
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from shutil import which
+
+import pytest
+from fake_run import FakeRun, rig_config
+
+from acquire.cli.install_service import install_service
+from acquire.config import builtin_directory, load_rig
+from acquire.daemon.facts import Health
+from acquire.daemon.hooks import Hooks
+from acquire.daemon.messages import ArmRequest
+from acquire.daemon.metrics import metrics_text
+from acquire.daemon.news import NewsLog
+from acquire.daemon.service import Service
+from acquire.daemon.states import State
+from acquire.daemon.unit import WATCHDOG_S, unit_text
+from acquire.errors import ConfigError, UsageError
+from acquire.service_config import HooksConfig
+
+
+def until_written(path: Path, lines: int) -> list[dict[str, str]]:
+    deadline = time.monotonic() + 300
+    while not path.exists() or len(path.read_text().splitlines()) < lines:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def test_a_command_is_told_faults_losses_and_the_disk_and_nothing_else(tmp_path: Path) -> None:
+    log, told = NewsLog(), tmp_path / "told"
+    code = f"import sys; open({str(told)!r}, 'a').write(sys.stdin.read() + chr(10))"
+    hooks = Hooks(HooksConfig(command=(sys.executable, "-c", code)), log, "rig")
+    log.tell("mark", "no")
+    log.tell("state", "armed", State.ARMED)
+    log.tell("loss", "arm a lost 5 lines: camera", level="error", lines=5)
+    log.tell("state", "fault: gone", State.FAULTED, level="error")
+    log.tell("state", "disarm", State.IDLE)
+    found = until_written(told, 2)
+    hooks.close()
+    assert [one["text"] for one in found] == ["rig: arm a lost 5 lines: camera", "rig: fault: gone"]
+    assert len(until_written(told, 2)) == 2
+
+
+def test_a_hook_that_hangs_or_fails_is_given_up(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    log = NewsLog()
+    hooks = [
+        Hooks(HooksConfig(command=words, timeout_s=0.2), log, "rig")
+        for words in (("sleep", "300"), ("false",), (str(tmp_path / "none"),))
+    ]
+    log.tell("loss", "x", level="error")
+    deadline = time.monotonic() + 300
+    while not all(word in caplog.text for word in ("timed out", "exit code 1", "No such file")):
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    for one in hooks:
+        one.close()
+
+
+def test_a_webhook_gets_json() -> None:
+    bodies: list[bytes] = []
+
+    class Handler(http.server.BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            bodies.append(self.rfile.read(int(self.headers["Content-Length"])))
+            self.send_response(200)
+            self.end_headers()
+
+        def log_message(self, *_: object) -> None: ...
+
+    with http.server.HTTPServer(("127.0.0.1", 0), Handler) as server:
+        thread = threading.Thread(target=server.handle_request)
+        thread.start()
+        log = NewsLog()
+        hooks = Hooks(HooksConfig(webhook=f"http://127.0.0.1:{server.server_port}/x"), log, "rig")
+        log.tell("disk", "the disk is full in 2 min", level="error")
+        thread.join(300)
+        hooks.close()
+    assert json.loads(bodies[0])["text"] == "rig: the disk is full in 2 min"
+
+
+@pytest.mark.parametrize("url", ["ftp://x", "http://", "http://user:secret@host/"])
+def test_webhooks_that_cannot_be_are_refused(url: str) -> None:
+    with pytest.raises(ConfigError, match=r"hooks\.webhook"):
+        load_rig("rig-demo", {"hooks.webhook": url})
+
+
+def unit_of(tmp_path: Path, *, user: bool) -> configparser.SectionProxy:
+    rig = rig_config(tmp_path)
+    parser = configparser.ConfigParser(interpolation=None, strict=False)
+    parser.optionxform = str  # type: ignore[assignment,method-assign]
+    parser.read_string(unit_text(rig, tmp_path / "my rig%.toml", user=user))
+    return parser["Service"]
+
+
+def test_the_unit_says_when_it_is_ready_and_what_it_may_not(tmp_path: Path) -> None:
+    unit = unit_of(tmp_path, user=False)
+    assert (unit["Type"], unit["WatchdogSec"], unit["Restart"]) == ("notify", str(WATCHDOG_S), "on-failure")
+    assert unit["ExecStart"].endswith(f'-m acquire serve --config "{tmp_path}/my rig%%.toml"')
+    assert str(tmp_path) in unit["ReadWritePaths"]
+    assert float(unit["TimeoutStopSec"]) > rig_config(tmp_path).recording.seal_timeout_s
+    assert unit["NoNewPrivileges"] == "yes"
+    assert "User" not in unit_of(tmp_path, user=True)
+
+
+@pytest.mark.skipif(which("systemd-analyze") is None, reason="systemd-analyze reads the unit")
+def test_systemd_takes_the_unit(tmp_path: Path) -> None:
+    install_service("rig-demo", directory=tmp_path)
+    command = ["systemd-analyze", "verify", str(tmp_path / "acquire.service")]
+    read = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert (read.returncode, read.stderr) == (0, "")
+    (tmp_path / "acquire.service").write_text("mine")
+    with pytest.raises(UsageError, match="is there, with another text"):
+        install_service("rig-demo", directory=tmp_path)
+
+
+def test_every_alert_is_on_a_metric_that_there_is(tmp_path: Path) -> None:
+    rules = (builtin_directory() / "prometheus-alerts.yml").read_text()
+    named = set(re.findall(r"acquire_\w+", rules))
+    assert len(named) >= 8
+    service = Service(rig_config(tmp_path), FakeRun)
+    service.arm(ArmRequest())
+    ledger = {"issued": 1, "preroll": 0, "stored": 1, "discarded": 0, "lost": {}, "waiting": 0, "pending": 0}
+    check = {"verdict": "verified", "shift": 0, "checked_line": 1, "lapped": 0}
+    trigger = {"clock_hz": 1, "uncertainty_ns": 1, "pulses": 1, "silent_s": 0.0, "answers": True}
+    status = service.status().model_dump()
+    for arm in status["arms"].values():
+        arm.update(ledger={**ledger, "balanced": True}, check=check)
+    numbers = ("free_bytes", "reserve_bytes", "bytes_per_s", "seconds_to_full")
+    disk = {"directory": "/d", **dict.fromkeys(numbers, 1)}
+    full = type(service.status()).model_validate({**status, "trigger": trigger, "disk": disk})
+    told = metrics_text(full, Health(level="good", sentence="", lost_lines=0, checks=[])).decode()
+    assert [name for name in sorted(named) if f"\n{name}" not in told] == []
+    service.disarm()

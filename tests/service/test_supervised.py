@@ -1,0 +1,113 @@
+"""Under a supervisor that does what systemd does with our unit: killed or hung, the service comes back.
+
+The supervisor here knows what the unit says: ready by a datagram, a word within the watchdog's time,
+restarted when it ends otherwise than by itself.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from live_daemon import COMMAND, write_rig
+
+from acquire.client import Client, State
+from acquire.daemon.messages import Status
+from acquire.errors import AcquireError
+
+LIMIT_S = 300.0
+WATCHDOG_S = 8.0
+"""The unit says 30. One that is merely slow is restarted once more, and no harm is done."""
+
+
+class Supervisor:
+    """Runs one service; `turn` is called again and again."""
+
+    def __init__(self, home: Path, *settings: str) -> None:
+        self._words = [*COMMAND, "serve", "--config", str(write_rig(home))]
+        self._words += [word for setting in settings for word in ("--set", setting)]
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(str(home / "notify"))
+        self._socket.settimeout(0.05)
+        self._home = home
+        self.lives = 0
+        self._start()
+
+    def _start(self) -> None:
+        self.lives += 1
+        self.is_ready, self._heard_s = False, time.monotonic() + LIMIT_S
+        environment = os.environ | {"NOTIFY_SOCKET": str(self._home / "notify")}
+        with (self._home / "serve.log").open("ab") as log:
+            self.process = subprocess.Popen(self._words, stderr=log, env=environment, start_new_session=True)
+
+    def turn(self) -> None:
+        with contextlib.suppress(TimeoutError):
+            said = self._socket.recv(256).decode()
+            self.is_ready |= "READY=1" in said
+            if self.is_ready:
+                self._heard_s = time.monotonic()
+        if self.is_ready and time.monotonic() - self._heard_s > WATCHDOG_S:
+            os.killpg(self.process.pid, signal.SIGKILL)  # systemd ends what is left of the group, too
+            self.process.wait()
+        if self.process.poll() is not None:
+            self._start()
+
+    def close(self) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self.process.pid, signal.SIGCONT)
+            self.process.terminate()
+        self.process.wait(LIMIT_S)
+        self._socket.close()
+
+
+@pytest.fixture
+def supervisor(tmp_path: Path) -> Iterator[Supervisor]:
+    with contextlib.closing(Supervisor(tmp_path, 'service.begin="recording"', "service.retry_s=0.5")) as made:
+        yield made
+
+
+def until_recording(supervisor: Supervisor, client: Client, life: int) -> Status:
+    deadline = time.monotonic() + LIMIT_S
+    while True:
+        supervisor.turn()
+        assert time.monotonic() < deadline
+        if supervisor.lives < life or not supervisor.is_ready:
+            continue
+        with contextlib.suppress(AcquireError):
+            status = client.status()
+            if status.state is State.RECORDING and status.recording and status.recording.committed_lines:
+                return status
+
+
+def test_killed_and_hung_it_comes_back_recovers_and_goes_on_recording(
+    supervisor: Supervisor, tmp_path: Path
+) -> None:
+    client = Client(tmp_path / "c.sock")
+    first = until_recording(supervisor, client, 1)
+    os.kill(supervisor.process.pid, signal.SIGKILL)
+    second = until_recording(supervisor, client, 2)
+    assert first.recording is not None
+    assert second.recording is not None
+    assert first.recording.path != second.recording.path
+    deadline = time.monotonic() + LIMIT_S
+    while client.open(first.recording.path).state != "sealed":  # by its recorder, or recovered
+        supervisor.turn()
+        assert time.monotonic() < deadline
+    assert client.open(first.recording.path).lines >= first.recording.committed_lines
+
+    os.kill(supervisor.process.pid, signal.SIGSTOP)  # it hangs: the watchdog hears nothing
+    third = until_recording(supervisor, client, 3)
+    assert third.recording is not None
+    assert third.recording.path not in (first.recording.path, second.recording.path)
+
+    client.stop()
+    client.disarm()  # the operator's word is the last: nothing begins by itself any more
+    time.sleep(1.0)
+    assert client.status().state is State.IDLE
