@@ -40,6 +40,8 @@ MOST_FILE_BYTES = 2**20
 """Of a file of this kind; written by hand, they have some kilobytes."""
 MOST_LISTED = 20
 """Things to mend that one error lists."""
+WHOLE_STEPS = ("VT-4K5C-H100",)
+"""Models of cameras that are known to have no intra-line charge transfer."""
 MAX_RING_BYTES = 4 * 2**30
 """Pixels that may wait in the ring of one arm."""
 
@@ -201,6 +203,24 @@ class RigConfig(FrozenModel):
                 f"trigger.tag_every_lines = {self.trigger.tag_every_lines}; possible: 1 to {lines // 2}, "
                 f"half of what a ring holds (stream.{self._ring_keys})"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _stages_meant(self) -> RigConfig:
+        """What a camera is set to, where that is known, has to be what the model is told."""
+        for arm, camera in (("a", self.cameras.a), ("b", self.cameras.b)):
+            for _, feature, value in camera.settings:
+                if feature == "TDIStages" and value != f"TDI{self.geometry.stages}":
+                    raise ValueError(
+                        f"cameras.{arm}.settings: TDIStages {value!r} with geometry.stages = "
+                        f"{self.geometry.stages}; possible: TDI{self.geometry.stages}"
+                    )
+            if self.geometry.substeps > 1 and camera.model in WHOLE_STEPS:
+                raise ValueError(
+                    f"geometry.substeps = {self.geometry.substeps} with cameras.{arm}.model = "
+                    f"{camera.model!r}, which moves its charge once a line; possible: substeps = 1, and as "
+                    "many stages as it has TDI stages; acquire cut --merge makes intra-line lines of those"
+                )
         return self
 
     @model_validator(mode="after")

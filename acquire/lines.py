@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntFlag
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from acquire.errors import UsageError
+from acquire.geometry import Geometry
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.alignment import Alignment
-    from acquire.geometry import Geometry
 
 ARMS = ("a", "b")
 """Names of the two arms, in the order of the ``arm`` axis."""
@@ -150,3 +150,41 @@ def _beside_lines(value: object, dtype: type[np.floating[Any]]) -> NDArray[Any]:
     """A number, or one per arm, or one per arm and pixel, as it stands beside lines (arm, line, pixel)."""
     given = np.asarray(value, dtype)
     return given[:, None, :] if given.ndim == 2 else given.reshape(-1, 1, 1)
+
+
+def merged(segment: Segment, count: int) -> Segment:
+    """Lines of whole steps merged ``count`` × ``count``: those of a sensor with ``count`` intra-line steps.
+
+    Line ℓ of Eq. (1) with M stages and S = ``count`` is the sum of the raw lines S·ℓ … S·ℓ + S − 1 of a
+    sensor of M·S stages whose charge moves once a line, S columns each (Sect. 5.1: 192 stages at 100 kHz
+    become 64 at 33.33 kHz). A merged sample can be used where all of its raw samples can. What is known of
+    single columns is used before they are added up: the result is then in units of the scene. Raw lines lose
+    nothing and reconstruct as they are, with S = 1; merged ones are a ninth as many.
+
+    Raises UsageError for lines that have intra-line steps already, and for a segment that does not begin and
+    end between merged lines.
+    """
+    geometry = segment.geometry
+    sizes = (geometry.stages, geometry.lines, segment.first_line)
+    if geometry.substeps != 1 or count < 1 or any(size % count for size in sizes):
+        raise UsageError(
+            f"{geometry.lines} lines of {geometry.stages} stages and S = {geometry.substeps} from line "
+            f"{segment.first_line} on cannot be merged {count} x {count}",
+            possible=f"S = 1; stages, lines and first line multiples of {count}",
+        )
+    columns = np.ndim(segment.black_level_dn) == 2 or np.ndim(segment.responsivity_dn) == 2
+    black = np.zeros(()) if columns else np.asarray(segment.black_level_dn, np.float64) * count**2
+    raw = segment.samples(np.float64) if columns else segment.lines
+    blocks = (len(raw), geometry.lines // count, count, geometry.stages // count, count)
+    usable = np.asarray(segment.mask.reshape(blocks).all(axis=(2, 4)))
+    total = raw.reshape(blocks).sum(axis=(2, 4), dtype=np.float64 if columns else np.uint32)
+    return replace(
+        segment,
+        lines=total,
+        mask=usable,
+        geometry=Geometry(geometry.stages // count, count, geometry.lines // count),
+        time_ns=segment.time_ns[::count],
+        first_line=segment.first_line // count,
+        black_level_dn=tuple(black.tolist()) if black.ndim else float(black),
+        responsivity_dn=1.0 if columns else segment.responsivity_dn,
+    )

@@ -137,3 +137,11 @@ def test_memory_is_compared_with_the_host_s(tmp_path: Path, monkeypatch: pytest.
     with pytest.raises(ConfigError, match=r"geometry.stages = 4096: .* possible: up to 6.4 GB on this host"):
         check_host(load_rig("rig-demo", changes))
     assert 2**28 < host.memory_bytes() < 2**60
+
+
+def test_a_camera_without_intra_line_steps_gets_none() -> None:
+    with pytest.raises(ConfigError, match="moves its charge once a line"):
+        load_rig("rig-vt-4k5c-h100", {"geometry.substeps": 3})
+    with pytest.raises(ConfigError, match=r"TDIStages 'TDI192' with geometry\.stages = 64"):
+        load_rig("rig-vt-4k5c-h100", {"geometry.stages": 64})
+    assert load_rig("rig-vt-4k5c-h100").line_rate_hz == 100_000

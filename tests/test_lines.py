@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from acquire.errors import UsageError
+from acquire.forward import DualArm
 from acquire.geometry import Geometry
-from acquire.lines import Segment
+from acquire.lines import Segment, merged
 
 GEOMETRY = Geometry(3, 2, 4)
 LIGHT = np.random.default_rng(0).random(GEOMETRY.lines_shape)
@@ -32,3 +34,67 @@ def test_samples_are_the_light_whoever_has_an_offset_and_a_gain(black: object, g
         responsivity_dn=gain,  # type: ignore[arg-type]
     )
     np.testing.assert_allclose(segment.samples(np.float64), np.where(mask, LIGHT, 0), atol=1e-12)
+
+
+M, S, LINES = 4, 3, 10
+RAW, MERGED = Geometry(M * S, 1, S * LINES), Geometry(M, S, LINES)
+CODE = np.random.default_rng(1).integers(0, 2, MERGED.span).astype(np.uint8)
+SCENE = np.random.default_rng(2).random((MERGED.span, M * S, M * S))
+
+
+def raw(**changes: object) -> Segment:
+    light = DualArm(RAW, CODE, dtype=np.float64).forward(SCENE)
+    facts = {
+        "lines": np.rint(20 + 50 * light).astype(np.uint16),
+        "mask": np.ones(RAW.lines_shape, bool),
+        "code": CODE,
+        "geometry": RAW,
+        "time_ns": 100 * np.arange(S * LINES),
+        "first_line": 6,
+        "black_level_dn": 20.0,
+        "responsivity_dn": 50.0,
+    }
+    return Segment(**(facts | changes))  # type: ignore[arg-type]
+
+
+def test_merged_lines_are_those_of_a_sensor_with_intra_line_steps() -> None:
+    """Eq. (1) with S = 3 out of Eq. (1) with S = 1, whole numbers of DN."""
+    assert RAW.span == MERGED.span
+    found = merged(raw(), S)
+    expected = DualArm(MERGED, CODE, dtype=np.float64).forward(SCENE)
+    np.testing.assert_allclose(found.samples(np.float64), expected, atol=9 * 0.5 / 50)
+    assert (found.geometry, found.first_line, found.black_level_dn) == (MERGED, 2, 180.0)
+    assert found.lines.dtype == np.uint32
+    np.testing.assert_array_equal(found.time_ns, 300 * np.arange(LINES))
+    np.testing.assert_array_equal(found.frame_time_ns(1), raw().frame_time_ns(1))
+
+
+def test_columns_are_corrected_before_they_are_added_up() -> None:
+    gain = 50 * np.random.default_rng(3).uniform(0.9, 1.1, (2, M * S))
+    black = np.random.default_rng(4).uniform(10, 30, (2, M * S))
+    light = DualArm(RAW, CODE, dtype=np.float64).forward(SCENE)
+    segment = raw(lines=black[:, None] + gain[:, None] * light, black_level_dn=black, responsivity_dn=gain)
+    expected = DualArm(MERGED, CODE, dtype=np.float64).forward(SCENE)
+    np.testing.assert_allclose(merged(segment, S).samples(np.float64), expected, atol=1e-9)
+
+
+def test_a_merged_sample_needs_all_of_its_raw_ones() -> None:
+    mask = np.ones(RAW.lines_shape, bool)
+    mask[1, 4, 7] = False
+    found = merged(raw(mask=mask), S).mask
+    assert not found[1, 1, 2]
+    assert found.sum() == found.size - 1
+
+
+INTRA_LINE = {
+    "geometry": MERGED,
+    "lines": np.zeros(MERGED.lines_shape),
+    "mask": np.ones(MERGED.lines_shape, bool),
+    "time_ns": np.arange(LINES),
+}
+
+
+@pytest.mark.parametrize("changes", [{"first_line": 7}, INTRA_LINE])
+def test_what_cannot_be_merged_is_refused(changes: dict[str, object]) -> None:
+    with pytest.raises(UsageError, match="cannot be merged"):
+        merged(raw(**changes), S)

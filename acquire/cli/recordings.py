@@ -192,19 +192,25 @@ def cut(
     first_line: Annotated[int, typer.Option(help="The trigger's number of the first line.")],
     lines: Annotated[int, typer.Option(help="How many lines.")],
     out: Annotated[Path, typer.Option(metavar="FILE.npz", help="New file.")],
+    merge: Annotated[
+        int, typer.Option(min=1, help="Add up so many raw lines and columns, of a sensor of whole steps.")
+    ] = 1,
     json: JsonFlag = False,
 ) -> None:
     """Write a stretch of both arms to an npz file: lines, mask, code, time_ns, stages, substeps and scales.
 
+    --merge 3 makes of 192 stages that are triggered at every sub-step 64 stages with 3 intra-line steps.
+
     Example: [bold]acquire cut run.zarr --first-line 2000 --lines 256 --out segment.npz[/]
     """
+    from acquire.lines import merged
     from acquire.store import open_recording
     from acquire.store.files import check_new_path
 
     check_new_path(out)
     with stage_progress(f"cutting {lines} lines"):
         segment = open_recording(recording).cut(first_line, lines)
-        size = _save(segment, out)
+        size = _save(segment if merge == 1 else merged(segment, merge), out)
     facts = {"path": str(out), "first_line": first_line, "lines": lines, "bytes": size}
     if json:
         print_json(facts)

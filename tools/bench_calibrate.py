@@ -1,0 +1,319 @@
+"""Instruments drawn at random, calibrated from three recordings each, against what was drawn.
+
+Usage: python -m tools.bench_calibrate [--instruments 5] [--seed 1] [--lines 1024] [--no-video] [--json FILE]
+
+Every instrument has shot noise, read noise, dark current, columns that differ in gain and offset, ambient
+light, a splitter that is not even, and an arm B that is shifted, turned and magnified; every second one a
+point spread. Dark, flat and target are recorded with ``--lines`` lines each, the target being random dots of
+2 to 6 fine pixels, and calibrated as `acquire calibrate` does. A flat's light ends at the field's edge in
+every second instrument. Then a scene of three lamps, whose shapes, places and frequencies are drawn as well,
+is reconstructed from 263 lines (voxels 3 x 1): as recorded, calibrated, and from lines that had nothing but
+the same noise. Columns: errors of shift (fine pixels), turn (degrees), DN per electron (%), gains and offsets
+in the worst column that the optics do not hide (%, DN), the splitter (%), PSNR in dB, seconds.
+
+--orientations draws 24 instruments instead (eight views of arm B, three targets each) and counts answers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.calibrate import Calibration, calibrated
+from acquire.calibrate.columns import dark, flat
+from acquire.calibrate.exposure import instrument_of, open_exposure
+from acquire.calibrate.orientation import VIEWS
+from acquire.calibrate.target import alignment, orientation
+from acquire.calibrate.transfer import transfer
+from acquire.config import load_rig
+from acquire.forward import merge_video
+from acquire.recon import reconstruct
+from acquire.scene_config import LedSceneConfig, VideoSceneConfig
+from acquire.sim.scenes import build_scene
+from acquire.simulate import bench_of, simulate
+from acquire.store import open_recording
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.lines import Segment
+    from acquire.scene_config import SceneConfig
+
+BLACK_DN = 40.0
+K = 0.1
+SEGMENT = 263
+LIGHT = {"dark": 0, "flat": 1, "target": None, "scene": None}
+NOISE = ("shot_noise", "read_noise", "dark_current")
+DARK = ("prnu", "column_offsets", "stray_light", "beam_splitter", "dark_current")
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """One instrument."""
+
+    seed: int
+    part_a: float
+    prnu: float
+    ambient: float
+    rows: float
+    columns: float
+    turn_deg: float
+    magnification: float
+    beyond: str
+    blur: float
+    code_seed: int
+
+    @classmethod
+    def at_random(cls, seed: int) -> Drawn:
+        rng = np.random.default_rng(seed)
+        far = float(rng.choice([0.4, 1.5, 6.0]))
+        return cls(
+            seed=seed,
+            part_a=float(rng.uniform(0.44, 0.56)),
+            prnu=float(rng.uniform(0.005, 0.02)),
+            ambient=float(rng.uniform(0, 0.03)),
+            rows=float(rng.uniform(-far, far)),
+            columns=float(rng.uniform(-far, far)),
+            turn_deg=float(rng.uniform(-0.6, 0.6)),
+            magnification=float(1 + rng.uniform(-1, 1) * 2e-3),
+            beyond=str(rng.choice(["dark", "edge"])),
+            blur=float(rng.choice([0.0, rng.uniform(0.3, 0.7)])),
+            code_seed=int(rng.integers(2**31)),
+        )
+
+    @property
+    def effects(self) -> list[dict[str, Any]]:
+        listed: list[dict[str, Any]] = [
+            {
+                "kind": "misregistration",
+                "rows": self.rows,
+                "columns": self.columns,
+                "turn_deg": self.turn_deg,
+                "magnification": self.magnification,
+                "beyond": self.beyond,
+            },
+            {"kind": "beam_splitter", "part_a": self.part_a},
+            {"kind": "stray_light", "ambient": self.ambient},
+            {"kind": "prnu", "prnu": self.prnu},
+            {"kind": "column_offsets", "sigma_dn": 1.5, "channels": 8},
+            {"kind": "dark_current", "electrons_per_s": 2e4},
+            {"kind": "shot_noise"},
+            {"kind": "read_noise", "sigma_e": 25.0},
+        ]
+        return listed + ([{"kind": "psf", "sigma_pixels": self.blur}] if self.blur else [])
+
+    def scene(self, kind: str, effects: list[dict[str, Any]], directory: Path) -> SceneConfig:
+        common = {"seed": self.seed, "system_gain_dn_per_e": K, "effects": effects}
+        if kind == "target":
+            np.save(directory / "dots.npy", dots(self.seed))
+            return VideoSceneConfig.model_validate(
+                {"kind": "video", "path": directory / "dots.npy", **common}
+            )
+        leds = lamps(self.seed) if kind == "scene" else [lamp("all", "square", (0.5, 0.5, 1.0), level=0.2)]
+        return LedSceneConfig.model_validate({"kind": "leds", "leds": leds, **common})
+
+    def record(
+        self, kind: str, directory: Path, lines: int, effects: list[dict[str, Any]] | None = None
+    ) -> Path:
+        path = directory / f"{kind}-{len(list(directory.iterdir()))}.zarr"
+        scene = self.scene(kind, self.effects if effects is None else effects, directory)
+        simulate(self.rig(kind), scene, path, lines)
+        return path
+
+    def rig(self, kind: str) -> Any:
+        value = LIGHT[kind]
+        code = (
+            {"code.seed": self.code_seed} if value is None else {"code": {"kind": "constant", "value": value}}
+        )
+        black = {f"cameras.{arm}.black_level_dn": BLACK_DN for arm in "ab"}
+        return load_rig("rig-demo", black | code)
+
+
+def lamp(
+    name: str, shape: str, place: tuple[float, float, float], *, level: float = 1.0, hertz: float = 0.0
+) -> Any:
+    row, column, size = place
+    drive: dict[str, Any] = {"waveform": "constant", "level": level}
+    if hertz:
+        drive = {"waveform": "sine", "frequency_hz": hertz, "low": 0.05, "high": 1.0}
+    return {"name": name, "shape": shape, "row": row, "column": column, "size": size, "drive": drive}
+
+
+def lamps(seed: int) -> list[Any]:
+    rng = np.random.default_rng(seed + 1000)
+    shapes, corners = rng.permutation(["x", "triangle", "circle", "equals"]), rng.permutation(4)
+    return [
+        lamp(
+            f"lamp {k}",
+            str(shapes[k]),
+            (
+                0.28 + 0.44 * (corners[k] // 2) + float(rng.uniform(-0.05, 0.05)),
+                0.28 + 0.44 * (corners[k] % 2) + float(rng.uniform(-0.05, 0.05)),
+                float(rng.uniform(0.25, 0.38)),
+            ),
+            hertz=float(rng.uniform(500, 6000)),
+        )
+        for k in range(3)
+    ]
+
+
+def dots(seed: int) -> NDArray[np.float32]:
+    rng, n = np.random.default_rng(seed + 2000), 192
+    picture = np.zeros((1, n, n), np.float32)
+    for _ in range(450):
+        side = int(rng.integers(2, 7))
+        row, column = rng.integers(0, n - side, 2)
+        picture[0, row : row + side, column : column + side] = 1
+    return picture
+
+
+def calibrate(drawn: Drawn, directory: Path, lines: int) -> Calibration:
+    """Dark, flat, transfer, orientation, alignment."""
+    taken = {kind: open_exposure(drawn.record(kind, directory, lines)) for kind in ("dark", "flat", "target")}
+    first = dark(taken["dark"])
+    known = Calibration(first.instrument).with_step(first)
+    known = known.with_step(flat(taken["flat"], known))
+    known = known.with_step(transfer([taken["flat"]], known))
+    known = known.with_step(orientation(taken["target"], known))
+    return known.with_step(alignment(taken["target"], known))
+
+
+def compared(drawn: Drawn, known: Calibration, directory: Path) -> dict[str, float]:
+    """What was found beside what was drawn."""
+    found = known.alignment
+    assert found is not None
+    at, K_found = found.alignment, known.quantities["dn_per_electron"].value
+    gain, offset = known.quantities["gain"].value, known.quantities["offset_dn"].value
+    own = fixed(drawn, "flat", ("prnu",), directory) - BLACK_DN
+    hidden = np.zeros(gain.shape, bool)
+    for arm, columns in known.steps["flat"]["optics_hide_columns"].items():
+        hidden["ab".index(arm), columns] = True
+    gains = np.where(hidden, 1.0, gain)
+    level = [row[~out].mean() for row, out in zip(own, hidden, strict=True)]
+    errors = np.where(hidden, 0.0, gains - own / np.array(level)[:, None])
+    errors -= np.array([row[~out].mean() for row, out in zip(errors, hidden, strict=True)])[:, None]
+    errors[hidden] = 0
+    balance = known.quantities["balance"].value
+    truth = np.array([drawn.part_a, 1 - drawn.part_a]) * np.array(level)
+    dark_truth = fixed(drawn, "dark", DARK, directory)
+    return {
+        "shift_px": float(np.hypot(at.rows - drawn.rows, at.columns - drawn.columns)),
+        "turn_deg": abs(at.turn_deg - drawn.turn_deg),
+        "magnification": abs(at.magnification - drawn.magnification),
+        "dn_per_e_percent": 100 * float(np.abs(K_found / K - 1).max()),
+        "gain_percent": 100 * float(np.abs(errors).max()),
+        "offset_dn": float(np.abs(offset - dark_truth).max()),
+        "splitter_percent": 100 * abs(float(balance[0] / balance.sum() / (truth[0] / truth.sum()) - 1)),
+    }
+
+
+def fixed(drawn: Drawn, kind: str, kinds: tuple[str, ...], directory: Path) -> NDArray[np.float64]:
+    """Mean DN of every column with these effects only, (arm, column); rounding averages out over lines."""
+    listed = [effect for effect in drawn.effects if effect["kind"] in kinds]
+    listed.append({"kind": "read_noise", "sigma_e": 25.0})
+    rig = drawn.rig(kind)
+    bench = bench_of(rig, drawn.scene(kind, listed, directory))
+    code = rig.code.build()
+    return np.stack(
+        [bench.camera(arm, code).read(64, 65536).pixels.mean(axis=0, dtype=np.float64) for arm in "ab"]
+    )
+
+
+def pictures(drawn: Drawn, known: Calibration, directory: Path) -> dict[str, float]:
+    """PSNR of the reconstructed lamps, as recorded, calibrated, and with nothing but noise."""
+    noise = [effect for effect in drawn.effects if effect["kind"] in NOISE]
+    paths = {
+        "raw": drawn.record("scene", directory, 400),
+        "noise": drawn.record("scene", directory, 400, noise),
+    }
+    cuts = {name: open_recording(path).cut(70, SEGMENT) for name, path in paths.items()}
+    cases = {"raw": cuts["raw"], "calibrated": calibrated(cuts["raw"], known), "noise": cuts["noise"]}
+    scene = build_scene(drawn.scene("scene", [], directory), 192, 1e-5)
+    truth = merge_video(scene.frames(3 * 70, cuts["raw"].geometry.span), 3, 1)
+    found = {}
+    for name, segment in cases.items():
+        began = time.perf_counter()
+        found[f"{name}_db"] = _psnr(segment, truth)
+        found[f"{name}_s"] = time.perf_counter() - began
+    return found
+
+
+def _psnr(segment: Segment, truth: NDArray[np.float32]) -> float:
+    result = reconstruct(segment, 3, 1)
+    at = result.trusted
+    return float(10 * np.log10(truth[at].max() ** 2 / np.mean((result.video[at] - truth[at]) ** 2)))
+
+
+def orientations(seed: int, lines: int) -> None:
+    """24 instruments: eight views of arm B, three targets each."""
+    right = wrong = untold = 0
+    for number, view in enumerate(VIEWS * 3):
+        drawn = Drawn.at_random(seed + number)
+        optics = {"b": {"turn_deg": view.turn_deg, "mirror": view.mirrored}}
+        with tempfile.TemporaryDirectory() as name:
+            directory = Path(name)
+            scene = drawn.scene("target", drawn.effects, directory).model_copy(
+                update={
+                    "optics": VideoSceneConfig.model_validate(
+                        {"kind": "video", "path": "x", "optics": optics}
+                    ).optics
+                }
+            )
+            path = directory / "target.zarr"
+            simulate(drawn.rig("target"), scene, path, lines)
+            recording = open_recording(path)
+            found = orientation(open_exposure(path), Calibration(instrument_of(recording)))
+        right += found.orientation == view.name
+        untold += found.orientation is None
+        wrong += found.orientation not in (None, view.name)
+        print(f"{view.name:20} found {found.orientation!s:20} ratio {found.facts['ratio']:.2f}", flush=True)
+    print(f"{right} right, {untold} not told, {wrong} wrong")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--instruments", type=int, default=5)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--lines", type=int, default=1024)
+    parser.add_argument("--no-video", action="store_true")
+    parser.add_argument("--orientations", action="store_true")
+    parser.add_argument("--json", type=Path)
+    asked = parser.parse_args()
+    if asked.orientations:
+        orientations(asked.seed, asked.lines)
+        return
+    rows = []
+    for number in range(asked.instruments):
+        drawn = Drawn.at_random(asked.seed + number)
+        with tempfile.TemporaryDirectory() as name:
+            began = time.perf_counter()
+            known = calibrate(drawn, Path(name), asked.lines)
+            row = {"calibration_s": time.perf_counter() - began, **compared(drawn, known, Path(name))}
+            if not asked.no_video:
+                row |= pictures(drawn, known, Path(name))
+        rows.append({"instrument": asdict(drawn), **row})
+        where = f"{drawn.rows:+.2f}/{drawn.columns:+.2f} px {drawn.turn_deg:+.2f} deg {drawn.beyond}"
+        where += f" psf {drawn.blur:.2f}"
+        print(
+            f"{asked.seed + number:3} {where:44} " + "  ".join(f"{k} {v:.4g}" for k, v in row.items()),
+            flush=True,
+        )
+    print(
+        "worst "
+        + "  ".join(f"{key} {max(row[key] for row in rows):.4g}" for key in rows[0] if key != "instrument")
+    )
+    if asked.json is not None:
+        asked.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
