@@ -123,6 +123,12 @@ class Segment:
             raise UsageError(
                 f"segment with {self.code.shape} code bits", possible=f"T = {self.geometry.span}"
             )
+        gains = np.asarray(self.responsivity_dn, np.float64)
+        if not (np.isfinite(gains).all() and (gains > 0).all() and np.isfinite(self.black_level_dn).all()):
+            raise UsageError(
+                f"segment with responsivity {self.responsivity_dn}, black level {self.black_level_dn} DN",
+                possible="a responsivity above 0 and a black level, as the camera has them",
+            )
         if self.time_ns.shape != (self.geometry.lines,):
             raise UsageError(
                 f"segment with {self.time_ns.shape} time stamps", possible=f"{self.geometry.lines}"

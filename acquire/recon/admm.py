@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING
 
 from acquire.arrays import dot, namespace
 from acquire.errors import NumericsError
+from acquire.recon.denoisers import Checked
 from acquire.recon.tv import FrameTv
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ class Admm:
         denoiser: Denoiser | None = None,
     ) -> None:
         self._samples, self._parameters = samples, parameters
-        self._denoiser = denoiser or FrameTv(parameters.tv_iterations)
+        self._denoiser = Checked(denoiser) if denoiser else FrameTv(parameters.tv_iterations)
         self._xp, arrays = namespace(samples), basis.arrays
         self._emphasis = arrays.asarray(emphasis)
         self._strength = self._emphasis * (parameters.tv_weight / parameters.tv_penalty)

@@ -16,7 +16,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Protocol
 
 from acquire.arrays import namespace
-from acquire.errors import UsageError
+from acquire.errors import NumericsError, UsageError
 
 if TYPE_CHECKING:
     from acquire.arrays import Array
@@ -26,6 +26,31 @@ class Denoiser(Protocol):
     """Cleans frames (K, row, column); ``weight`` says how strongly, in the units of TV's."""
 
     def prox(self, frames: Array, weight: float | Array, /) -> Array: ...
+
+
+class Checked:
+    """A denoiser that is held to its contract, so that what breaks it is told and named."""
+
+    def __init__(self, denoiser: Denoiser) -> None:
+        self._denoiser, self._name = denoiser, type(denoiser).__name__
+
+    def prox(self, frames: Array, weight: float | Array) -> Array:
+        cleaned = self._denoiser.prox(frames, weight)
+        if getattr(cleaned, "shape", None) != frames.shape:
+            raise UsageError(
+                f"denoiser {self._name} gave back {_what(cleaned)} for frames of shape {tuple(frames.shape)}",
+                possible="an array of the same shape",
+            )
+        if not bool(namespace(cleaned).all(namespace(cleaned).isfinite(cleaned))):
+            raise NumericsError(
+                f"denoiser {self._name} gave back values that are not finite", hint="another denoiser, or TV"
+            )
+        return cleaned
+
+
+def _what(given: object) -> str:
+    shape = getattr(given, "shape", None)
+    return f"a {type(given).__name__}" if shape is None else f"shape {tuple(shape)}"
 
 
 class HaarShrink:

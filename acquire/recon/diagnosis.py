@@ -10,7 +10,7 @@ import numpy as np
 from acquire.cores import limit_threads
 from acquire.recon.hypotheses import Hypothesis, Turn, Witness, compare
 from acquire.recon.search import Candidate, Inquiry, Standing, inquire
-from acquire.recon.suspects import Suspicion, suspicions, unusable
+from acquire.recon.suspects import Suspicion, black_level_off, suspicions, unusable
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -98,7 +98,8 @@ def diagnose(segment: Segment, bits: Callable[[int, int], NDArray[np.uint8]] | N
         return Diagnosis(Standing.UNCLEAR, few)
     # matrices are small: more threads would wait for each other
     with limit_threads(1):
-        return _asked(Witness(segment, bits))
+        found = _asked(Witness(segment, bits))
+    return replace(found, suspicions=(*found.suspicions, *black_level_off(segment)))
 
 
 def _asked(witness: Witness) -> Diagnosis:

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from acquire.recon.suspects import black_level_off, unusable
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -50,7 +52,9 @@ def frame_error(
 
 def judge(segment: Segment, problem: Problem, quality: Quality, trusted: slice) -> tuple[str, ...]:
     """Sentences for the user: why this video may not be believed."""
-    found = []
+    found = [
+        each.words for each in (*unusable(segment), *black_level_off(segment)) if each.kind != "constant_code"
+    ]
     missed = float(np.nanmax([quality.misfit, quality.prediction]))
     if missed > POOR_MISFIT:
         found.append(

@@ -26,6 +26,8 @@ SPIKE_LEVEL = 0.5
 HOT_RATIO = 10.0
 FEWEST_VARYING = 0.1
 """Share of an arm's columns that must vary for one that does not to be suspicious."""
+FEWEST_TOGETHER = 3
+"""Columns that stand still at one value, the lowest, before this is taken for darkness."""
 FEWEST_LINES = 16
 """Of fewer lines, columns say too little about themselves."""
 
@@ -63,9 +65,21 @@ def _stuck(samples: NDArray[np.float64], left: NDArray[np.bool_]) -> NDArray[np.
     low = np.where(left, samples, np.inf).min(axis=1, keepdims=True)
     high = np.where(left, samples, -np.inf).max(axis=1, keepdims=True)
     usual = (high > low).mean(axis=2, keepdims=True) > FEWEST_VARYING
-    dark = (high <= low) & (np.abs(high) <= 1e-3 * np.abs(samples).max(axis=(1, 2), keepdims=True))
+    dark = (high <= low) & (np.abs(high - _darkness(low, high)) <= 1e-3 * _brightest(samples))
     lonely = _between_lit(dark, samples)
     return np.asarray(np.broadcast_to((high <= low) & usual & (~dark | lonely), samples.shape))
+
+
+def _darkness(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Where an arm's unlit columns stand: at 0, or, if the black level is wrong, together at its lowest."""
+    still = np.where(high <= low, high, np.nan)
+    lowest = np.where(np.isfinite(low), low, np.inf).min(axis=2, keepdims=True)
+    together = (still == lowest).sum(axis=2, keepdims=True) >= FEWEST_TOGETHER
+    return np.where(together, lowest, 0.0)
+
+
+def _brightest(samples: NDArray[np.float64]) -> NDArray[np.float64]:
+    return np.asarray(np.abs(samples).max(axis=(1, 2), keepdims=True))
 
 
 def _between_lit(dark: NDArray[np.bool_], samples: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -26,6 +26,10 @@ ITERATIONS: dict[str, dict[str, int]] = {
 """Most iterations per solver and preset; ADMM ends sooner when the held-out samples say so."""
 
 
+NEGATIVE_SHARE = 0.01
+"""Of the largest value: what solvers without a sign leave below zero is no mistake."""
+
+
 class Stop(Protocol):
     """Asked after every iteration; a `threading.Event` is one."""
 
@@ -73,6 +77,8 @@ class Request:
         """Raise UsageError unless the given arrays are finite and fit the segment."""
         _check_array("initial video", self.initial, video_shape)
         _check_array("static image", self.static_image, (size, size))
+        if self.static_image is not None and not np.any(self.static_image):
+            raise UsageError("static image that is dark everywhere", possible="the scene at rest, lit")
 
 
 def preset_iterations(solver: str, preset: str) -> int:
@@ -91,3 +97,7 @@ def _check_array(what: str, given: NDArray[Any] | None, shape: tuple[int, ...]) 
         raise UsageError(f"{what} of shape {np.shape(given)} does not fit", possible=f"{shape}")
     if not np.isfinite(given).all():
         raise UsageError(f"{what} with values that are not finite")
+    if np.min(given) < -NEGATIVE_SHARE * np.max(np.abs(given)):
+        raise UsageError(
+            f"{what} with values down to {np.min(given):.3g}", possible="light: 0 or more, in any units"
+        )

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from acquire.recon.outliers import FEWEST_LINES, FEWEST_TOGETHER
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -47,10 +49,7 @@ def unusable(segment: Segment) -> list[Suspicion]:
         if not mask.any():
             found.append(Suspicion("no_samples", f"arm {arm} has no sample that can be used"))
             continue
-        still = (np.ptp(np.where(mask, lines, lines[mask].mean()), axis=0) == 0) | ~mask.any(0)
-        if still.mean() > STUCK_SHARE and segment.geometry.lines > 1:
-            words = f"arm {arm} is stuck: {still.mean():.0%} of its columns are the same in every line"
-            found.append(Suspicion("stuck", words))
+        found += _standing(arm, np.where(mask, lines, np.nan), segment.geometry.lines)
     if segment.code.min() == segment.code.max():
         found.append(
             Suspicion(
@@ -58,6 +57,41 @@ def unusable(segment: Segment) -> list[Suspicion]:
                 f"the code is {int(segment.code[0])} throughout: lines cannot be held against it",
             )
         )
+    return found
+
+
+def _standing(arm: str, lines: Floats, count: int) -> list[Suspicion]:
+    """An arm whose lit columns do not change from line to line."""
+    seen = np.isfinite(lines).any(0)
+    lowest, highest = np.nanmin(lines[:, seen], axis=0), np.nanmax(lines[:, seen], axis=0)
+    if count == 1 or not highest.any():
+        return []
+    still = lowest == highest
+    lit = ~still | (highest > lowest.min())
+    if still.all() or still[lit].mean() > STUCK_SHARE:
+        share = 1.0 if still.all() else float(still[lit].mean())
+        words = f"arm {arm} is stuck: {share:.0%} of its lit columns are the same in every line"
+        return [Suspicion("stuck", words)]
+    return []
+
+
+def black_level_off(segment: Segment) -> list[Suspicion]:
+    """A black level that unlit columns contradict: they stand still together, at what should be 0."""
+    found = []
+    for arm, lines, mask in zip("ab", segment.samples(np.float64), segment.mask, strict=True):
+        whole = mask.all(0)
+        if not whole.any() or segment.geometry.lines < FEWEST_LINES:
+            continue
+        columns = lines[:, whole]
+        lowest, mean = float(columns.min()), float(columns.mean())
+        still = (columns == lowest).all(0)
+        if still.sum() >= FEWEST_TOGETHER and still.mean() < 1 and abs(lowest) > 0.01 * abs(mean):
+            words = (
+                f"{still.sum()} columns of arm {arm} that see no light stand at {lowest:.3g}, "
+                f"{abs(lowest / mean):.0%} of the mean light: the black level is too "
+                f"{'low' if lowest > 0 else 'high'}, or light follows no code"
+            )
+            found.append(Suspicion("black_level", words))
     return found
 
 

@@ -192,3 +192,56 @@ def test_solvers_refuse_rather_than_return_nan() -> None:
         solve(segment(np.full_like(CLEAN, np.nan)))
     with pytest.raises(AcquireError):
         solve(segment(), initial=np.full(GEOMETRY.video_shape(3, 1), np.nan))
+
+
+class Wrong:
+    """A denoiser that breaks its contract."""
+
+    def __init__(self, answer: object) -> None:
+        self.answer = answer
+
+    def prox(self, frames: np.ndarray, weight: object) -> object:
+        return self.answer(frames) if callable(self.answer) else self.answer
+
+
+@pytest.mark.parametrize("answer", [lambda frames: frames[1:], lambda frames: None, 3.0])
+def test_a_denoiser_of_another_shape_is_named(answer: object) -> None:
+    with pytest.raises(UsageError, match="denoiser Wrong gave back") as refused:
+        solve(segment(), denoiser=Wrong(answer))
+    assert "same shape" in str(refused.value.possible)
+
+
+def test_a_denoiser_that_returns_nan_is_named() -> None:
+    with pytest.raises(NumericsError, match="denoiser Wrong gave back values that are not finite"):
+        solve(segment(), denoiser=Wrong(lambda frames: frames * np.nan))
+
+
+@pytest.mark.parametrize("option", ["static_image", "initial"])
+def test_images_without_light_and_below_it_are_refused(option: str) -> None:
+    n, shape = GEOMETRY.size, GEOMETRY.video_shape(3, 1)
+    image = np.ones((n, n) if option == "static_image" else shape)
+    with pytest.raises(UsageError, match="values down to -1"):
+        solve(segment(), **{option: -image})
+    if option == "static_image":
+        with pytest.raises(UsageError, match="dark everywhere"):
+            solve(segment(), static_image=0 * image)
+
+
+@pytest.mark.parametrize("given", [{"responsivity_dn": 0.0}, {"black_level_dn": (0.0, np.nan)}])
+def test_a_camera_that_turns_light_into_nothing_is_refused(given: dict[str, object]) -> None:
+    with pytest.raises(UsageError, match="responsivity"):
+        replace(segment(), **given)
+
+
+def test_a_stuck_camera_is_said() -> None:
+    stuck = CLEAN.copy()
+    stuck[1] = CLEAN[1].mean()
+    assert any("arm b is stuck" in warning for warning in solve(segment(stuck), iterations=5).warnings)
+
+
+@pytest.mark.parametrize("share", [0.2, -0.2])
+def test_a_wrong_black_level_masks_nothing_and_is_said(share: float) -> None:
+    """Columns that see no light stand still at a wrong value together: they are dark, not stuck."""
+    result = solve(segment(CLEAN + np.float32(share * CLEAN.mean())), iterations=10)
+    assert "stuck column" not in result.masked
+    assert any("the black level is too" in warning for warning in result.warnings)
