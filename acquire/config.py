@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, Field, PrivateAttr, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_validator
 
 from acquire.codes import TAPS, Code, ConstantCode, PrbsCode, mix_seed
 from acquire.device_config import SEEING_CAMERAS, SIMULATED_CAMERAS, CamerasConfig, TriggerConfig
@@ -181,12 +181,6 @@ class RigConfig(FrozenModel):
     service: ServiceConfig = ServiceConfig()
     hooks: HooksConfig = HooksConfig()
     web: WebConfig | None = Field(default=None, description="absent: the daemon starts no page")
-    _origin: str = PrivateAttr("")
-
-    @property
-    def origin(self) -> str:
-        """The file that it was read from; empty where it was none."""
-        return self._origin
 
     @model_validator(mode="after")
     def _ring_fits(self) -> RigConfig:
@@ -375,7 +369,6 @@ def load_rig(name: str | Path, overrides: Mapping[str, Any] | None = None) -> Ri
     rig = _validate(RigConfig, table, path)
     if rig.calibration is not None:
         rig = rig.model_copy(update={"calibration": _beside(rig.calibration, path)})
-    rig._origin = str(path.absolute())
     if not rig.needs_scene:
         return rig
     scene = find(rig.scene_file(), beside=path, kind="scene").resolve()

@@ -37,7 +37,7 @@ def serve(
     import logging
     import threading
 
-    from acquire.config import load_rig, parse_settings
+    from acquire.config import find, load_rig, parse_settings
     from acquire.daemon.host import check_host
     from acquire.daemon.server import serve as run_daemon
     from acquire.daemon.uploads import check_upload
@@ -53,7 +53,7 @@ def serve(
     logging.getLogger("uvicorn").setLevel(logging.WARNING)
     if owned:
         threading.Thread(target=end_with_owner, name="acquire-owner", daemon=True).start()
-    raise typer.Exit(run_daemon(rig))
+    raise typer.Exit(run_daemon(rig, str(find(config, kind="rig").absolute())))
 
 
 def end_with_owner() -> None:

@@ -74,7 +74,7 @@ class Local:
         return version_of(self._service.config)
 
     async def setup(self) -> Setup:
-        return setup_of(self._service.config)
+        return setup_of(self._service.config, self._service.origin)
 
     async def rings(self) -> Rings:
         return rings_of(self._service)

@@ -58,8 +58,8 @@ log = logging.getLogger("acquire.daemon")
 T = TypeVar("T")
 
 
-def serve(config: RigConfig) -> int:
-    """Own the devices of ``config`` until a signal; the exit code.
+def serve(config: RigConfig, origin: str = "") -> int:
+    """Own the devices of ``config``, read from the file ``origin``, until a signal; the exit code.
 
     Raises StateError where another daemon has the socket, before any device is touched.
     """
@@ -78,6 +78,7 @@ def serve(config: RigConfig) -> int:
             return Run(with_code(config, code), rig, proof.choose)
 
         service = Service(config, open_run, proof, salvage, uploads, troubles)
+        service.origin = origin
         page = Page(config, endpoint.path)
         with contextlib.closing(page), contextlib.closing(Hooks(config.hooks, service.news, config.name)):
             code = asyncio.run(Daemon(service, endpoint, page).run())

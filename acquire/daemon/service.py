@@ -13,7 +13,7 @@ import threading
 import time
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from acquire import __version__
 from acquire.daemon.disk_watch import disk_watch
@@ -32,10 +32,11 @@ from acquire.store import RunCondition
 from acquire.stream import CaptureStatus
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Iterator
 
     from acquire.config import RigConfig
-    from acquire.daemon.messages import CapacityStatus, LightCode, RecoveryStatus, StartRequest
+    from acquire.daemon.messages import CapacityStatus, RecoveryStatus, StartRequest
+    from acquire.daemon.needs import OpenRun, Prove, Run
     from acquire.stream import Window
     from acquire.stream.messages import Note
     from acquire.stream.ring import RingShape
@@ -48,36 +49,6 @@ TOLD = ("mark", "input", "threshold")
 """Kinds of events that are news; what the check of the code notes is told by its verdict."""
 
 log = logging.getLogger("acquire.daemon")
-
-
-class Run(Protocol):
-    """What the service needs of `acquire.daemon.plan.Run`."""
-
-    run_id: str
-
-    def arm(self, tell: Callable[[str], object]) -> None: ...
-    def start(self, path: Path, lines: int | None, window: Window, *, resume: bool = False) -> Path: ...
-    def mark(self, text: str) -> Note: ...
-    def extend(self, line: int) -> None: ...
-    def events(self) -> list[Note]: ...
-    def stop(self, reason: str) -> None: ...
-    def poll(self) -> CaptureStatus: ...
-    def ring_places(self) -> dict[str, tuple[str, RingShape]]: ...
-    def close(self) -> None: ...
-
-
-class OpenRun(Protocol):
-    """Makes the next run, whose light follows ``code``."""
-
-    def __call__(self, code: LightCode = "rig") -> Run: ...
-
-
-class Prove(Protocol):
-    """What the service needs of `acquire.daemon.proof.Proof`."""
-
-    def __call__(
-        self, *, force: bool, tell: Callable[[str], object], anew: bool = False
-    ) -> CapacityStatus: ...
 
 
 class Service:
@@ -93,6 +64,8 @@ class Service:
         troubles: Troubles | None = None,
     ) -> None:
         self.config = self._config = config
+        self.origin = ""
+        """The file that the configuration was read from."""
         self.news = NewsLog()
         self.armed_since = datetime.now(UTC)
         self._open_run = open_run

@@ -35,12 +35,12 @@ def version_of(config: RigConfig) -> Version:
     return Version(acquire=__version__, name=config.name, pid=os.getpid(), python=platform.python_version())
 
 
-def setup_of(config: RigConfig) -> Setup:
-    """All of it is said: a rig file holds no secrets (`recording_config`)."""
+def setup_of(config: RigConfig, origin: str) -> Setup:
+    """All of it, read from the file ``origin``: a rig file holds no secrets (`recording_config`)."""
     rate_hz = config.line_rate_hz
     return Setup(
         name=config.name,
-        file=config.origin,
+        file=origin,
         config=config.model_dump(mode="json"),
         changed=dict(_changed(config)),
         line_rate_hz=rate_hz * config.simulation.speed,

@@ -202,7 +202,8 @@ def test_healthz_says_503_for_a_fault(path: Path, daemon: Client, run: FakeRun, 
     assert "no light" in answer.json()["message"]
 
 
-def test_setup_says_what_is_not_the_default(daemon: Client) -> None:
+def test_setup_says_what_is_not_the_default(daemon: Client, service: Service) -> None:
+    service.origin = "/etc/rig-demo.toml"
     found = daemon.setup()
     assert found.changed["recording.directory"]
     assert found.file.endswith("rig-demo.toml")

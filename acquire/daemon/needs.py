@@ -1,0 +1,44 @@
+"""What the service needs of what it is given: a run, how one is made, the proof that the host keeps up."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from acquire.daemon.messages import CapacityStatus, LightCode
+    from acquire.stream import CaptureStatus, Window
+    from acquire.stream.messages import Note
+    from acquire.stream.ring import RingShape
+
+
+class Run(Protocol):
+    """What the service needs of `acquire.daemon.plan.Run`."""
+
+    run_id: str
+
+    def arm(self, tell: Callable[[str], object]) -> None: ...
+    def start(self, path: Path, lines: int | None, window: Window, *, resume: bool = False) -> Path: ...
+    def mark(self, text: str) -> Note: ...
+    def extend(self, line: int) -> None: ...
+    def events(self) -> list[Note]: ...
+    def stop(self, reason: str) -> None: ...
+    def poll(self) -> CaptureStatus: ...
+    def ring_places(self) -> dict[str, tuple[str, RingShape]]: ...
+    def close(self) -> None: ...
+
+
+class OpenRun(Protocol):
+    """Makes the next run, whose light follows ``code``."""
+
+    def __call__(self, code: LightCode = "rig") -> Run: ...
+
+
+class Prove(Protocol):
+    """What the service needs of `acquire.daemon.proof.Proof`."""
+
+    def __call__(
+        self, *, force: bool, tell: Callable[[str], object], anew: bool = False
+    ) -> CapacityStatus: ...
