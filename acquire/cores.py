@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 LOOKS, LOOK_S = 5, 0.004
 """Threads that run in each of several looks are there to stay."""
+SLICES, SLICE_S = 9, 0.004
+"""Of processor time, over which a thread's share of a core is measured."""
 
 
 def usable_cores() -> int:
@@ -43,11 +45,18 @@ def limit_blas(threads: int) -> threadpool_limits:
 
 
 def slowness() -> float:
-    """How many times longer than on a core of its own this thread takes now; at least 1."""
-    began, used = time.monotonic(), time.thread_time()
-    while time.thread_time() - used < LOOK_S * LOOKS / 2:
-        pass
-    return max(1.0, (time.monotonic() - began) / (LOOK_S * LOOKS / 2))
+    """How many times longer than on a core of its own this thread takes now; at least 1.
+
+    Cores are shared in slices of some milliseconds, over which the time is taken, but for the worst: a hiccup
+    is no share.
+    """
+    took_s = []
+    for _ in range(SLICES):
+        began, used = time.monotonic(), time.thread_time()
+        while time.thread_time() - used < SLICE_S:
+            pass
+        took_s.append(time.monotonic() - began)
+    return max(1.0, (sum(took_s) - max(took_s)) / (SLICE_S * (SLICES - 1)))
 
 
 def process_age_s(process: Path = Path("/proc/self")) -> float:

@@ -55,5 +55,26 @@ def test_cores_that_others_use_are_not_ours(monkeypatch: pytest.MonkeyPatch) -> 
     assert usable_cores() == 1
 
 
+def test_slowness_is_the_share_of_a_core_and_no_hiccup(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Clock:
+        """Of a thread that gets every third millisecond, and once nothing for a second."""
+
+        used = 0
+
+        def thread_time(self) -> float:
+            self.used += 1
+            return self.used * 1e-3
+
+        def monotonic(self) -> float:
+            return 3 * self.used * 1e-3 + (1.0 if self.used > 20 else 0.0)
+
+    monkeypatch.setattr(cores, "time", Clock())
+    assert cores.slowness() == pytest.approx(3.0, rel=0.5)
+
+
+def test_a_process_has_an_age() -> None:
+    assert 0 < cores.process_age_s() < 86_400
+
+
 def test_this_thread_runs() -> None:
     assert cores._running() >= 1

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from acquire.cores import slowness
 from acquire.errors import UsageError
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
@@ -21,8 +22,8 @@ if TYPE_CHECKING:
 
 PROBED_SHARE = 6
 """The pass is over one of so many lines."""
-LOOKS_S = 0.02
-"""Passes are repeated for so long: a core that is shared gives slices of some milliseconds."""
+LOOK_S = 0.005
+"""Of processor time, for which passes are repeated."""
 PASSES = {"admm": 14.0, "twist-band": 14.0, "twist": 18.0}
 """A reconstruction of one iteration without a search for the bandwidth, in passes of the operator."""
 MARGIN, MARGIN_S = 0.1, 0.3
@@ -36,12 +37,12 @@ def least_seconds(geometry: Geometry, spatial_merge: int, temporal_merge: int, s
     operator = DualArm(few, code, spatial_merge, min(temporal_merge, few.span))
     video = np.ones(operator.video_shape, np.float32)
     operator.adjoint(operator.forward(video))  # loads the compiled loops
-    began, passes = time.monotonic(), 0
-    while passes < 1 or time.monotonic() - began < LOOKS_S:
+    used, passes = time.thread_time(), 0
+    while passes < 1 or time.thread_time() - used < LOOK_S:
         operator.adjoint(operator.forward(video))
         passes += 1
-    once_s = (time.monotonic() - began) / passes
-    return PASSES[solver] * once_s * geometry.lines / few.lines
+    once_s = (time.thread_time() - used) / passes
+    return PASSES[solver] * once_s * geometry.lines / few.lines * slowness()
 
 
 def check_budget(clock: IterationClock, budget_s: float, least_s: float) -> None:
