@@ -73,7 +73,8 @@ class Run:
     """One reconstruction, from its first answer to its last; ``ended`` says what ended it.
 
     ``case`` names what was reconstructed, with its noise; ``repeat`` counts runs that differ in nothing that
-    was asked for.
+    was asked for. ``mean_db`` is the PSNR of the truth's own time mean, held: what a still reaches that
+    knows nothing of time.
     """
 
     solver: Solver
@@ -85,6 +86,7 @@ class Run:
     case: str = ""
     repeat: int = 0
     ended: str = "done"
+    mean_db: float | None = None
 
     @property
     def end(self) -> Point:
@@ -147,6 +149,13 @@ class Judge:
             amplitude_error=amplitude_error(shown, true),
             frequency_error_hz=self._frequency_error(shown, voxels),
         )
+
+    def mean_db(self, voxels: Voxels) -> float | None:
+        """PSNR of the truth's time mean, in every frame; None without a truth, and for one that rests."""
+        true = self.truth(voxels)
+        if true is None or np.array_equal(true, true[:1].repeat(len(true), axis=0)):
+            return None
+        return psnr(np.broadcast_to(true.mean(axis=0), true.shape), true)
 
     def picked(self, voxels: Voxels) -> int:
         """The frame to show: where the truth is far from its mean, rather brighter; else the middle one."""
@@ -233,6 +242,7 @@ def measure(
         (*earlier, judge.judged(last, result.video, voxels)),
         preset,
         ended=result.ended,
+        mean_db=judge.mean_db(voxels),
     )
 
 
@@ -278,6 +288,7 @@ def table(runs: Sequence[Run]) -> list[dict[str, Any]]:
             "frequency_error_hz": point.frequency_error_hz,
             "prediction": point.prediction,
             "pareto": id(point) in fronts,
+            "mean_db": run.mean_db,
         }
         for run in runs
         for point in run.points

@@ -82,6 +82,12 @@ def known(runs: Sequence[Run], metric: Metric) -> bool:
     return any(getattr(run.end, metric.name) is not None for run in runs)
 
 
+def yardstick(runs: Sequence[Run]) -> float | None:
+    """The median PSNR of the truth's own time mean, where it is known and is no truth itself."""
+    known_db = [run.mean_db for run in runs if run.mean_db is not None]
+    return float(np.median(known_db)) if known_db else None
+
+
 def in_series(runs: Sequence[Run]) -> dict[Series, list[Run]]:
     """Repeats together."""
     found: dict[Series, list[Run]] = {}
@@ -98,11 +104,15 @@ def curves(runs: Sequence[Run], metric: Metric, clock: Clock, theme: Theme) -> F
         solvers: list[str] = list(dict.fromkeys(run.solver for run in runs))
         for series, repeats in in_series(runs).items():
             _curve(ax, repeats, metric, clock, theme.solvers[solvers.index(series[0]) % len(theme.solvers)])
+        if metric is DECIBELS and (mean_db := yardstick(runs)) is not None:
+            ax.axhline(
+                mean_db, color=theme.soft, lw=1.2, ls=(0, (1, 1.5)), zorder=1, label="the truth's mean"
+            )
         _time_axis(ax, CLOCKS[clock])
         _value_axis(ax, metric)
         for line, solver in zip(theme.solvers, solvers, strict=False):
             ax.plot([], [], color=line, lw=2.2, label=solver)
-        figure.legend(*ax.get_legend_handles_labels(), loc="outside upper left", ncols=len(solvers))
+        figure.legend(*ax.get_legend_handles_labels(), loc="outside upper left", ncols=3)
         return figure
 
 
@@ -177,6 +187,7 @@ def frames(run: Run, truth: NDArray[Any] | None, theme: Theme) -> Figure:
                 continue
             ax.set_visible(True)
             ax.imshow(frame, cmap="gray", vmin=0, vmax=peak, interpolation="nearest")
+            ax.spines[:].set(visible=True, color=theme.soft)
             ax.set_title(title, fontsize=9.5, loc="left")
         return figure
 

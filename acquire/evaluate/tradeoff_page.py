@@ -15,7 +15,7 @@ from acquire.evaluate.knees import sentences
 from acquire.evaluate.paper.drawing import canvas
 from acquire.evaluate.report import fill_template
 from acquire.evaluate.tradeoff import table
-from acquire.evaluate.tradeoff_figures import METRICS, THEMES, curves, frames, in_series, known
+from acquire.evaluate.tradeoff_figures import METRICS, THEMES, curves, frames, in_series, known, yardstick
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -64,7 +64,10 @@ def write_page(
             {
                 "case": case,
                 "voxels": str(voxels),
-                "sentences": [text for repeats in in_series(own).values() for text in sentences(repeats)],
+                "sentences": [
+                    *(text for repeats in in_series(own).values() for text in sentences(repeats)),
+                    *_beside_a_still(own),
+                ],
                 "ends": [_end(repeats) for repeats in in_series(own).values()],
                 "pictures": drawn,
             }
@@ -110,6 +113,18 @@ def _draw(
     for metric in metrics[1:]:
         save(metric.name, f"{metric.label} over wall time", partial(curves, runs, metric, "seconds"))
     return made
+
+
+def _beside_a_still(runs: Sequence[Run]) -> list[str]:
+    """How the runs stand to the best still that there could be."""
+    mean_db = yardstick(runs)
+    if mean_db is None:
+        return []
+    reached = max(run.end.psnr_db or 0.0 for run in runs)
+    than = (
+        "more than any of these reached" if mean_db > reached else f"the best of these reached {reached:.0f}"
+    )
+    return [f"The truth's own time mean, shown as a still, has {mean_db:.0f} dB: {than}."]
 
 
 def _end(repeats: Sequence[Run]) -> dict[str, Any]:

@@ -41,7 +41,7 @@ def run(judge):
     return measure(judge, "admm", VOXELS)
 
 
-def test_one_run_is_looked_at_on_its_way(run):
+def test_one_run_is_looked_at_on_its_way(judge, run):
     assert all(one.seconds < other.seconds for one, other in pairwise(run.points))
     assert all(one.processor_s <= other.processor_s for one, other in pairwise(run.points))
     assert all(one.iterations <= other.iterations for one, other in pairwise(run.points))
@@ -51,6 +51,8 @@ def test_one_run_is_looked_at_on_its_way(run):
     assert run.end.frequency_error_hz < 60
     assert 0 <= run.end.amplitude_error < 0.5
     assert not run.cut
+    true = judge.truth(VOXELS)
+    assert run.mean_db == pytest.approx(10 * np.log10(true.max() ** 2 / true.var(axis=0).mean()), abs=0.01)
 
 
 def test_a_run_that_its_budget_ends_is_cut(judge):
@@ -113,6 +115,7 @@ def test_page_and_table_say_the_same(judge, run, tmp_path):
     assert text.count("<picture>") == 2 * 6  # PSNR by two clocks, frames, SSIM, amplitude, frequency
     assert text.count('prefers-color-scheme: dark)"><img') == 2 * 6
     assert "cut, 1 of 2" in text
+    assert f"The truth&#39;s own time mean, shown as a still, has {run.mean_db:.0f} dB" in text
     assert "cut by its budget after" in text
     assert f"{run.end.psnr_db:.1f}" in text
     with (tmp_path / "tradeoff.csv").open() as file:
