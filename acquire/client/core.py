@@ -28,6 +28,7 @@ from acquire.daemon.messages import (
     StartRequest,
     Status,
 )
+from acquire.daemon.who import HEADER, WHO
 from acquire.errors import AcquireError, UsageError
 from acquire.place import default_socket
 from acquire.text import shortened
@@ -113,6 +114,8 @@ class Call(Generic[T]):
 
     def headers(self, target: Target) -> dict[str, str]:
         headers = {"Connection": "close", **target.headers()}
+        if who := WHO.get():
+            headers[HEADER] = who
         if self.body is not None:
             headers["Content-Type"] = "application/json"
         if self.request_id is not None:

@@ -14,6 +14,7 @@ from acquire.daemon.messages import fault_error
 from acquire.daemon.setup import rings_of, setup_of, version_of
 from acquire.daemon.states import State
 from acquire.daemon.stream import Streams
+from acquire.daemon.who import WHO
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -39,17 +40,17 @@ class Local:
         return self._service.status()
 
     async def arm(self, request: ArmRequest) -> Status:
-        return await self._do(lambda: self._service.arm(request))
+        return await self._do("arm", lambda: self._service.arm(request))
 
     async def start(self, request: StartRequest) -> Status:
-        return await self._do(lambda: self._service.start(request))
+        return await self._do("start", lambda: self._service.start(request))
 
     async def mark(self, request: MarkRequest) -> Status:
-        return await self._do(lambda: self._service.mark(request.text))
+        return await self._do("mark", lambda: self._service.mark(request.text))
 
     async def stop(self) -> Status:
         """Returns once the recording is sealed; a fault meanwhile is raised."""
-        await self._run(self._service.stop)
+        await self._do("stop", self._service.stop)
         while (status := self._service.status()).state is State.DRAINING:
             await asyncio.sleep(POLL_S)
         if status.state is State.FAULTED:
@@ -57,7 +58,7 @@ class Local:
         return status
 
     async def disarm(self) -> Status:
-        return await self._do(self._service.disarm)
+        return await self._do("disarm", self._service.disarm)
 
     async def measure(self) -> CapacityStatus:
         await self._run(self._service.measure)
@@ -82,6 +83,13 @@ class Local:
     def events(self, last_id: str | None, status_s: float | None, *, history: bool) -> AsyncIterator[str]:
         return self._streams.open(last_id, status_s, history=history)
 
-    async def _do(self, command: Callable[[], None]) -> Status:
-        await self._run(command)
+    async def _do(self, name: str, command: Callable[[], None]) -> Status:
+        who = WHO.get()
+
+        def signed() -> None:
+            command()
+            if who:
+                self._service.sign(name, who)
+
+        await self._run(signed)
         return self._service.status()

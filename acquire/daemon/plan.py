@@ -79,6 +79,10 @@ class Run:
         """An event of the operator's, at the newest line."""
         return Note(self._capture.note("mark", text), "mark", text)
 
+    def note(self, kind: str, text: str) -> None:
+        """Something happens at the newest line: listed in the recording that holds it."""
+        self._capture.note(kind, text)
+
     def extend(self, line: int) -> None:
         """Let the recording under way not end before ``line``."""
         self._capture.extend(line)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Annotated, Any, Protocol
 
-from fastapi import APIRouter, Header, Query, Response
+from fastapi import APIRouter, Depends, Header, Query, Response
 from fastapi.responses import StreamingResponse
 
 from acquire.daemon.answers import LONGEST_ID, Answers
@@ -23,6 +23,7 @@ from acquire.daemon.messages import (
 )
 from acquire.daemon.metrics import CONTENT_TYPE, metrics_text
 from acquire.daemon.stream import LEAST_STATUS_S, MOST_STATUS_S
+from acquire.daemon.who import LONGEST, WHO
 
 RequestId = Annotated[
     str | None,
@@ -63,9 +64,19 @@ class Api(Protocol):
     def events(self, last_id: str | None, status_s: float | None, *, history: bool) -> AsyncIterator[str]: ...
 
 
+async def _note_who(
+    acquire_by: Annotated[
+        str | None,
+        Header(max_length=LONGEST, pattern="^[ -~]+$", description="who asks, for the log and the recording"),
+    ] = None,
+) -> None:
+    if acquire_by and not WHO.get():
+        WHO.set(acquire_by)
+
+
 def routes(api: Api, answers: Answers) -> APIRouter:
     """All that ``api`` offers; a command's request id is looked up in ``answers``."""
-    router = APIRouter()
+    router = APIRouter(dependencies=[Depends(_note_who)])
     _add_commands(router, api, answers)
     _add_facts(router, api)
     return router

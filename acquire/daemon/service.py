@@ -166,6 +166,12 @@ class Service:
             finally:
                 self._go(Event.DISARM)
 
+    def sign(self, command: str, who: str) -> None:
+        """Write down who gave a command: in the log, and among the events of the recording under way."""
+        log.info("%s by %s", command, who)
+        if self._run is not None and self._state in (State.RECORDING, State.DRAINING):
+            self._run.note("operator", f"{command} by {who}")
+
     def measure(self) -> None:
         """What the host sustains, anew; nothing may be armed, since that would be measured, too."""
         if self._state is not State.IDLE:

@@ -23,6 +23,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 
 from acquire.daemon.messages import error_body
+from acquire.daemon.who import LONGEST, WHO
 from acquire.errors import UsageError
 from acquire.text import shortened
 from acquire.web.tokens import COOKIE, Role, Tokens
@@ -141,7 +142,7 @@ class Guard:
             return _refuse(401, "the token is missing or wrong", "acquire web --link")
         if role != "operator" and request.method not in SAFE:
             return _refuse(403, "this token is for looking only", "the operator's: acquire web --link")
-        request.scope["acquire.who"] = f"{role} at {address}"
+        WHO.set(f"{role} at {address}"[:LONGEST])
         return None
 
     def role_of(self, request: Request) -> Role | None:

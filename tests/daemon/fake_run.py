@@ -84,6 +84,9 @@ class FakeRun:
         self._call("mark", text)
         return Note(77, "mark", text)
 
+    def note(self, kind: str, text: str) -> None:
+        self._call("note", kind, text)
+
     def extend(self, line: int) -> None:
         self._call("extend", line)
 

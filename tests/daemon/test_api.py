@@ -55,6 +55,22 @@ def test_a_request_that_comes_again_while_it_is_carried_out_waits_for_its_answer
     assert (found, run.names) == ([State.ARMED] * 3, ["arm"])
 
 
+def test_who_gave_a_command_is_in_the_log_and_in_the_recording(
+    path: Path, daemon: Client, run: FakeRun, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    headers = {"Acquire-By": "operator at 10.0.0.7"}
+    with raw_client(path) as raw:
+        raw.post("/arm", headers=headers)
+        raw.post("/start", json={"path": str(tmp_path / "x.zarr")}, headers=headers)
+        assert raw.post("/mark", json={}, headers={"Acquire-By": "x" * 200}).status_code == 422
+        daemon.mark("nobody says who")
+    assert "arm by operator at 10.0.0.7" in caplog.text
+    assert [call for call in run.calls if call[0] == "note"] == [
+        ("note", "operator", "start by operator at 10.0.0.7")
+    ]
+
+
 def test_request_ids_are_bounded(path: Path, daemon: Client) -> None:
     with raw_client(path) as raw:
         for bad in ("x" * 200, "a b"):

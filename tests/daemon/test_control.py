@@ -77,7 +77,7 @@ def test_malformed_request_names_the_key(path: Path, daemon: Client) -> None:
         assert message.error == "UsageError"
         assert message.message.startswith("line = 5")
         described = raw.get("/openapi.json").json()
-    assert {"/status", "/arm", "/start", "/mark", "/stop", "/disarm"} == set(described["paths"])
+    assert {"/status", "/arm", "/start", "/mark", "/stop", "/disarm"} < set(described["paths"])
     assert "Status" in described["components"]["schemas"]
 
 

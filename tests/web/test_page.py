@@ -77,6 +77,7 @@ def test_a_take_from_arming_to_the_video(page: Page, daemon: Daemon) -> None:
     recorded = open_recording(next(daemon.home.glob("small-*.zarr")))
     assert recorded.attrs["run_condition"] == "GOOD"
     (mark,) = [event for event in recorded.events if "valve" in event.text]
+    assert "start by operator at 127.0.0.1" in [event.text for event in recorded.events]
     assert mark.line - recorded.first_line >= 0.15 * 10_000  # it begins before it was asked for
 
     until_restarted(daemon, victim.pid)

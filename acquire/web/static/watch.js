@@ -37,7 +37,7 @@ export class Watch {
     this.#events.unshift(news);
     this.#events.length = Math.min(this.#events.length, MOST_EVENTS);
     $("events").replaceChildren(...this.#events.map((one) => make("li", { className: one.level === "error" ? "bad" : one.level === "warning" ? "warning" : "" },
-      make("time", { dateTime: one.time }, clock(one.time)), one.kind === "mark" ? `mark: ${one.text}` : one.text)));
+      make("time", { dateTime: one.time }, clock(one.time)), one.kind === "mark" && one.text !== "mark" ? `mark: ${one.text}` : one.text)));
   }
 
   show(status) {
