@@ -87,6 +87,9 @@ def reconstruct(
         str | None,
         typer.Option(metavar="CAL", help="Instead of the recording's own: NAME.zarr, or none."),
     ] = None,
+    explain: Annotated[
+        bool, typer.Option("--explain", help="Say what each part of the calibration gives, and costs.")
+    ] = False,
     preview: Annotated[bool, typer.Option("--preview", help="Coarse, in a second or two.")] = False,
     workers: Annotated[int | None, typer.Option(help="Processes at once; else one per core.")] = None,
     dask: Annotated[
@@ -102,17 +105,14 @@ def reconstruct(
     """
     from acquire.arrays import open_arrays
     from acquire.calibrate.choose import choose
+    from acquire.cli.reconstruct_explain import explain_calibration
     from acquire.cli.reconstruct_request import Asked, prepare
     from acquire.cores import process_age_s
     from acquire.reconstruct import Options
     from acquire.store import open_recording
     from acquire.store.delivery import check_new_place
 
-    if out is None and not auto:
-        raise UsageError(
-            "reconstruct needs --out, where the video goes",
-            possible="--out NAME.zarr; --auto alone shows a plan",
-        )
+    _check_something_asked(out, auto, explain)
     began = time.monotonic() - process_age_s()
     open_arrays(device if dask is None else "cpu", dtype)  # a cluster's devices are not here
     opened = open_recording(recording)
@@ -141,8 +141,9 @@ def reconstruct(
             None if chosen is None else chosen.calibration,
         ),
     )
-    for doubt in () if chosen is None else chosen.doubts:
-        print_warning(doubt)
+    explained = explain_calibration(opened, chosen, asked, wanted=explain, json=json and out is None)
+    if explained and not (out or auto):
+        return
     prepared = prepare(opened, asked)
     if not json:
         _print_prepared(prepared)
@@ -162,6 +163,14 @@ def reconstruct(
     _report(outcomes, json=json, brief=preview)
     if any(outcome.interrupted for outcome in outcomes):
         raise typer.Exit(EXIT_INTERRUPTED)
+
+
+def _check_something_asked(*wanted: object) -> None:
+    if not any(wanted):
+        raise UsageError(
+            "reconstruct needs --out, where the video goes",
+            possible="--out NAME.zarr; --auto alone shows a plan, --explain what a calibration gives",
+        )
 
 
 def _beside(out: str, suffix: str) -> str:

@@ -122,6 +122,21 @@ def test_a_recording_carries_what_its_rig_names(cli: Cli, taken: dict[str, Path]
     assert "arm B lies" in cli("calibrate", "show", carrying).out
 
 
+def test_what_each_part_gives_is_told(cli: Cli, taken: dict[str, Path], tmp_path: Path) -> None:
+    """The target itself, at rest: without arm B in its place its samples are predicted worse."""
+    cal = tmp_path / "cal.zarr"
+    for step, recording in (("dark", "dark"), ("flat", "flat"), ("align", "target")):
+        assert cli("calibrate", step, taken[recording], "--out", cal, "--json").code == 0
+    words = ("--calibration", cal, "--lines", 120, "--nm", 1, "--tm", 431)
+    told = cli("reconstruct", taken["target"], "--explain", *words, "--json")
+    assert told.code == 0, told.err
+    parts = {part["part"]: part for part in told.json["parts"]}
+    assert list(parts)[:2] == ["nothing", "all of it"]
+    assert parts["all of it"]["prediction"] < parts["nothing"]["prediction"]
+    assert parts["arm B laid on arm A"]["gain_db"] > 1
+    assert cli("reconstruct", taken["target"], "--explain").code == 2
+
+
 def test_one_of_another_instrument_is_refused(cli: Cli, taken: dict[str, Path], tmp_path: Path) -> None:
     cal = tmp_path / "cal.zarr"
     assert cli("calibrate", "dark", taken["dark"], "--out", cal).code == 0

@@ -1,0 +1,105 @@
+"""What each part of a calibration is worth: a short reconstruction with all of it, and without one part each.
+
+The measure needs no truth: blocks of samples that the solver does not see are predicted, and a part that
+belongs to the instrument lets them be predicted better. Every trial has the same lines, samples held out,
+bandwidth and iterations.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from acquire.calibrate import calibrated
+from acquire.calibrate.orientation import MODEL, view_named
+from acquire.recon import reconstruct
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from acquire.calibrate import Calibration
+    from acquire.lines import Segment
+
+ITERATIONS = 80
+MOST_LINES = 264
+OFFSETS, GAINS = ("offset_dn", "ambient_dn"), ("gain",)
+NOTHING, ALL = "nothing", "all of it"
+
+
+@dataclass(frozen=True, slots=True)
+class Worth:
+    """One trial: ``prediction`` is the relative error at samples held out.
+
+    ``gain_db`` is how much worse they are predicted without the part (of `NOTHING` and `ALL`: None), and
+    ``time_factor`` the time with all of it beside the time without.
+    """
+
+    part: str
+    prediction: float
+    seconds: float
+    gain_db: float | None = None
+    time_factor: float | None = None
+
+
+def explain(
+    segment: Segment,
+    known: Calibration,
+    spatial_merge: int,
+    temporal_merge: int,
+    progress: Callable[[int, int], object] = lambda _done, _all: None,
+) -> tuple[Worth, ...]:
+    """What the parts of a calibration give for a segment and what they cost; `NOTHING` and `ALL` first.
+
+    Raises what `calibrated` and `reconstruct` raise.
+    """
+    merges = (spatial_merge, temporal_merge)
+    reconstruct(calibrated(segment, known), *merges, iterations=1)  # compiles, so that no trial has to
+    frames = segment.geometry.video_shape(*merges)[0]
+    parts = dict(_without(known))
+    total = len(parts) + 2
+    bare = _trial(segment, merges, None)
+    progress(1, total)
+    bandwidth = bare.coefficients / frames
+    bare = _trial(segment, merges, bandwidth)
+    whole = _trial(calibrated(segment, known), merges, bandwidth)
+    progress(2, total)
+    found = [Worth(NOTHING, bare.prediction, bare.seconds), Worth(ALL, whole.prediction, whole.seconds)]
+    for number, (name, rest) in enumerate(parts.items()):
+        left = _trial(calibrated(segment, rest), merges, bandwidth)
+        gain_db = 20 * math.log10(left.prediction / whole.prediction)
+        found.append(Worth(name, left.prediction, left.seconds, gain_db, whole.seconds / left.seconds))
+        progress(number + 3, total)
+    return tuple(found)
+
+
+@dataclass(frozen=True, slots=True)
+class _Trial:
+    prediction: float
+    seconds: float
+    coefficients: int
+
+
+def _trial(segment: Segment, merges: tuple[int, int], bandwidth: float | None) -> _Trial:
+    result = reconstruct(segment, *merges, iterations=ITERATIONS, bandwidth=bandwidth)
+    coefficients = int(result.parameters.get("temporal_coefficients", 1))
+    seconds = result.seconds / max(result.iterations, 1) * ITERATIONS
+    return _Trial(result.quality.prediction, seconds, coefficients)
+
+
+def _without(known: Calibration) -> Iterator[tuple[str, Calibration]]:
+    """Name of a part → the calibration without it, as far as it holds it."""
+    for name, quantities in (
+        ("offsets per column", OFFSETS),
+        ("gains per column", GAINS),
+        ("the arms' balance", ("balance",)),
+    ):
+        if any(each in known.quantities for each in quantities):
+            rest = {key: value for key, value in known.quantities.items() if key not in quantities}
+            yield name, replace(known, quantities=rest)
+    if known.usable is not None and not known.usable.all():
+        yield "columns left out", replace(known, usable=None)
+    if known.orientation is not None and view_named(known.orientation) != MODEL:
+        yield "the orientation", replace(known, orientation=None)
+    if known.alignment is not None:
+        yield "arm B laid on arm A", replace(known, alignment=None)
