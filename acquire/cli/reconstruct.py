@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
@@ -107,13 +108,12 @@ def reconstruct(
     from acquire.calibrate.choose import choose
     from acquire.cli.reconstruct_explain import explain_calibration
     from acquire.cli.reconstruct_request import Asked, prepare
-    from acquire.cores import process_age_s
     from acquire.reconstruct import Options
     from acquire.store import open_recording
     from acquire.store.delivery import check_new_place
 
     _check_something_asked(out, auto, explain)
-    began = time.monotonic() - process_age_s()
+    began = time.monotonic() - _age_s()
     open_arrays(device if dask is None else "cpu", dtype)  # a cluster's devices are not here
     opened = open_recording(recording)
     chosen = choose(opened, calibration)
@@ -152,7 +152,7 @@ def reconstruct(
     places = [_beside(out, suffix) for suffix in prepared.requests]
     for place in places:
         check_new_place(place)
-    if workers is None and (preview or (budget is not None and budget < PROCESSES_FROM * process_age_s())):
+    if workers is None and (preview or (budget is not None and budget < PROCESSES_FROM * _age_s())):
         workers = 1  # processes take longer to start than that: as long as this one, or longer
     outcomes = []
     for number, (place, request) in enumerate(zip(places, prepared.requests.values(), strict=True)):
@@ -176,6 +176,14 @@ def _check_something_asked(*wanted: object) -> None:
 def _beside(out: str, suffix: str) -> str:
     """NAME.zarr as NAME-1x820.zarr."""
     return re.sub(r"(\.[^./]*)?$", rf"-{suffix}\1", out.rstrip("/"), count=1) if suffix else out
+
+
+def _age_s() -> float:
+    """Since this command began: with its process, unless another program called it."""
+    from acquire.cores import process_age_s
+
+    program = Path(getattr(sys.modules["__main__"], "__file__", None) or "")
+    return process_age_s() if "acquire" in (program.name, program.parent.name) else 0.0
 
 
 def _share(options: Options, elapsed_s: float, videos: int) -> Options:
