@@ -9,13 +9,17 @@ from __future__ import annotations
 
 import mmap
 import os
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from acquire.errors import DeviceError
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.shared import SharedBytes
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
     from acquire.stream.ring import RingBlock
 
 
@@ -79,6 +83,35 @@ class Peek:
         else:
             self._skip(1)
         return whole
+
+    @property
+    def newest_line(self) -> int:
+        """The line after the last that has come; 0 before the first."""
+        return self._ring.newest_line
+
+    def stretch(self, first_line: int, count: int) -> tuple[NDArray[Any], NDArray[np.uint16]] | None:
+        """A copy of ``count`` lines (line, pixel) of the past, and flags; None where one is missing."""
+        shape, head = self._ring.shape, self._ring.head
+        pixels = np.empty((count, shape.width), shape.dtype)
+        flags = np.empty(count, np.uint16)
+        end = first_line + count
+        for number in range(head - 1, max(-1, head - shape.slots), -1):
+            block = self._ring.read(number)
+            if block is None or block.end_line < end:
+                return None  # overwritten, or lines are missing between
+            start = max(first_line, block.first_line)
+            rows, here = slice(start - first_line, end - first_line), slice(start - block.first_line, None)
+            taken = end - start
+            if taken > 0:
+                pixels[rows] = block.pixels[here][:taken]
+                flags[rows] = block.flags[here][:taken]
+                end = start
+            del block
+            if not self._ring.is_whole(number):
+                return None
+            if end <= first_line:
+                return pixels, flags
+        return None
 
     def close(self) -> None:
         """Let go of the memory; views of blocks must be gone. Idempotent."""

@@ -110,7 +110,7 @@ def build_page(
 def _life(hub: Hub, jobs: Jobs) -> Any:
     @asynccontextmanager
     async def life(_: FastAPI) -> AsyncIterator[None]:
-        tasks = [asyncio.create_task(hub.run()), asyncio.create_task(jobs.run())]
+        tasks = [asyncio.create_task(one) for one in (hub.run(), jobs.run(), hub.glimpser.run())]
         try:
             yield
         finally:
@@ -153,8 +153,13 @@ def _add_stream(api: APIRouter, pages: Pages) -> None:
         responses=BYTES,
         response_class=Response,
     )
-    async def live(pictures: Annotated[bool, Query()] = True) -> StreamingResponse:
-        stream = pages.open(pictures=pictures)
+    async def live(
+        pictures: Annotated[bool, Query()] = True,
+        glimpses: Annotated[
+            bool, Query(description="coarse videos of what has just passed; takes a core")
+        ] = False,
+    ) -> StreamingResponse:
+        stream = pages.open(pictures=pictures, glimpses=glimpses)
         return StreamingResponse(stream, media_type="application/octet-stream", headers=NO_STORE)
 
 

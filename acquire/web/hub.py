@@ -19,6 +19,7 @@ from acquire.daemon.messages import Status
 from acquire.daemon.states import State
 from acquire.errors import AcquireError, NoDaemonError
 from acquire.web.frames import json_message, message
+from acquire.web.glimpser import Glimpser
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -43,6 +44,7 @@ class Hub:
         self.client = AsyncClient(socket)
         self._loop = asyncio.get_running_loop()
         self.live = make_live(self._wake_from_thread)
+        self.glimpser = Glimpser(socket, self._wake)
         self.status: Status | None = None
         self.setup: Setup | None = None
         self.connected = False

@@ -10,13 +10,14 @@ import logging
 import threading
 import time
 from collections import deque
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from acquire.errors import AcquireError
 from acquire.stream.peek import Peek
 from acquire.stream.ring import RingShape
 from acquire.web.decimate import Decimator, Scale
 from acquire.web.frames import rows_message
+from acquire.web.places import shape_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -101,7 +102,7 @@ class Live:
         eyes: dict[str, _Eye] = {}
         try:
             for arm, place in rings.arms.items():
-                eyes[arm] = _Eye(arm, place.path, _shape(place), setup)
+                eyes[arm] = _Eye(arm, place.path, shape_of(place), setup)
             self.error = ""
             while not self._ended and self._watchers and self._wanted == (rings, setup):
                 began_s = time.monotonic()
@@ -120,12 +121,6 @@ class Live:
         with self._lock:
             self._messages.append((self._count, told))
             self._count += 1
-
-
-def _shape(place: Any) -> RingShape:
-    facts = place.model_dump()
-    del facts["path"]
-    return RingShape(**facts)
 
 
 class _Eye:

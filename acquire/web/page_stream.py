@@ -31,18 +31,20 @@ class Pages:
         self._hub = hub
         self._open = 0
 
-    def open(self, *, pictures: bool) -> AsyncIterator[bytes]:
+    def open(self, *, pictures: bool, glimpses: bool) -> AsyncIterator[bytes]:
         """The messages of a page (`acquire.web.frames`). Raises StateError where there are too many pages."""
         if self._open >= MOST_PAGES:
             raise StateError(f"{MOST_PAGES} pages are open already", hint="close one of them")
-        return self._stream(pictures=pictures)
+        return self._stream(pictures=pictures, glimpses=glimpses)
 
-    async def _stream(self, *, pictures: bool) -> AsyncIterator[bytes]:
+    async def _stream(self, *, pictures: bool, glimpses: bool) -> AsyncIterator[bytes]:
         hub = self._hub
         self._open += 1
         woken = hub.listen()
         place = hub.live.watch() if pictures else 0
-        heard, version, told_s = 0, -1, 0.0
+        heard, version, told_s, seen = 0, -1, 0.0, hub.glimpser.number
+        if glimpses:
+            hub.glimpser.watch()
         try:
             while True:
                 woken.clear()
@@ -56,6 +58,9 @@ class Pages:
                 if pictures:
                     place, rows = hub.live.after(place)
                     parts += rows
+                if glimpses and hub.glimpser.number != seen:
+                    seen = hub.glimpser.number
+                    parts.append(hub.glimpser.latest)
                 if parts:
                     yield b"".join(parts)
                 await asyncio.sleep(LEAST_S)
@@ -65,6 +70,8 @@ class Pages:
             hub.forget(woken)
             if pictures:
                 hub.live.leave()
+            if glimpses:
+                hub.glimpser.leave()
 
 
 async def _wait(woken: asyncio.Event, seconds: float) -> None:

@@ -68,6 +68,9 @@ def test_a_take_from_arming_to_the_video(page: Page, daemon: Daemon) -> None:
     page.keyboard.press("Enter")
     page.locator("#events", has_text="mark: the valve <b>opens</b>").wait_for(timeout=SEEN_MS)
 
+    page.check("#glimpse-on")
+    page.locator("#glimpse-text", has_text="16 × 16 voxels").wait_for(timeout=SEEN_MS)
+
     victim = page_process(daemon)  # the recorder must not notice
     victim.kill()
     page.wait_for_selector("body[data-stale]", timeout=SEEN_MS)

@@ -3,6 +3,7 @@
 import { Aim } from "./aim.js";
 import { Band } from "./band.js";
 import { showHealth, showSetup } from "./facts.js";
+import { Glimpse } from "./glimpse.js";
 import { Link, ask } from "./link.js";
 import { Recordings } from "./recordings.js";
 import { Watch } from "./watch.js";
@@ -10,6 +11,7 @@ import { $ } from "./words.js";
 
 const SCREENS = ["watch", "aim", "recordings", "health", "setup"];
 const link = new Link(), band = new Band(), watch = new Watch(fail), aim = new Aim(), recordings = new Recordings(fail);
+new Glimpse(link);
 let operator = false, setup = null, latest = null;
 
 function fail(text) { $("error").textContent = text; $("error").hidden = !text; }

@@ -27,6 +27,7 @@ export class Messages {
 export class Link extends EventTarget {
   #heard = performance.now();
   #abort = null;
+  glimpses = false;
 
   /** Follow for ever. Hidden pages get no pictures; one that is shown again gets them at once. */
   async run() {
@@ -39,10 +40,13 @@ export class Link extends EventTarget {
     }
   }
 
+  /** Coarse videos of what has just passed, or not: the stream is opened anew. */
+  wantGlimpses(wanted) { this.glimpses = wanted; this.#abort?.abort(); }
+
   async #follow() {
     this.#abort = new AbortController();
     const pictures = document.visibilityState === "visible";
-    const answer = await fetch(`/api/live?pictures=${pictures}`, { signal: this.#abort.signal });
+    const answer = await fetch(`/api/live?pictures=${pictures}&glimpses=${pictures && this.glimpses}`, { signal: this.#abort.signal });
     if (answer.status === 401) { this.dispatchEvent(new Event("locked")); return; }
     if (!answer.ok) throw new Error(`HTTP ${answer.status}`);
     this.dispatchEvent(new Event("begun"));

@@ -1,0 +1,16 @@
+"""From what the daemon tells of a ring to its shape."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from acquire.stream.ring import RingShape
+
+if TYPE_CHECKING:
+    from acquire.daemon.facts import RingPlace
+
+
+def shape_of(place: RingPlace) -> RingShape:
+    facts = place.model_dump()
+    del facts["path"]
+    return RingShape(**facts)
