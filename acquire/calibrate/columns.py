@@ -38,6 +38,8 @@ DEAD, DARK = 0.5, 0.05
 """Response beside the arm's median below which a column is no good; at an edge it may see half a field."""
 DARK_EDGE = 4.0
 """Spreads of the gain below the median at which a column at the edge is dark by the optics."""
+TOGETHER, LEAST_LACK = 3.0, 2e-3
+"""Standard errors, and part of 1, by which the outermost columns together are below the others there."""
 EDGE_SHARE = 0.125
 SMOOTH_DEGREE = 4
 
@@ -154,7 +156,28 @@ def _dark_edges(shape: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArra
         low = row < middle - np.maximum(DARK_EDGE * spread, 2e-3 * middle)
         for order in (slice(None, most), slice(None, -most - 1, -1)):
             out[order] = np.logical_and.accumulate(low[order])
-    return dark
+    return dark | _blurred(shape, usable, dark)
+
+
+def _blurred(
+    shape: NDArray[np.float64], usable: NDArray[np.bool_], dark: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """The outermost columns, where all of them together lack light: a lens blurs the field's edge.
+
+    Each alone lacks no more than columns differ; the four of both arms do not do so by chance.
+    """
+    outermost = np.zeros_like(usable)
+    outermost[:, [0, -1]] = True
+    witnesses = outermost & usable & ~dark
+    inner = [row[good] for row, good in zip(shape, usable & ~outermost, strict=True)]
+    middle = np.array([np.median(row) for row in inner])[:, None]
+    spread = np.mean([1.4826 * np.median(np.abs(row / np.median(row) - 1)) for row in inner])
+    count = witnesses.sum()
+    if not count:
+        return witnesses
+    lack = 1 - float((shape / middle)[witnesses].mean())
+    blurred = lack > max(TOGETHER * spread / np.sqrt(count), LEAST_LACK)
+    return witnesses if blurred else np.zeros_like(witnesses)
 
 
 def _responses(shape: NDArray[np.float64], edges: NDArray[np.bool_]) -> dict[str, dict[str, float]]:

@@ -60,6 +60,17 @@ def test_what_the_optics_hide_is_no_gain(recordings: dict[str, Path], known: Cal
     assert all(gain[1, column] == 1 for column in hidden["b"])
 
 
+@pytest.mark.parametrize(("sigma", "hidden"), [(0.5, True), (None, False)])
+def test_a_blurred_edge_of_the_field_is_no_gain(tmp_path: Path, sigma: float | None, hidden: bool) -> None:
+    """The outermost columns lack some percent each, as much as columns differ: together they tell."""
+    blur = [] if sigma is None else [{"kind": "psf", "sigma_pixels": sigma}]
+    scene = white(effects=[*NOISE, *COLUMNS, *blur])
+    paths = [record(tmp_path / f"{each}.zarr", scene, each) for each in ("dark", "flat")]
+    step = measured(*map(open_exposure, paths)).steps["flat"]
+    edge = {0, 23}
+    assert all(edge.issubset(step["optics_hide_columns"][arm]) is hidden for arm in ARMS)
+
+
 @pytest.mark.parametrize("part_a", [0.46, 0.5, 0.57])
 def test_the_splitter(tmp_path: Path, part_a: float) -> None:
     effects = [*NOISE, *COLUMNS, {"kind": "beam_splitter", "part_a": part_a}]
