@@ -11,13 +11,14 @@ import numpy as np
 
 from acquire.arrays import Dtype, open_arrays
 from acquire.cores import idle_cores, limit_threads
+from acquire.recon.choose import solve_admm
 from acquire.recon.clock import IterationClock
 from acquire.recon.judge import frame_error, judge
 from acquire.recon.least import check_budget, least_seconds
 from acquire.recon.problem import pose
 from acquire.recon.request import Preset, Request, Solver, Stop, preset_iterations
 from acquire.recon.result import Look, Progress, Quality, Reconstruction
-from acquire.recon.solve import Lit, solve_admm, solve_twist
+from acquire.recon.solve import Lit, solve_twist
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -26,10 +27,10 @@ if TYPE_CHECKING:
 
     from acquire.lines import Segment
     from acquire.recon.denoisers import Denoiser
+    from acquire.recon.estimates import Estimate
     from acquire.recon.problem import Problem
-    from acquire.recon.solve import Estimate
 
-HOLD_OUT = 0.02
+HOLD_OUT = 0.08
 """Share of the samples kept from the default solver, to judge its prediction."""
 
 
@@ -137,7 +138,9 @@ def _finish(
     T_m = request.temporal_merge
     predicted = estimate.predict()
     video = _scaled(estimate.video(), problem, request)
-    quality = Quality(problem.misfit(predicted), problem.prediction_error(predicted), problem.coverage)
+    held_out = estimate.held_out_error
+    prediction = problem.prediction_error(predicted) if held_out is None else held_out
+    quality = Quality(problem.misfit(predicted), prediction, problem.coverage)
     trusted = segment.geometry.trusted_frames(T_m)
     return Reconstruction(
         video=video,
@@ -146,7 +149,7 @@ def _finish(
         seconds=clock.seconds,
         compiled_s=clock.compiled_s,
         processor_s=clock.processor_s,
-        iterations=clock.done,
+        iterations=clock.made,
         iterations_asked=clock.iterations,
         solver=request.solver,
         quality=quality,

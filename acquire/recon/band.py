@@ -8,13 +8,17 @@ work than synthesising the video and shearing it.
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from acquire.arrays import host
 from acquire.forward import DualArm, GatheredArms, block_bounds, column_merging, registration
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from acquire.alignment import Alignment
@@ -57,7 +61,8 @@ class BandOperator:
         side = geometry.video_shape(spatial_merge, temporal_merge)[1]
         self.theta_shape = (basis.count, side, side)
         self.lines_shape = geometry.lines_shape
-        self._xp, asarray = basis.arrays.xp, basis.arrays.asarray
+        self._xp, self._asarray = basis.arrays.xp, basis.arrays.asarray
+        asarray = self._asarray
         self._merging = asarray(column_merging(geometry, spatial_merge))
         self._registration = registration(alignment, geometry, spatial_merge, basis.arrays)
         starts, lengths = block_bounds(geometry.size, spatial_merge)
@@ -86,6 +91,24 @@ class BandOperator:
         seen = self._xp.permute_dims(columns, (1, 2, 0))
         back = seen if self._registration is None else self._registration.adjoint(seen)
         return self._xp.permute_dims(rows, (1, 0, 2)) + back
+
+    def near_inverse(self, damping: float) -> Callable[[Array], Array]:
+        """About (B·Bᵀ + damping)⁻¹, lines to lines: exact for either arm alone where N_m divides S.
+
+        Pixels of one arm share no voxel then, so that B·Bᵀ of an arm is one matrix between its lines, for all
+        pixels the same. Next to each other those lines are nearly equal, which is what makes B·Bᵀ so badly
+        conditioned; what the arms have in common is little but the mean, and left to whoever iterates.
+        """
+        xp, damped = self._xp, damping * np.eye(self.lines_shape[1])
+        inverses = [self._asarray(np.linalg.inv(gram + damped)) for gram in self._grams]
+        return lambda lines: xp.stack([m @ lines[arm, ...] for arm, m in enumerate(inverses)])
+
+    @cached_property
+    def _grams(self) -> list[NDArray[np.float64]]:
+        """B·Bᵀ of either arm between the lines (L_R, L_R)."""
+        each = float(np.square(host(self._merging), dtype=np.float64).sum(axis=0).mean())
+        exact = [host(factor).astype(np.float64) for factor in self._factors]
+        return [each * (factor @ factor.T) for factor in exact]
 
     def _arm(self, factor: Array, view: Array) -> Array:
         """Columns are merged into pixels on that side of the product where it is the smaller."""

@@ -35,6 +35,8 @@ FIRST_OF_STAGE = 4.0
 class IterationClock:
     """Counts iterations over all stages of a solver and says when they must end, and why (``ended``).
 
+    ``done`` are those that the limit is for, ``made`` all, those of trials too.
+
     Its time is the wall's since ``began`` (`time.monotonic`; else now), without what compiling took.
     ``shortcuts`` are sentences about what was left out for want of time. ``looks`` is called after iterations
     of what has a video already; the time it takes does not count.
@@ -51,6 +53,7 @@ class IterationClock:
         began: float | None = None,
     ) -> None:
         self.iterations, self.done, self.ended = iterations, 0, "done"
+        self.made = 0
         self.shortcuts: list[str] = []
         self._budget_s, self._progress, self._stop = budget_s, progress, stop
         self._began = time.monotonic() if began is None else began
@@ -93,17 +96,41 @@ class IterationClock:
             begun = self.seconds
             yield self.done
             self.done += 1
+            self.made += 1
             lately.append(self.seconds - begun)
             expected = self.longest_s
             if self._progress is not None:
-                self._progress(Progress(self.done, self.iterations, self.seconds, stage))
-            if self.looks is not None and video is not None:
-                self._show(self.looks, stage, video)
+                self._progress(Progress(self.made, max(self.made, self.iterations), self.seconds, stage))
+            if video is not None:
+                self.show(stage, video)
         if not lately:
             lately.append(expected / FIRST_OF_STAGE)
 
+    def attempt(self, most: int, stage: str, share: float = 1.0) -> Iterator[int]:
+        """As `run`, for iterations beside the limit, of a trial that may come to nothing; one is made.
+
+        Nobody sees them: `show` what is the best after a trial.
+        """
+        lately = self._lately_s = deque(maxlen=REMEMBERED)
+        for tried in range(most):
+            if tried and (self._stopped() or not self.affords(self.longest_s, share)):
+                return
+            begun = self.seconds
+            yield tried
+            self.made += 1
+            lately.append(self.seconds - begun)
+            if self._progress is not None:
+                self._progress(Progress(self.made, max(self.made, self.iterations), self.seconds, stage))
+
+    def show(self, stage: str, video: Callable[[], NDArray[Any]]) -> None:
+        """The answer as it would be now, dimensionless, to who looks on."""
+        if self.looks is not None:
+            self._show(self.looks, stage, video)
+
     def spent(self, share: float) -> bool:
-        """Whether that share of the budget is gone."""
+        """Whether that share of the budget is gone, or all is to stop."""
+        if self.made and self._stopped():
+            return True
         return self._budget_s is not None and self.seconds > share * self._budget_s
 
     def affords(self, seconds: float, share: float = 1.0) -> bool:
@@ -118,17 +145,22 @@ class IterationClock:
         self.ended = "converged"
 
     def _show(self, looks: Callable[[Look], object], stage: str, video: Callable[[], NDArray[Any]]) -> None:
-        wall, processor, seconds = time.monotonic(), time.process_time(), self.seconds
-        looks(Look(self.done, seconds, self.processor_s, stage, video))
+        seconds, wall, processor = self.seconds, time.monotonic(), time.process_time()
+        looks(Look(self.made, seconds, self.processor_s, stage, video))
         self._aside_s += time.monotonic() - wall
         self._processor_began_s += time.process_time() - processor
 
     def _may_go_on(self, expected: float, share: float) -> bool:
-        if self.done and self._stop is not None and self._stop.is_set():
-            self.ended = "stopped"
+        if self.made and self._stopped():
             return False
-        if not self.done or self.affords(expected, share):
+        if not self.made or self.affords(expected, share):
             return True
         if share >= 1:
             self.ended = "budget"
         return False
+
+    def _stopped(self) -> bool:
+        if self._stop is None or not self._stop.is_set():
+            return False
+        self.ended = "stopped"
+        return True

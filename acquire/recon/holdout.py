@@ -7,14 +7,18 @@ predicts it is the scene.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.ndimage import label
 
 from acquire.errors import UsageError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+
+    from acquire.geometry import Geometry
+    from acquire.recon.problem import Problem
 
 BLOCK_LINES, BLOCK_PIXELS = 24, 4
 FEWEST_BLOCKS = 8
@@ -61,3 +65,50 @@ def _drawn(
     begin = [int(rng.integers(side)) for side in size]
     whole = chosen.reshape(tiles).repeat(size[0], axis=0).repeat(size[1], axis=1)
     return whole[begin[0] : begin[0] + shape[0], begin[1] : begin[1] + shape[1]]
+
+
+class HeldOut:
+    """Scores predictions of held-out blocks; samples count as far as the light they saw is trusted.
+
+    The lines at a segment's ends see frames that few lines saw, which nothing can predict and nobody is
+    shown.
+    """
+
+    def __init__(self, problem: Problem, geometry: Geometry) -> None:
+        mask = problem.held_out
+        labels = [label(arm)[0] for arm in mask]
+        labels[1] = np.where(labels[1] > 0, labels[1] + labels[0].max(), 0)
+        self._block = np.stack(labels)[mask]
+        self._samples = problem.samples[mask].astype(np.float64)
+        self._weight = np.broadcast_to(_trusted_share(geometry)[:, None], mask.shape)[mask]
+        self._mask = mask
+        self._level = float(np.sum(self._weight * self._samples**2))
+
+    def __bool__(self) -> bool:
+        """Whether there is anything to score by."""
+        return self._level > 0
+
+    def errors(self, predicted: NDArray[Any]) -> NDArray[np.float64]:
+        """Weighted sum of squares of each block."""
+        off = self._weight * (predicted[self._mask] - self._samples) ** 2
+        return np.asarray(np.bincount(self._block, off)[1:], np.float64)
+
+    def relative(self, errors: NDArray[np.float64]) -> float:
+        """Relative RMS error of all blocks."""
+        return float(np.sqrt(errors.sum() / self._level)) if self._level > 0 else float("nan")
+
+    def clearly_less(self, errors: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
+        """Whether errors are less by more than the standard error of the blocks' difference."""
+        less = others - errors
+        return bool(less.mean() > less.std() / max(len(less) - 1, 1) ** 0.5)
+
+
+def _trusted_share(geometry: Geometry) -> NDArray[np.float64]:
+    """Of each line's sub-steps, the share in the trusted interval; 1 where no sub-step is trusted."""
+    trusted = geometry.trusted_frames(1)
+    if trusted.stop <= trusted.start:
+        return np.ones(geometry.lines)
+    first = np.arange(geometry.lines) * geometry.substeps
+    length = geometry.size + geometry.substeps - 1
+    seen = np.minimum(first + length, trusted.stop) - np.maximum(first, trusted.start)
+    return np.asarray(np.maximum(seen, 0) / length)

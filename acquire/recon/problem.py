@@ -12,12 +12,15 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from acquire.arrays import HOST, Arrays
+from acquire.arrays import HOST, Arrays, namespace
 from acquire.errors import NumericsError, UsageError
 from acquire.forward import DualArm
+from acquire.recon.holdout import held_out_blocks
 from acquire.recon.outliers import outliers
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from acquire.arrays import Array
@@ -66,6 +69,11 @@ class Problem:
         """The solvers' operator: weighted, of norm at most 1."""
         return MaskedOperator(operator, self.arrays.asarray(self.weight / self.norm))
 
+    def whole(self) -> Problem:
+        """The same with all usable samples in use."""
+        everything = np.maximum(self.weight, self.held_out.astype(self.weight.dtype))
+        return replace(self, weight=everything, held_out=np.zeros_like(self.held_out))
+
     def on_host(self) -> Problem:
         """The same, for what is solved on the host."""
         return replace(self, arrays=Arrays(dtype=self.arrays.dtype))
@@ -99,6 +107,20 @@ class MaskedOperator:
     def adjoint(self, y: Array) -> Array:
         return self.operator.adjoint(y * self.weight)
 
+    def near_inverse(self, damping: float) -> Callable[[Array], Array] | None:
+        """About (W·B·BᵀW + damping)⁻¹ for lines that are 0 where masked; None where B knows none.
+
+        What is masked counts as seen: its lines hang together with those beside them.
+        """
+        whole = getattr(self.operator, "near_inverse", None)
+        if whole is None:
+            return None
+        xp = namespace(self.weight)
+        largest = float(xp.max(self.weight))
+        mask = xp.astype(self.weight > 0, self.weight.dtype)
+        inverse = whole(damping / largest**2)
+        return lambda lines: mask * inverse(lines) / largest**2
+
 
 def pose(
     segment: Segment,
@@ -111,15 +133,13 @@ def pose(
 ) -> Problem:
     """The problem of a segment, to be solved in ``arrays``.
 
-    ``hold_out`` is the share of usable samples kept from the solver, chosen by ``seed``.
+    ``hold_out`` is the share of usable samples kept from the solver, in blocks drawn by ``seed``.
 
     Raises
     ------
     UsageError : no sample is usable, or the share is not in [0, 0.5]
     NumericsError : the code is dark for the whole segment, or the samples overflow
     """
-    if not 0 <= hold_out <= 0.5:
-        raise UsageError(f"held-out share {hold_out}", possible="0 to 0.5")
     samples = segment.samples(np.float64)
     bad = outliers(samples, segment.mask)
     usable = segment.mask & ~np.logical_or.reduce([np.zeros_like(segment.mask), *bad.values()])
@@ -131,7 +151,7 @@ def pose(
     norm = operator.norm_bound(steps=5)
     flat = operator.forward(np.ones(operator.video_shape, np.float32))
     scale = _scale(samples[usable], flat[usable])
-    held_out = usable & (np.random.default_rng(seed).random(usable.shape) < hold_out)
+    held_out = held_out_blocks(usable, hold_out, seed)
     if not (usable & ~held_out).any():
         held_out = np.zeros_like(usable)
     return Problem(

@@ -61,7 +61,8 @@ class Reconstruction:
     time_ns : the begin of each frame
     seconds : wall time, without ``compiled_s``, which compiling took: once after an installation
     processor_s : of all threads
-    iterations : fewer than ``iterations_asked`` where the budget, ``stop`` or the data ended it (``ended``)
+    iterations : all that were made, of trials too; those that ``iterations_asked`` limits may be fewer, where
+        the budget, ``stop`` or the data ended it (``ended``)
     frame_error : (time,) relative RMS residual of the samples that saw each frame; NaN where none did. It is
         no error of the frame, which may be many times larger; see `acquire.recon.judge.frame_error`
     masked : samples left out, by cause

@@ -46,7 +46,7 @@ def test_one_run_is_looked_at_on_its_way(judge, run):
     assert all(one.processor_s <= other.processor_s for one, other in pairwise(run.points))
     assert all(one.iterations <= other.iterations for one, other in pairwise(run.points))
     assert len(run.points) > 3
-    assert run.points[0].iterations == 1
+    assert 1 <= run.points[0].iterations < run.end.iterations
     assert run.end.psnr_db > run.points[0].psnr_db + 10
     assert run.end.frequency_error_hz < 60
     assert 0 <= run.end.amplitude_error < 0.5

@@ -139,8 +139,8 @@ def test_units_of_the_light_do_not_matter(factor: float) -> None:
 
 def test_a_budget_is_kept_and_progress_is_told() -> None:
     steps: list[Progress] = []
-    result = reconstruct(segment(), 3, 1, budget_s=1e-6, progress=steps.append)
-    assert result.iterations == len(steps) == 1
+    result = reconstruct(segment(), 3, 1, budget_s=1e-6, progress=steps.append, refuse=False)
+    assert 1 <= result.iterations == len(steps) <= 2
     assert steps[0].iterations == result.iterations_asked == 150
     assert result.ended == "budget"
 

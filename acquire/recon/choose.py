@@ -1,0 +1,109 @@
+"""The default: whichever prior predicts the held-out blocks best, then all samples.
+
+    still      one frame, total variation                         what rests, or light too weak for more
+    volume     few cosines, total variation of a volume           what moves; also times a free brightness
+    smooth     few cosines, quadratic in second differences       what flows
+    cosines    the whole band, total variation of coefficients    what blinks, then as patterns and curves
+
+A stronger prior is preferred to one that is not clearly better: noise that a weak one lets through hardly
+shows in the lines, which are sums. Nothing here sees the truth, and no weight is fixed: those in the code are
+where searches begin.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from acquire.arrays import host
+from acquire.recon.blinking import go_on, look_in_cosines, solve_blinking
+from acquire.recon.holdout import HeldOut
+from acquire.recon.patterns import find_patterns
+from acquire.recon.workbench import CALM, FIRST_ITERATIONS, SEARCH_SHARE, SMOOTH, STILL, VOLUME, Workbench
+
+if TYPE_CHECKING:
+    from acquire.lines import Segment
+    from acquire.recon.clock import IterationClock
+    from acquire.recon.estimates import Estimate, InBand
+    from acquire.recon.problem import Problem
+    from acquire.recon.request import Request
+    from acquire.recon.workbench import Trial
+
+ITERATIONS_PER_TRIAL = 10
+"""Of a preset's iterations, for each trial of a search."""
+OUTDONE = 0.6
+"""Of the others' held-out error, what cosines must stay below to spare the search for a better volume."""
+FAR = 1.25
+"""Of a volume's error, beyond which a smooth one is not searched."""
+SMOOTHER = 0.85
+"""Of a volume's error, what a smooth one must reach: a quadratic prior lets more noise through unseen."""
+CLEARLY = 0.97
+"""Of a still's error, what a volume must reach to be preferred."""
+CLOSE, DOUBTFUL = 1.1, 2.0
+"""Of the best trial's error: where cosines are gone on with, and where they are if patterns stand out."""
+
+
+def solve_admm(segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> Estimate:
+    """The chosen prior's video; as asked where the request fixes bandwidth, weight, denoiser or start."""
+    held_out = HeldOut(problem, segment.geometry)
+    asked = (request.denoiser, request.tv_weight, request.bandwidth, request.initial)
+    if not held_out or any(each is not None for each in asked):
+        return solve_blinking(segment, problem, request, clock)
+    bench = Workbench(segment, problem, request, clock, held_out)
+    trials = max(4, request.iterations // ITERATIONS_PER_TRIAL)
+    still = bench.climb(bench.attempt(STILL, FIRST_ITERATIONS), trials)
+    if bench.frames == 1:
+        return bench.finish(still)
+    if clock.spent(SEARCH_SHARE):
+        clock.shortcuts.append("the budget left no time to look for what changes: the video is a still")
+        return bench.finish(still)
+    volume = bench.attempt(bench.fitting(VOLUME), FIRST_ITERATIONS)
+    if clock.spent(SEARCH_SHARE):
+        clock.shortcuts.append("the budget left no time to try more than a still and one kind of motion")
+        return bench.finish(_better(volume, still))
+    first = look_in_cosines(segment, problem, request, clock)
+    bench.note({"prior": "cosines"} | first.facts(), first.predict())
+    best = _better(_moving(bench, still, volume, first, trials), still)
+    if not _worth_going_on(bench, first, best):
+        return bench.finish(best)
+    blinking = go_on(segment, problem, request, clock, first)
+    errors = bench.note({"prior": "patterns"} | blinking.facts(), blinking.predict())
+    return Told(blinking, bench.record) if held_out.clearly_less(errors, best.errors) else bench.finish(best)
+
+
+class Told:
+    """An estimate with the candidates that it was preferred to."""
+
+    def __init__(self, estimate: Estimate, record: list[dict[str, Any]]) -> None:
+        self._estimate, self._record, self.held_out_error = estimate, record, estimate.held_out_error
+        self.predict, self.video = estimate.predict, estimate.video
+
+    def facts(self) -> dict[str, Any]:
+        return self._estimate.facts() | {"prior": "cosines", "candidates": self._record}
+
+
+def _better(moving: Trial, still: Trial) -> Trial:
+    return moving if moving.error < CLEARLY * still.error else still
+
+
+def _moving(bench: Workbench, still: Trial, volume: Trial, first: InBand, trials: int) -> Trial:
+    """The best of volumes, smooth ones and those of changing brightness."""
+    calm = bench.attempt(bench.fitting(CALM), FIRST_ITERATIONS, still)
+    bright = bench.brighten(still, first.basis.count)
+    volume = min([volume, calm, bright or calm], key=lambda trial: trial.error)
+    smooth = bench.attempt(bench.fitting(SMOOTH), FIRST_ITERATIONS)
+    if bench.error(first.predict()) < OUTDONE * min(volume.error, smooth.error):
+        return volume
+    volume = bench.climb(volume, trials)
+    if smooth.error < FAR * volume.error:
+        smooth = bench.climb(smooth, trials)
+    return smooth if smooth.error < SMOOTHER * volume.error else volume
+
+
+def _worth_going_on(bench: Workbench, first: InBand, best: Trial) -> bool:
+    """Whether a first look in the cosines, which more iterations and patterns would improve, may yet win."""
+    error = bench.error(first.predict())
+    if error < CLOSE * best.error:
+        return True
+    if error > DOUBTFUL * best.error:
+        return False
+    return find_patterns(host(first.solver.theta), beyond_doubt=True) is not None

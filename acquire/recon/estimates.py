@@ -1,0 +1,75 @@
+"""What solvers end with: a video and the lines that it predicts, however they hold it."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any, Protocol
+
+from acquire.arrays import host
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.recon.admm import Admm, AdmmParameters
+    from acquire.recon.basis import Basis
+    from acquire.recon.patterns import Refinement
+    from acquire.recon.problem import Operator, Problem
+    from acquire.recon.twist import Twist, TwistParameters
+
+
+class Estimate(Protocol):
+    """A solver's state of knowledge: dimensionless video, and the lines that it predicts."""
+
+    held_out_error: float | None
+    """Relative error of the samples held out while they were; None: that of `predict`."""
+
+    def predict(self) -> NDArray[Any]: ...
+
+    def video(self) -> NDArray[Any]: ...
+
+    def facts(self) -> dict[str, Any]: ...
+
+
+class InBand:
+    """Coefficient frames of an iterative solver as an estimate."""
+
+    held_out_error: float | None = None
+
+    def __init__(
+        self,
+        solver: Admm | Twist,
+        operator: Operator,
+        basis: Basis,
+        problem: Problem,
+        parameters: AdmmParameters | TwistParameters,
+    ) -> None:
+        self.solver, self._parameters = solver, parameters
+        self.basis, self._operator, self._problem = basis, operator, problem
+
+    def predict(self) -> NDArray[Any]:
+        return host(self._operator.forward(self.solver.theta)) / self._problem.norm
+
+    def video(self) -> NDArray[Any]:
+        return host(self.basis.synthesize(self.solver.theta))
+
+    def facts(self) -> dict[str, Any]:
+        return {"temporal_coefficients": self.basis.count} | asdict(self._parameters)
+
+
+class Refined:
+    """A refinement as an estimate."""
+
+    held_out_error: float | None = None
+
+    def __init__(self, refinement: Refinement, coefficients: int) -> None:
+        self._refinement, self._coefficients = refinement, coefficients
+
+    def predict(self) -> NDArray[Any]:
+        return self._refinement.predict()
+
+    def video(self) -> NDArray[Any]:
+        return self._refinement.video()
+
+    def facts(self) -> dict[str, Any]:
+        found = {"temporal_coefficients": self._coefficients, "patterns": self._refinement.rank}
+        return found | asdict(self._refinement.parameters)

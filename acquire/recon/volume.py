@@ -1,0 +1,149 @@
+"""Total variation of a video as a volume: a prior for what moves, in place of that of coefficient frames.
+
+    TV₃(x) = Σ √( (∂x/∂row)² + (∂x/∂column)² + (μ·∂x/∂t)² )
+
+over as many instants as there are cosines. An edge that moves is one surface in that volume and costs no more
+than one at rest, while its coefficients are all busy; what blinks in place costs twice its contrast at every
+turn. So it serves moving things, and coefficient frames (`tv.FrameTv`) those that blink. ``pace`` is μ: the
+higher, the less a scene may change.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+from array_api_compat import is_numpy_array
+
+from acquire.arrays import Arrays, namespace
+from acquire.errors import UsageError
+from acquire.recon.basis import TemporalBasis
+from acquire.recon.kernels import SMALLEST_WEIGHT, volume_prox, volume_prox_parallel
+
+if TYPE_CHECKING:
+    from acquire.arrays import Array
+
+PARALLEL_VOXELS = 1 << 20
+"""From here on, two threads are faster than one, also where another program has a core."""
+
+
+class VolumeTv:
+    """Isotropic 3-D TV of the first K cosines' volume on K instants, as a denoiser of their coefficients.
+
+    Between coefficients and instants lies an orthonormal transform, so that the prox of one is the prox of
+    the other. ``prox`` is approximate: ``iterations`` of fast gradient projection (Beck and Teboulle, IEEE
+    Trans. Image Process. 18, 2419 (2009)) from where the last call ended.
+    """
+
+    def __init__(self, pace: float = 1.0, iterations: int = 6) -> None:
+        if not 0 <= pace < math.inf:
+            raise UsageError(f"pace {pace} of a volume's total variation", possible="a number of at least 0")
+        if iterations < 1:
+            raise UsageError(f"{iterations} iterations of the TV prox", possible="1 or more")
+        self.pace, self.iterations = pace, iterations
+        self._dual: Array = None
+        self._instants: Array = None
+
+    def resume(self, other: VolumeTv) -> None:
+        """Begin with the dual field of another, of whatever pace."""
+        self._instants = other._instants
+        self._dual = None if other._dual is None else namespace(other._dual).asarray(other._dual, copy=True)
+
+    def prox(self, frames: Array, weight: float | Array) -> Array:
+        """argmin_θ ½‖θ − frames‖² + weight·TV₃(Dᵀ·θ) for coefficients (K, row, column); one weight."""
+        xp, weight = namespace(frames), _one(weight)
+        if weight < SMALLEST_WEIGHT:
+            return frames
+        if self._dual is None:
+            self._dual = xp.stack([xp.zeros_like(frames)] * 3)
+            count = frames.shape[0]
+            matrix = TemporalBasis(count, count, Arrays(dtype="float64")).matrix()
+            self._instants = xp.asarray(matrix, dtype=frames.dtype, device=frames.device)
+        volume = xp.tensordot(self._instants.T, frames, axes=1)
+        if is_numpy_array(volume):
+            cleaned = np.empty_like(volume)
+            clean = volume_prox if volume.size < PARALLEL_VOXELS else volume_prox_parallel
+            clean(volume, weight, self.pace, self._dual, self.iterations, cleaned)
+        else:
+            cleaned = self._prox_of_any(volume, weight)
+        return xp.tensordot(self._instants, cleaned, axes=1)
+
+    def _prox_of_any(self, volume: Array, weight: float) -> Array:
+        """As `kernels.volume_prox`, in the standard's operations."""
+        xp, scales = namespace(volume), (1.0, 1.0, self.pace)
+        step, momentum = 1 / ((8 + 4 * self.pace**2) * weight), 1.0
+        dual, ahead = self._dual, self._dual
+        for _ in range(self.iterations):
+            x = volume + weight * _divergence(ahead, scales)
+            new = ahead + step * xp.stack([k * _ahead(x, axis) for axis, k in _axes(scales)])
+            new = new / xp.maximum(xp.sqrt(xp.sum(new**2, axis=0)), 1)
+            following = (1 + math.sqrt(1 + 4 * momentum**2)) / 2
+            ahead = new + ((momentum - 1) / following) * (new - dual)
+            dual, momentum = new, following
+        self._dual = dual
+        return volume + weight * _divergence(dual, scales)
+
+
+def _only(axis: int, at: int) -> tuple[slice, ...]:
+    """The first (0) or last (−1) layer along an axis of a volume."""
+    return tuple(slice(at, at + 1 or None) if each == axis else slice(None) for each in range(3))
+
+
+def _one(weight: float | Array) -> float:
+    """A weight that may come as an array of one number."""
+    return weight if isinstance(weight, float) else float(namespace(weight).max(weight))
+
+
+def _axes(scales: tuple[float, float, float]) -> tuple[tuple[int, float], ...]:
+    """Axes of a volume (t, row, column) in the order of the dual's parts, with their scales."""
+    return tuple(zip((1, 2, 0), scales, strict=True))
+
+
+def _ahead(x: Array, axis: int) -> Array:
+    """x_{i+1} − x_i along an axis, 0 at its end."""
+    return namespace(x).diff(x, axis=axis, append=x[_only(axis, -1)])
+
+
+def _divergence(dual: Array, scales: tuple[float, float, float]) -> Array:
+    """The negative transpose of the scaled differences, for a dual that is 0 at its ends."""
+    xp, total = namespace(dual), 0.0
+    for index, (axis, scale) in enumerate(_axes(scales)):
+        part = dual[index, ...]
+        none = xp.zeros_like(part[_only(axis, 0)])
+        total = total + scale * xp.diff(part, axis=axis, prepend=none)
+    return total
+
+
+class Smooth:
+    """Quadratic penalty of second differences along rows, columns and time: a prior for flames and fog.
+
+        weight/2·‖(∂²/∂row² + ∂²/∂column² + (μ·∂/∂t)²)·x‖²
+
+    In cosines of space and time, which coefficients are already, it is a number each (Wiener's filter).
+    """
+
+    def __init__(self, pace: float = 1.0) -> None:
+        if not 0 <= pace < math.inf:
+            raise UsageError(f"pace {pace} of a smooth volume", possible="a number of at least 0")
+        self.pace = pace
+        self._cosines: tuple[Array, Array] | None = None
+
+    def prox(self, frames: Array, weight: float | Array) -> Array:
+        """argmin_θ ½‖θ − frames‖² + weight/2·Σ (k_r² + k_c² + μ²·k_t²)²·θ̂² for θ (K, row, column)."""
+        xp, weight = namespace(frames), _one(weight)
+        if self._cosines is None:
+            self._cosines = self._prepare(frames)
+        along, square = self._cosines
+        spectrum = along @ frames @ along.T
+        return along.T @ (spectrum / (1 + weight * square)) @ along if weight else xp.asarray(frames)
+
+    def _prepare(self, frames: Array) -> tuple[Array, Array]:
+        """The cosines of a frame's side (n′, n′), and (k_r² + k_c² + μ²·k_t²)² for each coefficient."""
+        xp, (count, side, _) = namespace(frames), frames.shape
+        k = np.square(np.pi * np.arange(side) / side)
+        t = np.square(self.pace * np.pi * np.arange(count) / side)
+        square = np.square(t[:, None, None] + k[:, None] + k)
+        matrix = TemporalBasis(side, side, Arrays(dtype="float64")).matrix()
+        made = [xp.asarray(each, dtype=frames.dtype, device=frames.device) for each in (matrix, square)]
+        return made[0], made[1]

@@ -1,0 +1,316 @@
+"""Where candidates for the prior are tried: solved for a while, and scored by the held-out blocks.
+
+A search changes one thing of a candidate at a time (weight λ, pace μ, number of cosines), and each trial
+begins where the best ended. A scene whose brightness changes as a whole is tried as a volume times that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from acquire.arrays import host
+from acquire.recon.admm import Admm, AdmmParameters
+from acquire.recon.band import band_operator
+from acquire.recon.basis import TemporalBasis
+from acquire.recon.brightness import fit_brightness
+from acquire.recon.tv import FrameTv
+from acquire.recon.volume import Smooth, VolumeTv
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+
+    from acquire.arrays import Array
+    from acquire.lines import Segment
+    from acquire.recon.clock import IterationClock
+    from acquire.recon.denoisers import Denoiser
+    from acquire.recon.holdout import HeldOut
+    from acquire.recon.problem import Operator, Problem
+    from acquire.recon.request import Request
+
+FIRST_ITERATIONS, NEXT_ITERATIONS = 30, 25
+"""Of a trial from nothing, and of one that begins where another ended."""
+LAST_ITERATIONS = 15
+"""Of the best, with all samples."""
+SEARCH_SHARE = 0.6
+"""Of a budget, the most that the search may take."""
+COSINES = (8, 12, 16, 24, 36, 54)
+LEAST_PACE, LARGEST_PACE = 0.25, 64.0
+LEAST_WEIGHT, LARGEST_WEIGHT = 1e-7, 1e3
+WEIGHT_STEP, PACE_STEP = 10**0.5, 4.0
+LEAST_GAIN = 0.02
+"""Relative gain of the prediction below which a weaker prior is no better; a stronger one need only be as
+good."""
+BRIGHT_STILLS, BRIGHT_ROUNDS = 2, 8
+"""Fits of a scene's brightness beside a still, and beside a volume."""
+BRIGHTER = 0.85
+"""Of a still's error, what one of changing brightness must reach to be followed up."""
+USUAL_FRAMES = 980
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """A prior and how much of it: K cosines, weight λ, pace μ of a volume's time."""
+
+    prior: Literal["still", "smooth", "volume"]
+    coefficients: int
+    weight: float
+    pace: float = 0.0
+    brightness: bool = False
+
+
+STILL = Candidate("still", 1, 2e-3)
+SMOOTH = Candidate("smooth", 24, 3e-3, 1.0)
+VOLUME = Candidate("volume", 24, 2e-3, 4.0)
+CALM = Candidate("volume", 24, 2e-3, 16.0)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trial:
+    """A candidate as far as it has been solved; ``errors`` are those of the held-out blocks."""
+
+    candidate: Candidate
+    admm: Admm
+    denoiser: Denoiser
+    basis: TemporalBasis
+    operator: Operator
+    brightness: NDArray[Any] | None
+    errors: NDArray[np.float64]
+    error: float
+
+
+class Workbench:
+    """Tries candidates on one problem and keeps a record of them."""
+
+    def __init__(
+        self, segment: Segment, problem: Problem, request: Request, clock: IterationClock, held_out: HeldOut
+    ) -> None:
+        self._segment, self._problem, self._request = segment, problem, request
+        self._clock, self.held_out = clock, held_out
+        self._merges = (request.spatial_merge, request.temporal_merge)
+        self.frames, self._side, _ = segment.geometry.video_shape(*self._merges)
+        self._brightness: NDArray[Any] | None = None
+        self._operators: dict[tuple[int, bool], Operator] = {}
+        self.record: list[dict[str, Any]] = []
+        self._best: Trial | None = None
+
+    def brighten(self, still: Trial, cosines: int) -> Trial | None:
+        """A calm volume times the brightness of the whole scene, found in turn; None where there is none."""
+        lit = still
+        for _ in range(BRIGHT_STILLS if not self._clock.spent(SEARCH_SHARE) else 0):
+            self._fit_brightness(lit, cosines)
+            lit = self.attempt(replace(still.candidate, brightness=True), FIRST_ITERATIONS)
+        if not lit.error < BRIGHTER * still.error:
+            return None
+        best = lit = self.attempt(replace(self.fitting(CALM), brightness=True), FIRST_ITERATIONS, lit)
+        for _ in range(BRIGHT_ROUNDS):
+            self._fit_brightness(lit, cosines)
+            lit = self.attempt(lit.candidate, NEXT_ITERATIONS, lit)
+            if not lit.error < (1 - LEAST_GAIN) * best.error:
+                break
+            best = lit
+        self._brightness = best.brightness
+        self._operators = {key: kept for key, kept in self._operators.items() if not key[1]}
+        return best
+
+    def _fit_brightness(self, trial: Trial, cosines: int) -> None:
+        """The brightness that goes with a trial's video from now on."""
+        video = np.maximum(self.video(trial), 0)
+        light = np.ones(self.frames) if trial.brightness is None else trial.brightness
+        found = light * fit_brightness(self._segment, self._problem, video, self._merges, cosines)
+        self._brightness = found / found.mean()
+        self._operators = {key: kept for key, kept in self._operators.items() if not key[1]}
+
+    def fitting(self, candidate: Candidate) -> Candidate:
+        """The candidate with no more cosines than there are frames."""
+        return replace(candidate, coefficients=min(candidate.coefficients, self.frames))
+
+    def attempt(self, candidate: Candidate, iterations: int, start: Trial | None = None) -> Trial:
+        """Solve a candidate for so many iterations, or as many as there is time for, from ``start``."""
+        basis = TemporalBasis(self.frames, candidate.coefficients, self._problem.arrays)
+        brightness = self._brightness if candidate.brightness else None
+        operator = self._operator(basis, brightness)  # kept: neighbours mostly share it
+        shape, denoiser = (basis.count, self._side, self._side), _denoiser(candidate)
+        admm = Admm(
+            self._problem.masked(operator),
+            self._problem.used_samples,
+            shape,
+            basis,
+            parameters(candidate, self.frames),
+            start=None if start is None else _resized(start.admm.theta, basis),
+            denoiser=denoiser,
+        )
+        if start is not None and start.candidate.coefficients == candidate.coefficients:
+            admm.resume(start.admm)
+            if isinstance(denoiser, VolumeTv) and isinstance(start.denoiser, VolumeTv):
+                denoiser.resume(start.denoiser)
+        trial = Trial(candidate, admm, denoiser, basis, operator, brightness, np.zeros(0), np.inf)
+        return self.go_on(trial, iterations)
+
+    def go_on(self, trial: Trial, iterations: int) -> Trial:
+        """More iterations of a trial."""
+        began = self._clock.seconds
+        for _ in self._clock.attempt(iterations, "choose", SEARCH_SHARE):
+            trial.admm.step()
+        errors = self.note(asdict(trial.candidate), self.predict(trial), began)
+        trial = replace(trial, errors=errors, error=self.held_out.relative(errors))
+        if self._best is None or trial.error < self._best.error:
+            self._best = trial
+            self._clock.show("choose", partial(self.video, trial))
+        return trial
+
+    def note(
+        self, candidate: dict[str, Any], predicted: NDArray[Any], began: float | None = None
+    ) -> NDArray[np.float64]:
+        """The errors of a prediction, and a record of it."""
+        errors = self.held_out.errors(predicted)
+        seconds = {} if began is None else {"seconds": self._clock.seconds - began}
+        self.record.append(candidate | {"error": self.held_out.relative(errors)} | seconds)
+        return errors
+
+    def error(self, predicted: NDArray[Any]) -> float:
+        """Relative error of the held-out blocks."""
+        return self.held_out.relative(self.held_out.errors(predicted))
+
+    def video(self, trial: Trial) -> NDArray[Any]:
+        """Of a trial, dimensionless."""
+        video = host(trial.basis.synthesize(trial.admm.theta))
+        light = trial.brightness
+        return video if light is None else video * light[:, None, None].astype(video.dtype)
+
+    def predict(self, trial: Trial) -> NDArray[Any]:
+        """The lines of a trial, as `Problem.samples`."""
+        return host(trial.operator.forward(trial.admm.theta)) / self._problem.norm
+
+    def climb(self, best: Trial, trials: int) -> Trial:
+        """Change one thing of a candidate at a time, in steps, for as long as the prediction gets better."""
+        seen = {best.candidate}
+        moving = True
+        while moving:
+            moving = False
+            for step in self._steps(best.candidate):
+                while (candidate := step(best.candidate)) is not None and candidate not in seen:
+                    if len(seen) > trials or self._clock.spent(SEARCH_SHARE):
+                        return best
+                    seen.add(candidate)
+                    found = self.attempt(candidate, NEXT_ITERATIONS, best)
+                    gain = 0.0 if _stronger(candidate, best.candidate) else LEAST_GAIN
+                    if not found.error < (1 - gain) * best.error:
+                        break
+                    best, moving = found, True
+        return best
+
+    def _steps(self, candidate: Candidate) -> Sequence[Callable[[Candidate], Candidate | None]]:
+        """Ways to change a candidate; each gives None where there is nowhere to go."""
+        factor = WEIGHT_STEP**2 if candidate.prior == "smooth" else WEIGHT_STEP
+        weights = [partial(_weighed, by) for by in (1 / factor, factor)]
+        if candidate.prior == "still":
+            return weights
+        stride = PACE_STEP if candidate.prior == "volume" else 2.0
+        paces = [partial(_paced, by) for by in (1 / stride, stride)]
+        return [*weights, *paces, partial(self._resized, 1), partial(self._resized, -1)]
+
+    def _resized(self, by: int, candidate: Candidate) -> Candidate | None:
+        sizes = sorted({min(count, self.frames) for count in COSINES})
+        at = sizes.index(candidate.coefficients) + by
+        return replace(candidate, coefficients=sizes[at]) if 0 <= at < len(sizes) else None
+
+    def finish(self, best: Trial) -> Chosen:
+        """The best with all samples, which none were kept back for."""
+        whole = self._problem.whole()
+        admm = Admm(
+            whole.masked(best.operator),
+            whole.used_samples,
+            best.admm.theta.shape,
+            best.basis,
+            parameters(best.candidate, self.frames),
+            denoiser=best.denoiser,
+        )
+        admm.resume(best.admm)
+        last = replace(best, admm=admm)
+        for _ in self._clock.run(LAST_ITERATIONS, "solve", video=partial(self.video, last)):
+            admm.step()
+        if self._clock.ended == "done":
+            self._clock.converged()
+        return Chosen(self, last)
+
+    def _operator(self, basis: TemporalBasis, brightness: NDArray[Any] | None) -> Operator:
+        key, segment = (basis.count, brightness is not None), self._segment
+        if key not in self._operators:
+            code: NDArray[Any] = segment.code
+            if brightness is not None:
+                code = code * np.repeat(brightness, self._merges[1])[: len(code)]
+            self._operators[key] = band_operator(
+                segment.geometry, code, basis, *self._merges, segment.alignment
+            )
+        return self._operators[key]
+
+
+class Chosen:
+    """The candidate that was chosen, as an estimate."""
+
+    def __init__(self, bench: Workbench, trial: Trial) -> None:
+        self._bench, self._trial = bench, trial
+        self.held_out_error: float | None = trial.error
+
+    def predict(self) -> NDArray[Any]:
+        return self._bench.predict(self._trial)
+
+    def video(self) -> NDArray[Any]:
+        return self._bench.video(self._trial)
+
+    def facts(self) -> dict[str, Any]:
+        chosen = asdict(self._trial.candidate)
+        chosen["temporal_coefficients"] = chosen.pop("coefficients")
+        return chosen | {"candidates": self._bench.record}
+
+
+def _denoiser(candidate: Candidate) -> Denoiser:
+    if candidate.prior == "still":
+        return FrameTv(10)
+    return VolumeTv(candidate.pace) if candidate.prior == "volume" else Smooth(candidate.pace)
+
+
+def _stronger(one: Candidate, other: Candidate) -> bool:
+    """Whether one candidate leaves the video less freedom than another that differs in one thing."""
+    return one.weight > other.weight or one.pace > other.pace or one.coefficients < other.coefficients
+
+
+def _weighed(by: float, candidate: Candidate) -> Candidate | None:
+    weight = float(f"{candidate.weight * by:.3g}")
+    return replace(candidate, weight=weight) if LEAST_WEIGHT <= weight <= LARGEST_WEIGHT else None
+
+
+def _paced(by: float, candidate: Candidate) -> Candidate | None:
+    pace = candidate.pace * by
+    return replace(candidate, pace=pace) if LEAST_PACE <= pace <= LARGEST_PACE else None
+
+
+def parameters(candidate: Candidate, frames: int) -> AdmmParameters:
+    """The solver's, for a video of so many frames: coefficients, and with them λ, grow with their root."""
+    weight = candidate.weight * (frames / USUAL_FRAMES) ** 0.5
+    if candidate.prior == "still":
+        # all sub-steps add up in one frame: its mean light outweighs a detail thousands of times
+        penalty, steps = weight, 8 if candidate.weight > 1e-4 else 20
+    else:
+        penalty = 2e-3 if candidate.prior == "smooth" else 2e-3 * (candidate.weight / 1e-3) ** 0.5
+        steps = 2
+    return AdmmParameters(
+        tv_weight=weight,
+        tv_penalty=penalty,
+        sign_penalty=0.3 * penalty,
+        gradient_steps=steps,
+        preconditioned=True,
+    )
+
+
+def _resized(theta: Array, basis: TemporalBasis) -> Array:
+    """Coefficients of another number of cosines."""
+    xp, kept = basis.arrays.xp, theta[: min(basis.count, theta.shape[0]), ...]
+    missing = basis.arrays.zeros((basis.count - kept.shape[0], *theta.shape[1:]))
+    return xp.concat([kept, missing])

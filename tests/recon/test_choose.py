@@ -1,0 +1,131 @@
+"""The default chooses its prior without the truth: what moves, rests, blinks or flickers, with noise."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from recon_cases import cases
+
+from acquire.codes import mix_seed, prbs
+from acquire.evaluate.metrics import psnr
+from acquire.forward import DualArm, merge_video
+from acquire.geometry import Geometry
+from acquire.lines import Segment
+from acquire.recon import reconstruct
+from acquire.recon.band import BandOperator
+from acquire.recon.basis import TemporalBasis
+from acquire.recon.brightness import fit_brightness
+from acquire.recon.holdout import HeldOut
+from acquire.recon.problem import pose
+
+GEOMETRY = Geometry(16, 3, 120)
+CODE = prbs(31, mix_seed(5, 31), 0, GEOMETRY.span)
+FULL_WELL_E, READ_NOISE_E = 1e4, 10.0
+BRIGHTNESS = 1 + 0.6 * np.sin(2 * np.pi * 7 * np.arange(GEOMETRY.span) / GEOMETRY.span)
+
+
+def ground() -> np.ndarray:
+    rng = np.random.default_rng(1)
+    return 0.4 + 0.5 * rng.integers(0, 2, (8, 8)).repeat(6, axis=0).repeat(6, axis=1)
+
+
+def light(kind: str) -> np.ndarray:
+    n, y, x = GEOMETRY.size, *np.meshgrid(*[np.arange(GEOMETRY.size)] * 2, indexing="ij")
+    time = np.linspace(0, 1, GEOMETRY.span)
+    if kind == "still":
+        return np.broadcast_to(ground(), (GEOMETRY.span, n, n)).astype(np.float32)
+    if kind == "flicker":
+        return (BRIGHTNESS[:, None, None] * ground()).astype(np.float32)
+    ball = [np.hypot(y - 24, x - (8 + 32 * t)) < 7 for t in time]
+    return np.where(ball, 0.9, 0.1 if kind == "moving" else ground()).astype(np.float32)
+
+
+@cache
+def segment(kind: str, full_well_e: float = FULL_WELL_E) -> Segment:
+    rng = np.random.default_rng(9)
+    exact = DualArm(GEOMETRY, CODE).forward(light(kind)).astype(np.float64)
+    per_e = full_well_e / exact.max()
+    electrons = rng.poisson(exact * per_e) + READ_NOISE_E * rng.standard_normal(exact.shape)
+    return Segment(
+        lines=electrons.astype(np.float32),
+        mask=np.ones(exact.shape, bool),
+        code=CODE,
+        geometry=GEOMETRY,
+        time_ns=np.arange(GEOMETRY.lines) * 30_000,
+        responsivity_dn=per_e,
+    )
+
+
+def quality_db(kind: str, video: np.ndarray) -> float:
+    frames = GEOMETRY.trusted_frames(1)
+    return psnr(video[frames], merge_video(light(kind), 3, 1)[frames].astype(np.float32))
+
+
+@pytest.mark.parametrize(("kind", "prior", "least_db"), [("moving", "volume", 27), ("still", "still", 30)])
+def test_the_prior_suits_the_scene(kind: str, prior: str, least_db: float) -> None:
+    result = reconstruct(segment(kind), 3, 1)
+    assert result.parameters["prior"] == prior
+    assert quality_db(kind, result.video) > least_db
+    tried = result.parameters["candidates"]
+    assert {"still", "volume", "smooth", "cosines"} <= {each["prior"] for each in tried}
+    assert result.quality.prediction <= min(each["error"] for each in tried) * 1.1
+
+
+def test_a_scene_that_flickers_as_a_whole_is_a_video_times_its_brightness() -> None:
+    result = reconstruct(segment("flicker"), 3, 1)
+    frames = GEOMETRY.trusted_frames(1)
+    seen = result.video[frames].mean((1, 2))
+    assert np.corrcoef(seen, BRIGHTNESS[frames])[0, 1] > 0.99
+    assert quality_db("flicker", result.video) > 22
+
+
+def test_less_light_ends_in_a_smoother_picture_and_not_in_noise() -> None:
+    weights = []
+    for full_well_e in (1e5, 1e3):
+        result = reconstruct(segment("still", full_well_e), 1, GEOMETRY.span)
+        weights.append(result.parameters["weight"])
+        rough = np.abs(np.diff(result.video[0], axis=0)).mean()
+        assert rough < 2 * np.abs(np.diff(ground(), axis=0)).mean()
+    assert weights[0] < weights[1]
+
+
+def test_brightness_is_found_with_the_picture_known() -> None:
+    problem = pose(segment("flicker"), 3, 1, hold_out=0.08)
+    picture = merge_video(light("still"), 3, 1).astype(np.float32) / problem.scale
+    found = fit_brightness(segment("flicker"), problem, picture, (3, 1), 40)
+    frames = GEOMETRY.trusted_frames(1)
+    wanted = BRIGHTNESS / BRIGHTNESS.mean()
+    assert np.abs(found - wanted)[frames].max() < 0.05
+
+
+@settings(max_examples=25, deadline=None)
+@given(case=cases())
+def test_the_near_inverse_is_that_of_either_arm_where_pixels_share_no_voxel(
+    case: tuple[Geometry, int, int, int, int],
+) -> None:
+    geometry, _, T_m, count, seed = case
+    rng = np.random.default_rng(seed)
+    code = rng.integers(0, 2, geometry.span).astype(np.uint8)
+    frames = geometry.video_shape(geometry.substeps, T_m)[0]
+    basis = TemporalBasis(frames, min(count, frames))
+    operator = BandOperator(geometry, code, basis, geometry.substeps, T_m)
+    lines = np.zeros(geometry.lines_shape, np.float32)
+    lines[0] = rng.standard_normal(lines[0].shape)
+    damping = 0.5
+    back = operator.near_inverse(damping)(lines)
+    again = operator.forward(operator.adjoint(np.stack([back[0], 0 * back[0]])))[0] + damping * back[0]
+    np.testing.assert_allclose(again, lines[0], atol=2e-3 * max(1.0, float(np.abs(back).max())))
+
+
+def test_blocks_that_see_what_nobody_is_shown_do_not_count() -> None:
+    problem = pose(segment("still"), 3, 1, hold_out=0.3)
+    held_out = HeldOut(problem, GEOMETRY)
+    wrong = problem.samples.copy()
+    wrong[:, 0] += 1  # this line ends where the trusted interval begins
+    assert held_out.relative(held_out.errors(wrong)) < 0.02 * held_out.relative(
+        held_out.errors(problem.samples + 1)
+    )
+    assert held_out.clearly_less(held_out.errors(problem.samples), held_out.errors(problem.samples + 1))
