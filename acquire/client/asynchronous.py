@@ -184,7 +184,7 @@ class AsyncClient:
         """The answer's status, then its content as it comes. ``limit_s`` bounds each wait."""
         reader, writer = await self._connect()
         http = h11.Connection(h11.CLIENT)
-        sent = {"Host": "acquire", **headers} | ({"Content-Length": str(len(body))} if body else {})
+        sent = headers | ({"Content-Length": str(len(body))} if body else {})
         try:
             writer.write(
                 http.send(h11.Request(method=method, target=path, headers=list(sent.items()))) or b""

@@ -94,7 +94,10 @@ class Target:
         return f"/{below}" if self.socket is not None else f"{API}/{below}"
 
     def headers(self) -> dict[str, str]:
-        return {"Authorization": f"Bearer {self.token}"} if self.token else {}
+        """With the name that it is asked for by, which a page insists on."""
+        host = f"[{self.host}]" if ":" in self.host else self.host
+        named = {"Host": host if self.socket is not None else f"{host}:{self.port}"}
+        return named | ({"Authorization": f"Bearer {self.token}"} if self.token else {})
 
 
 @dataclass(frozen=True, slots=True)

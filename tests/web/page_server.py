@@ -17,7 +17,7 @@ END_S = 300.0
 def address_in(log: Path) -> str:
     """The latest that the log names."""
     deadline = time.monotonic() + END_S
-    while not (found := re.findall(r"the operator's page: (http://\S+/)", log.read_text())):
+    while not (found := re.findall(r"the operator's page: (https?://\S+/)", log.read_text())):
         assert time.monotonic() < deadline, log.read_text()
         time.sleep(0.02)
     return found[-1]
@@ -26,9 +26,9 @@ def address_in(log: Path) -> str:
 class PageServer:
     """``acquire web`` for a socket."""
 
-    def __init__(self, socket: Path, directory: Path) -> None:
+    def __init__(self, socket: Path, directory: Path, **settings: object) -> None:
         self.log = directory / "web.log"
-        given = {"socket": str(socket), "directory": str(directory), "web": {"port": 0}}
+        given = {"socket": str(socket), "directory": str(directory), "web": {"port": 0, **settings}}
         with self.log.open("wb") as log:
             self.process = subprocess.Popen(
                 [sys.executable, "-m", "acquire", "web", "--owned", "--given", json.dumps(given)],
