@@ -119,13 +119,13 @@ class Changes:
     def of(self, status: Status) -> list[dict[str, Any]]:
         """Facts for `NewsLog.tell`. The daemon's own state is told by whoever changes it."""
         before, self._before = self._before, status
-        if before is None or before.run_id != status.run_id:
+        same_run = before is not None and before.run_id == status.run_id
+        if not same_run:
             self._lost.clear()
-            before = before if before is not None and before.run_id == status.run_id else None
         found = self._losses(status)
-        if before is not None:
+        if before is not None and same_run:
             found += _verdicts(before, status) + _segment(before, status)
-        found += self._disk_level(status)
+        found += self._disk_level(status) + _troubles(before, status)
         return found + _waiting(before, status) + _recoveries(before, status) + _uploads(before, status)
 
     def _disk_level(self, status: Status) -> list[dict[str, Any]]:
@@ -186,6 +186,12 @@ def _waiting(before: Status | None, after: Status) -> list[dict[str, Any]]:
     if now and not was:
         return [_fact("waiting", now, "warning")]
     return [_fact("waiting", "what was waited for has answered")] if was and not now else []
+
+
+def _troubles(before: Status | None, after: Status) -> list[dict[str, Any]]:
+    known = {one.text: one.times for one in before.troubles} if before else {}
+    new = [one for one in after.troubles if one.times > known.get(one.text, 0)]
+    return [_fact("trouble", one.text, "error") for one in new]
 
 
 def _recoveries(before: Status | None, after: Status) -> list[dict[str, Any]]:

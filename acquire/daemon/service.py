@@ -199,6 +199,7 @@ class Service:
             except Exception as error:  # noqa: BLE001 - told in the status; the capture comes first
                 self.troubles.note(name, error)
         self._disk.look(recording=self._state is State.RECORDING)
+        self.news.look(self.status())
         if self._run is None:
             return
         try:

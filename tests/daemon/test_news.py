@@ -140,6 +140,16 @@ def test_waiting_is_told_when_it_begins_and_ends() -> None:
     assert [one["text"] for one in changes.of(status())] == ["what was waited for has answered"]
 
 
+def test_what_was_told_is_not_told_again_when_a_run_begins() -> None:
+    changes = Changes()
+    recovered = {"path": "/d/x.zarr", "state": "recovered", "text": "killed"}
+    trouble = {"text": "oh", "times": 1, "last": "2026-01-01T00:00:00Z"}
+    facts = {"recoveries": [recovered], "troubles": [trouble]}
+    assert [one["kind"] for one in changes.of(status(run_id=None, **facts))] == ["trouble", "recovery"]
+    for run_id in ("a", None, "b"):
+        assert changes.of(status(run_id=run_id, **facts)) == []
+
+
 def test_a_disk_that_fills_is_told_once() -> None:
     changes = Changes(lambda: 0.0)
     assert changes.of(status(disk=disk(1e6))) == []
@@ -147,6 +157,16 @@ def test_a_disk_that_fills_is_told_once() -> None:
     (told,) = changes.of(status(disk=disk(100.0)))
     assert (told["kind"], told["level"], told["text"]) == ("disk", "error", "the disk is full in 2 min")
     assert changes.of(status(disk=disk(90.0))) == []
+
+
+def test_what_nobody_foresaw_is_told_every_time_it_happens(tmp_path: Path) -> None:
+    service = Service(rig_config(tmp_path), FakeRun)
+    for _ in range(2):
+        service.troubles.note("thread x", ValueError("oh"))
+        service.supervise()
+        service.supervise()
+    told = [one for one in service.news.after(None) if one.kind == "trouble"]
+    assert [(one.text, one.level) for one in told] == [("thread x: ValueError: oh", "error")] * 2
 
 
 def test_the_service_tells_states_marks_and_faults(tmp_path: Path) -> None:
