@@ -5,7 +5,8 @@ Usage: python tools/bench_diagnose.py [--seeds 11 12] [--scenes bullet …] [--f
 Every scene is recorded once per seed (scene, code and noise are of it), described rightly and wrongly, and
 diagnosed. `acquire.recon.search` was written looking at seeds 1 to 5: figures of these and of others are to
 be told apart. Prints what was said of each: ✓ named as it is, ? cannot tell, · nothing, u the code does not
-explain the lines, ✗ another fault; ! a level besides. Where all is right, any fault named is a false alarm.
+explain the lines, 2 one of two, ✗ another fault; ! a level besides. Where all is right, any fault named is
+a false alarm.
 
     seed      the code of another seed         swapped   arm A is called B
     inverted  every bit                        mirrored  arm B's pixels in the other order
@@ -79,6 +80,8 @@ def mark(found: Diagnosis, truth: Hypothesis | None) -> str:
         return "?" if found.standing is Standing.UNCLEAR else "·"
     if found.standing is Standing.UNEXPLAINED:
         return "✓" if truth is None else "u"
+    if truth is not None and found.alternative is not None and truth in (found.hypothesis, found.alternative):
+        return "2"
     return "✓" if found.hypothesis == truth else "✗"
 
 

@@ -24,6 +24,10 @@ def diagnose(
     recording: PlaceArgument,
     first_line: Annotated[int | None, typer.Option(help="The trigger's number; else the middle.")] = None,
     lines: Annotated[int | None, typer.Option(help="How many lines; else some hundreds.")] = None,
+    calibration: Annotated[
+        str | None,
+        typer.Option(metavar="CAL", help="Instead of the recording's own: NAME.zarr, or none."),
+    ] = None,
     json: JsonFlag = False,
 ) -> None:
     """Hold a recording's lines against its code, geometry and orientation, and say what is wrong.
@@ -35,12 +39,14 @@ def diagnose(
 
     Example: [bold]acquire diagnose run.zarr[/]
     """
+    from acquire.calibrate.choose import choose
     from acquire.reconstruct.diagnose import diagnose_recording, stretch
     from acquire.store import open_recording
 
     opened = open_recording(recording)
+    chosen = choose(opened, calibration)
     first, count = stretch(opened, first_line, lines)
-    found = diagnose_recording(opened, first, count)
+    found = diagnose_recording(opened, first, count, None if chosen is None else chosen.calibration)
     if json:
         print_json({"recording": str(opened), "first_line": first, "lines": count, **found.to_dict()})
     else:

@@ -18,7 +18,7 @@ from acquire.cli.recordings import PlaceArgument
 from acquire.errors import EXIT_INTERRUPTED, UsageError
 
 if TYPE_CHECKING:
-    from acquire.cli.reconstruct_request import Prepared
+    from acquire.cli.reconstruct_request import Asked, Prepared
     from acquire.plan_config import ReconstructionPlan
     from acquire.reconstruct import Options, Outcome, Request
     from acquire.store import Recording
@@ -91,6 +91,10 @@ def reconstruct(
     explain: Annotated[
         bool, typer.Option("--explain", help="Say what each part of the calibration gives, and costs.")
     ] = False,
+    try_orientations: Annotated[
+        bool,
+        typer.Option("--try-orientations", help="Arms swapped or mirrored, if the lines say so clearly."),
+    ] = False,
     preview: Annotated[bool, typer.Option("--preview", help="Coarse, in a second or two.")] = False,
     workers: Annotated[int | None, typer.Option(help="Processes at once; else one per core.")] = None,
     dask: Annotated[
@@ -144,6 +148,7 @@ def reconstruct(
     explained = explain_calibration(opened, chosen, asked, wanted=explain, json=json and out is None)
     if explained and not (out or auto):
         return
+    asked = _turned(opened, asked, wanted=try_orientations)
     prepared = prepare(opened, asked)
     if not json:
         _print_prepared(prepared)
@@ -171,6 +176,25 @@ def _check_something_asked(*wanted: object) -> None:
             "reconstruct needs --out, where the video goes",
             possible="--out NAME.zarr; --auto alone shows a plan, --explain what a calibration gives",
         )
+
+
+def _turned(recording: Recording, asked: Asked, *, wanted: bool) -> Asked:
+    """With the orientation that the lines bear out, where the evidence is clear; says so either way."""
+    if not wanted:
+        return asked
+    from acquire.recon.diagnosis import TURNED
+    from acquire.recon.hypotheses import AS_BUILT
+    from acquire.recon.search import Standing
+    from acquire.reconstruct.diagnose import diagnose_recording, stretch
+
+    first, count = stretch(recording, asked.first_line, asked.lines)
+    found = diagnose_recording(recording, first, count, asked.options.calibration)
+    turn = AS_BUILT if found.hypothesis is None else found.hypothesis.turn
+    if found.standing is Standing.NAMED and turn != AS_BUILT and found.alternative is None:
+        note(f"{TURNED[turn]}; reconstructed so")
+        return replace(asked, options=replace(asked.options, turn=turn))
+    note(f"orientation left as it is: {found.sentence}")
+    return asked
 
 
 def _beside(out: str, suffix: str) -> str:

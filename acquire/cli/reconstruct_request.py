@@ -94,7 +94,9 @@ def _requests(recording: Recording, asked: Asked) -> Prepared:
         raise UsageError("--plan, --segment, --auto and --preview exclude each other", possible="one of them")
     selection, whole = _select(recording, asked), ENDS[asked.ends]
     if asked.preview:
-        options = replace(asked.options, iterations=PREVIEW_ITERATIONS, bandwidth=PREVIEW_BANDWIDTH)
+        options = replace(
+            asked.options, iterations=PREVIEW_ITERATIONS, bandwidth=PREVIEW_BANDWIDTH, check=False
+        )
         return Prepared({"": _preview(selection, whole=whole)}, options)
     plan = _plan(recording, selection, asked)
     if plan is not None:

@@ -19,6 +19,7 @@ from acquire.recon.problem import pose
 from acquire.recon.request import Preset, Request, Solver, Stop, preset_iterations
 from acquire.recon.result import Look, Progress, Quality, Reconstruction
 from acquire.recon.solve import Lit, solve_twist
+from acquire.recon.told import Told, tell
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -54,6 +55,7 @@ def reconstruct(
     stop: Stop | None = None,
     refuse: bool = True,
     look: Callable[[Look], object] | None = None,
+    check: bool = True,
 ) -> Reconstruction:
     """Reconstruct the voxels X′ of a segment at N_m = ``spatial_merge``, T_m = ``temporal_merge`` (Eq. 5).
 
@@ -76,6 +78,7 @@ def reconstruct(
     device : ``"cpu"`` or ``"gpu"``, where iterations are made; see `acquire.arrays`
     stop : asked after every iteration; once set, the best so far is returned
     refuse : a budget that cannot be kept here; else as little as possible is done
+    check : where the lines are not explained, ask what would explain them (a second); see `recon.told`
     look : called after iterations, with what the answer would be if it ended there; its time does not count
 
     Raises
@@ -112,7 +115,7 @@ def reconstruct(
         if look is not None:
             clock.looks = _looking(look, problem, request)
         estimate = _solve(segment, problem, request, clock)
-        return _finish(segment, problem, request, estimate, clock)
+        return _finish(segment, problem, request, estimate, clock, check=check)
 
 
 def _solve(segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> Estimate:
@@ -133,7 +136,13 @@ def _scaled(video: NDArray[Any], problem: Problem, request: Request) -> NDArray[
 
 
 def _finish(
-    segment: Segment, problem: Problem, request: Request, estimate: Estimate, clock: IterationClock
+    segment: Segment,
+    problem: Problem,
+    request: Request,
+    estimate: Estimate,
+    clock: IterationClock,
+    *,
+    check: bool,
 ) -> Reconstruction:
     T_m = request.temporal_merge
     predicted = estimate.predict()
@@ -142,6 +151,8 @@ def _finish(
     prediction = problem.prediction_error(predicted) if held_out is None else held_out
     quality = Quality(problem.misfit(predicted), prediction, problem.coverage)
     trusted = segment.geometry.trusted_frames(T_m)
+    asked = check and request.static_image is None and clock.ended != "stopped"
+    told = tell(segment, quality, clock) if asked else Told()
     return Reconstruction(
         video=video,
         time_ns=segment.frame_time_ns(T_m),
@@ -155,8 +166,9 @@ def _finish(
         quality=quality,
         frame_error=frame_error(problem, predicted, segment.geometry, T_m),
         ended=clock.ended,
+        believed=told.believed,
         masked=problem.masked_by,
-        warnings=(*judge(segment, problem, quality, trusted), *clock.shortcuts),
+        warnings=(*judge(segment, problem, quality, trusted), *told.warnings, *clock.shortcuts),
         parameters={
             "spatial_merge": request.spatial_merge,
             "temporal_merge": T_m,

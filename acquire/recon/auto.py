@@ -73,6 +73,6 @@ def tempo(segment: Segment, progress: Callable[[float], object] | None = None) -
 
 def _error(segment: Segment, voxels: Voxels) -> float:
     quality = reconstruct(
-        segment, voxels.spatial_merge, voxels.temporal_merge, "fast", iterations=ITERATIONS
+        segment, voxels.spatial_merge, voxels.temporal_merge, "fast", iterations=ITERATIONS, check=False
     ).quality
     return quality.misfit if np.isnan(quality.prediction) else quality.prediction

@@ -47,7 +47,7 @@ class Row:
 class Diagnosis:
     """``standing`` of the description; ``sentence`` for people; ``hypothesis`` where one is named or right.
 
-    ``alternative`` is the best other one, where it cannot be told from what is said.
+    ``alternative`` is another that cannot be told from it.
     """
 
     standing: Standing
@@ -113,7 +113,10 @@ def _asked(witness: Witness) -> Diagnosis:
         return Diagnosis(inquiry.standing, sentence, rows, (), inquiry.said.hypothesis, hypothesis)
     witness.settle(hypothesis)
     found = tuple(suspicions(witness, hypothesis))
-    return Diagnosis(inquiry.standing, sentence, rows, found, hypothesis)
+    rival = inquiry.rival if inquiry.standing is Standing.NAMED else None
+    return Diagnosis(
+        inquiry.standing, sentence, rows, found, hypothesis, None if rival is None else rival.hypothesis
+    )
 
 
 def sentence_of(inquiry: Inquiry) -> str:
@@ -122,9 +125,12 @@ def sentence_of(inquiry: Inquiry) -> str:
         return UNEXPLAINED
     if inquiry.standing is Standing.RIGHT:
         return "the lines are what their description says: code, its place and the arms' orientation"
+    if inquiry.standing is Standing.UNCLEAR and inquiry.best.hypothesis == inquiry.said.hypothesis:
+        return "cannot tell: the lines follow a code, but the scene does not show the arms' place"
     words = name_of(inquiry.best.hypothesis)
     if inquiry.standing is Standing.NAMED:
-        return words
+        rival = inquiry.rival
+        return words if rival is None else f"{words}; or, as likely, {name_of(rival.hypothesis)}"
     return f"cannot tell whether all is as said, or {words}"
 
 

@@ -88,6 +88,11 @@ class Hypothesis:
     substeps: int | None = None
     strange: int = 0
 
+    @property
+    def changes(self) -> int:
+        """In how many points it differs from what is said."""
+        return self.inverted + (self.late != (0, 0)) + (self.turn != AS_BUILT)
+
 
 Said = tuple[bool, int, int, int]
 """A hypothesis without turn, of one arm, as `Witness` remembers it."""

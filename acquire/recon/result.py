@@ -65,6 +65,8 @@ class Reconstruction:
         the budget, ``stop`` or the data ended it (``ended``)
     frame_error : (time,) relative RMS residual of the samples that saw each frame; NaN where none did. It is
         no error of the frame, which may be many times larger; see `acquire.recon.judge.frame_error`
+    believed : False where the lines say that code, geometry or orientation are not the segment's: then no
+        frame is to be trusted, and ``warnings`` says what is wrong
     masked : samples left out, by cause
     warnings : what a user should know before believing the video, in sentences
     """
@@ -79,6 +81,7 @@ class Reconstruction:
     quality: Quality
     frame_error: NDArray[np.float32]
     ended: str = "done"
+    believed: bool = True
     masked: dict[str, int] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     compiled_s: float = 0.0

@@ -52,7 +52,8 @@ class Standing(StrEnum):
 class Candidate:
     """A hypothesis with its evidence.
 
-    ``contrast``: gain of its orientation over the others'; ``agreement``: that over what wrong codes reach;
+    ``contrast``: gain of its orientation over the others'; ``agreement``: that, or the gain, over what wrong
+    codes reach;
     ``beyond``: own evidence over that of wrong codes, in their standard deviations.
     """
 
@@ -89,6 +90,16 @@ class Inquiry:
     def best(self) -> Candidate:
         return self.candidates[0]
 
+    @property
+    def rival(self) -> Candidate | None:
+        """Another that is as likely as the best and says as little."""
+        for each in self.candidates[1:]:
+            alike = each.hypothesis.inverted == self.best.hypothesis.inverted
+            simple = each.hypothesis.changes <= self.best.hypothesis.changes
+            if alike and simple and each.verified and not clearly(self.best, each):
+                return each
+        return None
+
 
 def inquire(witness: Witness) -> Inquiry:
     """Try code, inversion, delays and orientations, and where none explains the lines, other S."""
@@ -99,8 +110,9 @@ def inquire(witness: Witness) -> Inquiry:
     witness.prior = USUAL
     substeps = max(others, key=lambda each: _contrast(witness, each).contrast).substeps
     other = _inquire(witness, substeps)
-    explained = other.best.agreement >= VERIFIED_ALONE and not other.best.hypothesis.inverted
-    if explained and _better(other.best, inquiry.best)[0] > CLEAR:
+    # nothing else may be wrong with it: with all delays to choose from, chance finds something
+    explained = other.best.agreement >= VERIFIED_ALONE and other.best.hypothesis.changes == 0
+    if explained and other.best.gain > inquiry.best.gain + CLEAR:
         return replace(other, standing=Standing.NAMED, said=inquiry.said)
     return inquiry
 
@@ -123,7 +135,7 @@ def _inquire(witness: Witness, substeps: int | None) -> Inquiry:
 def _standing(said: Candidate, found: tuple[Candidate, ...]) -> Standing:
     best = found[0]
     if not best.verified:
-        return Standing.UNEXPLAINED
+        return Standing.UNEXPLAINED if max(best.beyond, said.beyond) < BEYOND else Standing.UNCLEAR
     if best.hypothesis == said.hypothesis:
         return Standing.RIGHT
     if clearly(best, said):
@@ -155,14 +167,23 @@ def _search(witness: Witness, plain: Hypothesis) -> tuple[Candidate, tuple[Candi
     for start in _first_look(witness, plain)[:2]:
         climbed = _climb(witness, start.hypothesis)
         found.append(said if climbed == plain else strangers.judged(_contrast(witness, climbed)))
-    return said, tuple(sorted(found, key=lambda each: -each.gain))
+    return said, _simplest_first(found)
+
+
+def _simplest_first(found: list[Candidate]) -> tuple[Candidate, ...]:
+    """Best first; of those that cannot be told apart, the one that says least against the description."""
+    best = max(found, key=lambda each: each.gain)
+    equal = [each for each in found if each is best or not clearly(best, each)]
+    first = min(equal, key=lambda each: (each.hypothesis.changes, -each.gain))
+    return first, *sorted((each for each in found if each is not first), key=lambda each: -each.gain)
 
 
 @dataclass(frozen=True, slots=True)
 class Strangers:
-    """What codes reach that have nothing to do with the lines: ``contrast``, own evidence and its spread."""
+    """What codes reach that have nothing to do with the lines: contrast, gain, own evidence, its spread."""
 
     contrast: float
+    gain: float
     own: float
     spread: float
 
@@ -171,11 +192,15 @@ class Strangers:
         found = [_contrast(witness, replace(plain, strange=number)) for number in range(1, STRANGERS + 1)]
         own = np.array([each.evidence.own.sum() for each in found])
         contrast = max(each.contrast for each in found)
-        return cls(max(contrast, LEAST_CONTRAST), float(own.mean()), float(own.std(ddof=1)))
+        gain = max(each.gain for each in found)
+        floor = LEAST_CONTRAST
+        return cls(max(contrast, floor), max(gain, floor), float(own.mean()), float(own.std(ddof=1)))
 
     def judged(self, candidate: Candidate) -> Candidate:
         beyond = (float(candidate.evidence.own.sum()) - self.own) / max(self.spread, 1e-9)
-        return replace(candidate, agreement=candidate.contrast / self.contrast, beyond=beyond)
+        # a scene that looks the same turned has no contrast, and yet the arms agree on it
+        agreement = max(candidate.contrast / self.contrast, candidate.gain / self.gain)
+        return replace(candidate, agreement=agreement, beyond=beyond)
 
 
 def _first_look(witness: Witness, plain: Hypothesis) -> list[Candidate]:

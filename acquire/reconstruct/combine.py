@@ -16,6 +16,7 @@ import numpy as np
 from acquire import __version__
 from acquire.calibrate.choose import provenance
 from acquire.errors import AcquireError
+from acquire.recon.diagnosis import TURNED
 from acquire.recon.segments import Stitcher
 from acquire.reconstruct.budget import Budget
 from acquire.reconstruct.times import Times
@@ -204,6 +205,7 @@ def describe_parts(
         "segments": segments,
         "segments_asked": len(request.stretches),
         "calibration": provenance(options.calibration),
+        "turned": TURNED.get(options.turn),
         "versions": {"acquire": __version__},
     }
 

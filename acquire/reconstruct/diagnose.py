@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from acquire.calibrate import calibrated
 from acquire.codes import code_from_attrs
 from acquire.lines import ARMS
 from acquire.recon.diagnosis import Diagnosis, diagnose
@@ -18,6 +19,7 @@ from acquire.stream.lightcheck import Finding, Judge, Sight, Verdict, explain
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from acquire.calibrate import Calibration
     from acquire.lines import Segment
     from acquire.recon.segments import Stream
     from acquire.store import Recording
@@ -36,13 +38,22 @@ def stretch(recording: Recording, first_line: int | None, lines: int | None) -> 
     return stream.first_line + (0 if first_line is not None else (count - taken) // 2), taken
 
 
-def diagnose_recording(recording: Recording, first_line: int | None, lines: int | None) -> Diagnosis:
+def diagnose_recording(
+    recording: Recording,
+    first_line: int | None,
+    lines: int | None,
+    calibration: Calibration | None = None,
+) -> Diagnosis:
     """Which hypothesis explains the lines; where none near does, what the light check finds farther off.
+
+    Lines are read with the ``calibration``, as for a reconstruction.
 
     UsageError and DataError as `Recording.cut` raises them.
     """
     first, count = stretch(recording, first_line, lines)
     segment = recording.cut(first, count)
+    if calibration is not None:
+        segment = calibrated(segment, calibration)
     code = code_from_attrs(recording.attrs["code"])
     begin = segment.geometry.substeps * first
 

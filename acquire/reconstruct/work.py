@@ -10,6 +10,8 @@ import numpy as np
 
 from acquire.calibrate import calibrated
 from acquire.recon import reconstruct
+from acquire.recon.diagnosis import put_right
+from acquire.recon.hypotheses import AS_BUILT
 from acquire.recon.judge import POOR_MISFIT
 from acquire.store import open_recording
 
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     from acquire.arrays import Dtype
     from acquire.calibrate import Calibration
     from acquire.recon import Preset, Progress, Reconstruction, Solver
+    from acquire.recon.hypotheses import Turn
     from acquire.recon.segments import Grid, SubSegment
 
 LEAST_BUDGET_S = 0.05
@@ -29,7 +32,8 @@ LEAST_BUDGET_S = 0.05
 class Options:
     """How to solve; see `acquire.recon.reconstruct`. ``budget_s`` is for all that is asked for.
 
-    ``calibration`` is what lines are read with; None: as the cameras' configuration says.
+    ``calibration`` is what lines are read with; None: as the cameras' configuration says. ``turn`` is how the
+    arms are to be put right beyond that, and ``check`` whether what is not explained is looked into.
     """
 
     preset: Preset = "balanced"
@@ -40,6 +44,8 @@ class Options:
     dtype: Dtype = "float32"
     device: str = "cpu"
     calibration: Calibration | None = None
+    turn: Turn = AS_BUILT
+    check: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +89,7 @@ def solve(task: Task, watch: Watch) -> Part:
     lines = open_recording(task.recording).cut(segment.first_line, segment.lines)
     if options.calibration is not None:
         lines = calibrated(lines, options.calibration)
+    lines = put_right(lines, options.turn)
 
     def advanced(progress: Progress) -> None:
         watch.advance(1 / progress.iterations)
@@ -101,6 +108,7 @@ def solve(task: Task, watch: Watch) -> Part:
         device=options.device,
         stop=watch,
         refuse=False,  # what is begun is ended in order
+        check=options.check,
     )
     watch.advance(1 - result.iterations / result.iterations_asked)
     substeps = lines.geometry.substeps
@@ -131,6 +139,8 @@ def solve(task: Task, watch: Watch) -> Part:
 
 def _why_not_trusted(result: Reconstruction, segment: SubSegment) -> str | None:
     """Why nothing of it may be believed: it was broken off, or had too little time to explain its lines."""
+    if not result.believed:
+        return "no frame of it is trusted: the lines are not what the recording says of them"
     missed = float(np.nanmax([result.quality.misfit, result.quality.prediction]))
     if result.ended != "stopped" and (result.ended != "budget" or missed <= POOR_MISFIT):
         return None

@@ -10,8 +10,9 @@ import pytest
 
 from acquire.config import load_rig
 from acquire.effect_config import CodeErrors
-from acquire.scene_config import ConstantDrive, LedConfig, LedSceneConfig, SineDrive
+from acquire.scene_config import ArmOptics, ConstantDrive, LedConfig, LedSceneConfig, OpticsConfig, SineDrive
 from acquire.simulate import simulate
+from acquire.store import open_video
 
 Cli = Callable[..., Any]
 
@@ -53,3 +54,49 @@ def test_lines_that_are_not_there(cli: Cli, late: Path) -> None:
     answer = cli("diagnose", late, "--first-line", 100_000_000)
     assert answer.code == 2
     assert "not there" in answer.err
+
+
+@pytest.fixture(scope="module")
+def mirrored(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its arm B is mirrored; the scene is a pulsing square and a steady one."""
+    rig = load_rig("rig-demo", {"geometry.stages": 24, "geometry.substeps": 2})
+    slow = SineDrive(waveform="sine", frequency_hz=200.0, low=0.3)
+    leds = (
+        LedConfig(name="slow", shape="square", row=0.25, column=0.3, size=0.3, drive=slow),
+        LedConfig(
+            name="still",
+            shape="square",
+            row=0.75,
+            column=0.6,
+            size=0.2,
+            drive=ConstantDrive(waveform="constant", level=0.9),
+        ),
+    )
+    optics = OpticsConfig(b=ArmOptics(turn_deg=270, mirror=True))
+    path = tmp_path_factory.mktemp("mirrored") / "run.zarr"
+    simulate(rig, LedSceneConfig(kind="leds", leds=leds, optics=optics), path, 150)
+    return path
+
+
+def test_a_mirrored_arm_is_named_by_reconstruct_and_put_right_on_request(
+    cli: Cli, mirrored: Path, tmp_path: Path
+) -> None:
+    words = ("--nm", 2, "--iterations", 30, "--workers", 1)
+    wrong = cli("reconstruct", mirrored, "--out", tmp_path / "wrong.zarr", *words)
+    assert wrong.code == 0, wrong.err
+    assert "warning: arm B is mirrored" in wrong.err
+    assert "no frame of it is trusted" in wrong.err
+    right = cli("reconstruct", mirrored, "--out", tmp_path / "right.zarr", "--try-orientations", *words)
+    assert right.code == 0, right.err
+    assert "reconstructed so" in right.err
+    assert "warning: arm B" not in right.err
+    video = open_video(tmp_path / "right.zarr").video[:]
+    steady, dark = video[:, 18, 14].mean(), video[:, 18, 4].mean()
+    assert steady > 10 * abs(dark)
+
+
+def test_orientations_that_are_right_are_left_alone(cli: Cli, late: Path, tmp_path: Path) -> None:
+    words = ("--nm", 2, "--iterations", 5, "--workers", 1, "--try-orientations")
+    answer = cli("reconstruct", late, "--out", tmp_path / "v.zarr", *words)
+    assert answer.code == 0, answer.err
+    assert "orientation left as it is: the lines are 2 sub-steps late" in answer.err
