@@ -147,6 +147,8 @@ def test_every_state_is_told_in_words_and_fits(name: str, page: Page, instrument
     page.wait_for_selector(f"body{wanted}", timeout=SEEN_MS)
     page.locator("#sentence", has_text=sentence).wait_for(timeout=SEEN_MS)
     assert word in page.inner_text(".word").lower()
+    if name == "stale":
+        assert page.locator(".controls button:enabled").count() == page.locator("#aim-reset").count()
     for theme in ("light", "dark"):
         page.emulate_media(color_scheme=theme)  # type: ignore[arg-type]
         for width in WIDTHS:

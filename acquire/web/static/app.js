@@ -16,6 +16,8 @@ let operator = false, setup = null, latest = null;
 
 function fail(text) { $("error").textContent = text; $("error").hidden = !text; }
 
+function stale(why) { band.stale(why); watch.stale(); }
+
 async function enter(token) {
   await ask("POST", "session", { token });
   await admitted();
@@ -42,8 +44,8 @@ function screen() {
 
 link.addEventListener("begun", () => { if (!setup) admitted().catch(() => {}); });
 link.addEventListener("locked", () => { if (!$("enter").open) $("enter").showModal(); });
-link.addEventListener("silent", ({ detail }) => band.stale(`No word from the page's server for ${Math.round(detail)} s.`));
-link.addEventListener("link", ({ detail }) => band.stale(`The page's server has no daemon: ${detail.header.why}`));
+link.addEventListener("silent", ({ detail }) => stale(`No word from the page's server for ${Math.round(detail)} s.`));
+link.addEventListener("link", ({ detail }) => stale(`The page's server has no daemon: ${detail.header.why}`));
 link.addEventListener("news", ({ detail }) => watch.news(detail.header.news));
 link.addEventListener("rows", ({ detail }) => { watch.rows(detail.header, detail.body); aim.rows(detail.header, detail.body); });
 link.addEventListener("state", ({ detail }) => {

@@ -48,6 +48,9 @@ export class Watch {
     this.#ledger(status);
   }
 
+  /** What is shown is old: no command is given on the strength of it. */
+  stale() { this.#possible = new Set(); this.#enable(); }
+
   key(key) {
     const button = { a: "arm", r: "record", m: "mark", d: "disarm" }[key];
     if (button) { if (!$(button).disabled) $(button).click(); return true; }
