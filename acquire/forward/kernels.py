@@ -128,18 +128,33 @@ def add_transposed_frames(video: NDArray[Any], out: NDArray[Any]) -> None:
                 out[t, c, r] += video[t, r, c]
 
 
-@numba.njit(parallel=True, cache=True, fastmath={"contract", "reassoc", "nsz"})
-def gather_frames(
-    frames: NDArray[Any],
-    first: NDArray[np.int64],
-    source: NDArray[np.int64],
+@numba.njit(cache=True)
+def gather_frame(
+    frame: NDArray[Any],
+    first: NDArray[np.uint32],
+    source: NDArray[np.uint32],
     weight: NDArray[Any],
     out: NDArray[Any],
 ) -> None:
-    """out[k, p] = Σ_j weight[j]·frames[k, source[j]], j from first[p] to first[p + 1]: a CSR matrix."""
+    """out[p] = Σ_j weight[j]·frame[source[j]], j from first[p] to first[p + 1]: a CSR matrix.
+
+    Rows are short: to reorder their sums for wide instructions costs more than it saves.
+    """
+    for p in range(len(out)):
+        total = out.dtype.type(0)
+        for j in range(first[p], first[p + 1]):
+            total += weight[j] * frame[source[j]]
+        out[p] = total
+
+
+@numba.njit(parallel=True, cache=True)
+def gather_frames(
+    frames: NDArray[Any],
+    first: NDArray[np.uint32],
+    source: NDArray[np.uint32],
+    weight: NDArray[Any],
+    out: NDArray[Any],
+) -> None:
+    """`gather_frame` of many frames at once."""
     for k in numba.prange(out.shape[0]):
-        for p in range(out.shape[1]):
-            total = out.dtype.type(0)
-            for j in range(first[p], first[p + 1]):
-                total += weight[j] * frames[k, source[j]]
-            out[k, p] = total
+        gather_frame(frames[k], first, source, weight, out[k])

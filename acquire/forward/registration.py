@@ -18,7 +18,7 @@ import numpy as np
 from scipy import sparse
 
 from acquire.arrays import HOST
-from acquire.forward.kernels import gather_frames
+from acquire.forward.kernels import gather_frame, gather_frames
 from acquire.forward.merge import block_bounds
 
 if TYPE_CHECKING:
@@ -27,6 +27,10 @@ if TYPE_CHECKING:
     from acquire.alignment import Alignment
     from acquire.arrays import Array, Arrays
     from acquire.geometry import Geometry
+
+
+FEW = 2**21
+"""Products that one thread has done before others are woken on a busy host."""
 
 
 def registration(
@@ -102,8 +106,8 @@ class _Gather:
         self._arrays = arrays
         self._terms: list[tuple[Array, Array]] = []
         if arrays.compiled:
-            self._first = matrix.indptr.astype(np.int64)
-            self._source, self._weight = matrix.indices.astype(np.int64), matrix.data.astype(arrays.dtype)
+            self._first = matrix.indptr.astype(np.uint32)
+            self._source, self._weight = matrix.indices.astype(np.uint32), matrix.data.astype(arrays.dtype)
             return
         self._terms = [(arrays.indices(index), arrays.asarray(weight)) for index, weight in _padded(matrix)]
 
@@ -111,7 +115,11 @@ class _Gather:
         if not self._terms:
             out = np.empty(frames.shape, frames.dtype)
             flat, into = frames.reshape(len(frames), -1), out.reshape(len(frames), -1)
-            gather_frames(flat, self._first, self._source, self._weight, into)
+            if flat.shape[0] * len(self._source) > FEW:
+                gather_frames(flat, self._first, self._source, self._weight, into)
+                return out
+            for frame, made in zip(flat, into, strict=True):
+                gather_frame(frame, self._first, self._source, self._weight, made)
             return out
         xp = self._arrays.xp
         flat = xp.reshape(frames, (frames.shape[0], -1))
