@@ -31,8 +31,9 @@ better than wrong codes do, by so many of their standard deviations."""
 OTHER_SUBSTEPS = (1, 2, 3, 4, 5, 6)
 USUAL = Prior(0.06, 0.3, 3.0, 1e-2)
 """Under which they are looked through, before the best has a prior that suits it."""
-APART = 15.0
-"""Log likelihood by which delays that differ between the arms have to be better than a common one."""
+APART, APART_SHARE = 15.0, 0.15
+"""Log likelihood, and share of the gain, by which delays that differ between the arms have to be better than
+a common one: smooth scenes fit a little better a little off."""
 CLEAR, CLEAR_SHARE, CLEAR_ERRORS = 12.0, 0.11, 0.3
 """Of two hypotheses the better is clearly so beyond this log likelihood, beyond this share of what it gains
 by the other arm's word, and beyond so many standard errors over the blocks of lines. Small delays, and arms
@@ -135,7 +136,7 @@ def _inquire(witness: Witness, substeps: int | None) -> Inquiry:
 def _standing(said: Candidate, found: tuple[Candidate, ...]) -> Standing:
     best = found[0]
     if not best.verified:
-        return Standing.UNEXPLAINED if max(best.beyond, said.beyond) < BEYOND else Standing.UNCLEAR
+        return Standing.UNEXPLAINED if max(best.beyond, said.beyond) < VERIFIED_ALONE else Standing.UNCLEAR
     if best.hypothesis == said.hypothesis:
         return Standing.RIGHT
     if clearly(best, said):
@@ -244,7 +245,8 @@ def _climb(witness: Witness, start: Hypothesis) -> Hypothesis:
     known: dict[tuple[int, int], float] = {}
     common = _uphill(gain, start.late, ((3, 3), (1, 1)))
     apart = _uphill(gain, common, ((3, 0), (0, 3), (1, 0), (0, 1)))
-    return replace(start, late=apart if gain(apart) > gain(common) + APART else common)
+    limit = gain(common) + max(APART, APART_SHARE * gain(apart))
+    return replace(start, late=apart if gain(apart) > limit else common)
 
 
 def _uphill(

@@ -81,7 +81,7 @@ def mirrored(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_mirrored_arm_is_named_by_reconstruct_and_put_right_on_request(
     cli: Cli, mirrored: Path, tmp_path: Path
 ) -> None:
-    words = ("--nm", 2, "--iterations", 30, "--workers", 1)
+    words = ("--nm", 2, "--iterations", 12, "--workers", 1)
     wrong = cli("reconstruct", mirrored, "--out", tmp_path / "wrong.zarr", *words)
     assert wrong.code == 0, wrong.err
     assert "warning: arm B is mirrored" in wrong.err
