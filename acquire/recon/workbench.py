@@ -50,7 +50,8 @@ BRIGHT_STILLS, BRIGHT_ROUNDS = 2, 8
 """Fits of a scene's brightness beside a still, and beside a volume."""
 BRIGHTER = 0.85
 """Of a still's error, what one of changing brightness must reach to be followed up."""
-USUAL_FRAMES = 980
+USUAL_FRAMES, USUAL_ENERGY = 980, 7.1e-3
+"""Of Fig. 9's voxels, in which the weights of candidates are told."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +99,7 @@ class Workbench:
         self._operators: dict[tuple[int, bool], Operator] = {}
         self.record: list[dict[str, Any]] = []
         self._best: Trial | None = None
+        self._response = self._energy_of_a_voxel() / USUAL_ENERGY
 
     def brighten(self, still: Trial, cosines: int) -> Trial | None:
         """A calm volume times the brightness of the whole scene, found in turn; None where there is none."""
@@ -141,7 +143,7 @@ class Workbench:
             self._problem.used_samples,
             shape,
             basis,
-            parameters(candidate, self.frames),
+            parameters(candidate, self.frames, self._response),
             start=None if start is None else _resized(start.admm.theta, basis),
             denoiser=denoiser,
         )
@@ -228,7 +230,7 @@ class Workbench:
             whole.used_samples,
             best.admm.theta.shape,
             best.basis,
-            parameters(best.candidate, self.frames),
+            parameters(best.candidate, self.frames, self._response),
             denoiser=best.denoiser,
         )
         admm.resume(best.admm)
@@ -238,6 +240,14 @@ class Workbench:
         if self._clock.ended == "done":
             self._clock.converged()
         return Chosen(self, last)
+
+    def _energy_of_a_voxel(self) -> float:
+        """Σ of squares of the lines' response to a voxel in the middle, as the solvers have it."""
+        still = TemporalBasis(self.frames, 1, self._problem.arrays)
+        point = np.zeros((1, self._side, self._side))
+        point[0, self._side // 2, self._side // 2] = 1
+        lines = host(self._operator(still, None).forward(self._problem.arrays.asarray(point)))
+        return float(np.square(lines / self._problem.norm, dtype=np.float64).sum()) or USUAL_ENERGY
 
     def _operator(self, basis: TemporalBasis, brightness: NDArray[Any] | None) -> Operator:
         key, segment = (basis.count, brightness is not None), self._segment
@@ -291,15 +301,18 @@ def _paced(by: float, candidate: Candidate) -> Candidate | None:
     return replace(candidate, pace=pace) if LEAST_PACE <= pace <= LARGEST_PACE else None
 
 
-def parameters(candidate: Candidate, frames: int) -> AdmmParameters:
-    """The solver's, for a video of so many frames: coefficients, and with them λ, grow with their root."""
-    weight = candidate.weight * (frames / USUAL_FRAMES) ** 0.5
+def parameters(candidate: Candidate, frames: int, response: float) -> AdmmParameters:
+    """The solver's. λ grows with the coefficients, which do with the root of the frames, and both λ and ρ
+    with the lines' ``response`` to a voxel, so that a candidate means the same whatever the voxels."""
+    w, extent = candidate.weight, (frames / USUAL_FRAMES) ** 0.5
     if candidate.prior == "still":
         # all sub-steps add up in one frame: its mean light outweighs a detail thousands of times
-        penalty, steps = weight, 8 if candidate.weight > 1e-4 else 20
+        weight, penalty, steps = w * extent, w, 8 if w > 1e-4 else 20
+    elif candidate.prior == "smooth":
+        weight, penalty, steps = w, 2e-3, 2
     else:
-        penalty = 2e-3 if candidate.prior == "smooth" else 2e-3 * (candidate.weight / 1e-3) ** 0.5
-        steps = 2
+        weight, penalty, steps = w * extent, 2e-3 * (w / 1e-3) ** 0.5, 2
+    weight, penalty = response * weight, response * penalty
     return AdmmParameters(
         tv_weight=weight,
         tv_penalty=penalty,
