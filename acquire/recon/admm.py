@@ -40,7 +40,8 @@ class AdmmParameters:
 
     ``tv_weight`` is λ; ``tv_penalty`` and ``sign_penalty`` are the splits' ρ. ``preconditioned`` makes the
     data step nearly exact in a few gradient steps; without it the iterates come to weak details last, which
-    holds back noise as a higher weight would.
+    holds back noise as a higher weight would. Of ``gradient_steps`` no more are made than leave
+    ``gradient_share`` of the residual.
     """
 
     tv_weight: float = 1e-3
@@ -48,6 +49,7 @@ class AdmmParameters:
     sign_penalty: float = 6e-5
     relaxation: float = 1.7
     gradient_steps: int = 2
+    gradient_share: float = 0.0
     tv_iterations: int = 10
     grid_per_coefficient: int = 1
     preconditioned: bool = False
@@ -151,6 +153,7 @@ class Admm:
         """Conjugate-gradient steps on (W·B·BᵀW + ρ)·w; ``residual`` is used up."""
         scaled = self._precondition(residual)
         direction, energy = self._xp.asarray(scaled, copy=True), dot(residual, scaled)
+        enough = self._parameters.gradient_share**2 * energy
         for _ in range(self._parameters.gradient_steps):
             if not energy > 0:
                 return
@@ -162,6 +165,8 @@ class Admm:
             residual -= length * image
             scaled = self._precondition(residual)
             energy, before = dot(residual, scaled), energy
+            if energy <= enough:
+                return
             direction = scaled + (energy / before) * direction
 
 

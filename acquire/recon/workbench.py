@@ -39,6 +39,8 @@ LAST_ITERATIONS = 15
 """Of the best, with all samples."""
 SEARCH_SHARE = 0.6
 """Of a budget, the most that the search may take."""
+STILL_STEPS, STILL_SHARE = 60, 0.02
+"""Gradient steps at most, and the share of the residual at which they end, for one frame."""
 COSINES = (8, 12, 16, 24, 36, 54)
 LEAST_PACE, LARGEST_PACE = 0.25, 64.0
 LEAST_WEIGHT, LARGEST_WEIGHT = 1e-7, 1e3
@@ -306,8 +308,9 @@ def parameters(candidate: Candidate, frames: int, response: float) -> AdmmParame
     with the lines' ``response`` to a voxel, so that a candidate means the same whatever the voxels."""
     w, extent = candidate.weight, (frames / USUAL_FRAMES) ** 0.5
     if candidate.prior == "still":
-        # all sub-steps add up in one frame: its mean light outweighs a detail thousands of times
-        weight, penalty, steps = w * extent, w, 8 if w > 1e-4 else 20
+        # all sub-steps add up in one frame: its mean light outweighs a detail thousands of times, and small
+        # penalties with data steps made to the end are what lets details through
+        weight, penalty, steps = w * extent, 0.1 * w, STILL_STEPS
     elif candidate.prior == "smooth":
         weight, penalty, steps = w, 2e-3, 2
     else:
@@ -318,6 +321,7 @@ def parameters(candidate: Candidate, frames: int, response: float) -> AdmmParame
         tv_penalty=penalty,
         sign_penalty=0.3 * penalty,
         gradient_steps=steps,
+        gradient_share=0.0 if steps < STILL_STEPS else STILL_SHARE,
         preconditioned=True,
     )
 
