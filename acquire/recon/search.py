@@ -25,9 +25,11 @@ FARTHEST = 24
 STRANGERS = 4
 """Random codes that say what agreement comes of itself."""
 LEAST_CONTRAST = 10.0
-VERIFIED_ALONE, VERIFIED, BEYOND = 5.0, 2.0, 3.0
+VERIFIED_ALONE, VERIFIED, BEYOND = 4.0, 2.0, 3.0
 """Agreement of the arms at which a code is believed; less is enough where it also explains each arm's lines
 better than wrong codes do, by so many of their standard deviations."""
+DOUBTFUL = 3.0
+"""Agreement below which a code is foreign; between this and belief, nothing is claimed."""
 OTHER_SUBSTEPS = (1, 2, 3, 4, 5, 6)
 USUAL = Prior(0.06, 0.3, 3.0, 1e-2)
 """Under which they are looked through, before the best has a prior that suits it."""
@@ -136,7 +138,10 @@ def _inquire(witness: Witness, substeps: int | None) -> Inquiry:
 def _standing(said: Candidate, found: tuple[Candidate, ...]) -> Standing:
     best = found[0]
     if not best.verified:
-        return Standing.UNEXPLAINED if max(best.beyond, said.beyond) < VERIFIED_ALONE else Standing.UNCLEAR
+        foreign = (
+            max(best.agreement, said.agreement) < DOUBTFUL and max(best.beyond, said.beyond) < VERIFIED_ALONE
+        )
+        return Standing.UNEXPLAINED if foreign else Standing.UNCLEAR
     if best.hypothesis == said.hypothesis:
         return Standing.RIGHT
     if clearly(best, said):

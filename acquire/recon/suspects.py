@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 SURE = 5.0
 """Standard errors beyond which something is so."""
-CONSTANT_SHARE, CONSTANT_ERROR = 0.03, 0.02
+CONSTANT_SHARE, CONSTANT_ERROR = 0.03, 0.012
 """Of an arm's mean light: less that follows no code costs little, and what is not known as well as this is
 not told, since a scene that changes smoothly looks much like it."""
 RATIO = 0.05
