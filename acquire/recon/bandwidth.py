@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.ndimage import median_filter
 
 from acquire.arrays import HOST, host
 from acquire.recon.admm import Admm, AdmmParameters
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
     from acquire.arrays import Arrays
     from acquire.lines import Segment
+    from acquire.recon.problem import Problem
 
 COARSE_SIDE = 24
 ITERATIONS, FEWEST_ITERATIONS = 12, 10
@@ -33,6 +35,9 @@ PEAK = 25.0
 """The floor's highest coefficient is 5 to 15 times its median; beyond this it is no floor."""
 MARGIN = 1.25
 FEWEST_COEFFICIENTS = 32
+WINDOW, STANDS_OUT = 61, 9.0
+"""Cosines about one whose median is its floor, and how far light rises above it; the rest
+reaches 5 to 8."""
 LARGEST_SHARE = 0.25
 
 
@@ -55,6 +60,29 @@ def estimate_coefficients(
     theta = _tentative(segment, (merge, temporal_merge), most, hurry, replace(arrays, dtype="float32"))
     energy = np.square(theta, dtype=np.float64).sum((1, 2))
     return int(np.clip(MARGIN * _end_of_signal(energy), FEWEST_COEFFICIENTS, most))
+
+
+def light_beyond(
+    segment: Segment, problem: Problem, predicted: NDArray[Any], temporal_merge: int, count: int
+) -> int | None:
+    """The cosine beyond the first ``count`` that stands out in what a prediction leaves of the lines.
+
+    A search may overlook a lamp that is small or fast; once the rest is explained, it is the brightest thing
+    that is left. ``predicted`` is as `Problem.samples`. None where no cosine up to half of them stands out.
+    """
+    merge = -(-segment.geometry.size // COARSE_SIDE)
+    frames = segment.geometry.video_shape(merge, temporal_merge)[0]
+    if frames // 2 <= count + WINDOW:
+        return None
+    basis = TemporalBasis(frames, frames // 2)
+    operator = band_operator(segment.geometry, segment.code, basis, merge, temporal_merge, segment.alignment)
+    left = np.where(problem.weight > 0, problem.samples - predicted, 0).astype(np.float32)
+    energy = np.square(operator.adjoint(left), dtype=np.float64).sum((1, 2))
+    floor = np.maximum(median_filter(energy, WINDOW, mode="nearest"), np.finfo(float).tiny)
+    ratio = energy / floor
+    ratio[:count] = 0
+    highest = int(np.argmax(ratio))
+    return highest if ratio[highest] > STANDS_OUT else None
 
 
 def _tentative(

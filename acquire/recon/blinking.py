@@ -17,7 +17,7 @@ import numpy as np
 from acquire.arrays import host
 from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import band_operator
-from acquire.recon.bandwidth import FEWEST_COEFFICIENTS, estimate_coefficients
+from acquire.recon.bandwidth import FEWEST_COEFFICIENTS, MARGIN, estimate_coefficients, light_beyond
 from acquire.recon.basis import TemporalBasis
 from acquire.recon.estimates import InBand, Refined
 from acquire.recon.patterns import ROUND, Refinement, find_patterns
@@ -34,6 +34,10 @@ FIRST_LOOK, LONGER_LOOK = 60, 90
 """Iterations in the cosines before patterns are looked for; longer where these are in doubt."""
 FIRST_LOOK_SHARE = 0.7
 """Of a budget, the most that the first look may take."""
+BEYOND_S = 0.5
+"""What it takes to look for light beyond the band; it is not done with less to spare."""
+WIDER_SHARE = 0.5
+"""Of a budget, after which nothing is made again in a wider band."""
 TENTATIVE_SHARE = 0.15
 """Of a budget, after which the search for the bandwidth hurries."""
 UNSEARCHED_SHARE = 0.2
@@ -63,12 +67,43 @@ def solve_blinking(segment: Segment, problem: Problem, request: Request, clock: 
 
 
 def look_in_cosines(segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> InBand:
-    frames = segment.geometry.video_shape(request.spatial_merge, request.temporal_merge)[0]
-    basis = TemporalBasis(frames, find_band(segment, problem, request, clock), problem.arrays)
-    return _first_look(segment, problem, request, basis, clock)
+    """A first look in the band that was asked for or found."""
+    count = find_band(segment, problem, request, clock)
+    return _look(segment, problem, request, clock, count)
 
 
 def go_on(
+    segment: Segment, problem: Problem, request: Request, clock: IterationClock, first: InBand
+) -> Estimate:
+    """Patterns, or more of the same; once more in a wider band where the lines show light beyond this one."""
+    found = _go_on(segment, problem, request, clock, first)
+    if not clock.affords(BEYOND_S):
+        return found
+    predicted = found.predict()
+    beyond = light_beyond(segment, problem, predicted, request.temporal_merge, first.basis.count)
+    if beyond is None:
+        return found
+    if request.bandwidth is not None or clock.spent(WIDER_SHARE):
+        rate_hz = 1e9 / (segment.substep_ns * request.temporal_merge)
+        clock.shortcuts.append(
+            f"the lines hold light of about {beyond * rate_hz / (2 * first.basis.frames):.3g} Hz, which is "
+            "faster than what the video may hold: a longer budget or another bandwidth shows it"
+        )
+        return found
+    clock.begin_anew()
+    first = _look(segment, problem, request, clock, round(MARGIN * (beyond + 1)))
+    wider = _go_on(segment, problem, request, clock, first)
+    better = problem.prediction_error(wider.predict()) < problem.prediction_error(predicted)
+    return wider if better else found
+
+
+def _look(segment: Segment, problem: Problem, request: Request, clock: IterationClock, count: int) -> InBand:
+    frames = segment.geometry.video_shape(request.spatial_merge, request.temporal_merge)[0]
+    basis = TemporalBasis(frames, min(frames, count), problem.arrays)
+    return _first_look(segment, problem, request, basis, clock)
+
+
+def _go_on(
     segment: Segment, problem: Problem, request: Request, clock: IterationClock, first: InBand
 ) -> Estimate:
     refined = None if request.denoiser else _refine(segment, problem, request, first, clock)

@@ -50,19 +50,18 @@ def solve_admm(segment: Segment, problem: Problem, request: Request, clock: Iter
         return solve_blinking(segment, problem, request, clock)
     bench = Workbench(segment, problem, request, clock, held_out)
     trials = max(4, request.iterations // ITERATIONS_PER_TRIAL)
-    still = bench.climb(bench.attempt(STILL, FIRST_ITERATIONS), trials)
     if bench.frames == 1:
-        return bench.finish(still)
-    if clock.spent(SEARCH_SHARE):
-        clock.shortcuts.append("the budget left no time to look for what changes: the video is a still")
-        return bench.finish(still)
+        return bench.finish(bench.climb(bench.attempt(STILL, FIRST_ITERATIONS), trials))
     volume = bench.attempt(bench.fitting(VOLUME), FIRST_ITERATIONS)
     if clock.spent(SEARCH_SHARE):
-        clock.shortcuts.append("the budget left no time to try more than a still and one kind of motion")
-        return bench.finish(_better(volume, still))
+        clock.shortcuts.append("the budget left no time to try more than one kind of motion")
+        return bench.finish(volume)
     first = look_in_cosines(segment, problem, request, clock)
     bench.note({"prior": "cosines"} | first.facts(), first.predict())
-    best = _better(_moving(bench, still, volume, first, trials), still)
+    still = bench.attempt(STILL, FIRST_ITERATIONS)
+    best = _better(volume, still)
+    if bench.error(first.predict()) > OUTDONE * best.error:
+        best = _search(bench, still, volume, first, trials)
     if not _worth_going_on(bench, first, best):
         return bench.finish(best)
     blinking = go_on(segment, problem, request, clock, first)
@@ -85,18 +84,19 @@ def _better(moving: Trial, still: Trial) -> Trial:
     return moving if moving.error < CLEARLY * still.error else still
 
 
-def _moving(bench: Workbench, still: Trial, volume: Trial, first: InBand, trials: int) -> Trial:
-    """The best of volumes, smooth ones and those of changing brightness."""
+def _search(bench: Workbench, still: Trial, volume: Trial, first: InBand, trials: int) -> Trial:
+    """The best of stills, volumes, smooth ones and those of changing brightness."""
+    if still.error < FAR * volume.error:
+        still = bench.climb(still, trials)
     calm = bench.attempt(bench.fitting(CALM), FIRST_ITERATIONS, still)
     bright = bench.brighten(still, first.basis.count)
     volume = min([volume, calm, bright or calm], key=lambda trial: trial.error)
     smooth = bench.attempt(bench.fitting(SMOOTH), FIRST_ITERATIONS)
-    if bench.error(first.predict()) < OUTDONE * min(volume.error, smooth.error):
-        return volume
     volume = bench.climb(volume, trials)
     if smooth.error < FAR * volume.error:
         smooth = bench.climb(smooth, trials)
-    return smooth if smooth.error < SMOOTHER * volume.error else volume
+    moving = smooth if smooth.error < SMOOTHER * volume.error else volume
+    return _better(moving, still)
 
 
 def _worth_going_on(bench: Workbench, first: InBand, best: Trial) -> bool:

@@ -140,6 +140,10 @@ class IterationClock:
         finish_s = FINISH_SHARE * self._budget_s + FINISH_ITERATIONS * self.longest_s
         return self.seconds + seconds <= min(share * self._budget_s, self._budget_s - finish_s)
 
+    def begin_anew(self) -> None:
+        """What was done so far does not count against the limit of iterations."""
+        self.done = 0
+
     def converged(self) -> None:
         """Nothing is to be gained from more iterations."""
         self.ended = "converged"

@@ -143,4 +143,4 @@ def test_a_hopeless_budget_gives_the_least_where_it_is_not_to_be_refused() -> No
     result = reconstruct(segment(Geometry(20, 3, 120)), 3, 1, budget_s=1e-6, refuse=False)
     assert result.iterations <= 3
     assert result.ended == "budget"
-    assert any("no time to look for what changes" in each for each in result.warnings)
+    assert any("no time to try more" in each for each in result.warnings)

@@ -16,6 +16,7 @@ from acquire.geometry import Geometry
 from acquire.lines import Segment
 from acquire.recon import reconstruct
 from acquire.recon.band import BandOperator
+from acquire.recon.bandwidth import light_beyond
 from acquire.recon.basis import TemporalBasis
 from acquire.recon.brightness import fit_brightness
 from acquire.recon.holdout import HeldOut
@@ -99,6 +100,18 @@ def test_brightness_is_found_with_the_picture_known() -> None:
     frames = GEOMETRY.trusted_frames(1)
     wanted = BRIGHTNESS / BRIGHTNESS.mean()
     assert np.abs(found - wanted)[frames].max() < 0.05
+
+
+def test_light_beyond_the_band_stands_out_of_what_the_rest_leaves() -> None:
+    problem = pose(segment("still"), 3, 1, hold_out=0.0)
+    swing = np.cos(np.pi * 50 * (np.arange(GEOMETRY.span) + 0.5) / GEOMETRY.span)
+    lamp = np.zeros((GEOMETRY.size, GEOMETRY.size), np.float32)
+    lamp[10:20, 12:25] = 0.3
+    fast = DualArm(GEOMETRY, CODE).forward((swing[:, None, None] * lamp).astype(np.float32))
+    scaled = fast / (problem.scale * problem.norm)
+    assert light_beyond(segment("still"), problem, problem.samples - scaled, 1, 32) == 50
+    noise = np.random.default_rng(3).standard_normal(scaled.shape) * scaled.std()
+    assert light_beyond(segment("still"), problem, problem.samples - noise, 1, 32) is None
 
 
 @settings(max_examples=25, deadline=None)
