@@ -93,12 +93,11 @@ class Workbench:
     def __init__(
         self, segment: Segment, problem: Problem, request: Request, clock: IterationClock, held_out: HeldOut
     ) -> None:
-        self._segment, self._problem, self._request = segment, problem, request
-        self._clock, self.held_out = clock, held_out
+        self._segment, self._problem, self._clock, self.held_out = segment, problem, clock, held_out
         self._merges = (request.spatial_merge, request.temporal_merge)
         self.frames, self._side, _ = segment.geometry.video_shape(*self._merges)
         self._brightness: NDArray[Any] | None = None
-        self._operators: dict[tuple[int, bool], Operator] = {}
+        self._operators: dict[tuple[int, bool], Operator] = {}  # neighbours mostly share one
         self.record: list[dict[str, Any]] = []
         self._best: Trial | None = None
         self._response = self._energy_of_a_voxel() / USUAL_ENERGY
@@ -138,7 +137,7 @@ class Workbench:
         """Solve a candidate for so many iterations, or as many as there is time for, from ``start``."""
         basis = TemporalBasis(self.frames, candidate.coefficients, self._problem.arrays)
         brightness = self._brightness if candidate.brightness else None
-        operator = self._operator(basis, brightness)  # kept: neighbours mostly share it
+        operator = self._operator(basis, brightness)
         shape, denoiser = (basis.count, self._side, self._side), _denoiser(candidate)
         admm = Admm(
             self._problem.masked(operator),
@@ -154,13 +153,9 @@ class Workbench:
             if isinstance(denoiser, VolumeTv) and isinstance(start.denoiser, VolumeTv):
                 denoiser.resume(start.denoiser)
         trial = Trial(candidate, admm, denoiser, basis, operator, brightness, np.zeros(0), np.inf)
-        return self.go_on(trial, iterations)
-
-    def go_on(self, trial: Trial, iterations: int) -> Trial:
-        """More iterations of a trial."""
         began = self._clock.seconds
         for _ in self._clock.attempt(iterations, "choose", SEARCH_SHARE):
-            trial.admm.step()
+            admm.step()
         errors = self.note(asdict(trial.candidate), self.predict(trial), began)
         trial = replace(trial, errors=errors, error=self.held_out.relative(errors))
         if self._best is None or trial.error < self._best.error:

@@ -163,7 +163,8 @@ def test_both_arms_from_one_camera_are_eq1(tmp_path: Path, rig: str) -> None:
     settings = [["remote", "PixelFormat", "Mono12p"], ["stream", "BufferHeight", 100]]
     given = dict(SMALL)
     given |= {"cameras.layout": "compact", "cameras.b.serial": "SIM-A", "cameras.b.first_column": STAGES + 5}
-    config = load_rig(rig, given | ({"cameras.a.settings": settings} if "gentl" in rig else {}))
+    both = {f"cameras.{arm}.settings": settings for arm in "ab"}
+    config = load_rig(rig, given | (both if "gentl" in rig else {}))
     recording, status = record(config, tmp_path / "r.zarr", 5000, stamps="gentl" in rig)
     assert status.condition is RunCondition.GOOD
     assert recording.attrs["layout"] == "compact"

@@ -10,6 +10,7 @@ import contextlib
 import errno
 import math
 import os
+import re
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -85,7 +86,8 @@ def check_graceful_end(capture: Capture, path: Path) -> None:
     seen, acknowledged = until_done(capture, path)
     assert seen.condition == "INTERRUPTED"
     assert "too slow to write: " in str(seen.end_reason)
-    assert "ring slots of arm" in str(seen.end_reason)
+    # seen coming, or, where the host held us up as well, ended before the first line that found no room
+    assert re.search("ring slots of arm|ring of arm . was full at line", str(seen.end_reason))
     assert acknowledged > 0
     recording = open_recording(path)
     assert (recording.state, recording.attrs["end_reason"]) == ("sealed", seen.end_reason)
