@@ -18,10 +18,10 @@ from acquire.daemon.control import new_app
 from acquire.daemon.messages import ErrorMessage
 from acquire.daemon.routes import NO_STORE, routes
 from acquire.errors import UsageError
+from acquire.web.archive import Archive
 from acquire.web.guard import Guard
 from acquire.web.hub import Hub
 from acquire.web.jobs import Jobs
-from acquire.web.library import Library
 from acquire.web.live import Live
 from acquire.web.messages import (
     HoldRequest,
@@ -88,8 +88,8 @@ def build_page(
     Must be called while the event loop runs that serves it. ``secure``: by https only.
     """
     hub = Hub(socket, Live)
-    library, reading = Library(directory), Reading()
-    jobs = Jobs(directory, library)
+    archive, reading = Archive(directory), Reading()
+    jobs = Jobs(directory, archive)
     app = new_app(
         "The instrument's page: the daemon's API, recordings, videos and jobs.",
         openapi_url="/api/openapi.json",
@@ -98,7 +98,7 @@ def build_page(
     api = APIRouter(prefix="/api", responses=WHY_REFUSED)
     api.include_router(routes(Passing(hub), Answers()))
     _add_stream(api, Pages(hub))
-    _add_recordings(api, library, reading)
+    _add_recordings(api, archive, reading)
     _add_jobs(api, jobs)
     guard = Guard(app, tokens, names)
     _add_session(api, guard, tokens, secure=secure)
@@ -163,14 +163,14 @@ def _add_stream(api: APIRouter, pages: Pages) -> None:
         return StreamingResponse(stream, media_type="application/octet-stream", headers=NO_STORE)
 
 
-def _add_recordings(api: APIRouter, library: Library, reading: Reading) -> None:
+def _add_recordings(api: APIRouter, archive: Archive, reading: Reading) -> None:
     @api.get("/recordings", summary="Recordings, the newest first")
     async def recordings() -> list[RecordingFacts]:
-        return await reading(library.recordings)
+        return await reading(archive.recordings)
 
     @api.get("/recordings/{name}", summary="A recording, with events, gaps and holds")
     async def recording(name: str) -> RecordingDetail:
-        return await reading(lambda: library.recording(name))
+        return await reading(lambda: archive.recording(name))
 
     @api.get(
         "/recordings/{name}/picture",
@@ -179,21 +179,21 @@ def _add_recordings(api: APIRouter, library: Library, reading: Reading) -> None:
         response_class=Response,
     )
     async def picture(name: str) -> Response:
-        content = await reading(lambda: library.picture(name))
+        content = await reading(lambda: archive.picture(name))
         return Response(content, media_type="image/png", headers=NO_STORE)
 
     @api.post("/recordings/{name}/hold", summary="Keep lines from being deleted by retention")
     async def hold(name: str, asked: HoldRequest) -> RecordingDetail:
-        await reading(lambda: library.hold(name, asked))
-        return await reading(lambda: library.recording(name))
+        await reading(lambda: archive.hold(name, asked))
+        return await reading(lambda: archive.recording(name))
 
     @api.get("/videos", summary="Reconstructed videos, the newest first")
     async def videos() -> list[VideoFacts]:
-        return await reading(library.videos)
+        return await reading(archive.videos)
 
     @api.get("/videos/{name}", summary="A video, with the range that it is shown in")
     async def video(name: str) -> VideoFacts:
-        return await reading(lambda: library.video(name))
+        return await reading(lambda: archive.video(name))
 
     @api.get(
         "/videos/{name}/frames",
@@ -204,12 +204,12 @@ def _add_recordings(api: APIRouter, library: Library, reading: Reading) -> None:
     async def frames(
         name: str, first: Annotated[int, Query(ge=0)] = 0, count: Annotated[int, Query(ge=1, le=4096)] = 1
     ) -> Response:
-        content = await reading(lambda: library.frames(name, first, count))
+        content = await reading(lambda: archive.frames(name, first, count))
         return Response(content, media_type="application/octet-stream", headers=NO_STORE)
 
     @api.get("/cuts/{name}", summary="A stretch that was cut", responses=BYTES, response_class=Response)
     async def cut(name: str) -> FileResponse:
-        path = await reading(lambda: library.path_of(name, ".npz"))
+        path = await reading(lambda: archive.path_of(name, ".npz"))
         return FileResponse(path, media_type="application/octet-stream", filename=name)
 
 

@@ -22,7 +22,7 @@ from acquire.web.messages import JobFacts, JobRequest
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from acquire.web.library import Library
+    from acquire.web.archive import Archive
 
 MOST_WAITING = 16
 MOST_LISTED = 50
@@ -47,9 +47,9 @@ class _Job:
 class Jobs:
     """For one event loop; `run` is its life."""
 
-    def __init__(self, directory: Path, library: Library) -> None:
+    def __init__(self, directory: Path, archive: Archive) -> None:
         self._directory = directory
-        self._library = library
+        self._archive = archive
         self._jobs: dict[int, _Job] = {}
         self._count = 0
         self._added = asyncio.Event()
@@ -60,7 +60,7 @@ class Jobs:
 
     def add(self, request: JobRequest) -> JobFacts:
         """Raises PlaceError where there is no such recording, StateError where too much waits already."""
-        self._library.path_of(request.recording)
+        self._archive.path_of(request.recording)
         if sum(job.facts.state == "waiting" for job in self._jobs.values()) >= MOST_WAITING:
             raise StateError(f"{MOST_WAITING} jobs are waiting already", hint="stop one of them")
         self._count += 1

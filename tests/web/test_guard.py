@@ -17,8 +17,8 @@ from starlette.routing import Route
 from acquire.config import load_rig
 from acquire.errors import ConfigError, PlaceError, UsageError
 from acquire.web import guard as guard_module
+from acquire.web.archive import Archive
 from acquire.web.guard import Buckets, Guard
-from acquire.web.library import Library
 from acquire.web.server import address_of, link, names_of
 from acquire.web.tokens import COOKIE, Tokens, load_tokens
 from acquire.web_config import WebConfig
@@ -186,12 +186,12 @@ def test_nothing_outside_the_directory_is_served(tmp_path: Path, name: str) -> N
     (inside / "link.zarr").symlink_to(tmp_path / "outside.zarr")
     (inside / "file.zarr").write_text("x")
     (inside / "cut.npz").symlink_to("/etc/passwd")
-    library = Library(inside)
+    archive = Archive(inside)
     for suffix in (".zarr", ".npz"):
         with pytest.raises(PlaceError, match="among the recordings"):
-            library.path_of(name, suffix)
+            archive.path_of(name, suffix)
     with pytest.raises(PlaceError, match="among the recordings"):
-        library.path_of("cut.npz", ".npz")
-    assert library.recordings() == []
+        archive.path_of("cut.npz", ".npz")
+    assert archive.recordings() == []
     (tmp_path / "outside.zarr").rename(inside / "odd.zarr")
-    assert [one.error is None for one in library.recordings()] == [False]
+    assert [one.error is None for one in archive.recordings()] == [False]

@@ -51,7 +51,7 @@ VIDEO = "acquire-video/"
 LOST_COLOUR = (200, 0, 140)
 
 
-class Library:
+class Archive:
     """See the module. For one thread at a time."""
 
     def __init__(self, directory: Path) -> None:
