@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_validator
 
 from acquire.codes import TAPS, Code, ConstantCode, PrbsCode, mix_seed
+from acquire.config_errors import explained
 from acquire.device_config import SEEING_CAMERAS, SIMULATED_CAMERAS, CamerasConfig, TriggerConfig
 from acquire.effect_config import MOST_SECONDS, SEED_END, FilePath, FrozenModel
 from acquire.errors import ConfigError
@@ -38,8 +39,6 @@ EVENT_DELAY_S = 0.5
 """Between an event and the recording that it starts."""
 MOST_FILE_BYTES = 2**20
 """Of a file of this kind; written by hand, they have some kilobytes."""
-MOST_LISTED = 20
-"""Things to mend that one error lists."""
 WHOLE_STEPS = ("VT-4K5C-H100",)
 """Models of cameras that are known to have no intra-line charge transfer."""
 MAX_RING_BYTES = 4 * 2**30
@@ -469,45 +468,4 @@ def _validate(model: type[M], table: dict[str, Any], path: Path) -> M:
     try:
         return model.model_validate(table)
     except ValidationError as error:
-        raise ConfigError(_explain(error, model, path)) from error
-
-
-def _explain(error: ValidationError, model: type[BaseModel], path: Path) -> str:
-    lines = [f"{path}: {error.error_count()} thing(s) to mend"]
-    found = error.errors()
-    for item in found[:MOST_LISTED]:
-        keys, allowed = _locate(model, item["loc"])
-        key = shortened(".".join(keys)) or "(file)"
-        why = shortened(item["msg"].removeprefix("Value error, "), 400)
-        if item["type"] == "extra_forbidden":
-            lines.append(f"  {key}: unknown key; allowed here: {', '.join(allowed)}")
-        elif item["type"] == "missing":
-            lines.append(f"  {key}: missing")
-        elif isinstance(item["input"], dict):
-            lines.append(f"  {key}: {why}")
-        else:
-            lines.append(f"  {key} = {shown(item['input'])}: {why}")
-    if len(found) > MOST_LISTED:
-        lines.append(f"  and {len(found) - MOST_LISTED} more")
-    return "\n".join(lines)
-
-
-def _locate(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list[str], list[str]]:
-    """The key as the file writes it, and the keys allowed beside it.
-
-    pydantic's location also holds the tags of unions, which no file contains: the schema tells them apart.
-    """
-    schema = model.model_json_schema()
-    node: dict[str, Any] = schema
-    keys: list[str] = []
-    allowed: list[str] = []
-    for part in location:
-        while "$ref" in node:
-            node = schema["$defs"][node["$ref"].rsplit("/", 1)[1]]
-        if "mapping" in node.get("discriminator", {}) and part in node["discriminator"]["mapping"]:
-            node = {"$ref": node["discriminator"]["mapping"][part]}
-            continue
-        keys.append(str(part))
-        allowed = sorted(node.get("properties", {}))
-        node = node.get("items", {}) if isinstance(part, int) else node.get("properties", {}).get(part, {})
-    return keys, allowed
+        raise ConfigError(explained(error, model, path)) from error

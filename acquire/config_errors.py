@@ -1,0 +1,57 @@
+"""What is to be mended in a file: pydantic's findings in the words of the file that they are about."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from acquire.text import shortened, shown
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from pydantic import BaseModel, ValidationError
+
+MOST_LISTED = 20
+"""Things to mend that one error lists."""
+
+
+def explained(error: ValidationError, model: type[BaseModel], path: Path) -> str:
+    """Every finding on a line: its key, what stands there, why it cannot, and what is allowed."""
+    lines = [f"{path}: {error.error_count()} thing(s) to mend"]
+    found = error.errors()
+    for item in found[:MOST_LISTED]:
+        keys, allowed = _locate(model, item["loc"])
+        key = shortened(".".join(keys)) or "(file)"
+        why = shortened(item["msg"].removeprefix("Value error, "), 400)
+        if item["type"] == "extra_forbidden":
+            lines.append(f"  {key}: unknown key; allowed here: {', '.join(allowed)}")
+        elif item["type"] == "missing":
+            lines.append(f"  {key}: missing")
+        elif isinstance(item["input"], dict):
+            lines.append(f"  {key}: {why}")
+        else:
+            lines.append(f"  {key} = {shown(item['input'])}: {why}")
+    if len(found) > MOST_LISTED:
+        lines.append(f"  and {len(found) - MOST_LISTED} more")
+    return "\n".join(lines)
+
+
+def _locate(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list[str], list[str]]:
+    """The key as the file writes it, and the keys allowed beside it.
+
+    pydantic's location also holds the tags of unions, which no file contains: the schema tells them apart.
+    """
+    schema = model.model_json_schema()
+    node: dict[str, Any] = schema
+    keys: list[str] = []
+    allowed: list[str] = []
+    for part in location:
+        while "$ref" in node:
+            node = schema["$defs"][node["$ref"].rsplit("/", 1)[1]]
+        if "mapping" in node.get("discriminator", {}) and part in node["discriminator"]["mapping"]:
+            node = {"$ref": node["discriminator"]["mapping"][part]}
+            continue
+        keys.append(str(part))
+        allowed = sorted(node.get("properties", {}))
+        node = node.get("items", {}) if isinstance(part, int) else node.get("properties", {}).get(part, {})
+    return keys, allowed
