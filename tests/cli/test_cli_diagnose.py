@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from two_squares import record_two_squares
 
-from acquire.config import load_rig
 from acquire.effect_config import CodeErrors
-from acquire.scene_config import ArmOptics, ConstantDrive, LedConfig, LedSceneConfig, OpticsConfig, SineDrive
-from acquire.simulate import simulate
+from acquire.scene_config import ArmOptics
 from acquire.store import open_video
 
 Cli = Callable[..., Any]
@@ -20,17 +19,8 @@ Cli = Callable[..., Any]
 @pytest.fixture(scope="module")
 def late(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Its light is two sub-steps late."""
-    rig = load_rig("rig-demo", {"geometry.stages": 24, "geometry.substeps": 2})
-    slow = SineDrive(waveform="sine", frequency_hz=200.0, low=0.3)
-    still = ConstantDrive(waveform="constant", level=0.9)
-    leds = (
-        LedConfig(name="slow", shape="square", row=0.25, column=0.3, size=0.3, drive=slow),
-        LedConfig(name="still", shape="square", row=0.75, column=0.6, size=0.2, drive=still),
-    )
-    scene = LedSceneConfig(kind="leds", leds=leds, effects=(CodeErrors(kind="code_errors", late_substeps=2),))
-    path = tmp_path_factory.mktemp("late") / "run.zarr"
-    simulate(rig, scene, path, 150)
-    return path
+    late = CodeErrors(kind="code_errors", late_substeps=2)
+    return record_two_squares(tmp_path_factory.mktemp("late") / "run.zarr", 150, [late])
 
 
 def test_what_is_wrong_is_said_with_its_evidence(cli: Cli, late: Path) -> None:
@@ -59,23 +49,8 @@ def test_lines_that_are_not_there(cli: Cli, late: Path) -> None:
 @pytest.fixture(scope="module")
 def mirrored(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Its arm B is mirrored; the scene is a pulsing square and a steady one."""
-    rig = load_rig("rig-demo", {"geometry.stages": 24, "geometry.substeps": 2})
-    slow = SineDrive(waveform="sine", frequency_hz=200.0, low=0.3)
-    leds = (
-        LedConfig(name="slow", shape="square", row=0.25, column=0.3, size=0.3, drive=slow),
-        LedConfig(
-            name="still",
-            shape="square",
-            row=0.75,
-            column=0.6,
-            size=0.2,
-            drive=ConstantDrive(waveform="constant", level=0.9),
-        ),
-    )
-    optics = OpticsConfig(b=ArmOptics(turn_deg=270, mirror=True))
-    path = tmp_path_factory.mktemp("mirrored") / "run.zarr"
-    simulate(rig, LedSceneConfig(kind="leds", leds=leds, optics=optics), path, 150)
-    return path
+    b = ArmOptics(turn_deg=270, mirror=True)
+    return record_two_squares(tmp_path_factory.mktemp("mirrored") / "run.zarr", 150, b=b)
 
 
 def test_a_mirrored_arm_is_named_by_reconstruct_and_put_right_on_request(

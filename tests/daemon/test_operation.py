@@ -114,7 +114,10 @@ def test_the_unit_says_when_it_is_ready_and_what_it_may_not(tmp_path: Path) -> N
     assert "User" not in unit_of(tmp_path, user=True)
 
 
-@pytest.mark.skipif(which("systemd-analyze") is None, reason="systemd-analyze reads the unit")
+@pytest.mark.skipif(
+    which("systemd-analyze") is None,
+    reason="there is no systemd-analyze here, whose verdict on the unit is asked for",
+)
 def test_systemd_takes_the_unit(tmp_path: Path) -> None:
     install_service("rig-demo", directory=tmp_path)
     command = ["systemd-analyze", "verify", str(tmp_path / "acquire.service")]

@@ -6,15 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from two_squares import record_two_squares
 
-from acquire.config import load_rig
 from acquire.effect_config import CodeErrors, EffectConfig, StrayLight
 from acquire.recon.diagnosis import Diagnosis
 from acquire.recon.hypotheses import Hypothesis, Turn
 from acquire.recon.search import Standing
 from acquire.reconstruct.diagnose import diagnose_recording, stretch
-from acquire.scene_config import ArmOptics, ConstantDrive, LedConfig, LedSceneConfig, OpticsConfig, SineDrive
-from acquire.simulate import simulate
+from acquire.scene_config import ArmOptics
 from acquire.store import open_recording
 
 LINES = 150
@@ -24,31 +23,10 @@ Told = Callable[..., Diagnosis]
 @pytest.fixture
 def told(tmp_path: Path) -> Told:
     """Simulate a recording with a fault and ask what it is."""
-    rig = load_rig("rig-demo", {"geometry.stages": 24, "geometry.substeps": 2})
-    leds = (
-        LedConfig(
-            name="slow",
-            shape="square",
-            row=0.25,
-            column=0.3,
-            size=0.3,
-            drive=SineDrive(waveform="sine", frequency_hz=200.0, low=0.3),
-        ),
-        LedConfig(
-            name="still",
-            shape="square",
-            row=0.75,
-            column=0.6,
-            size=0.2,
-            drive=ConstantDrive(waveform="constant", level=0.9),
-        ),
-    )
 
     def tell(*effects: EffectConfig, b: ArmOptics | None = None, lines: int = LINES) -> Diagnosis:
-        optics = OpticsConfig() if b is None else OpticsConfig(b=b)
-        scene = LedSceneConfig(kind="leds", leds=leds, optics=optics, effects=effects)
-        simulate(rig, scene, tmp_path / "run.zarr", lines)
-        return diagnose_recording(open_recording(tmp_path / "run.zarr"), None, None)
+        path = record_two_squares(tmp_path / "run.zarr", lines, effects, b)
+        return diagnose_recording(open_recording(path), None, None)
 
     return tell
 
