@@ -34,8 +34,8 @@ FIRST_LOOK, LONGER_LOOK = 60, 90
 """Iterations in the cosines before patterns are looked for; longer where these are in doubt."""
 FIRST_LOOK_SHARE = 0.7
 """Of a budget, the most that the first look may take."""
-BEYOND_S = 0.5
-"""What it takes to look for light beyond the band; it is not done with less to spare."""
+BEYOND_S = 2e-6
+"""What it takes to look for light beyond the band, for each line and frame; not done with less to spare."""
 WIDER_SHARE = 0.5
 """Of a budget, after which nothing is made again in a wider band."""
 TENTATIVE_SHARE = 0.15
@@ -77,7 +77,7 @@ def go_on(
 ) -> Estimate:
     """Patterns, or more of the same; once more in a wider band where the lines show light beyond this one."""
     found = _go_on(segment, problem, request, clock, first)
-    if not clock.affords(BEYOND_S):
+    if not clock.affords(BEYOND_S * segment.geometry.lines * first.basis.frames):
         return found
     predicted = found.predict()
     beyond = light_beyond(segment, problem, predicted, request.temporal_merge, first.basis.count)

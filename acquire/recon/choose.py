@@ -66,10 +66,12 @@ def solve_admm(segment: Segment, problem: Problem, request: Request, clock: Iter
         return bench.finish(best)
     blinking = go_on(segment, problem, request, clock, first)
     errors = bench.note({"prior": "patterns"} | blinking.facts(), blinking.predict())
-    return Told(blinking, bench.record) if held_out.clearly_less(errors, best.errors) else bench.finish(best)
+    if held_out.clearly_less(errors, best.errors):
+        return Preferred(blinking, bench.record)
+    return bench.finish(best)
 
 
-class Told:
+class Preferred:
     """An estimate with the candidates that it was preferred to."""
 
     def __init__(self, estimate: Estimate, record: list[dict[str, Any]]) -> None:

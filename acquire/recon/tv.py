@@ -41,7 +41,7 @@ class FrameTv:
             tv_value(frames, values)
             return float(values.sum())
         xp = namespace(frames)
-        return float(xp.sum(xp.sqrt(_ahead(frames, 1) ** 2 + _ahead(frames, 2) ** 2), dtype=xp.float64))
+        return float(xp.sum(xp.sqrt(ahead(frames, 1) ** 2 + ahead(frames, 2) ** 2), dtype=xp.float64))
 
     def prox(self, frames: Array, weight: float | Array) -> Array:
         """argmin_x ½‖x − frames‖² + Σ_k weight_k·TV(x_k); ``weight`` is one number or (K,).
@@ -69,7 +69,7 @@ class FrameTv:
         p_ahead, q_ahead, momentum = p, q, 1.0
         for _ in range(self.iterations):
             x = frames + used * _divergence(p_ahead, q_ahead)
-            new_p, new_q = p_ahead + _ahead(x, 1) / (8 * used), q_ahead + _ahead(x, 2) / (8 * used)
+            new_p, new_q = p_ahead + ahead(x, 1) / (8 * used), q_ahead + ahead(x, 2) / (8 * used)
             length = xp.maximum(xp.sqrt(new_p**2 + new_q**2), 1)
             new_p, new_q = new_p / length, new_q / length
             following = (1 + math.sqrt(1 + 4 * momentum**2)) / 2
@@ -80,11 +80,14 @@ class FrameTv:
         return xp.where(scale < SMALLEST_WEIGHT, frames, frames + used * _divergence(p, q))
 
 
-def _ahead(x: Array, axis: int) -> Array:
-    """x_{i+1} − x_i along an axis, 0 at its end."""
-    xp = namespace(x)
-    last = x[:, -1:, :] if axis == 1 else x[:, :, -1:]
-    return xp.diff(x, axis=axis, append=last)
+def ahead(x: Array, axis: int) -> Array:
+    """x_{i+1} − x_i along an axis of three, 0 at its end."""
+    return namespace(x).diff(x, axis=axis, append=x[layer(axis, -1)])
+
+
+def layer(axis: int, at: int) -> tuple[slice, ...]:
+    """The first (0) or last (−1) layer along an axis of a volume."""
+    return tuple(slice(at, at + 1 or None) if each == axis else slice(None) for each in range(3))
 
 
 def _divergence(p: Array, q: Array) -> Array:

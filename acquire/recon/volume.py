@@ -20,6 +20,7 @@ from acquire.arrays import Arrays, namespace
 from acquire.errors import UsageError
 from acquire.recon.basis import TemporalBasis
 from acquire.recon.kernels import SMALLEST_WEIGHT, volume_prox, volume_prox_parallel
+from acquire.recon.tv import ahead, layer
 
 if TYPE_CHECKING:
     from acquire.arrays import Array
@@ -73,21 +74,16 @@ class VolumeTv:
         """As `kernels.volume_prox`, in the standard's operations."""
         xp, scales = namespace(volume), (1.0, 1.0, self.pace)
         step, momentum = 1 / ((8 + 4 * self.pace**2) * weight), 1.0
-        dual, ahead = self._dual, self._dual
+        dual, leading = self._dual, self._dual
         for _ in range(self.iterations):
-            x = volume + weight * _divergence(ahead, scales)
-            new = ahead + step * xp.stack([k * _ahead(x, axis) for axis, k in _axes(scales)])
+            x = volume + weight * _divergence(leading, scales)
+            new = leading + step * xp.stack([k * ahead(x, axis) for axis, k in _axes(scales)])
             new = new / xp.maximum(xp.sqrt(xp.sum(new**2, axis=0)), 1)
             following = (1 + math.sqrt(1 + 4 * momentum**2)) / 2
-            ahead = new + ((momentum - 1) / following) * (new - dual)
+            leading = new + ((momentum - 1) / following) * (new - dual)
             dual, momentum = new, following
         self._dual = dual
         return volume + weight * _divergence(dual, scales)
-
-
-def _only(axis: int, at: int) -> tuple[slice, ...]:
-    """The first (0) or last (−1) layer along an axis of a volume."""
-    return tuple(slice(at, at + 1 or None) if each == axis else slice(None) for each in range(3))
 
 
 def _one(weight: float | Array) -> float:
@@ -100,17 +96,12 @@ def _axes(scales: tuple[float, float, float]) -> tuple[tuple[int, float], ...]:
     return tuple(zip((1, 2, 0), scales, strict=True))
 
 
-def _ahead(x: Array, axis: int) -> Array:
-    """x_{i+1} − x_i along an axis, 0 at its end."""
-    return namespace(x).diff(x, axis=axis, append=x[_only(axis, -1)])
-
-
 def _divergence(dual: Array, scales: tuple[float, float, float]) -> Array:
     """The negative transpose of the scaled differences, for a dual that is 0 at its ends."""
     xp, total = namespace(dual), 0.0
     for index, (axis, scale) in enumerate(_axes(scales)):
         part = dual[index, ...]
-        none = xp.zeros_like(part[_only(axis, 0)])
+        none = xp.zeros_like(part[layer(axis, 0)])
         total = total + scale * xp.diff(part, axis=axis, prepend=none)
     return total
 
