@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Self
 from acquire.camera.aravis import AravisOpener
 from acquire.camera.harvesters import HarvestersOpener
 from acquire.camera.spec import spec_of
-from acquire.device_config import LightOutputConfig
+from acquire.config.device import LightOutputConfig
 from acquire.errors import ConfigError, TriggerError, UsageError
 from acquire.lines import ARMS
 from acquire.trigger.base import TriggerRun
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from acquire.camera.base import CameraOpener
     from acquire.config import RigConfig
-    from acquire.device_config import TriggerConfig
+    from acquire.config.device import TriggerConfig
     from acquire.sim.instrument import SimulatedDevices
     from acquire.sim.scene import Scene
     from acquire.trigger.base import Trigger

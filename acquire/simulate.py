@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from acquire.codes import Code
     from acquire.config import RigConfig
-    from acquire.scene_config import SceneConfig
+    from acquire.config.scene import SceneConfig
     from acquire.sim.pipeline import Camera
     from acquire.sim.readout import Readout
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from acquire.config import load_rig
-from acquire.scene_config import LedSceneConfig, VideoSceneConfig
+from acquire.config.scene import LedSceneConfig, VideoSceneConfig
 from acquire.simulate import bench_of, simulate
 
 M, S = 24, 3

@@ -12,8 +12,8 @@ import xarray
 from PIL import Image
 
 from acquire.config import load_rig, load_scene
+from acquire.config.scene import FunctionSceneConfig, LedSceneConfig
 from acquire.errors import UsageError
-from acquire.scene_config import FunctionSceneConfig, LedSceneConfig
 from acquire.sim.effects import ORDER
 from acquire.sim.lines import StreamingArm
 from acquire.sim.scenes import build_scene

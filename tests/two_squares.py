@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from acquire.config import load_rig
-from acquire.effect_config import EffectConfig
-from acquire.scene_config import ArmOptics, ConstantDrive, LedConfig, LedSceneConfig, OpticsConfig, SineDrive
+from acquire.config.effect import EffectConfig
+from acquire.config.scene import ArmOptics, ConstantDrive, LedConfig, LedSceneConfig, OpticsConfig, SineDrive
 from acquire.simulate import simulate
 
 

@@ -33,9 +33,9 @@ from acquire.calibrate.orientation import VIEWS
 from acquire.calibrate.target import alignment, orientation
 from acquire.calibrate.transfer import transfer
 from acquire.config import load_rig
+from acquire.config.scene import LedSceneConfig, VideoSceneConfig
 from acquire.forward import merge_video
 from acquire.recon import reconstruct
-from acquire.scene_config import LedSceneConfig, VideoSceneConfig
 from acquire.sim.scenes import build_scene
 from acquire.simulate import bench_of, simulate
 from acquire.store import open_recording
@@ -43,8 +43,8 @@ from acquire.store import open_recording
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from acquire.config.scene import SceneConfig
     from acquire.lines import Segment
-    from acquire.scene_config import SceneConfig
 
 BLACK_DN = 40.0
 K = 0.1

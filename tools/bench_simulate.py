@@ -23,10 +23,10 @@ from scipy import sparse
 
 from acquire.codes import PrbsCode, mix_seed
 from acquire.config import GeometryConfig, load_scene
+from acquire.config.device import CameraConfig
+from acquire.config.scene import SceneFile
 from acquire.cores import limit_blas
-from acquire.device_config import CameraConfig
 from acquire.lines import ARMS
-from acquire.scene_config import SceneFile
 from acquire.sim.lines import SeparableLines, StreamingArm
 from acquire.sim.pipeline import Bench, Converter
 from acquire.sim.scenes import build_scene

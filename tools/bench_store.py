@@ -22,8 +22,8 @@ import numpy as np
 
 from acquire.clock import ClockFit
 from acquire.codes import ConstantCode
+from acquire.config.recording import usual_chunk_lines, usual_tag_chunks
 from acquire.lines import ARMS, TaggedBlock
-from acquire.recording_config import usual_chunk_lines, usual_tag_chunks
 from acquire.store import RecordingSpec, RecordingWriter, RunCondition, open_recording
 from acquire.store.codecs import CODECS, measure_codec
 from acquire.store.files import DISK

@@ -15,8 +15,8 @@ import matplotlib as mpl
 import numpy as np
 
 from acquire.config import builtin_directory, load_rig, load_scene
+from acquire.config.scene import SceneBase
 from acquire.lines import ARMS
-from acquire.scene_config import SceneBase
 from acquire.sim.scenes import build_scene
 from acquire.sim.voxels import truth
 from acquire.simulate import bench_of

@@ -36,7 +36,7 @@ import numpy as np
 
 from acquire.camera.base import CameraBlock
 from acquire.capacity.load import Load, capture_plan, recording_spec
-from acquire.device_config import TriggerConfig
+from acquire.config.device import TriggerConfig
 from acquire.errors import CameraLostError
 from acquire.lines import ARMS
 from acquire.sim.clock import Wire

@@ -24,10 +24,10 @@ import numpy as np
 from acquire.capacity.latency import Latencies, TimedOpener
 from acquire.codes import PrbsCode, mix_seed
 from acquire.config import GeometryConfig
-from acquire.device_config import CameraConfig, TriggerConfig
+from acquire.config.device import CameraConfig, TriggerConfig
+from acquire.config.recording import usual_chunk_lines, usual_tag_chunks
 from acquire.errors import DataError, UsageError
 from acquire.lines import ARMS
-from acquire.recording_config import usual_chunk_lines, usual_tag_chunks
 from acquire.sim.clock import Wire
 from acquire.sim.pattern import PatternCameraOpener
 from acquire.sim.trigger_model import TriggerModel

@@ -10,6 +10,7 @@ import numpy as np
 
 from acquire.cli.demo_plan import N_M, SEGMENT_LINES, T_M, segment_row
 from acquire.cli.progress import stage_progress
+from acquire.config.scene import LedSceneConfig, SineDrive
 from acquire.cores import idle_cores, limit_blas
 from acquire.evaluate.report import (
     ArmLedger,
@@ -22,7 +23,6 @@ from acquire.evaluate.report import (
 )
 from acquire.recon import Reconstruction, reconstruct
 from acquire.reconstruct import save_reconstruction
-from acquire.scene_config import LedSceneConfig, SineDrive
 from acquire.sim.leds import LedScene
 from acquire.sim.scenes import build_scene
 from acquire.sim.voxels import truth

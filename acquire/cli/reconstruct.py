@@ -19,7 +19,7 @@ from acquire.errors import EXIT_INTERRUPTED, UsageError
 
 if TYPE_CHECKING:
     from acquire.cli.reconstruct_request import Asked, Prepared
-    from acquire.plan_config import ReconstructionPlan
+    from acquire.config.plan import ReconstructionPlan
     from acquire.reconstruct import Options, Outcome, Request
     from acquire.store import Recording
 

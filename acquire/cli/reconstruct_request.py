@@ -20,7 +20,7 @@ from acquire.store.files import check_new_path
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from acquire.plan_config import ReconstructionPlan
+    from acquire.config.plan import ReconstructionPlan
     from acquire.reconstruct import Options, Request
     from acquire.store import Recording
 

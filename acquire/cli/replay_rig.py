@@ -11,7 +11,7 @@ import os
 import shutil
 from typing import TYPE_CHECKING, Any
 
-from acquire.device_config import PIXEL_BITS
+from acquire.config.device import PIXEL_BITS
 from acquire.errors import UsageError
 from acquire.lines import ARMS
 

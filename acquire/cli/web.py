@@ -12,7 +12,7 @@ from acquire.cli.output import say
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from acquire.web_config import WebConfig
+    from acquire.config.web import WebConfig
 
 
 def register(app: typer.Typer) -> None:
@@ -74,8 +74,8 @@ def _settings(
     import json
 
     from acquire.config import load_rig
+    from acquire.config.web import WebConfig
     from acquire.place import default_socket
-    from acquire.web_config import WebConfig
 
     if given is not None:
         facts = json.loads(given)

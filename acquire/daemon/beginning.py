@@ -17,8 +17,8 @@ from acquire.errors import AcquireError
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
+    from acquire.config.service import ServiceConfig
     from acquire.daemon.service import Service
-    from acquire.service_config import ServiceConfig
 
 log = logging.getLogger("acquire.daemon")
 

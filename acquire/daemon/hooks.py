@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 from acquire.daemon.states import State
 
 if TYPE_CHECKING:
+    from acquire.config.service import HooksConfig
     from acquire.daemon.facts import News
     from acquire.daemon.news import NewsLog
-    from acquire.service_config import HooksConfig
 
 END_S = 2.0
 MOST_AT_ONCE = 20

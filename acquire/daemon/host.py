@@ -15,10 +15,10 @@ import numpy as np
 
 from acquire.clock import ClockFit
 from acquire.config import check_directory, load_scene
+from acquire.config.scene import LedSceneConfig
 from acquire.daemon.storage import storage_settings
 from acquire.errors import ConfigError, UsageError
 from acquire.lines import ARMS
-from acquire.scene_config import LedSceneConfig
 from acquire.store import RecordingSpec
 
 if TYPE_CHECKING:

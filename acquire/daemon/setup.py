@@ -36,7 +36,7 @@ def version_of(config: RigConfig) -> Version:
 
 
 def setup_of(config: RigConfig, origin: str) -> Setup:
-    """All of it, read from the file ``origin``: a rig file holds no secrets (`recording_config`)."""
+    """All of it, read from the file ``origin``: a rig file holds no secrets (`acquire.config.recording`)."""
     rate_hz = config.line_rate_hz
     return Setup(
         name=config.name,

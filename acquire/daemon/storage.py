@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.config import RigConfig
-    from acquire.recording_config import RetentionConfig
+    from acquire.config.recording import RetentionConfig
     from acquire.store import CodecChoice
 
 SAMPLE_BYTES = 4 * 2**20

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.config import RigConfig
+from acquire.config.scene import SceneFile, SineDrive
 from acquire.evaluate.curves import compare_curve, region_mean
 from acquire.evaluate.metrics import psnr, ssim
 from acquire.forward import merge_video
 from acquire.recon import reconstruct
-from acquire.scene_config import SceneFile, SineDrive
 from acquire.sim.leds import LedScene
 from acquire.sim.scene import Scene
 from acquire.sim.voxels import truth

@@ -7,7 +7,7 @@ from itertools import groupby, pairwise
 from typing import TYPE_CHECKING
 
 from acquire.calibrate import calibrated
-from acquire.plan_config import ReconstructionPlan, SegmentPlan
+from acquire.config.plan import ReconstructionPlan, SegmentPlan
 from acquire.recon.auto import TEMPORAL_MERGES, Tempo, tempo
 from acquire.recon.segments import Stretch, Voxels, split
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from acquire.config.plan import FADE_SUBSTEPS
 from acquire.errors import UsageError
-from acquire.plan_config import FADE_SUBSTEPS
 from acquire.recon.segments import Grid, Stream, Stretch, SubSegment, Voxels, split
 from acquire.reconstruct.times import Times, duration
 
 if TYPE_CHECKING:
-    from acquire.plan_config import ReconstructionPlan
+    from acquire.config.plan import ReconstructionPlan
     from acquire.store import Recording
 
 SPANS_PER_SEGMENT = 4

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
     from acquire.codes import Code
     from acquire.config import GeometryConfig
-    from acquire.device_config import CameraConfig
-    from acquire.scene_config import SceneConfig
+    from acquire.config.device import CameraConfig
+    from acquire.config.scene import SceneConfig
     from acquire.sim.clock import PulseTrain, Reading, Wire
     from acquire.sim.pins import PinWire
     from acquire.sim.pipeline import Camera

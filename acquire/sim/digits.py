@@ -24,7 +24,7 @@ from acquire.sim.targets import overlap
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from acquire.scene_config import DisplayConfig
+    from acquire.config.scene import DisplayConfig
 
 SEGMENTS = ("abcdef", "bc", "abdeg", "abcdg", "bcfg", "acdfg", "acdefg", "abc", "abcdefg", "abcdfg")
 """Segments of each digit."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.scene_config import ConstantDrive, PulseDrive, SineDrive, TriangleDrive
+from acquire.config.scene import ConstantDrive, PulseDrive, SineDrive, TriangleDrive
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
     from acquire.camera.base import CameraOpener
     from acquire.config import RigConfig
-    from acquire.device_config import SimulatedDriver
-    from acquire.scene_config import SceneConfig
+    from acquire.config.device import SimulatedDriver
+    from acquire.config.scene import SceneConfig
     from acquire.sim.scene import Scene
     from acquire.trigger.transports import Transport
 

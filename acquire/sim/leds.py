@@ -13,7 +13,7 @@ from acquire.sim.shapes import coverage
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from acquire.scene_config import LedConfig
+    from acquire.config.scene import LedConfig
 
 
 _EDGE = 2

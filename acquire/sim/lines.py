@@ -24,9 +24,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from acquire.config.scene import ArmOptics, OpticsConfig
 from acquire.errors import UsageError
 from acquire.lines import ARMS
-from acquire.scene_config import ArmOptics, OpticsConfig
 from acquire.sim.light import Illumination
 from acquire.sim.scene import SeparableScene, frames_at
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from acquire.scene_config import VideoSceneConfig
+    from acquire.config.scene import VideoSceneConfig
 
     Light = NDArray[np.floating[Any]]
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from acquire.codes import Code
     from acquire.config import GeometryConfig
-    from acquire.device_config import CameraConfig
+    from acquire.config.device import CameraConfig
     from acquire.sim.clock import PulseTrain, Wire
     from acquire.sim.pins import PinWire
 

@@ -37,8 +37,8 @@ if TYPE_CHECKING:
 
     from acquire.codes import Code
     from acquire.config import GeometryConfig
-    from acquire.device_config import CameraConfig
-    from acquire.scene_config import OpticsConfig, SceneConfig
+    from acquire.config.device import CameraConfig
+    from acquire.config.scene import OpticsConfig, SceneConfig
     from acquire.sim.scene import Scene
     from acquire.sim.stopwatch import Stopwatch
 

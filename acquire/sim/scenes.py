@@ -8,7 +8,7 @@ from acquire.sim.leds import LedScene
 from acquire.sim.scene import add
 
 if TYPE_CHECKING:
-    from acquire.scene_config import SceneConfig
+    from acquire.config.scene import SceneConfig
     from acquire.sim.scene import Scene
 
 

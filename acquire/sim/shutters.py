@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from acquire.scene_config import WindowConfig
+from acquire.config.scene import WindowConfig
 from acquire.sim.kernels import chop
 from acquire.sim.scene import frames_at
 from acquire.sim.targets import overlap
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from acquire.scene_config import ChopperConfig, WindowPhase
+    from acquire.config.scene import ChopperConfig, WindowPhase
     from acquire.sim.scene import Scene
 
 

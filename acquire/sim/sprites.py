@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from acquire.scene_config import SpriteConfig
+    from acquire.config.scene import SpriteConfig
 
     Grid = NDArray[Any]
     Picture = tuple[Grid, Grid]

@@ -39,7 +39,7 @@ from acquire.trigger.tags import TagReader, signed_ticks
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from acquire.device_config import TriggerConfig
+    from acquire.config.device import TriggerConfig
     from acquire.trigger.base import TriggerRun
     from acquire.trigger.transports import Transport
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from acquire.device_config import LightOutputConfig, LineOutputConfig, TriggerConfig
+    from acquire.config.device import LightOutputConfig, LineOutputConfig, TriggerConfig
     from acquire.trigger.base import TriggerRun
 
 _DEFAULT_WIDTH = 90

@@ -21,7 +21,7 @@ from acquire.web.tokens import Tokens, load_tokens
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from acquire.web_config import WebConfig
+    from acquire.config.web import WebConfig
 
 NICE = 10
 IDLE_S = 5

@@ -15,7 +15,7 @@ import pytest
 from PIL import Image
 
 from acquire.config import load_rig
-from acquire.scene_config import ConstantDrive, LedConfig, LedSceneConfig, SineDrive
+from acquire.config.scene import ConstantDrive, LedConfig, LedSceneConfig, SineDrive
 from acquire.simulate import simulate
 from acquire.store import open_video
 

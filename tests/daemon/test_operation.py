@@ -18,6 +18,7 @@ from fake_run import FakeRun, rig_config
 
 from acquire.cli.install_service import install_service
 from acquire.config import builtin_directory, load_rig
+from acquire.config.service import HooksConfig
 from acquire.daemon.facts import Health
 from acquire.daemon.hooks import Hooks
 from acquire.daemon.messages import ArmRequest
@@ -27,7 +28,6 @@ from acquire.daemon.service import Service
 from acquire.daemon.states import State
 from acquire.daemon.unit import WATCHDOG_S, unit_text
 from acquire.errors import ConfigError, UsageError
-from acquire.service_config import HooksConfig
 
 
 def until_written(path: Path, lines: int) -> list[dict[str, str]]:

@@ -9,7 +9,7 @@ import pytest
 from bench import simulate
 
 from acquire.codes import ConstantCode
-from acquire.device_config import TriggerConfig
+from acquire.config.device import TriggerConfig
 from acquire.errors import TriggerError
 from acquire.sim.trigger_registers import constants
 from acquire.trigger import registers as r

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from acquire.config import RigConfig, load_rig
-from acquire.scene_config import (
+from acquire.config.scene import (
     ConstantDrive,
     LedConfig,
     LedSceneConfig,

@@ -12,8 +12,9 @@ import time
 import numpy as np
 import pytest
 
+from acquire.config.plan import ReconstructionPlan
+from acquire.config.scene import LedSceneConfig
 from acquire.errors import UsageError
-from acquire.plan_config import ReconstructionPlan
 from acquire.recon.judge import POOR_MISFIT
 from acquire.recon.segments import Voxels
 from acquire.reconstruct import (
@@ -28,7 +29,6 @@ from acquire.reconstruct import (
     open_pool,
 )
 from acquire.reconstruct.budget import Budget
-from acquire.scene_config import LedSceneConfig
 from acquire.sim.scenes import build_scene
 from acquire.sim.voxels import truth
 from acquire.store import open_recording, open_video

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 from two_squares import record_two_squares
 
-from acquire.effect_config import CodeErrors, EffectConfig, StrayLight
+from acquire.config.effect import CodeErrors, EffectConfig, StrayLight
+from acquire.config.scene import ArmOptics
 from acquire.recon.diagnosis import Diagnosis
 from acquire.recon.hypotheses import Hypothesis, Turn
 from acquire.recon.search import Standing
 from acquire.reconstruct.diagnose import diagnose_recording, stretch
-from acquire.scene_config import ArmOptics
 from acquire.store import open_recording
 
 LINES = 150

@@ -11,8 +11,8 @@ import numpy as np
 
 from acquire.codes import PrbsCode, mix_seed
 from acquire.config import GeometryConfig
-from acquire.device_config import CameraConfig
-from acquire.scene_config import ConstantDrive, LedConfig, LedSceneConfig, SineDrive
+from acquire.config.device import CameraConfig
+from acquire.config.scene import ConstantDrive, LedConfig, LedSceneConfig, SineDrive
 from acquire.sim.devices import SimulatedOptics
 from acquire.trigger.base import TriggerRun
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from acquire.codes import ConstantCode
 from acquire.config import GeometryConfig
-from acquire.device_config import CameraConfig
-from acquire.scene_config import LedSceneConfig
+from acquire.config.device import CameraConfig
+from acquire.config.scene import LedSceneConfig
 from acquire.sim.pipeline import Bench
 
 M, S, DT = 8, 3, 1e-5

@@ -24,7 +24,7 @@ from sim_helpers import (
 )
 
 from acquire.codes import ConstantCode
-from acquire.device_config import TriggerConfig
+from acquire.config.device import TriggerConfig
 from acquire.errors import CameraError
 from acquire.sim.clock import Wire
 from acquire.sim.devices import SimulatedCamera, SimulatedCameraOpener

@@ -11,7 +11,7 @@ from sim_helpers import CODE
 from small_bench import DT, LIT, N, bench, blinking, flat, read
 
 from acquire.codes import ConstantCode
-from acquire.scene_config import FunctionSceneConfig, LedSceneConfig
+from acquire.config.scene import FunctionSceneConfig, LedSceneConfig
 from acquire.sim.scenes import build_scene
 
 

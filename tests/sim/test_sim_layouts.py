@@ -8,8 +8,8 @@ from sim_helpers import CODE
 from small_bench import DT, M, N, S, bench, blinking, flat, read
 
 from acquire.config import GeometryConfig
+from acquire.config.scene import SceneFile
 from acquire.errors import UsageError
-from acquire.scene_config import SceneFile
 from acquire.sim.pipeline import Bench
 from acquire.sim.scenes import build_scene
 

@@ -8,8 +8,8 @@ import pytest
 from PIL import Image
 
 from acquire.config import load_scene
+from acquire.config.scene import SpriteConfig, SpritesSceneConfig, VideoSceneConfig
 from acquire.errors import DataError, UsageError
-from acquire.scene_config import SpriteConfig, SpritesSceneConfig, VideoSceneConfig
 from acquire.sim.media import _KEPT_FRAMES, VideoScene, resample
 from acquire.sim.scenes import build_scene
 

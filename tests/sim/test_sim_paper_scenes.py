@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from acquire.config import builtin_directory, load_scene
+from acquire.config.scene import ChopperConfig, DisplayConfig, PulseDrive, TriangleDrive, WindowConfig
 from acquire.errors import ConfigError
-from acquire.scene_config import ChopperConfig, DisplayConfig, PulseDrive, TriangleDrive, WindowConfig
 from acquire.sim.digits import DigitScene
 from acquire.sim.drives import mean_drive
 from acquire.sim.scene import ArrayScene, SeparableScene, SumScene, frames_at
@@ -151,7 +151,7 @@ def test_scenes_add_up_and_stay_separable_where_they_can():
     usaf = {"kind": "usaf"}
     digits = load_scene("scene-digits").model_dump(exclude={"effects", "optics"})
     window = {**usaf, "shutters": [{"kind": "window", "phases": [{"duration_s": 1.0, "axis": "row"}]}]}
-    from acquire.scene_config import SceneFile
+    from acquire.config.scene import SceneFile
 
     for parts, kind in (([usaf, digits], SeparableScene), ([window, digits], SumScene)):
         both = build_scene(SceneFile.model_validate({"kind": "sum", "parts": parts}).root, 24, DT)

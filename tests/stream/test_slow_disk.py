@@ -27,7 +27,7 @@ from throttle import Throttle
 from waiting import until
 
 from acquire.capacity.load import CLOCK_HZ, Load, capture_plan, recording_spec
-from acquire.device_config import TriggerConfig
+from acquire.config.device import TriggerConfig
 from acquire.lines import ARMS
 from acquire.sim.clock import Wire
 from acquire.sim.pattern import Pattern

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from trigger_twins import CLOCK_HZ, run, wired_model
 
-from acquire.device_config import TriggerConfig
+from acquire.config.device import TriggerConfig
 from acquire.errors import TriggerError
 from acquire.sim.trigger_model import TriggerModel
 from acquire.sim.twin_links import PtyTwin

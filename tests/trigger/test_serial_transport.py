@@ -15,7 +15,7 @@ import serial
 from serial.tools.list_ports_common import ListPortInfo
 from trigger_twins import CLOCK_HZ, run, wired_model
 
-from acquire.device_config import TriggerConfig
+from acquire.config.device import TriggerConfig
 from acquire.errors import TriggerError
 from acquire.sim.twin_links import PtyTwin
 from acquire.trigger.driver import TriggerDriver

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from trigger_twins import CLOCK_HZ, CODE, run, wired_model
 
-from acquire.device_config import TriggerConfig
+from acquire.config.device import TriggerConfig
 from acquire.errors import TriggerError
 from acquire.sim.clock import Wire
 from acquire.sim.trigger_model import TriggerModel

@@ -7,7 +7,7 @@ import usb.core
 from fake_bus import FakeBus
 from trigger_twins import run, wired_model
 
-from acquire.device_config import TriggerConfig
+from acquire.config.device import TriggerConfig
 from acquire.errors import TriggerError
 from acquire.trigger.driver import TriggerDriver
 from acquire.trigger.transports.usb import FoundDevice, UsbTransport, list_devices

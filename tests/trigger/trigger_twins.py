@@ -18,7 +18,7 @@ from fake_bus import FakeBus
 
 import firmware.cxxrtl
 from acquire.codes import PrbsCode, mix_seed
-from acquire.device_config import TriggerConfig
+from acquire.config.device import TriggerConfig
 from acquire.sim.clock import Wire
 from acquire.sim.trigger_model import TriggerModel
 from acquire.sim.twin_links import PtyTwin, TwinTransport

@@ -15,13 +15,13 @@ from starlette.responses import PlainTextResponse
 from starlette.routing import Route
 
 from acquire.config import load_rig
+from acquire.config.web import WebConfig
 from acquire.errors import ConfigError, PlaceError, UsageError
 from acquire.web import guard as guard_module
 from acquire.web.archive import Archive
 from acquire.web.guard import Buckets, Guard
 from acquire.web.server import address_of, link, names_of
 from acquire.web.tokens import COOKIE, Tokens, load_tokens
-from acquire.web_config import WebConfig
 
 TOKENS = Tokens("o" * 32, "v" * 32)
 OPERATOR = {"Authorization": f"Bearer {TOKENS.operator}"}

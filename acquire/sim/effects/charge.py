@@ -11,7 +11,7 @@ from acquire.sim.effects.base import TILE_LINES, Setting, Stage, draws, pattern
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from acquire import effect_config as config
+    from acquire.config import effect as config
 
 
 def prnu(effect: config.Prnu, setting: Setting) -> list[Stage]:

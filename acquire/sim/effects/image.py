@@ -16,7 +16,7 @@ from acquire.sim.effects.base import Setting, Stage
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from acquire import effect_config as config
+    from acquire.config import effect as config
 
 
 def misregistration(effect: config.Misregistration, setting: Setting) -> list[Stage]:

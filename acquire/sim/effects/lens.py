@@ -11,7 +11,7 @@ from acquire.sim.effects.base import Setting, Stage
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from acquire import effect_config as config
+    from acquire.config import effect as config
 
 
 def lens_distortion(effect: config.LensDistortion, setting: Setting) -> list[Stage]:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from acquire import effect_config as config
+    from acquire.config import effect as config
 
 _TILE = 1024
 """Sub-steps whose random numbers are drawn at once."""

@@ -11,7 +11,7 @@ from acquire.sim.effects.base import Setting, Stage, pattern
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from acquire import effect_config as config
+    from acquire.config import effect as config
 
 
 SECONDS_PER_HOUR = 3600.0

@@ -11,7 +11,7 @@ from acquire.sim.effects.base import Setting, Stage
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from acquire import effect_config as config
+    from acquire.config import effect as config
 
 _TAIL = 1e-9
 """Part of the charge that may be forgotten."""

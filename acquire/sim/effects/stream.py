@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from acquire import effect_config as config
+    from acquire.config import effect as config
 
 
 def dropped_lines(effect: config.DroppedLines, setting: Setting) -> list[Stage]:

@@ -18,7 +18,7 @@ from acquire.cli.demo_plan import DemoPlan, trigger_settings
 from acquire.cli.journal import Journal
 from acquire.codes import PrbsCode, mix_seed
 from acquire.config import load_rig
-from acquire.device_config import TriggerConfig
+from acquire.config.device import TriggerConfig
 from acquire.errors import DeviceError, TriggerError, UsageError
 from acquire.rig import Rig
 from acquire.sim.lines import StreamingArm

@@ -8,7 +8,7 @@ import sys
 import usb.backend.libusb1
 from trigger_twins import run
 
-from acquire.device_config import TriggerConfig
+from acquire.config.device import TriggerConfig
 from acquire.errors import TriggerError
 from acquire.trigger.driver import TriggerDriver
 from acquire.trigger.transports.usb import UsbTransport

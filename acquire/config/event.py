@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from acquire.effect_config import MOST_DN, FrozenModel, Seconds
+from acquire.config.base import MOST_DN, FrozenModel, Seconds
 
 
 class EventsConfig(FrozenModel):

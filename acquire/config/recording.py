@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 
 from pydantic import Field, field_validator
 
-from acquire.effect_config import FilePath, FrozenModel, Seconds
+from acquire.config.base import FilePath, FrozenModel, Seconds
 
 MOST_GB = 1e9
 """An exabyte."""

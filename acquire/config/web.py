@@ -6,7 +6,7 @@ from pathlib import Path
 
 from pydantic import Field, model_validator
 
-from acquire.effect_config import FilePath, FrozenModel
+from acquire.config.base import FilePath, FrozenModel
 
 
 class WebConfig(FrozenModel):

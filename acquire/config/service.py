@@ -7,7 +7,7 @@ from urllib.parse import urlsplit
 
 from pydantic import Field, field_validator
 
-from acquire.effect_config import FrozenModel
+from acquire.config.base import FrozenModel
 
 
 class ServiceConfig(FrozenModel):

@@ -5,7 +5,7 @@
     scene = one kind  (leds, usaf, digits, sprites, video, function, sum of parts)
             seen through shutters (window, chopper), in order
             + optics (which layout, how each arm is turned)
-            + effects (`acquire.effect_config`), each absent unless listed
+            + effects (`acquire.config.effect`), each absent unless listed
 
 Positions and sizes are fractions of the scene's side unless their name says otherwise.
 """
@@ -17,7 +17,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field, RootModel, model_validator
 
-from acquire.effect_config import MOST_LINES, SEED_END, EffectConfig, FilePath, FrozenModel, Seconds
+from acquire.config.base import MOST_LINES, SEED_END, FilePath, FrozenModel, Seconds
+from acquire.config.effect import EffectConfig
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 

@@ -1,50 +1,36 @@
-"""Models of the files in ``configs/``: what a rig is, what a scene shows.
-
-Unknown keys are refused. An error names the file, the key, what stood there and what is allowed.
-"""
+"""What a rig is: geometry, code, capture path and what its parts have in common."""
 
 from __future__ import annotations
 
 import math
-import os
-import tomllib
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, Field, ValidationError, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from acquire.codes import TAPS, Code, ConstantCode, PrbsCode, mix_seed
-from acquire.config_errors import explained
-from acquire.device_config import SEEING_CAMERAS, SIMULATED_CAMERAS, CamerasConfig, TriggerConfig
-from acquire.effect_config import MOST_SECONDS, SEED_END, FilePath, FrozenModel
+from acquire.config.base import MOST_SECONDS, SEED_END, FilePath, FrozenModel
+from acquire.config.builtin import builtin_names
+from acquire.config.device import SEEING_CAMERAS, SIMULATED_CAMERAS, CamerasConfig, TriggerConfig
+from acquire.config.event import CheckConfig, EventsConfig
+from acquire.config.recording import USUAL_CHUNK_BYTES, RecordingConfig, usual_chunk_lines, usual_tag_chunks
+from acquire.config.service import HooksConfig, ServiceConfig
+from acquire.config.web import WebConfig
 from acquire.errors import ConfigError
-from acquire.event_config import CheckConfig, EventsConfig
 from acquire.geometry import Geometry
 from acquire.place import default_socket
-from acquire.plan_config import ReconstructionPlan
-from acquire.reading import read_regular
-from acquire.recording_config import USUAL_CHUNK_BYTES, RecordingConfig, usual_chunk_lines, usual_tag_chunks
-from acquire.scene_config import SceneConfig, SceneFile, VideoSceneConfig, anchored
-from acquire.service_config import HooksConfig, ServiceConfig
-from acquire.text import shortened, shown
-from acquire.web_config import WebConfig
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    pass
 
 RING_RESERVE_SHARE = 4
 """Of the ring's slots, one part in so many stays free for the cameras while a recording takes the past."""
 EVENT_DELAY_S = 0.5
 """Between an event and the recording that it starts."""
-MOST_FILE_BYTES = 2**20
-"""Of a file of this kind; written by hand, they have some kilobytes."""
 WHOLE_STEPS = ("VT-4K5C-H100",)
 """Models of cameras that are known to have no intra-line charge transfer."""
 MAX_RING_BYTES = 4 * 2**30
 """Pixels that may wait in the ring of one arm."""
-
-M = TypeVar("M", bound=BaseModel)
 
 
 class GeometryConfig(FrozenModel):
@@ -250,10 +236,9 @@ class RigConfig(FrozenModel):
     def scene_file(self) -> str:
         """What simulated cameras see. Raises ConfigError where nothing is said of it."""
         if self.simulation.scene is None:
-            scenes = (path.stem for path in sorted(builtin_directory().glob("scene-*.toml")))
             raise ConfigError(
                 f"rig {self.name}: simulation.scene is missing, which simulated cameras see",
-                possible=f"a scene file, a picture or a video, or one of {', '.join(scenes)}",
+                possible=f"a scene file, a picture or a video, or one of {', '.join(builtin_names('scene'))}",
                 hint='simulation.scene = "scene-leds", or cameras of another driver',
             )
         return self.simulation.scene
@@ -316,156 +301,3 @@ class RigConfig(FrozenModel):
     @property
     def line_rate_hz(self) -> float:
         return self.trigger.clock_hz / self.line_period_ticks
-
-
-def builtin_directory() -> Path:
-    """The directory of the configurations that come with the program."""
-    installed = Path(__file__).parent / "configs"
-    return installed if installed.is_dir() else Path(__file__).parent.parent / "configs"
-
-
-_MARKS = {"rig": {"geometry", "cameras", "trigger"}, "scene": {"kind"}, "plan": {"segments"}}
-"""Keys by which a file shows what it describes."""
-_USES = {
-    "rig": "acquire serve --config {0}, or acquire simulate SCENE --config {0}",
-    "scene": "acquire simulate {0} --out NAME.zarr",
-    "plan": "acquire reconstruct RECORDING --plan {0} --out VIDEO.zarr",
-}
-"""The command that takes a file, by what it describes."""
-
-
-def find(name: str | Path, beside: Path | None = None, kind: str = "") -> Path:
-    """The file ``name``: as a path, beside another file, or a built-in one (with or without .toml).
-
-    ``kind``, one of rig, scene and plan, chooses the built-in files that an error lists.
-    """
-    candidates = [Path(name)]
-    if beside is not None:
-        candidates.append(beside.parent / name)
-    candidates += [builtin_directory() / name, builtin_directory() / f"{name}.toml"]
-    for path in candidates:
-        if os.path.isfile(path):  # noqa: PTH113  # Path's raises for a name that no file can have
-            return path
-    have = ", ".join(sorted(p.stem for p in builtin_directory().glob(f"{kind}*.toml")))
-    if name and os.path.isdir(name):  # noqa: PTH112
-        why = "is a directory"
-    else:
-        why = "is no regular file" if os.path.lexists(name) else "does not exist"
-    what = f"{kind} file" if kind else "configuration file"
-    raise ConfigError(f"{what} {shown(str(name))} {why}", possible=f"a path, or one of the built-in {have}")
-
-
-def load_rig(name: str | Path, overrides: Mapping[str, Any] | None = None) -> RigConfig:
-    """Read, override (dotted keys, as ``{"simulation.speed": 10}``) and validate a rig file.
-
-    Relative paths of scenes and calibrations are resolved against the file.
-    """
-    path = find(name, kind="rig")
-    table = _read(path)
-    _check_kind(table, "rig", path)
-    for key, value in (overrides or {}).items():
-        _set(table, key, value)
-    rig = _validate(RigConfig, table, path)
-    if rig.calibration is not None:
-        rig = rig.model_copy(update={"calibration": _beside(rig.calibration, path)})
-    if not rig.needs_scene:
-        return rig
-    scene = find(rig.scene_file(), beside=path, kind="scene").resolve()
-    return rig.model_copy(update={"simulation": rig.simulation.model_copy(update={"scene": str(scene)})})
-
-
-def _beside(named: Path, file: Path) -> Path:
-    """What a file names: from here on, or else from where the file is."""
-    return named.resolve() if os.path.lexists(named) else (file.parent / named).resolve()
-
-
-def check_directory(rig: RigConfig) -> None:
-    """Raise ConfigError unless the directory for recordings is there."""
-    directory = rig.recording.directory
-    if not directory.is_dir():
-        raise ConfigError(f"recording.directory: there is no directory {directory}", hint="create it first")
-
-
-def parse_settings(settings: Sequence[str]) -> dict[str, Any]:
-    """``["code.seed=7", "name='x'"]`` as overrides of `load_rig`; values are TOML."""
-    overrides = {}
-    for setting in settings:
-        key, equals, value = setting.partition("=")
-        try:
-            overrides[key.strip()] = tomllib.loads(f"value = {value}")["value"]
-        except (ValueError, RecursionError) as error:
-            raise ConfigError(
-                f"setting {shown(setting)}: {shortened(error)}"
-                if equals
-                else f"setting {shown(setting)} has no '='",
-                possible="KEY=VALUE with a TOML value: code.seed=7, name='lab', cameras.a.serial='12'",
-            ) from error
-    return overrides
-
-
-def load_scene(name: str | Path) -> SceneConfig:
-    """Read and validate a scene file; a picture or video file is a scene that shows it.
-
-    Relative paths in it are resolved against the file.
-    """
-    path = find(name, kind="scene")
-    if path.suffix != ".toml":
-        return VideoSceneConfig(kind="video", title=path.name, path=path.resolve())
-    table = _read(path)
-    _check_kind(table, "scene", path)
-    return anchored(_validate(SceneFile, table, path).root, path.parent)
-
-
-def load_plan(name: str | Path) -> ReconstructionPlan:
-    """Read and validate the plan of a combinatorial reconstruction."""
-    path = find(name, kind="plan")
-    table = _read(path)
-    _check_kind(table, "plan", path)
-    return check_plan(table, path)
-
-
-def check_plan(table: dict[str, Any], origin: str | Path) -> ReconstructionPlan:
-    """The plan that a table describes; ``origin`` is where its mistakes are to be mended."""
-    return _validate(ReconstructionPlan, table, Path(origin))
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        # Editors of some systems begin a file with a mark.
-        text = read_regular(path, MOST_FILE_BYTES).decode("utf-8-sig")
-        return tomllib.loads(text)
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path} is not TOML: byte {error.start} is not UTF-8") from error
-    except RecursionError as error:
-        raise ConfigError(f"{path} is not TOML: it is nested too deeply") from error
-    except ValueError as error:  # that of a number with thousands of digits, too
-        raise ConfigError(f"{path} is not TOML: {shortened(error, 400)}") from error
-    except OSError as error:
-        raise ConfigError(f"{path} cannot be read: {error.strerror}") from error
-
-
-def _check_kind(table: dict[str, Any], wanted: str, path: Path) -> None:
-    """Raise ConfigError for a file that shows that it describes something else than what is ``wanted``."""
-    found = [kind for kind, keys in _MARKS.items() if keys & table.keys()]
-    if len(found) == 1 and found != [wanted]:
-        raise ConfigError(
-            f"{path} describes a {found[0]}, and a {wanted} was asked for",
-            possible=f"a {wanted} file",
-            hint=_USES[found[0]].format(path.stem if path.parent == builtin_directory() else path),
-        )
-
-
-def _set(table: dict[str, Any], dotted: str, value: Any) -> None:
-    *parents, last = dotted.split(".")
-    for key in parents:
-        table = table.setdefault(key, {})
-        if not isinstance(table, dict):
-            raise ConfigError(f"setting {dotted!r}: {key!r} is a value, nothing is below it")
-    table[last] = value
-
-
-def _validate(model: type[M], table: dict[str, Any], path: Path) -> M:
-    try:
-        return model.model_validate(table)
-    except ValidationError as error:
-        raise ConfigError(explained(error, model, path)) from error

@@ -22,7 +22,7 @@ from typing import Literal
 
 from pydantic import Field, model_validator
 
-from acquire.effect_config import MOST_LINES, FrozenModel, Seconds
+from acquire.config.base import MOST_LINES, FrozenModel, Seconds
 
 FADE_SUBSTEPS = 32
 """To either side of a seam: over this, one sub-segment becomes the next."""
