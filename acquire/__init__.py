@@ -18,7 +18,7 @@ The layers, top to bottom; imports point downwards only (checked by the tests)::
     sim           recon              simulated devices · solvers, priors
     stream        forward            capture path · Eq. (1)-(4) of the paper and their adjoints
     store  camera  trigger           recording format · device protocols
-    config        lines              what a rig is · what travels from camera to disk
+    config  lines  processes         what a rig is · what travels from camera to disk · children
     codes  geometry  clock           the code, the shear, the time: plain arithmetic
     arrays  cores                    whose arrays are computed with, and on how many cores
     logs  reading                    one line per entry · files that anybody may have put there

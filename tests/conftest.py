@@ -31,7 +31,7 @@ from numcodecs import blosc
 
 from acquire.cores import limit_blas, usable_cores
 from acquire.forward.kernels import transpose_frames
-from acquire.stream.nursery import warm_up
+from acquire.processes.nursery import warm_up
 
 pytest_plugins = ["left_out"]
 

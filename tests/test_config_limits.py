@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from acquire.config import MOST_FILE_BYTES, RigConfig, builtin_directory, load_plan, load_rig, load_scene
+from acquire.config import RigConfig, builtin_directory, load_plan, load_rig, load_scene
+from acquire.config.files import MOST_FILE_BYTES
 from acquire.daemon import host
 from acquire.daemon.host import check_host
 from acquire.errors import ConfigError

@@ -23,17 +23,17 @@ import psutil
 from acquire.camera.harvesters import HarvestersCamera, HarvestersOpener
 from acquire.camera.settings import Setting
 from acquire.camera.spec import GenicamSpec
+from acquire.processes.messages import Ready
+from acquire.processes.shared import Counters
+from acquire.processes.worker import Worker
 from acquire.sim.gentl.bench import GentlBench
 from acquire.sim.gentl.models import CameraModel
 from acquire.stream import grabber
-from acquire.stream.messages import Ready
-from acquire.stream.process import Worker
 from acquire.stream.ring import Ring, RingShape
-from acquire.stream.shared import Counters
 
 if TYPE_CHECKING:
+    from acquire.processes.worker import Mailbox
     from acquire.sim.gentl.memory import CameraMemory
-    from acquire.stream.process import Mailbox
 
 COLUMNS = 5
 """Pixels of every line that are compared."""

@@ -34,8 +34,8 @@ from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.plan import Run, worker_modules
 from acquire.daemon.server import Daemon
 from acquire.daemon.service import Service
+from acquire.processes.nursery import warm_up
 from acquire.rig import Rig
-from acquire.stream.nursery import warm_up
 from acquire.web.tokens import load_tokens
 
 CLIENTS = 4

@@ -20,11 +20,12 @@ import numpy as np
 from acquire.config import RigConfig, load_rig, load_scene
 from acquire.daemon.watching import judge_of
 from acquire.lines import ARMS
+from acquire.processes.messages import Ready
+from acquire.processes.shared import Counters
+from acquire.processes.worker import Worker
 from acquire.sim.pipeline import Bench
-from acquire.stream.messages import Checked, Ready
-from acquire.stream.process import Worker
+from acquire.stream.messages import Checked
 from acquire.stream.ring import Ring, RingShape
-from acquire.stream.shared import Counters
 from acquire.stream.threshold import ThresholdPlan
 from acquire.stream.watcher import COUNTERS, WatchPlan, watch
 

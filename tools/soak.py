@@ -39,12 +39,12 @@ from acquire.capacity.load import Load, capture_plan, recording_spec
 from acquire.config.device import TriggerConfig
 from acquire.errors import CameraLostError
 from acquire.lines import ARMS
+from acquire.processes.shared import Counters
 from acquire.sim.clock import Wire
 from acquire.sim.trigger_model import TriggerModel
 from acquire.sim.twin_links import TwinTransport
 from acquire.store import open_recording
 from acquire.stream import Capture
-from acquire.stream.shared import Counters
 from acquire.trigger.driver import TriggerDriver
 from tools.kill_storm import check_recording
 

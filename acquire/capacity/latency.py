@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from acquire.processes.shared import WORD_BYTES, SharedBytes
 from acquire.sim.devices import SimulatedCamera
-from acquire.stream.shared import WORD_BYTES, SharedBytes
 
 if TYPE_CHECKING:
     from acquire.camera.base import Camera, CameraBlock, CameraOpener

@@ -43,7 +43,7 @@ def features(serial: SerialArgument, config: ConfigOption = None, json: JsonFlag
     Example: [bold]acquire camera features SIM-A --config rig-demo[/]
     """
     from acquire.camera.look import feature_table
-    from acquire.stream.visit import visit
+    from acquire.camera.visit import visit
 
     with _Bench(config) as bench:
         rows = visit(bench.opener(serial), feature_table, timeout_s=OPEN_S)
@@ -70,7 +70,7 @@ def snapshot(
     Example: [bold]acquire camera snapshot SIM-A --config rig-demo --lines 500[/]
     """
     from acquire.camera.look import snapshot as take
-    from acquire.stream.visit import visit
+    from acquire.camera.visit import visit
 
     path = out or Path(f"{serial}.png")
     _check_out(path)

@@ -48,9 +48,9 @@ def devices(
 def of_rig(config: str) -> Iterator[dict[str, Any]]:
     """Trigger and cameras of a rig file, opened one after the other; what each lacks. Raises ConfigError."""
     from acquire.camera.look import facts
+    from acquire.camera.visit import visit
     from acquire.config import load_rig
     from acquire.rig import Rig
-    from acquire.stream.visit import visit
 
     rig_config = load_rig(config)
     with Rig(rig_config) as rig:

@@ -160,7 +160,7 @@ def _until_nothing_is_lost(stored: Recording, out: Path, speed: float) -> tuple[
 
 def _record(stored: Recording, out: Path, speed: float) -> str | None:
     """One attempt; what was lost on the way, None where nothing was."""
-    from acquire.cli.demo_capture import await_daemon, daemon_process, follow
+    from acquire.cli.demo.capture import await_daemon, daemon_process, follow
     from acquire.cli.replay_rig import replay_rig
     from acquire.client import Client
 

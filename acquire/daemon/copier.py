@@ -33,7 +33,7 @@ from acquire.store.source import LocalSource
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from acquire.stream.process import Mailbox
+    from acquire.processes.worker import Mailbox
 
 FIRST_WAIT_S = 1.0
 MOST_WAIT_S = 60.0

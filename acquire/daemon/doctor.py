@@ -21,7 +21,7 @@ import numpy as np
 from acquire import __version__
 from acquire.cores import usable_cores
 from acquire.lines import ARMS
-from acquire.stream.shared import available_bytes
+from acquire.processes.shared import available_bytes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection
     from pathlib import Path
 
-    from acquire.stream.process import Mailbox
+    from acquire.processes.worker import Mailbox
 
 RECOVERED = "recovered: "
 """How the end reason begins of a recording that was recovered."""

@@ -25,8 +25,8 @@ from acquire.daemon.journal import Journal
 from acquire.daemon.messages import RecoveryStatus
 from acquire.daemon.recoverer import RECOVERED, Found, Task, hindrance, salvage, search
 from acquire.errors import DeviceError
-from acquire.stream.messages import Failed
-from acquire.stream.process import Worker
+from acquire.processes.messages import Failed
+from acquire.processes.worker import Worker
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -34,8 +34,8 @@ from acquire.daemon.states import State
 from acquire.daemon.troubles import Troubles
 from acquire.daemon.uploads import Uploads
 from acquire.errors import EXIT_INTERRUPTED, StateError
+from acquire.processes.nursery import nursery, warm_up
 from acquire.rig import Rig
-from acquire.stream.nursery import nursery, warm_up
 
 if TYPE_CHECKING:
     from collections.abc import Callable

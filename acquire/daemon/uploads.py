@@ -22,12 +22,12 @@ from acquire.daemon.copier import MOST_WAIT_S, Copy, Reach, Reached, copy_record
 from acquire.daemon.journal import Journal
 from acquire.daemon.messages import UploadStatus
 from acquire.errors import AcquireError, ConfigError, DeviceError, UsageError
+from acquire.processes.messages import Failed
+from acquire.processes.worker import Worker
 from acquire.store.attributes import upload_target
 from acquire.store.opening import read_root
 from acquire.store.remote import check_url, url_below
 from acquire.store.source import LocalSource
-from acquire.stream.messages import Failed
-from acquire.stream.process import Worker
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -20,7 +20,7 @@ from acquire.clock import NS_PER_S
 from acquire.cores import limit_blas
 from acquire.errors import CameraError
 from acquire.lines import ARMS
-from acquire.stream import nursery
+from acquire.processes import nursery
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -11,10 +11,9 @@
 Grabbers, recorder and watcher are processes, the supervisor is a thread; `Capture` owns them all. Rings are
 shared memory: nothing between a camera's buffer and the recorder's is sent, and no camera waits for a reader.
 
-`shared` memory, counters · `losses` causes · `ring` · `observer` of a ring · `process` children and their
-pipe · `messages` · `grabber` · `tagger` · `window` of lines around an event · `session` one recording ·
-`recorder` · `lightcheck`, `threshold`, `watcher` · `witness` what others counted · `ledger` of every pulse ·
-`plan` · `succession` of what was killed · `supervisor` · `capture`
+`losses` causes · `ring` · `observer` of a ring · `messages` · `grabber` · `tagger` · `window` of lines around
+an event · `session` one recording · `recorder` · `lightcheck`, `threshold`, `watcher` · `witness` what others
+counted · `ledger` of every pulse · `plan` · `succession` of what was killed · `supervisor` · `capture`
 """
 
 from acquire.stream.capture import Capture

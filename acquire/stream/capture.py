@@ -18,14 +18,15 @@ from typing import TYPE_CHECKING, Any
 
 from acquire.errors import AcquireError, DataError, StateError, UsageError
 from acquire.lines import ARMS
+from acquire.processes.messages import Quit, Ready
+from acquire.processes.shared import Counters
+from acquire.processes.worker import Worker
 from acquire.stream import grabber, recorder, recorder_plan, watcher
 from acquire.stream.ledger import Counted, account
 from acquire.stream.losses import Cause
-from acquire.stream.messages import Begin, Interrupt, Note, Quit, Ready, RunStarted
+from acquire.stream.messages import Begin, Interrupt, Note, RunStarted
 from acquire.stream.plan import CaptureStatus
-from acquire.stream.process import Worker
 from acquire.stream.ring import Ring, RingShape
-from acquire.stream.shared import Counters
 from acquire.stream.succession import Succession
 from acquire.stream.supervisor import RECORDER, Supervisor
 from acquire.stream.window import NOW

@@ -20,18 +20,18 @@ import numpy as np
 from acquire.camera.base import LossCause
 from acquire.errors import AcquireError, CameraError, CameraLostError
 from acquire.lines import LineFlag
+from acquire.processes.messages import Ready
+from acquire.processes.worker import become_urgent
 from acquire.stream.lineclock import LineClock
 from acquire.stream.losses import Cause, Loss, LossLog
-from acquire.stream.messages import Ready
-from acquire.stream.process import become_urgent
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.camera.base import Camera, CameraBlock, CameraLoss, CameraOpener
-    from acquire.stream.process import Mailbox
+    from acquire.processes.shared import Counters
+    from acquire.processes.worker import Mailbox
     from acquire.stream.ring import Ring
-    from acquire.stream.shared import Counters
 
 CAMERA_CAUSES = (Cause.CAMERA, *(Cause(cause) for cause in LossCause))
 COUNTERS = (

@@ -27,20 +27,6 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Ready:
-    """The process has what it needs; a grabber tells who its camera is and how it is set."""
-
-    facts: dict[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
-class Failed:
-    """The process ends because of this."""
-
-    error: AcquireError
-
-
-@dataclass(frozen=True, slots=True)
 class RunStarted:
     """The trigger started; from now on its tags arrive. ``kept``: arm → ranges of lines, first and end, that
     are in recordings already, for the successor of a recorder.
@@ -138,8 +124,3 @@ class Sealed:
     ledger: dict[str, Any]
     on_disk: bool = True
     end_line: int | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Quit:
-    """Finish what is under way and end."""

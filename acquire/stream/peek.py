@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.errors import DeviceError
+from acquire.processes.shared import SharedBytes
 from acquire.stream.ring import Ring, RingShape
-from acquire.stream.shared import SharedBytes
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

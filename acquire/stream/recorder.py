@@ -27,23 +27,13 @@ import numpy as np
 
 from acquire.errors import AcquireError, StateError, StoreError, UsageError
 from acquire.lines import ARMS
+from acquire.processes.messages import Ready
+from acquire.processes.worker import OwnerGone, become_important
 from acquire.store import RecordingWriter, RunCondition
 from acquire.stream.kept import Kept
 from acquire.stream.losses import Cause
-from acquire.stream.messages import (
-    Began,
-    Begin,
-    Cancel,
-    End,
-    Extend,
-    Interrupt,
-    Note,
-    Ready,
-    Refused,
-    RunStarted,
-)
+from acquire.stream.messages import Began, Begin, Cancel, End, Extend, Interrupt, Note, Refused, RunStarted
 from acquire.stream.opening import Notes, Opening, is_verdict
-from acquire.stream.process import OwnerGone, become_important
 from acquire.stream.session import OPEN_END, Session
 from acquire.stream.stalls import HELD_UP_S, Arm, Backlog, DiskWaits, HoldUps, Lent, find_stall
 from acquire.stream.tagger import Tagger
@@ -51,11 +41,11 @@ from acquire.stream.window import Span, hold, span
 from acquire.stream.witness import Witness
 
 if TYPE_CHECKING:
+    from acquire.processes.shared import Counters
+    from acquire.processes.worker import Mailbox
     from acquire.stream.messages import Sealed
-    from acquire.stream.process import Mailbox
     from acquire.stream.recorder_plan import RecorderPlan
     from acquire.stream.ring import Ring, RingBlock
-    from acquire.stream.shared import Counters
 
 _WAIT_S = 0.02
 _COMMIT_INTERVAL_S = 0.1

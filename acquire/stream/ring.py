@@ -41,8 +41,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.errors import DataError, UsageError
+from acquire.processes.shared import WORD_BYTES, SharedBytes
 from acquire.stream.losses import MAX_LOSSES, Cause, Loss
-from acquire.stream.shared import WORD_BYTES, SharedBytes
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

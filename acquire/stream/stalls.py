@@ -19,9 +19,9 @@ from acquire.stream.kept import Kept
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from acquire.processes.shared import Counters
     from acquire.stream.ring import Ring
     from acquire.stream.session import Session
-    from acquire.stream.shared import Counters
 
 T = TypeVar("T")
 

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
+    from acquire.processes.worker import Worker
     from acquire.stream.messages import Began, Begin
-    from acquire.stream.process import Worker
 
 MOST = 5
 """Successors of one process in a run: what dies more often has a reason."""

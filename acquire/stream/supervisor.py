@@ -13,19 +13,8 @@ from typing import TYPE_CHECKING
 
 from acquire.errors import AcquireError, DeviceError, TriggerError
 from acquire.lines import ARMS
-from acquire.stream.messages import (
-    Began,
-    Cancel,
-    Checked,
-    End,
-    Extend,
-    Failed,
-    Interrupt,
-    Note,
-    Ready,
-    Refused,
-    Sealed,
-)
+from acquire.processes.messages import Failed, Ready
+from acquire.stream.messages import Began, Cancel, Checked, End, Extend, Interrupt, Note, Refused, Sealed
 from acquire.stream.stalls import Excess, Heartbeat
 from acquire.stream.succession import (
     Orphan,
@@ -42,11 +31,11 @@ from acquire.stream.witness import TRIGGER, TRIGGER_COUNTERS, WATCHER
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from acquire.processes.shared import Counters
+    from acquire.processes.worker import Worker
     from acquire.stream.messages import Begin
     from acquire.stream.plan import CapturePlan
-    from acquire.stream.process import Worker
     from acquire.stream.ring import Ring
-    from acquire.stream.shared import Counters
     from acquire.trigger.base import LineTag, Trigger
 
 RECORDER = "recorder"

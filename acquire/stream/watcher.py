@@ -21,18 +21,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from acquire.lines import ARMS
+from acquire.processes.messages import Ready
 from acquire.store.suspect import DOUBTFUL, VERIFIED
 from acquire.stream.lightcheck import Finding, Judge, Sight, Verdict, explain
-from acquire.stream.messages import Checked, Note, Ready
+from acquire.stream.messages import Checked, Note
 from acquire.stream.observer import Observer
 from acquire.stream.threshold import Threshold
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from acquire.stream.process import Mailbox
+    from acquire.processes.shared import Counters
+    from acquire.processes.worker import Mailbox
     from acquire.stream.ring import Ring, RingBlock
-    from acquire.stream.shared import Counters
     from acquire.stream.threshold import ThresholdPlan
 
 COUNTERS = tuple(

@@ -15,7 +15,7 @@ from acquire.stream.watcher import VERDICTS
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from acquire.stream.shared import Counters
+    from acquire.processes.shared import Counters
 
 TRIGGER, WATCHER = "trigger", "watcher"
 

@@ -25,6 +25,8 @@ from acquire.camera.settings import Setting
 from acquire.camera.spec import GenicamSpec, spec_of
 from acquire.config import load_rig, load_scene
 from acquire.errors import CameraError
+from acquire.processes.messages import Ready
+from acquire.processes.worker import Worker
 from acquire.sim.clock import Wire
 from acquire.sim.devices import SimulatedCameraOpener, SimulatedOptics
 from acquire.sim.gentl.bench import GentlBench
@@ -33,8 +35,6 @@ from acquire.sim.gige.arms import address_of
 from acquire.sim.gige.camera import serve
 from acquire.sim.lines import StreamingArm
 from acquire.sim.scenes import build_scene
-from acquire.stream.messages import Ready
-from acquire.stream.process import Worker
 
 WAIT_S = 300.0
 STAGES, BLOCK = 16, 32

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from acquire.cli.demo_capture import end
-from acquire.cli.demo_plan import DemoPlan, trigger_settings
+from acquire.cli.demo.capture import end
+from acquire.cli.demo.plan import DemoPlan, trigger_settings
 from acquire.config import builtin_directory
 
 Cli = Callable[..., Any]

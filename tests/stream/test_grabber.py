@@ -12,10 +12,10 @@ from hypothesis import strategies as st
 from acquire.camera.base import CameraBlock
 from acquire.errors import CameraError
 from acquire.lines import LineFlag
+from acquire.processes.shared import Counters
 from acquire.stream.grabber import COUNTERS, GrabberPlan, Intake
 from acquire.stream.losses import Cause, Loss
 from acquire.stream.ring import Ring, RingBlock, RingShape
-from acquire.stream.shared import Counters
 
 DEPTH, WHITE, MOST_LOST = 9, 4000, 100_000
 SHAPE = RingShape(slots=4, rows=16, width=3, dtype="uint16")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from acquire.stream.process import Mailbox, Worker
+from acquire.processes.worker import Mailbox, Worker
 
 SHARED = Path("/dev/shm")
 

@@ -15,6 +15,7 @@ from wired_devices import CODE, PIXELS, STAGES, SUBSTEP_TICKS, SUBSTEPS, make_sp
 from acquire.clock import ClockFit
 from acquire.errors import StoreError
 from acquire.lines import ARMS
+from acquire.processes.shared import Counters
 from acquire.store import RunCondition, Suspect, open_recording, suspect_lines
 from acquire.store.suspect import DOUBTFUL, VERIFIED
 from acquire.stream.losses import Cause, Loss, LossLog
@@ -22,7 +23,6 @@ from acquire.stream.messages import Began, Begin, End, Note, Refused, RunStarted
 from acquire.stream.recorder import Recorder
 from acquire.stream.recorder_plan import COUNTERS, RecorderPlan
 from acquire.stream.ring import Ring, RingShape
-from acquire.stream.shared import Counters
 from acquire.stream.window import NOW, Window
 from acquire.stream.witness import Witness
 from acquire.trigger.base import TriggerRun

@@ -19,10 +19,10 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from acquire.errors import DataError, UsageError
+from acquire.processes.shared import Counters
 from acquire.stream.losses import MAX_LOSSES, Cause, Loss
 from acquire.stream.observer import Observer, ObserverStatistics
 from acquire.stream.ring import Ring, RingBlock, RingShape, RingStatistics
-from acquire.stream.shared import Counters
 
 SHAPE = RingShape(slots=3, rows=4, width=5, dtype="uint16")
 

@@ -8,11 +8,11 @@ from collections.abc import Iterator
 import pytest
 from test_session import MemoryWriter, feed, make_session, ring_block
 
+from acquire.processes.shared import Counters
 from acquire.store import RunCondition
 from acquire.stream.losses import Cause
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.session import Session
-from acquire.stream.shared import Counters
 from acquire.stream.stalls import HELD_UP_S, Arm, Heartbeat, HoldUps, find_stall
 
 LIMIT_S, SKEW = 10.0, 1000

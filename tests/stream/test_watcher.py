@@ -10,10 +10,10 @@ from test_lightcheck import Altered, recorded
 from test_recorder import Post
 
 from acquire.lines import ARMS
+from acquire.processes.shared import Counters
 from acquire.stream.lightcheck import Judge, Verdict
 from acquire.stream.messages import Checked, Note
 from acquire.stream.ring import Ring, RingShape
-from acquire.stream.shared import Counters
 from acquire.stream.threshold import ThresholdPlan
 from acquire.stream.watcher import COUNTERS, VERDICTS, Watcher, WatchPlan
 

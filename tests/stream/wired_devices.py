@@ -17,9 +17,9 @@ from acquire.camera.base import CameraBlock, CameraIdentity
 from acquire.clock import ClockFit
 from acquire.codes import PrbsCode
 from acquire.errors import CameraError, TriggerError
+from acquire.processes.shared import Counters
 from acquire.store import RecordingSpec
 from acquire.stream import CapturePlan
-from acquire.stream.shared import Counters
 from acquire.trigger.base import LineTag, TagEvent, TriggerIdentity, TriggerRun
 
 STAGES, SUBSTEPS, PIXELS, WHITE = 8, 3, 8, 4095

@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from acquire.errors import UsageError
+from acquire.processes.messages import Ready
+from acquire.processes.worker import Worker
 from acquire.sim.gentl import layout
 from acquire.sim.gentl.build import build
 from acquire.sim.gentl.feeder import feed
 from acquire.sim.gentl.memory import CameraMemory, host_ports
-from acquire.stream.messages import Ready
-from acquire.stream.process import Worker
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING, Any, Protocol
 
-from acquire.stream.messages import Ready
+from acquire.processes.messages import Ready
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.camera.base import CameraBlock
+    from acquire.processes.worker import Mailbox
     from acquire.sim.gentl.memory import CameraMemory
-    from acquire.stream.process import Mailbox
 
 _IDLE_S = 0.001
 _BLOCK_WAIT_S = 0.01

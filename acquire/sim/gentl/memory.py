@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.errors import UsageError
+from acquire.processes.shared import SharedBytes
 from acquire.sim.gentl import layout, models
-from acquire.stream.shared import SharedBytes
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 from acquire.camera.aravis import AravisOpener, load
 from acquire.camera.spec import spec_of
 from acquire.lines import ARMS
+from acquire.processes.messages import Ready
+from acquire.processes.worker import Worker
 from acquire.sim.gentl.arms import model_of
 from acquire.sim.gige.camera import Transmission, serve
-from acquire.stream.messages import Ready
-from acquire.stream.process import Worker
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -17,16 +17,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.errors import DeviceError
+from acquire.processes.messages import Ready
 from acquire.sim.gentl.layout import PIXEL_FORMATS, REGISTERS, XML_AT
 from acquire.sim.gentl.models import VENDOR, CameraModel, gige
 from acquire.sim.gige import protocol
-from acquire.stream.messages import Ready
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from acquire.processes.worker import Mailbox
     from acquire.sim.gentl.feeder import Sensor
-    from acquire.stream.process import Mailbox
 
 _IDLE_S = 0.01
 _BLOCK_WAIT_S = 0.002

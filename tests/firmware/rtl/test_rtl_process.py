@@ -13,8 +13,8 @@ import pytest
 from waiting import until
 
 import acquire.sim.rtl
-from acquire.cli.demo_capture import record
-from acquire.cli.demo_plan import DemoPlan, trigger_settings
+from acquire.cli.demo.capture import record
+from acquire.cli.demo.plan import DemoPlan, trigger_settings
 from acquire.cli.journal import Journal
 from acquire.codes import PrbsCode, mix_seed
 from acquire.config import load_rig

@@ -16,10 +16,10 @@ import pytest
 from waiting import until
 
 from acquire.errors import AcquireError, DeviceError
-from acquire.stream.messages import Ready
-from acquire.stream.nursery import Nursery, Own, nursery
-from acquire.stream.process import Mailbox, Worker
-from acquire.stream.shared import Counters
+from acquire.processes.messages import Ready
+from acquire.processes.nursery import Nursery, Own, nursery
+from acquire.processes.shared import Counters
+from acquire.processes.worker import Mailbox, Worker
 
 LIMIT_S = 60.0
 
@@ -118,7 +118,7 @@ def mortal(monkeypatch: pytest.MonkeyPatch) -> Iterator[Own]:
     """A nursery that the other tests do not need."""
     own = Own()
     own.replace(lambda: Nursery(("acquire.stream.recorder",)))
-    monkeypatch.setattr("acquire.stream.process.nursery", own.get)
+    monkeypatch.setattr("acquire.processes.worker.nursery", own.get)
     yield own
     own.replace(lambda: None)
 
@@ -152,9 +152,9 @@ def test_a_worker_that_was_not_born_yet_is_told() -> None:
 OWNER = """
 import json, time
 from test_nursery import tell
-from acquire.stream.messages import Ready
-from acquire.stream.nursery import nursery
-from acquire.stream.process import Worker
+from acquire.processes.messages import Ready
+from acquire.processes.nursery import nursery
+from acquire.processes.worker import Worker
 workers = [Worker(name, tell) for name in ("one", "two")]
 for worker in workers:
     worker.expect(Ready, time.monotonic() + 60)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from acquire.cli.demo_plan import N_M, SEGMENT_LINES, T_M, segment_row
+from acquire.cli.demo.plan import N_M, SEGMENT_LINES, T_M, segment_row
 from acquire.cli.progress import stage_progress
 from acquire.config.scene import LedSceneConfig, SineDrive
 from acquire.cores import idle_cores, limit_blas
@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from acquire.cli.demo_capture import Captured
-    from acquire.cli.demo_plan import DemoPlan
+    from acquire.cli.demo.capture import Captured
+    from acquire.cli.demo.plan import DemoPlan
     from acquire.cli.journal import Journal
     from acquire.config import RigConfig
     from acquire.daemon.messages import ArmStatus

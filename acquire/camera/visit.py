@@ -6,13 +6,13 @@ import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from acquire.stream.process import Worker
+from acquire.processes.worker import Worker
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from acquire.camera.base import Camera, CameraOpener
-    from acquire.stream.process import Mailbox
+    from acquire.processes.worker import Mailbox
 
 T = TypeVar("T")
 _END_S = 30.0

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from acquire.cli.demo_plan import trigger_settings
+from acquire.cli.demo.plan import trigger_settings
 from acquire.cli.progress import stage_progress
 from acquire.client import Client
 from acquire.daemon.states import SEALED, State
@@ -20,7 +20,7 @@ from acquire.errors import AcquireError, DataError, NoDaemonError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from acquire.cli.demo_plan import DemoPlan
+    from acquire.cli.demo.plan import DemoPlan
     from acquire.cli.journal import Journal
     from acquire.config import RigConfig
     from acquire.daemon.messages import Status

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from acquire.cli.demo_plan import (
+from acquire.cli.demo.plan import (
     LINES,
     RIG,
     SEED,
@@ -61,8 +61,8 @@ def demo(
     rig = load_rig(config, trigger_settings(plan))
     check(plan, rig)
 
-    from acquire.cli.demo_analysis import analyse
-    from acquire.cli.demo_capture import compile_gateware, record
+    from acquire.cli.demo.analysis import analyse
+    from acquire.cli.demo.capture import compile_gateware, record
     from acquire.evaluate.report import write_report
     from acquire.evaluate.summary import summarise
 

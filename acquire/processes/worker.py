@@ -24,8 +24,8 @@ from typing import TYPE_CHECKING, Any
 
 from acquire.errors import AcquireError, DeviceError
 from acquire.logs import write_log
-from acquire.stream.messages import Failed, Quit
-from acquire.stream.nursery import UNTOLD, nursery
+from acquire.processes.messages import Failed, Quit
+from acquire.processes.nursery import UNTOLD, nursery
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -9,7 +9,7 @@
 The nursery imports modules and does nothing else: it has one thread, no device, no file. Whatever must not be
 forked, such as a GenTL producer or a library's threads, is loaded by the worker, in a process of its own. It
 ends with its owner, since the kernel closes the owner's end of the socket; workers see their owner's end by
-themselves (`acquire.stream.process`). A nursery that has died is replaced, and its workers are not touched.
+themselves (`acquire.processes.worker`). A nursery that has died is replaced, and its workers are not touched.
 
 multiprocessing's own forkserver is not used: when it is killed, it reports its living children as dead (exit
 code 255), and a successor would write to the ring beside the recorder that it replaces. Here the owner has a
@@ -47,7 +47,7 @@ _REAP_S = 1.0
 """For the nursery to say how a worker ended."""
 UNTOLD = 255
 """Exit code of a worker whose nursery has died: nobody is left who could know it."""
-_START = "import sys; from acquire.stream import nursery; nursery.main(int(sys.argv[1]), sys.argv[2:])"
+_START = "import sys; from acquire.processes import nursery; nursery.main(int(sys.argv[1]), sys.argv[2:])"
 
 
 class Child:
