@@ -1,4 +1,4 @@
-"""``acquire trigger info | load | arm | stop | selftest | monitor``: the sync trigger by itself.
+"""``acquire trigger``: the sync trigger by itself; its test patterns are `acquire.cli.trigger_patterns`.
 
 These commands talk to the device, not to the daemon: while a daemon has the port, they are told so.
 """
@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import json as json_text
 import time
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from acquire.cli.output import JsonFlag, print_facts, print_json, say
+from acquire.cli.trigger_device import ConfigOption, SetOption, UrlOption, device_of
+from acquire.cli.trigger_patterns import blink, square
 from acquire.errors import TriggerError, UsageError
 
 if TYPE_CHECKING:
@@ -22,31 +23,15 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from acquire.config import RigConfig
     from acquire.trigger.device import Device
-    from acquire.trigger.driver import TriggerDriver
     from acquire.trigger.registers import TagRecord
 
 _LOOK_S = 0.2
 
-ConfigOption = Annotated[
-    str, typer.Option("--config", "-c", metavar="FILE", help="Rig file, or the name of a built-in one.")
-]
-UrlOption = Annotated[
-    str | None,
-    typer.Option(
-        "--url", "--port", metavar="URL", help="Serial port or socket://host:port, not the rig file's."
-    ),
-]
-SetOption = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Change one value of the file, e.g. code.seed=7."),
-]
-
 
 def register(app: typer.Typer) -> None:
     group = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
-    for command in (info, load, arm, stop, selftest, monitor):
+    for command in (info, load, arm, stop, selftest, monitor, blink, square):
         group.command()(command)
     app.add_typer(group, name="trigger", help="The sync trigger by itself.", rich_help_panel="Rig")
 
@@ -63,7 +48,7 @@ def info(
     """
     from acquire.trigger.device import facts_of
 
-    with _device(config, url, settings) as (driver, _):
+    with device_of(config, url, settings) as (driver, _):
         facts = {"model": driver.identify().model, **facts_of(driver.device().capabilities)}
         facts |= {**facts_of(driver.device().status()), **driver.statistics()}
     if json:
@@ -84,7 +69,7 @@ def load(
     Example: [bold]acquire trigger load code.txt --url /dev/ttyUSB0[/]
     """
     bits = _read_code(file)
-    with _device(config, url, settings) as (driver, _):
+    with device_of(config, url, settings) as (driver, _):
         device = driver.device()
         begun_s = time.monotonic()
         crc = device.load_code(bits)
@@ -121,7 +106,7 @@ def arm(
     from acquire.trigger.device import facts_of
     from acquire.trigger.settings import LoadedCode
 
-    with _device(config, url, settings) as (driver, rig):
+    with device_of(config, url, settings) as (driver, rig):
         run = TriggerRun(
             run_id=run_id or new_run_id(rig.name),
             code=rig.code.build(),
@@ -152,7 +137,7 @@ def stop(
 
     Example: [bold]acquire trigger stop --url /dev/ttyUSB0[/]
     """
-    with _device(config, url, settings) as (driver, _):
+    with device_of(config, url, settings) as (driver, _):
         driver.device()
         lines = driver.stop()
     if json:
@@ -171,7 +156,7 @@ def selftest(
 
     Example: [bold]acquire trigger selftest --url /dev/ttyUSB0[/]
     """
-    with _device(config, url, settings) as (driver, _):
+    with device_of(config, url, settings) as (driver, _):
         result = driver.device().self_test()
     failed = [name.removesuffix("_failed") for name, bit in result.items() if name != "done" and bit]
     if failed or not result["done"]:
@@ -196,7 +181,7 @@ def monitor(
     """
     from itertools import islice
 
-    with _device(config, url, settings) as (driver, _):
+    with device_of(config, url, settings) as (driver, _):
         for tag in islice(_watch(driver.device(), seconds), tags):
             facts = _tag_facts(tag)
             text = json_text.dumps(facts) if json else "  ".join(f"{k} {v}" for k, v in facts.items())
@@ -230,27 +215,6 @@ def _tag_facts(tag: TagRecord) -> dict[str, object]:
         "time": tag.timestamp,
         "flags": "+".join(map(str, flags)),
     }
-
-
-@contextmanager
-def _device(
-    config: str, url: str | None, settings: list[str] | None
-) -> Iterator[tuple[TriggerDriver, RigConfig]]:
-    """The rig's trigger; left as it is at the end."""
-    from acquire.config import load_rig, parse_settings
-    from acquire.rig import open_trigger
-    from acquire.trigger.driver import TriggerDriver
-
-    overrides = parse_settings(settings or [])
-    if url is not None:
-        overrides |= {"trigger.driver": "serial", "trigger.url": url}
-    rig = load_rig(config, overrides)
-    driver = open_trigger(rig)
-    assert isinstance(driver, TriggerDriver)
-    try:
-        yield driver, rig
-    finally:
-        driver.release()
 
 
 def _read_code(file: Path) -> NDArray[np.uint8]:

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import json
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import closing
+from functools import partial
 
 import numpy as np
 import pytest
 from trigger_twins import SocketTwin, wired_model
 
 from acquire.codes import prbs
+from acquire.config.device import TriggerConfig
 from acquire.sim.twin_links import PtyTwin
+from acquire.trigger import registers as r
+from acquire.trigger.driver import TriggerDriver
 from acquire.trigger.transports.serial import SerialTransport
 
 
@@ -125,3 +130,39 @@ def test_self_test_and_refusals(port: str) -> None:
 
 def test_the_demo_rig_has_a_trigger_as_well() -> None:
     assert "sync trigger (model)" in acquire("info")
+
+
+def held(port: str, bits: int) -> tuple[str, dict[r.Register, int]]:
+    """The code memory's first bits, and the configuration, as the device has them."""
+    driver = TriggerDriver(partial(SerialTransport, port, 3_000_000), TriggerConfig())
+    try:
+        return "".join(map(str, driver.device().read_code(bits))), driver.device().configuration()
+    finally:
+        driver.release()
+
+
+def test_square_waves_for_an_oscilloscope(port: str) -> None:
+    facts = json.loads(acquire("square", "--url", port, "--seconds", "0.1", "--json"))
+    assert facts["light_hz"] == pytest.approx(100e3 / 6)
+    assert facts["lines"] > 1000
+    bits, registers = held(port, 6)
+    assert (bits, registers[r.CODE_LENGTH]) == ("111000", 6)
+    assert r.CODE_SOURCE.kind.of(registers[r.CODE_SOURCE]) == r.Source.MEMORY
+    assert "possible: 1 to 262144" in acquire("square", "--url", port, "--substeps", "262145", code=2)
+
+
+def test_the_light_blinks_for_the_eye_until_ctrl_c(port: str) -> None:
+    fast = ("--set", "trigger.clock_hz=90_000_000", "--set", "trigger.substep_ticks=50")
+    command = [sys.executable, "-m", "acquire", "trigger", "blink", "--url", port, "--hz", "1", *fast]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as blinking:
+        assert blinking.stderr is not None
+        assert "until Ctrl-C" in blinking.stderr.readline()
+        blinking.send_signal(signal.SIGINT)
+        out = blinking.communicate(timeout=300)[0]
+    assert (blinking.returncode, "1 Hz: 500 ms lit, 500 ms dark" in out) == (0, True)
+    bits, registers = held(port, 1 << 19)
+    half = registers[r.CODE_LENGTH] // 2
+    assert 2 * half * registers[r.SUBSTEP_CLOCKS] == 90_000_000  # a second, in sub-steps that fit
+    assert registers[r.SUBSTEP_CLOCKS] == 4 * 50
+    assert bits[: 2 * half] == "1" * half + "0" * half
+    assert "900000 Hz" in acquire("blink", "--url", port, "--hz", "1e8", *fast, code=2)

@@ -1,0 +1,56 @@
+"""Test patterns of the light: square waves out of the code memory, for the eye and for an oscilloscope."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.trigger.settings import Capabilities
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SquareWave:
+    """Lit for ``half_substeps``, dark for as many, again and again; sub-steps of ``substep_ticks``."""
+
+    half_substeps: int
+    substep_ticks: int
+
+    @property
+    def bits(self) -> NDArray[np.uint8]:
+        """One period (sub-step), 0 or 1 each; the code memory repeats it."""
+        return np.repeat(np.array([1, 0], np.uint8), self.half_substeps)
+
+    def frequency_hz(self, clock_hz: int) -> float:
+        return clock_hz / (2 * self.half_substeps * self.substep_ticks)
+
+
+def blink(hz: float, substep_ticks: int, device: Capabilities) -> SquareWave:
+    """Of about ``hz``, in sub-steps of ``substep_ticks``, or of the next multiple with which the code memory
+    holds a period. UsageError for what is too fast or too slow for the device.
+    """
+    slowest = device.clock_hz / device.code_bits / device.substep_ticks_max
+    fastest = device.clock_hz / (2 * substep_ticks)
+    if not slowest <= hz <= fastest:
+        raise UsageError(
+            f"a light that blinks {hz:g} times a second",
+            possible=f"{slowest:.3g} to {fastest:.6g} Hz, with sub-steps of {substep_ticks} ticks",
+        )
+    half_ticks = device.clock_hz / (2 * hz)
+    longer = int(-(-half_ticks // (substep_ticks * (device.code_bits // 2))))
+    ticks = min(longer * substep_ticks, device.substep_ticks_max)
+    return SquareWave(max(1, round(half_ticks / ticks)), ticks)
+
+
+def square(half_substeps: int, substep_ticks: int, device: Capabilities) -> SquareWave:
+    """UsageError for more than the code memory holds."""
+    most = device.code_bits // 2
+    if not 1 <= half_substeps <= most:
+        raise UsageError(f"light for {half_substeps} sub-steps at a time", possible=f"1 to {most}")
+    return SquareWave(half_substeps, substep_ticks)
