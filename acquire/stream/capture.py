@@ -22,6 +22,7 @@ from acquire.processes.messages import Quit, Ready
 from acquire.processes.shared import Counters
 from acquire.processes.worker import Worker
 from acquire.stream import grabber, recorder, recorder_plan, watcher
+from acquire.stream.kept import Kept
 from acquire.stream.ledger import Counted, account
 from acquire.stream.losses import Cause
 from acquire.stream.messages import Begin, Interrupt, Note, RunStarted
@@ -459,11 +460,17 @@ class Capture:
             grabber.settle_books(self._rings[arm], self._counters[arm])
 
     def _empty_rings(self) -> None:
-        """Nobody will take what the last of the grabbers left."""
+        """Nobody will take what the last of the grabbers left, or what a recording was to begin with: that
+        may be in another one.
+        """
         for name in self._supervisor.dead if self._supervisor else ():
             self._settle_books(self._plan.grabbers.get(name, ()))
         for arm, ring in self._rings.items():
-            self._left_over[arm] = ring.empty()
+            kept = Kept(self._supervisor.kept(arm, ring.released_line) if self._supervisor else ())
+            blocks = ring.empty()
+            stored = sum(kept.count(lines.start, lines.stop) for lines in blocks)
+            self._counters[RECORDER].add(f"stored_{arm}", stored)
+            self._left_over[arm] = sum(map(len, blocks)) - stored
         self._emptied = True
 
     def _end_memory(self) -> None:

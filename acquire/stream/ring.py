@@ -233,13 +233,13 @@ class Ring:
         headers = map(self._header, range(oldest, tail))
         return [range(header[_FIRST_LINE], header[_FIRST_LINE] + header[_COUNT]) for header in headers]
 
-    def empty(self) -> int:
-        """Release everything that waits, unread; returns the number of lines."""
-        lines = 0
+    def empty(self) -> list[range]:
+        """Release everything that waits, unread; the lines of each block."""
+        blocks = []
         while (block := self.acquire()) is not None:
-            lines += len(block.flags)
+            blocks.append(range(block.first_line, block.end_line))
             self.release()
-        return lines
+        return blocks
 
     def fileno(self) -> int:
         """The doorbell: readable when something was committed since `hush`."""
@@ -299,14 +299,17 @@ class Ring:
         return self._end_line(tail - 1) if tail else 0
 
     @property
+    def oldest_block(self) -> RingBlock | None:
+        """The first that `lease` can take back, or that waits; None where there is none."""
+        first = min(self._control[_TAIL], self._oldest())
+        blocks = map(self.read, range(first, self._control[_HEAD]))
+        return next((block for block in blocks if block is not None), None)
+
+    @property
     def history_line(self) -> int:
         """The first line that `lease` can take back, or that waits; `newest_line` where there is none."""
-        head = self._control[_HEAD]
-        for number in range(self._oldest(), head):
-            block = self.read(number)
-            if block is not None:
-                return block.first_line
-        return self.newest_line
+        block = self.oldest_block
+        return self.newest_line if block is None else block.first_line
 
     @property
     def head(self) -> int:

@@ -21,7 +21,7 @@ from acquire.errors import UsageError
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from acquire.stream.ring import Ring
+    from acquire.stream.ring import Ring, RingBlock
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,14 +81,18 @@ class Span:
 
 
 def hold(window: Window, rings: Mapping[str, Ring]) -> Held:
-    """Take back what the window asks for, as far as it is there, in another recording or in none."""
+    """Take back what the window asks for, as far as it is there, in another recording or in none.
+
+    Nothing is taken where `span` will refuse, as far as that can be seen before.
+    """
     at = min(ring.newest_line for ring in rings.values()) if window.at is None else window.at
+    there = _whole_from(window, rings, {name: ring.oldest_block for name, ring in rings.items()})
+    if window.exact and at - window.pre_lines < there:
+        return Held(at, there, {})
     wanted = max(at - window.pre_lines, 0)
     taken = {name: ring.lease(wanted) for name, ring in rings.items()}
-    whole_from = max(_whole_from(ring) for ring in rings.values())
-    if not window.padded:  # else what found its ring full is missing, as what the ring does not hold any more
-        whole_from = max(whole_from, *(ring.dropped_end for ring in rings.values()))
-    return Held(at, max(0, whole_from), taken)
+    whole_from = _whole_from(window, rings, {name: ring.acquire() for name, ring in rings.items()})
+    return Held(at, whole_from, taken)
 
 
 def span(window: Window, lines: int | None, held: Held, line_rate_hz: float) -> Span:
@@ -110,9 +114,13 @@ def span(window: Window, lines: int | None, held: Held, line_rate_hz: float) -> 
     return Span(first, max(min(ends), first + 1) if ends else None, held.at)
 
 
-def _whole_from(ring: Ring) -> int:
-    """The line from which on everything is in the ring, or known to be lost."""
-    block = ring.acquire()
-    if block is None:
-        return ring.newest_line
-    return block.first_line - sum(loss.count for loss in block.losses)
+def _whole_from(window: Window, rings: Mapping[str, Ring], first: Mapping[str, RingBlock | None]) -> int:
+    """The line from which on everything is in the rings, or known to be lost, if these blocks come first."""
+    lines = [0]
+    for name, ring in rings.items():
+        block = first[name]
+        lost = 0 if block is None else sum(loss.count for loss in block.losses)
+        lines.append(ring.newest_line if block is None else block.first_line - lost)
+        if not window.padded:  # else what found its ring full is missing, as what the ring holds no more
+            lines.append(ring.dropped_end)
+    return max(lines)

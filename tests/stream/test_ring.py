@@ -182,7 +182,7 @@ class RingMachine(RuleBasedStateMachine):
         )
         newest = sum(self.blocks[-1][:2]) if self.blocks else 0
         assert self.ring.newest_line == newest
-        held = self.blocks[self.oldest :]
+        held = self.blocks[min(self.tail, self.oldest) :]
         assert self.ring.history_line == (held[0][0] if held else newest)
         for observer, seen in zip(self.observers, self.watching, strict=True):
             fill = min(self.head - seen.cursor, self.slots)

@@ -10,13 +10,14 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from slow_disks import PausingDisk
 from test_capture import UNCONFIRMED, armed, check_balance, check_rows, sealed, until
 from wired_devices import make_bench, make_spec
 
-from acquire.errors import UsageError
+from acquire.errors import DeviceError, UsageError
 from acquire.store import RunCondition
 from acquire.stream.losses import Cause, Loss
-from acquire.stream.messages import Note
+from acquire.stream.messages import Begin, Note
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.threshold import ThresholdPlan
 from acquire.stream.watcher import WatchPlan
@@ -70,6 +71,18 @@ def test_lines_that_were_lost_are_known_to_be(make_ring: Callable[..., Ring]) ->
     held = hold(Window(pre_lines=60), rings)
     assert held == Held(400, 340, {"a": blocks(340, 400), "b": blocks(360, 400)})
     assert span(Window(pre_lines=60), None, held, 1000.0).first_line == 340
+
+
+def test_a_refusal_takes_nothing_back(make_ring: Callable[..., Ring]) -> None:
+    """Else the cameras would have the reserve only, until all of it is let go of once more."""
+    rings = {"a": make_ring("a", 40), "b": make_ring("b", 40, lost=range(28, 30))}
+    for window, from_line in ((Window(pre_lines=121), 280), (Window(at=290, pre_lines=500), 280)):
+        held = hold(window, rings)
+        assert held == Held(window.at or 400, from_line, {})
+        assert [ring.fill for ring in rings.values()] == [0, 0]
+        with pytest.raises(UsageError, match="which both rings hold now"):
+            span(window, None, held, 1000.0)
+    assert hold(Window(pre_lines=120), rings).from_line == 280  # what was lost is known
 
 
 @given(
@@ -166,6 +179,32 @@ def test_takes_of_one_run_overlap_and_every_line_counts_once(tmp_path: Path) -> 
         assert account.balanced
         assert account.stored == end - first
         assert account.discarded >= 0
+
+
+def test_what_a_take_was_to_begin_with_stays_in_the_one_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The recorder is ended with stored lines in its hands, and nobody takes them from the rings again."""
+    monkeypatch.setattr("acquire.stream.capture._LEAST_END_S", 2.0)
+    disk = PausingDisk(tmp_path / "gate", "make")
+    with armed(make_bench(ring_slots=1024, disk=disk)) as capture:
+        capture.start(tmp_path / "1.zarr", make_spec(), 3000)
+        first = sealed(capture).first_line
+        assert first is not None
+        disk.gate.touch()
+        capture._workers["recorder"].post(
+            Begin(tmp_path / "2.zarr", make_spec(), None, Window(first + 700, 0))
+        )
+        until(disk.held.exists, "a disk that does not answer")
+        assert all(account.stored <= 700 for account in capture.poll().accounts.values())
+        with pytest.raises(DeviceError, match="recorder: the process did not end"):
+            capture.close(0.0)
+        status = capture.poll()
+    for arm, account in status.accounts.items():
+        assert account.balanced
+        assert account.stored == 3000
+        assert account.lost == {}
+        assert status.ring[arm]["fill"] == 0
 
 
 def test_what_the_trigger_tells_is_in_the_recording_that_begins_before_it(tmp_path: Path) -> None:
