@@ -13,7 +13,7 @@ The layers, top to bottom; imports point downwards only (checked by the tests)::
     client                           the service from a script, blocking or awaited
     daemon        evaluate           the capture service · metrics, report
     rig           reconstruct        config -> devices · recording -> video
-    capacity                         what this host captures and records without a loss
+    capacity      exchange           what this host captures without a loss · files of other programs
     calibrate                        what an instrument is, measured
     sim           recon              simulated devices · solvers, priors
     stream        forward            capture path · Eq. (1)-(4) of the paper and their adjoints

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING
 
+from acquire.cli.moments import after_ns, parse_duration_ns
 from acquire.cli.progress import stage_progress
 from acquire.config import check_plan, load_plan
 from acquire.cores import idle_cores, limit_blas
@@ -32,7 +32,6 @@ PREVIEW_LINES = 320
 """More than these are not looked at one after the other, but in glimpses."""
 GLIMPSES = 12
 GLIMPSE_MERGE = 16
-NS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 ENDS = {None: None, "trusted": False, "whole": True}
 
 
@@ -132,16 +131,6 @@ def parse_segment(text: str) -> dict[str, float]:
     return table
 
 
-def parse_duration_ns(text: str) -> int:
-    """``52ms``, ``0.052 s``, ``300us``."""
-    found = re.fullmatch(r"(\d+(?:\.\d*)?|\.\d+)\s*(ns|us|ms|s)", text)
-    if found is None:
-        raise UsageError(
-            f"time {text!r} cannot be read", possible="52ms, 0.052s, 300us, or UTC as 2026-01-31T12:00:00"
-        )
-    return round(float(found[1]) * NS[found[2]])
-
-
 def _select(recording: Recording, asked: Asked) -> Selection:
     timed = asked.begin is not None or asked.end is not None
     if not timed:
@@ -155,15 +144,7 @@ def _select(recording: Recording, asked: Asked) -> Selection:
 
 def _after_ns(recording: Recording, text: str | None) -> int | None:
     """A time as nanoseconds after the read-out of the recording's first line begins."""
-    if text is None:
-        return None
-    try:
-        moment = datetime.fromisoformat(text)
-    except ValueError:
-        return parse_duration_ns(text)
-    first_ns = int(recording.arms["a"].read("time", 0, 1)[0])
-    since = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)) - datetime.fromtimestamp(0, UTC)
-    return (since.days * 86_400 + since.seconds) * NS["s"] + since.microseconds * NS["us"] - first_ns
+    return after_ns(text, lambda: int(recording.arms["a"].read("time", 0, 1)[0]))
 
 
 def _preview(selection: Selection, *, whole: bool | None) -> Request:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,7 +11,7 @@ import typer
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, quantity, say
 from acquire.cli.places import local_path
 from acquire.cli.progress import stage_progress
-from acquire.errors import AcquireError, DataError, UsageError
+from acquire.errors import AcquireError, DataError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -386,31 +385,21 @@ def _save(segment: Segment, out: Path) -> int:
     """Write the segment; a file that is there is whole. The file's size."""
     import numpy as np
 
-    from acquire.store.refusals import refusal, refused
+    from acquire.store.delivery import whole_file
+    from acquire.store.refusals import refused
 
-    part = out.with_name(f".{out.name}.{os.getpid()}.partial")
-    with refused(out, "written"):
-        file = part.open("xb")
-    try:
-        with file:
-            np.savez(
-                file,
-                lines=segment.lines,
-                mask=segment.mask,
-                code=segment.code,
-                time_ns=segment.time_ns,
-                stages=segment.geometry.stages,
-                substeps=segment.geometry.substeps,
-                first_line=segment.first_line,
-                substep_ns=segment.substep_ns,
-                black_level_dn=segment.black_level_dn,
-                responsivity_dn=segment.responsivity_dn,
-            )
-        os.link(part, out)  # refuses where a rename would replace
-    except FileExistsError as error:
-        raise UsageError(f"{out} was made by somebody else meanwhile", hint="another --out") from error
-    except OSError as error:
-        raise refusal(out, error, "written") from error
-    finally:
-        part.unlink(missing_ok=True)
+    with whole_file(out) as part, refused(out, "written"), part.open("wb") as file:
+        np.savez(
+            file,
+            lines=segment.lines,
+            mask=segment.mask,
+            code=segment.code,
+            time_ns=segment.time_ns,
+            stages=segment.geometry.stages,
+            substeps=segment.geometry.substeps,
+            first_line=segment.first_line,
+            substep_ns=segment.substep_ns,
+            black_level_dn=segment.black_level_dn,
+            responsivity_dn=segment.responsivity_dn,
+        )
     return out.stat().st_size

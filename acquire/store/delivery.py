@@ -4,6 +4,7 @@
 
     path   .NAME.partial beside it ─▶ forced to the medium ─▶ renamed
     URL    a temporary directory   ─▶ its arrays are put ─▶ its root metadata, as the last
+    file   .NAME.partial beside it ─▶ forced to the medium ─▶ linked (`whole_file`)
 
 Who opens a group asks for its ``zarr.json`` first: as long as there is none, nothing is there. What an upload
 leaves that failed is therefore no group, and is replaced when it is tried again.
@@ -14,13 +15,17 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 from acquire.errors import UsageError
 from acquire.store.files import DISK, check_new_path
 from acquire.store.refusals import refused
 from acquire.store.remote import RemoteSource, is_url
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
 
 ROOT = "zarr.json"
 
@@ -35,6 +40,31 @@ class Delivery(Protocol):
 
     def clear(self) -> None:
         """Nothing of it stays here; what was delivered does."""
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """An empty file to be filled, which appears at ``path`` when the block ends without an error.
+
+    Raises UsageError where somebody else has made ``path`` meanwhile, which is left as it is, and what
+    `refused` makes of a disk that refuses; then nothing is left.
+    """
+    part = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    with refused(path, "written"):
+        part.open("xb").close()
+    try:
+        yield part
+        with refused(path, "written"):
+            with part.open("rb+") as file:
+                os.fsync(file.fileno())
+            try:
+                os.link(part, path)  # refuses where a rename would replace
+            except FileExistsError as error:
+                raise UsageError(
+                    f"{path} was made by somebody else meanwhile", hint="another name"
+                ) from error
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def delivery_to(place: Path | str) -> Delivery:

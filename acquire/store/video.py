@@ -77,8 +77,38 @@ class VideoFile:
     @property
     def interval_ns(self) -> float:
         """Duration of a frame."""
-        scale = self.attrs["ome"]["multiscales"][0]["datasets"][0]["coordinateTransformations"][0]["scale"]
-        return float(scale[0]) * 1e9
+        return self.scale[0] * 1e9
+
+    @property
+    def scale(self) -> tuple[float, float, float]:
+        """Seconds of a frame, height and width of a pixel in `pixel_unit`."""
+        return self._transformed("scale", 1.0)
+
+    @property
+    def origin(self) -> tuple[float, float, float]:
+        """Where the first frame begins, in seconds, and where the centre of the first pixel lies."""
+        return self._transformed("translation", 0.0)
+
+    @property
+    def pixel_unit(self) -> str | None:
+        """UDUNITS-2 name of a length; None where only ratios are known."""
+        unit = self.attrs["ome"]["multiscales"][0]["axes"][-1].get("unit")
+        return None if unit is None else str(unit)
+
+    @property
+    def trusted(self) -> range | None:
+        """Frames that are sampled in full; None for a video that does not say."""
+        found = (self.attrs.get("provenance") or {}).get("trusted")
+        if found is None:
+            return None
+        first, end = (min(max(int(edge), 0), len(self.time_ns)) for edge in found)
+        return range(first, max(first, end))
+
+    def _transformed(self, kind: str, default: float) -> tuple[float, float, float]:
+        steps = self.attrs["ome"]["multiscales"][0]["datasets"][0]["coordinateTransformations"]
+        found = next((step[kind] for step in steps if step["type"] == kind), [default] * 3)
+        t, y, x = map(float, found)
+        return t, y, x
 
 
 def write_video(

@@ -249,7 +249,6 @@ def _png(picture: NDArray[np.uint8]) -> bytes:
 
 def _of_video(name: str, video: VideoFile) -> VideoFacts:
     frames, rows, columns = video.video.shape
-    trusted = (video.attrs.get("provenance") or {}).get("trusted")
     return VideoFacts(
         name=name,
         frames=frames,
@@ -257,7 +256,7 @@ def _of_video(name: str, video: VideoFile) -> VideoFacts:
         columns=columns,
         interval_ns=video.interval_ns,
         start_ns=int(video.time_ns[0]) if len(video.time_ns) else None,
-        trusted=(int(trusted[0]), int(trusted[1])) if trusted else None,
+        trusted=None if video.trusted is None else (video.trusted.start, video.trusted.stop),
     )
 
 

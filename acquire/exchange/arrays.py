@@ -1,0 +1,44 @@
+"""NumPy's own files: ``.npy`` is the image alone, ``.npz`` has its columns and the facts (JSON), too."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from typing import IO, TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.lib import format as npy
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from acquire.exchange.content import Array, Content
+
+
+def write_npy(path: Path, content: Content, advance: Callable[[int], object]) -> None:
+    """The image. Raises OSError as the disk gives it."""
+    with path.open("wb") as file:
+        _write(file, content.image, advance)
+
+
+def write_npz(path: Path, content: Content, advance: Callable[[int], object]) -> None:
+    """The image, its columns, and ``facts``: JSON in a text. Raises OSError as the disk gives it."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
+        for array in (content.image, *content.columns):
+            with archive.open(f"{array.name}.npy", "w", force_zip64=True) as file:
+                _write(file, array, advance)
+        with archive.open("facts.npy", "w") as file:
+            npy.write_array(file, np.array(json.dumps(content.facts)), allow_pickle=False)
+
+
+def _write(file: IO[bytes], array: Array, advance: Callable[[int], object]) -> None:
+    header: dict[str, Any] = {
+        "descr": npy.dtype_to_descr(array.dtype),
+        "fortran_order": False,
+        "shape": array.shape,
+    }
+    npy.write_array_header_1_0(file, header)
+    for _, block in array.blocks():
+        file.write(np.ascontiguousarray(block).data)
+        advance(block.nbytes)

@@ -1,0 +1,96 @@
+"""Writes what is exported as the one file that its name asks for: whole, or not at all."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from acquire.errors import UsageError
+from acquire.exchange.arrays import write_npy, write_npz
+from acquire.exchange.hdf5 import write_hdf5
+from acquire.exchange.libraries import library
+from acquire.exchange.movie import check_movie, write_movie
+from acquire.exchange.tiff import check_tiff, write_tiff
+from acquire.store.delivery import whole_file
+from acquire.store.files import check_new_path
+from acquire.store.refusals import refused
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from acquire.exchange.content import Content
+
+SUFFIXES = {
+    ".ome.tif": "ome",
+    ".ome.tiff": "ome",
+    ".tif": "imagej",
+    ".tiff": "imagej",
+    ".h5": "hdf5",
+    ".hdf5": "hdf5",
+    ".nxs": "hdf5",
+    ".npy": "npy",
+    ".npz": "npz",
+    ".mp4": "movie",
+}
+"""What a file's name ends with → how it is written; the longest ending counts."""
+
+
+def format_for(path: Path) -> str:
+    """One of the values of `SUFFIXES`. UsageError for a name that says none."""
+    for suffix, name in SUFFIXES.items():
+        if path.name.lower().endswith(suffix):
+            return name
+    raise UsageError(
+        f"{path}: its name does not say what it is to be",
+        possible=".tif (ImageJ), .ome.tif, .h5 or .nxs (NeXus), .npy, .npz, .mp4",
+        hint=f"{path.with_suffix('.h5')}",
+    )
+
+
+def check_export(content: Content, path: Path) -> None:
+    """UsageError for what cannot be written so, before anything is touched."""
+    kind = format_for(path)
+    check_new_path(path)
+    if kind in {"imagej", "ome"}:
+        check_tiff(content, ome=kind == "ome")
+    elif kind == "hdf5":
+        library("h5py", "export", "an HDF5 file")
+    elif kind == "movie":
+        check_movie(content)
+
+
+def export(
+    content: Content,
+    path: Path,
+    progress: Callable[[float, float], object] | None = None,
+    *,
+    fps: float = 25.0,
+    peak: float | None = None,
+) -> int:
+    """Write ``content`` as ``path``'s name says; the size of the file in bytes.
+
+    ``fps`` and ``peak`` (white) are of movies. ``progress`` takes (bytes done, of how many). Raises
+    UsageError as `check_export`, DataError for what cannot be read, and StoreError where the disk refuses;
+    then nothing is left.
+    """
+    check_export(content, path)
+    kind, total, done = format_for(path), content.image.bytes, 0
+
+    def advance(count: int) -> None:
+        nonlocal done
+        done += count
+        if progress is not None:
+            progress(min(done, total), total)
+
+    with whole_file(path) as part, refused(path, "written"):
+        if kind in {"imagej", "ome"}:
+            write_tiff(part, content, advance, ome=kind == "ome")
+        elif kind == "hdf5":
+            write_hdf5(part, content, advance)
+        elif kind == "movie":
+            write_movie(part, content, advance, fps, peak)
+        elif kind == "npy":
+            write_npy(part, content, advance)
+        else:
+            write_npz(part, content, advance)
+    return path.stat().st_size

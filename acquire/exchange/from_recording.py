@@ -1,0 +1,119 @@
+"""Lines of a recording, with their tags and flags, as the content of an export."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire import __version__
+from acquire.errors import UsageError
+from acquire.exchange.content import Array, Axis, Block, Content, block, little
+from acquire.lines import ARMS, LineFlag
+from acquire.store.present import MISSING, flags_of, present_values
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from acquire.store import Recording
+
+BLOCK_BYTES = 2**23
+"""Of pixels that are in memory at a time."""
+FACTS = (
+    "run_id", "run_condition", "end_reason", "layout", "geometry", "trigger", "code", "clock", "cameras",
+    "simulated", "imported", "versions",
+)  # fmt: skip
+"""What a recording says of itself that a file of its lines says, too."""
+
+
+def recording_content(recording: Recording, rows: range | None = None) -> Content:
+    """Lines of both arms of a recording (rows; None: all) as (arm, line, pixel), with their tags and flags.
+
+    A line that is missing, or was dropped by retention, is 0 and flagged so. UsageError for lines that are
+    not there.
+    """
+    asked = range(recording.lines) if rows is None else rows
+    if not 0 <= asked.start < asked.stop <= recording.lines:
+        first, last = recording.first_line, recording.first_line + recording.lines - 1
+        raise UsageError(
+            f"lines {first + asked.start} to {first + asked.stop - 1} of {recording} are not all there",
+            possible=f"lines {first} to {last}" if recording.lines else "none: it holds no lines yet",
+        )
+    stream, first_line = recording.arms[ARMS[0]], recording.first_line + asked.start
+    image = Array(
+        "lines",
+        ("arm", "line", "pixel"),
+        (len(ARMS), len(asked), stream.pixels),
+        little(stream.dtype),
+        partial(_of_arms, recording, asked, "lines"),
+        {"long_name": "lines as recorded", "units": "DN"},
+    )
+    axes = (Axis("arm"), Axis("line", 1.0, first_line), Axis("pixel", 1.0))
+    facts = _facts(recording, first_line, len(asked))
+    return Content("lines", str(recording), axes, image, tuple(_columns(recording, asked)), facts)
+
+
+def _facts(recording: Recording, first_line: int, count: int) -> dict[str, Any]:
+    return {
+        "source": str(recording),
+        **{key: recording.attrs[key] for key in FACTS if key in recording.attrs},
+        "first_line": first_line,
+        "lines": count,
+        "arms": list(ARMS),
+        "line_period_s": recording.line_period_ns * 1e-9,
+        "flag_masks": {flag.name.lower(): int(flag) for flag in LineFlag if flag.name},
+        "exported_by": f"acquire {__version__}",
+    }
+
+
+def _columns(recording: Recording, rows: range) -> Iterator[Array]:
+    """Flags of each arm; what follows from the line's number is the same in both."""
+    stream = recording.arms[ARMS[0]]
+    flags = partial(_of_arms, recording, rows, "flags")
+    words = "what is known about the line beyond its pixels"
+    yield Array(
+        "flags", ("arm", "line"), (len(ARMS), len(rows)), np.dtype("<u2"), flags, {"long_name": words}
+    )
+    for name, column, words in (
+        ("time_ns", "time", "UTC at which the line's read-out begins, ns since 1970"),
+        ("code_index", "code_index", "index of the code's bit in the line's first sub-step"),
+        ("code", "code", "the line's code bits, first sub-step in bit 0"),
+    ):
+        blocks = partial(_of_either, recording, rows, column)
+        dtype = little(stream.reader(column).shape.dtype)
+        yield Array(name, ("line",), (len(rows),), dtype, blocks, {"long_name": words})
+
+
+def _steps(recording: Recording, rows: range) -> Iterator[tuple[int, int]]:
+    """Parts of the rows that are read at once."""
+    stream = recording.arms[ARMS[0]]
+    size = max(1, BLOCK_BYTES // (stream.pixels * stream.dtype.itemsize))
+    for start in range(rows.start, rows.stop, size):
+        yield start, min(rows.stop, start + size)
+
+
+def _of_arms(recording: Recording, rows: range, name: str) -> Iterator[Block]:
+    for number, arm in enumerate(ARMS):
+        for start, stop in _steps(recording, rows):
+            flags = flags_of(recording, arm, start, stop)
+            values = flags if name == "flags" else present_values(recording, arm, name, start, flags)
+            yield block((number, slice(start - rows.start, stop - rows.start)), values)
+
+
+def _of_either(recording: Recording, rows: range, name: str) -> Iterator[Block]:
+    """Tags of arm a; where its line is missing, those of arm b."""
+    for start, stop in _steps(recording, rows):
+        (missing, values), (_, others) = (_tags(recording, arm, name, start, stop) for arm in ARMS)
+        both = np.where(missing, others, values)
+        yield block((slice(start - rows.start, stop - rows.start),), both)
+
+
+def _tags(
+    recording: Recording, arm: str, name: str, start: int, stop: int
+) -> tuple[NDArray[np.bool_], NDArray[Any]]:
+    """Which rows are missing, and the tags of the others."""
+    flags = flags_of(recording, arm, start, stop)
+    return (flags & MISSING) != 0, present_values(recording, arm, name, start, flags)

@@ -1,0 +1,133 @@
+"""A reconstructed video as the content of an export."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire import __version__
+from acquire.errors import DataError, UsageError
+from acquire.exchange.content import Array, Axis, Block, Content, block, little
+from acquire.store.camera_stream import DAMAGE
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+
+    from acquire.store import VideoFile
+
+UNITS = {"micrometer": "um", "millimeter": "mm", "meter": "m", "nanometer": "nm"}
+"""UDUNITS-2 names as other programs write them."""
+
+
+def video_content(
+    video: VideoFile, title: str, frames: range | None = None, *, whole: bool = False
+) -> Content:
+    """Frames of a video (None: all), of these only the trusted ones unless ``whole``.
+
+    A video that does not say which of its frames can be trusted is exported as it is. UsageError where
+    nothing is left.
+    """
+    count = int(video.video.shape[0])
+    asked = range(count) if frames is None else frames
+    if not 0 <= asked.start < asked.stop <= count:
+        raise UsageError(
+            f"frames {asked.start} to {asked.stop - 1} are not there", possible=f"0 to {count - 1}"
+        )
+    trusted = video.trusted
+    kept = asked if whole or trusted is None else _common(asked, trusted)
+    if not kept:
+        raise UsageError(
+            f"none of the frames {asked.start} to {asked.stop - 1} of {title} is trusted: its lines sample "
+            "them in part",
+            possible=f"frames {trusted.start} to {trusted.stop - 1}" if trusted else "",
+            hint="--all-frames, which marks them instead",
+        )
+    image = Array(
+        "video",
+        ("time", "y", "x"),
+        (len(kept), *video.video.shape[1:]),
+        little(video.video.dtype),
+        partial(_frames, video, kept),
+        {"long_name": "reconstructed light"},
+    )
+    inside = kept if trusted is None else _common(kept, trusted)
+    return Content(
+        "video",
+        title,
+        _axes(video, kept),
+        image,
+        tuple(_columns(video, kept)),
+        _facts(video, title, kept, None if trusted is None else inside),
+        len(kept) - len(inside),
+    )
+
+
+def _common(one: range, other: range) -> range:
+    start = max(one.start, other.start)
+    return range(start, max(start, min(one.stop, other.stop)))
+
+
+def _unit(video: VideoFile) -> str:
+    unit = video.pixel_unit
+    return "pixel" if unit is None else UNITS.get(unit, unit)
+
+
+def _axes(video: VideoFile, kept: range) -> tuple[Axis, ...]:
+    (interval_s, height, width), (t, y, x) = video.scale, video.origin
+    first_s = t + (int(video.time_ns[kept.start]) - int(video.time_ns[0])) * 1e-9
+    unit = _unit(video)
+    return (
+        Axis("time", interval_s, first_s, "s"),
+        Axis("y", height, y, unit),
+        Axis("x", width, x, unit),
+    )
+
+
+def _facts(video: VideoFile, title: str, kept: range, inside: range | None) -> dict[str, Any]:
+    """``frames`` are numbers in the source, ``trusted_frames`` in the file: the first, and after the last."""
+    interval_s, *pixel = video.scale
+    return {
+        "source": title,
+        "frames": [kept.start, kept.stop],
+        "frames_of_source": len(video.time_ns),
+        "trusted_frames": inside and [inside.start - kept.start, inside.stop - kept.start],
+        "first_frame_utc_ns": int(video.time_ns[kept.start]),
+        "frame_interval_s": interval_s,
+        "pixel_size": pixel,
+        "pixel_unit": _unit(video),
+        "provenance": video.attrs.get("provenance"),
+        "exported_by": f"acquire {__version__}",
+    }
+
+
+def _columns(video: VideoFile, kept: range) -> Iterator[Array]:
+    yield _column("time_ns", video.time_ns[kept.start : kept.stop], "UTC, ns since 1970")
+    if video.trusted is not None:
+        inside = np.isin(np.arange(kept.start, kept.stop), video.trusted)
+        yield _column("trusted", inside.astype(np.uint8), "1: the frame is sampled in full")
+    if video.quality is not None:
+        quality = video.quality[kept.start : kept.stop]
+        yield _column("quality", quality, "relative RMS residual of the lines that see the frame")
+
+
+def _column(name: str, values: NDArray[Any], words: str) -> Array:
+    """A value for each frame, in memory."""
+    piece = block((slice(0, len(values)),), values)
+    return Array(name, ("time",), values.shape, piece[1].dtype, lambda: iter([piece]), {"long_name": words})
+
+
+def _frames(video: VideoFile, kept: range) -> Iterator[Block]:
+    """Whole chunks of the video, so that none is unpacked twice."""
+    size, start = int(video.video.chunks[0]), kept.start
+    while start < kept.stop:
+        stop = min(kept.stop, (start // size + 1) * size)
+        try:
+            frames = np.asarray(video.video[start:stop])
+        except DAMAGE as error:
+            raise DataError(f"frames {start} to {stop - 1} of the video cannot be read: {error}") from error
+        yield block((slice(start - kept.start, stop - kept.start),), frames)
+        start = stop

@@ -1,0 +1,19 @@
+"""Libraries that one format of files needs, and the core does not."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+from acquire.errors import UsageError
+
+
+def library(module: str, extra: str, what: str) -> Any:
+    """The module. UsageError with the command that installs it, where it is missing."""
+    try:
+        return import_module(module)
+    except ModuleNotFoundError as error:
+        raise UsageError(
+            f"{what} needs the Python package {module!r}, which is not installed",
+            hint=f"pip install 'tdi-acquire[{extra}]'",
+        ) from error

@@ -1,0 +1,88 @@
+"""TIFF: an ImageJ hyperstack, or, as ``.ome.tif``, an OME-TIFF of any size.
+
+The image lies in one piece behind the header, so that it is written as it is read, block by block.
+"""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.errors import UsageError
+from acquire.exchange.libraries import library
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from pathlib import Path
+
+    from acquire.exchange.content import Content
+
+MOST_BYTES = 2**32 - 2**26
+"""Of an image in a file whose offsets have 32 bits."""
+AXES = {"video": "TYX", "lines": "CYX"}
+"""Letters of ImageJ and OME: the arms of a recording are channels, its lines rows."""
+
+
+def check_tiff(content: Content, *, ome: bool) -> None:
+    """UsageError for an image that no such file can hold."""
+    library("tifffile", "export", "a TIFF file")
+    if not ome and content.image.bytes > MOST_BYTES:
+        raise UsageError(
+            f"a TIFF file for ImageJ cannot hold {content.image.bytes} bytes of pixels",
+            possible=f"up to {MOST_BYTES}",
+            hint="NAME.ome.tif, which can, or NAME.h5; or a part: --from and --to",
+        )
+
+
+def write_tiff(path: Path, content: Content, advance: Callable[[int], object], *, ome: bool) -> None:
+    """Raises OSError as the disk gives it."""
+    tifffile = library("tifffile", "export", "a TIFF file")
+    kind: dict[str, Any] = {"ome": True, "bigtiff": True} if ome else {"imagej": True}
+    with tifffile.TiffWriter(path, byteorder="<", **kind) as writer:
+        writer.write(
+            None,
+            shape=content.image.shape,
+            dtype=content.image.dtype,
+            photometric="minisblack",
+            metadata=_ome(content) if ome else _imagej(content),
+            resolution=_resolution(content),
+            resolutionunit="NONE",
+        )
+    with tifffile.TiffFile(path) as reader:
+        offset = reader.series[0].dataoffset
+    with path.open("r+b") as file:
+        file.seek(offset)
+        for _, block in content.image.blocks():
+            file.write(np.ascontiguousarray(block).data)
+            advance(block.nbytes)
+
+
+def _resolution(content: Content) -> tuple[float, float]:
+    """Pixels per unit, along x and y."""
+    *_, y, x = content.axes
+    return 1 / (x.step or 1.0), 1 / (y.step or 1.0)
+
+
+def _imagej(content: Content) -> dict[str, Any]:
+    facts: dict[str, Any] = {"axes": AXES[content.kind], "Info": json.dumps(content.facts, indent=1)}
+    if content.kind == "lines":
+        return {**facts, "Labels": [f"arm {arm}" for arm in content.facts["arms"]]}
+    time = content.axes[0]
+    return {**facts, "finterval": time.step, "fps": 1 / (time.step or 1.0), "unit": content.axes[-1].unit}
+
+
+def _ome(content: Content) -> dict[str, Any]:
+    facts: dict[str, Any] = {
+        "axes": AXES[content.kind],
+        "Name": content.title,
+        "Description": json.dumps(content.facts),
+    }
+    if content.kind == "lines":
+        return {**facts, "Channel": {"Name": [f"arm {arm}" for arm in content.facts["arms"]]}}
+    time, y, x = content.axes
+    for axis in (y, x):
+        letter, unit = axis.name.upper(), "µm" if axis.unit == "um" else axis.unit
+        facts |= {f"PhysicalSize{letter}": axis.step, f"PhysicalSize{letter}Unit": unit}
+    return {**facts, "TimeIncrement": time.step, "TimeIncrementUnit": "s"}

@@ -1,0 +1,217 @@
+"""``acquire export``: its files, opened by the libraries that everybody opens them with."""
+
+from __future__ import annotations
+
+import errno
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import av
+import h5py
+import numpy as np
+import pytest
+import tifffile
+
+from acquire.cli import main
+from acquire.exchange import arrays, export, from_recording, recording_content, tiff, video_content
+from acquire.lines import LineFlag
+from acquire.store import open_recording, open_video
+
+FIRST, S, TRUSTED = 100, 2, range(3, 17)
+Cli = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def cli(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Cli:
+    def run(*words: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["acquire", *map(str, words)])
+        code = main()
+        said = capsys.readouterr()
+        return code, said.out, said.err
+
+    return run
+
+
+def test_imagej_has_axes_interval_and_pixel_size(cli: Cli, video: Path, tmp_path: Path) -> None:
+    assert cli("export", video, tmp_path / "v.tif")[0] == 0
+    with tifffile.TiffFile(tmp_path / "v.tif") as file:
+        (series,) = file.series
+        assert (series.axes, series.shape) == ("TYX", (14, 7, 5))
+        np.testing.assert_array_equal(series.asarray(), open_video(video).video[3:17])
+        facts = file.imagej_metadata
+        assert facts is not None
+        assert (facts["finterval"], facts["unit"], facts["frames"]) == (pytest.approx(1e-5), "um", 14)
+        assert json.loads(facts["Info"])["frames"] == [3, 17]
+        above, below = file.pages[0].tags["XResolution"].value
+        assert above / below == pytest.approx(1 / 2.5)
+    assert [path.name for path in tmp_path.iterdir()] == ["v.tif"]
+
+
+def test_ome_tiff_says_the_same(cli: Cli, video: Path, tmp_path: Path) -> None:
+    assert cli("export", video, tmp_path / "v.ome.tif")[0] == 0
+    with tifffile.TiffFile(tmp_path / "v.ome.tif") as file:
+        assert file.is_bigtiff
+        assert file.series[0].axes == "TYX"
+        np.testing.assert_array_equal(file.asarray(), open_video(video).video[3:17])
+        pixels = tifffile.xml2dict(file.ome_metadata)["OME"]["Image"]["Pixels"]
+    assert (pixels["PhysicalSizeX"], pixels["PhysicalSizeXUnit"]) == (2.5, "µm")
+    assert float(pixels["TimeIncrement"]) == pytest.approx(1e-5)
+
+
+def test_nexus_plots_the_video_by_default(cli: Cli, video: Path, tmp_path: Path) -> None:
+    assert cli("export", video, tmp_path / "v.nxs", "--all-frames")[0] == 0
+    with h5py.File(tmp_path / "v.nxs") as file:
+        entry = file[file.attrs["default"]]
+        data = entry[entry.attrs["default"]]
+        assert (entry.attrs["NX_class"], data.attrs["NX_class"]) == ("NXentry", "NXdata")
+        signal, axes = data[data.attrs["signal"]], list(data.attrs["axes"])
+        np.testing.assert_array_equal(signal, open_video(video).video[:])
+        assert axes == ["time", "y", "x"]
+        assert [len(data[name]) for name in axes] == list(signal.shape)
+        np.testing.assert_allclose(data["time"], np.arange(20) * 1e-5)
+        assert [data[name].attrs["units"] for name in axes] == ["s", "um", "um"]
+        np.testing.assert_allclose(data["x"], np.arange(5) * 2.5)
+        np.testing.assert_array_equal(data["time_ns"], open_video(video).time_ns)
+        np.testing.assert_array_equal(np.flatnonzero(data["trusted"]), TRUSTED)
+        facts = json.loads(entry["process/note/data"][()])
+    assert facts["trusted_frames"] == [3, 17]
+    assert facts["provenance"]["recording"] == "run.zarr"
+
+
+def test_frames_that_are_not_trusted_are_left_out_or_named(cli: Cli, video: Path, tmp_path: Path) -> None:
+    code, out, err = cli("export", video, tmp_path / "a.npy")
+    assert (code, err, np.load(tmp_path / "a.npy").shape) == (0, "", (14, 7, 5))
+    assert "14 × 7 × 5 (time, y, x)" in out
+    code, _, err = cli("export", video, tmp_path / "b.npy", "--all-frames")
+    assert (code, np.load(tmp_path / "b.npy").shape) == (0, (20, 7, 5))
+    assert "6 of 20 frames are not trusted" in err
+    code, _, err = cli("export", video, tmp_path / "c.npy", "--frames", 3)
+    assert (code, "frames 3 to 16" in err, "--all-frames" in err) == (2, True, True)
+    assert cli("export", video, tmp_path / "c.npz", "--frames", 8)[0] == 0
+    with np.load(tmp_path / "c.npz") as saved:
+        np.testing.assert_array_equal(saved["video"], open_video(video).video[3:8])
+        np.testing.assert_array_equal(saved["trusted"], np.ones(5))
+        assert json.loads(str(saved["facts"]))["frames"] == [3, 8]
+
+
+def test_times_choose_frames(cli: Cli, video: Path, tmp_path: Path) -> None:
+    utc = "2023-11-14T22:13:20.000120"  # 12 frames after the first
+    assert cli("export", video, tmp_path / "v.npz", "--from", "50us", "--to", utc)[0] == 0
+    with np.load(tmp_path / "v.npz") as saved:
+        np.testing.assert_array_equal(saved["time_ns"], open_video(video).time_ns[5:12])
+
+
+def test_a_movie_shows_what_the_video_holds(cli: Cli, video: Path, tmp_path: Path) -> None:
+    assert cli("export", video, tmp_path / "v.mp4", "--peak", 1, "--fps", 10)[0] == 0
+    with av.open(str(tmp_path / "v.mp4")) as file:
+        assert file.streams.video[0].average_rate == 10
+        frames = np.stack([frame.to_ndarray(format="gray") for frame in file.decode(video=0)])
+        facts = json.loads(file.metadata["comment"])
+    assert frames.shape == (14, 8, 6)  # even sides
+    error = frames[:, :7, :5] / 255 - open_video(video).video[3:17]
+    assert np.sqrt(np.mean(error**2)) < 0.1  # the codec loses some of what is all noise
+    assert (facts["white"], facts["frames"]) == (1.0, [3, 17])
+
+
+@pytest.mark.parametrize("block_bytes", [200, 2**23])
+def test_lines_and_tags_of_a_recording(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_bytes: int
+) -> None:
+    monkeypatch.setattr(from_recording, "BLOCK_BYTES", block_bytes)
+    opened = open_recording(recording)
+    content = recording_content(opened, range(20, 60))
+    export(content, tmp_path / "l.h5")
+    export(content, tmp_path / "l.npz")
+    export(content, tmp_path / "l.tif")
+    cut = opened.cut(FIRST + 20, 40)
+    with h5py.File(tmp_path / "l.h5") as file:
+        data = file["entry/data"]
+        np.testing.assert_array_equal(data["lines"], cut.lines)
+        assert list(data.attrs["axes"]) == [".", "line", "pixel"]
+        np.testing.assert_array_equal(data["line"], np.arange(FIRST + 20, FIRST + 60))
+    with np.load(tmp_path / "l.npz") as saved:
+        np.testing.assert_array_equal(saved["lines"], cut.lines)
+        np.testing.assert_array_equal(saved["time_ns"], cut.time_ns)
+        np.testing.assert_array_equal(saved["code_index"], S * np.arange(FIRST + 20, FIRST + 60))
+        bits = np.unpackbits(saved["code"][:, None], axis=1, bitorder="little")[:, :S].reshape(-1)
+        np.testing.assert_array_equal(bits, cut.code[: len(bits)])
+        missing = (saved["flags"] & LineFlag.MISSING) != 0
+        assert [np.flatnonzero(arm).tolist() for arm in missing] == [[], [*range(10, 15)]]
+        facts = json.loads(str(saved["facts"]))
+    assert (facts["first_line"], facts["run_condition"], facts["code"]["seed"]) == (120, "INCOMPLETE", "0x4d")
+    with tifffile.TiffFile(tmp_path / "l.tif") as file:
+        assert file.series[0].axes == "CYX"
+        np.testing.assert_array_equal(file.asarray(), cut.lines)
+
+
+def test_times_choose_lines(cli: Cli, recording: Path, tmp_path: Path) -> None:
+    assert cli("export", recording, tmp_path / "l.npz", "--from", "200us", "--to", "0.4ms")[0] == 0
+    with np.load(tmp_path / "l.npz") as saved:
+        np.testing.assert_array_equal(saved["code_index"], S * np.arange(FIRST + 10, FIRST + 20))
+    code, _, err = cli("export", recording, tmp_path / "m.npz", "--from", "1ms", "--to", "3s")
+    assert (code, "0ms to 1.8ms after the first" in err) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["run", "l.xyz"], "possible: .tif (ImageJ)"),
+        (["run", "l.mp4"], "whose lines are no pictures"),
+        (["run", "l.npy", "--frames", 3], "a recording has no frames"),
+        (["video", "v.npy", "--lines", 3], "a video has no lines"),
+        (["run", "l.npy", "--lines", 300], "possible: lines 100 to 189"),
+        (["run", "l.npy", "--lines", 0], "1 or more"),
+        (["run", "l.npy", "--lines", 5, "--from", "1ms"], "numbers and times exclude each other"),
+        (["video", "v.npy", "--first-frame", 19, "--frames", 2], "possible: 0 to 19"),
+        (["video", "v.mp4", "--fps", 0], "0.1 to 240"),
+        (["video", "v.mp4", "--peak", -1], "above 0"),
+        (["nothing", "v.npy"], "does not exist"),
+        (["video", "no/v.npy"], "does not exist"),
+    ],
+)
+def test_what_cannot_be_is_refused_and_nothing_touched(
+    cli: Cli, recording: Path, video: Path, tmp_path: Path, words: list[Any], said: str
+) -> None:
+    source = {"run": recording, "video": video}.get(words[0], tmp_path / "absent.zarr")
+    code, _, err = cli("export", source, tmp_path / words[1], *words[2:])
+    assert (code, said in err) == (2, True), err
+    assert not list(tmp_path.iterdir())
+
+
+def test_nothing_is_overwritten(cli: Cli, video: Path, tmp_path: Path) -> None:
+    (tmp_path / "v.npy").write_text("precious")
+    assert cli("export", video, tmp_path / "v.npy")[0] == 2
+    assert (tmp_path / "v.npy").read_text() == "precious"
+
+
+@pytest.mark.parametrize(("module", "name"), [("tifffile", "v.tif"), ("h5py", "v.h5"), ("av", "v.mp4")])
+def test_a_library_that_is_missing_is_named_with_its_extra(
+    cli: Cli, video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, name: str
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    code, _, err = cli("export", video, tmp_path / name)
+    extra = "video" if module == "av" else "export"
+    assert (code, f"pip install 'tdi-acquire[{extra}]'" in err) == (2, True)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_image_too_large_for_imagej_is_told_of_ome(
+    video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cli: Cli
+) -> None:
+    monkeypatch.setattr(tiff, "MOST_BYTES", 100)
+    code, _, err = cli("export", video, tmp_path / "v.tif")
+    assert (code, "NAME.ome.tif" in err) == (2, True)
+    assert cli("export", video, tmp_path / "v.ome.tif")[0] == 0
+
+
+def test_a_full_disk_leaves_nothing(video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(arrays.npy, "write_array_header_1_0", full)
+    with pytest.raises(Exception, match="No space left"):
+        export(video_content(open_video(video), "v"), tmp_path / "v.npy")
+    assert not list(tmp_path.iterdir())
