@@ -1,21 +1,16 @@
-"""``acquire camera features | snapshot``: look at one camera before it is used."""
+"""``acquire camera features | snapshot | live``: look at a camera before it is used."""
 
 from __future__ import annotations
 
-import threading
-from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
+from acquire.cli.camera_bench import OPEN_S, Bench
+from acquire.cli.camera_live import live
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table
-from acquire.errors import TriggerError, UsageError
-
-if TYPE_CHECKING:
-    from acquire.camera.base import CameraOpener
-    from acquire.config import RigConfig
-    from acquire.rig import Rig
+from acquire.errors import UsageError
 
 ConfigOption = Annotated[
     str | None,
@@ -24,15 +19,13 @@ ConfigOption = Annotated[
     ),
 ]
 SerialArgument = Annotated[str, typer.Argument(help="Serial number: acquire devices lists them.")]
-OPEN_S = 60.0
-_LISTEN_S = 0.2
 
 
 def register(app: typer.Typer) -> None:
     group = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
-    for command in (features, snapshot):
+    for command in (features, snapshot, live):
         group.command()(command)
-    app.add_typer(group, name="camera", help="Look at one camera.", rich_help_panel="Rig")
+    app.add_typer(group, name="camera", help="Look at the cameras.", rich_help_panel="Rig")
 
 
 def features(serial: SerialArgument, config: ConfigOption = None, json: JsonFlag = False) -> None:
@@ -45,7 +38,7 @@ def features(serial: SerialArgument, config: ConfigOption = None, json: JsonFlag
     from acquire.camera.look import feature_table
     from acquire.camera.visit import visit
 
-    with _Bench(config) as bench:
+    with Bench(config) as bench:
         rows = visit(bench.opener(serial), feature_table, timeout_s=OPEN_S)
     if json:
         print_json(rows)
@@ -74,7 +67,7 @@ def snapshot(
 
     path = out or Path(f"{serial}.png")
     _check_out(path)
-    with _Bench(config) as bench:
+    with Bench(config) as bench:
         seconds = OPEN_S + lines / bench.line_rate_hz
         pixels, flags = visit(
             bench.opener(serial), take, lines, seconds, timeout_s=2 * OPEN_S + seconds, armed=bench.pulse
@@ -91,63 +84,6 @@ def snapshot(
         "flagged_lines": int((flags != 0).sum()),
     }
     (print_json if json else print_facts)(facts)
-
-
-class _Bench:
-    """A rig to look at, or, without a file, whatever the environment's producers show."""
-
-    def __init__(self, config: str | None) -> None:
-        from acquire.config import load_rig
-
-        self._config: RigConfig | None = load_rig(config) if config else None
-        self._rig: Rig | None = None
-        self._ending = threading.Event()
-        self._listener = threading.Thread(target=self._listen, name="acquire-snapshot-trigger", daemon=True)
-
-    @property
-    def line_rate_hz(self) -> float:
-        return self._config.line_rate_hz if self._config else 1000.0
-
-    def opener(self, serial: str) -> CameraOpener:
-        if self._rig is None or self._config is None:
-            from acquire.camera.harvesters import HarvestersOpener
-            from acquire.camera.spec import GenicamSpec
-
-            return HarvestersOpener(GenicamSpec(serial))
-        arms = {self._config.cameras.arm(arm).serial: arm for arm in ("a", "b")}
-        if serial not in arms:
-            raise UsageError(f"the rig has no camera {serial!r}", possible=", ".join(arms))
-        return self._rig.openers()[arms[serial]]
-
-    def pulse(self) -> None:
-        """Let the rig's trigger run; a camera without a rig has its own."""
-        if self._rig is not None and self._config is not None:
-            from acquire.daemon.plan import trigger_run
-
-            self._rig.trigger.prepare(trigger_run(self._config, "snapshot"))
-            self._rig.trigger.start()
-            self._listener.start()
-
-    def _listen(self) -> None:
-        """Take the trigger's tags, which keeps its watchdog quiet. A dead link is the camera's silence."""
-        assert self._rig is not None
-        with suppress(TriggerError):
-            while not self._ending.wait(_LISTEN_S):
-                self._rig.trigger.tags(_LISTEN_S)
-
-    def __enter__(self) -> _Bench:
-        if self._config is not None:
-            from acquire.rig import Rig
-
-            self._rig = Rig(self._config)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._ending.set()
-        if self._listener.ident is not None:
-            self._listener.join(OPEN_S)
-        if self._rig is not None:
-            self._rig.close()
 
 
 def _check_out(path: Path) -> None:

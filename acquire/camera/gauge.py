@@ -1,0 +1,103 @@
+"""How bright and how sharp an image is, from its lines as they come: for whoever turns a lens or a lamp."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.lines import LineFlag
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+MOST_PIXELS = 2**15
+"""Of a block that are looked at; whole lines, spread over it."""
+FAINT = 0.01
+"""Level, of white, below which sharpness would be that of the noise."""
+_NO_IMAGE = LineFlag.MISSING | LineFlag.INCOMPLETE
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What some lines of one arm show.
+
+    ``level`` and ``brightest`` are parts of the way from black to white; ``saturated`` is the part of the
+    pixels that are white; ``focus`` is the RMS difference of neighbouring pixels beside the mean light, None
+    where there is too little light for it. All are None where there was no line. ``lost`` lines did not come,
+    or not whole.
+    """
+
+    lines: int
+    lost: int = 0
+    level: float | None = None
+    brightest: float | None = None
+    saturated: float | None = None
+    focus: float | None = None
+
+
+@dataclass(slots=True)
+class Sums:
+    """Over the pixels of some lines that were looked at, in DN and DN²."""
+
+    lines: int = 0
+    lost: int = 0
+    samples: int = 0
+    total: int = 0
+    brightest: int = 0
+    saturated: int = 0
+    steps: int = 0
+    energy: int = 0
+
+    def add(self, other: Sums) -> None:
+        self.brightest = max(self.brightest, other.brightest)
+        for name in ("lines", "lost", "samples", "total", "saturated", "steps", "energy"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+
+
+class Gauge:
+    """Of one arm: blocks go in by `look` and `keep`, `take` says what they showed since it was last asked.
+
+    Focus is √⟨(y_{j+1} − y_j)²⟩ / ⟨y − black⟩ over pixels j and lines. A lens out of focus moves light to the
+    neighbours and takes none away, so that at steady light the number is largest in focus; noise and the
+    columns' own gains add the same to it everywhere.
+    """
+
+    def __init__(self, black_dn: float, white_dn: int) -> None:
+        self._black_dn, self._white_dn = black_dn, white_dn
+        self._sums = Sums()
+
+    def look(self, pixels: NDArray[Any], flags: NDArray[np.uint16], lost: int = 0) -> Sums:
+        """Of consecutive lines (line, pixel) and their flags (line), ``lost`` lines missing before them."""
+        good = (flags & _NO_IMAGE) == 0
+        sums = Sums(int(good.sum()), lost + int(len(flags) - good.sum()))
+        stride = max(1, -(-pixels.size // MOST_PIXELS))
+        seen = pixels[::stride][good[::stride]].astype(np.int32)
+        if seen.size:
+            steps = np.diff(seen, axis=1)
+            sums.samples, sums.total, sums.brightest = seen.size, int(seen.sum()), int(seen.max())
+            sums.saturated = int((seen >= self._white_dn).sum())
+            sums.steps, sums.energy = steps.size, int((steps.astype(np.int64) ** 2).sum())
+        return sums
+
+    def keep(self, sums: Sums) -> None:
+        """What was looked at counts."""
+        self._sums.add(sums)
+
+    def take(self) -> Reading:
+        """Of what was kept since the last call."""
+        sums, self._sums = self._sums, Sums()
+        if not sums.samples:
+            return Reading(sums.lines, sums.lost)
+        span = self._white_dn - self._black_dn
+        light = sums.total / sums.samples - self._black_dn
+        bright = light > FAINT * span and sums.steps > 0
+        return Reading(
+            sums.lines,
+            sums.lost,
+            level=light / span,
+            brightest=(sums.brightest - self._black_dn) / span,
+            saturated=sums.saturated / sums.samples,
+            focus=(sums.energy / sums.steps) ** 0.5 / light if bright else None,
+        )

@@ -1,0 +1,113 @@
+"""One camera looked at for as long as somebody wants, in a process of its own that tells again and again."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from acquire.camera.gauge import Gauge, Reading
+from acquire.config.device import PIXEL_BITS
+from acquire.errors import CameraError
+from acquire.processes.messages import Failed, Ready
+from acquire.processes.worker import Worker
+
+if TYPE_CHECKING:
+    from acquire.camera.base import Camera, CameraOpener
+    from acquire.processes.worker import Mailbox
+
+TURN_S = 0.2
+"""Between two readings."""
+_WAIT_S = 0.05
+_END_S = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """What of a camera is looked at: an arm's columns, its black and white; None: all, and as it tells."""
+
+    columns: tuple[int, int] | None = None
+    black_dn: float = 0.0
+    white_dn: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """By the names of the views."""
+
+    of: dict[str, Reading]
+
+
+class LiveCamera:
+    """One camera, opened and armed in a process that ends with `close`. Line triggers are others' business.
+
+    A camera may have several views, as one with both arms' images has.
+    """
+
+    def __init__(self, name: str, opener: CameraOpener, views: dict[str, View], timeout_s: float) -> None:
+        """Returns once the camera waits for lines. Raises CameraError, or DeviceError, in ``timeout_s``."""
+        self._worker = Worker(name, _look, opener, views)
+        try:
+            self.facts: dict[str, Any] = self._worker.expect(Ready, time.monotonic() + timeout_s).facts
+        except BaseException:
+            self.close()
+            raise
+
+    def take(self, timeout_s: float) -> dict[str, Reading]:
+        """The next readings by view; empty when none came in time. Raises what the camera failed with."""
+        message = self._worker.message(timeout_s)
+        if isinstance(message, Failed):
+            raise message.error
+        if isinstance(message, Readings):
+            return message.of
+        if self._worker.death is not None:
+            raise CameraError(f"{self._worker.name}: its process {self._worker.death}")
+        return {}
+
+    def close(self) -> None:
+        """Let go of the camera. Idempotent."""
+        self._worker.end(time.monotonic() + _END_S)
+
+
+def _look(mailbox: Mailbox, opener: CameraOpener, views: dict[str, View]) -> None:
+    camera: Camera = opener()
+    try:
+        facts: dict[str, Any] = {"serial": camera.identify().serial, "settings": camera.settings()}
+        gauges = {name: Gauge(view.black_dn, _white(view, facts["settings"])) for name, view in views.items()}
+        camera.arm()
+        mailbox.post(Ready(facts))
+        due_s = time.monotonic() + TURN_S
+        while True:
+            mailbox.take()  # raises OwnerGone at the end
+            _take_block(camera, views, gauges)
+            if time.monotonic() >= due_s:
+                mailbox.post(Readings({name: gauge.take() for name, gauge in gauges.items()}))
+                due_s = max(due_s + TURN_S, time.monotonic())
+    finally:
+        camera.close()
+
+
+def _take_block(camera: Camera, views: dict[str, View], gauges: dict[str, Gauge]) -> None:
+    block = camera.next_block(_WAIT_S)
+    if block is None:
+        return
+    lost = sum(loss.count for loss in block.losses)
+    for name, view in views.items():
+        pixels = block.pixels if view.columns is None else block.pixels[:, slice(*view.columns)]
+        gauges[name].keep(gauges[name].look(pixels, block.flags, lost))
+    camera.release(block)
+
+
+def _white(view: View, settings: dict[str, Any]) -> int:
+    """Of the view, or by the name of the camera's pixel format, ``Mono12p`` being Mono12 in a tight pack."""
+    if view.white_dn is not None:
+        return view.white_dn
+    pixel_format = str(settings.get("PixelFormat", ""))
+    bits = PIXEL_BITS.get(pixel_format.removesuffix("p").removesuffix("Packed"))
+    if bits is None:
+        raise CameraError(
+            f"the camera's PixelFormat is {pixel_format!r}: what is white is not known",
+            possible=", ".join(PIXEL_BITS),
+            hint="a rig file, which says so",
+        )
+    return (1 << bits) - 1

@@ -1,0 +1,85 @@
+"""Cameras on the bench: a rig's, with its trigger, or one that the environment's producers show."""
+
+from __future__ import annotations
+
+import threading
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from acquire.errors import TriggerError, UsageError
+
+if TYPE_CHECKING:
+    from acquire.camera.base import CameraOpener
+    from acquire.config import RigConfig
+    from acquire.daemon.messages import LightCode
+    from acquire.rig import Rig
+
+OPEN_S = 60.0
+_LISTEN_S = 0.2
+
+
+class Bench:
+    """A rig to look at, or, without a file, whatever the environment's producers show."""
+
+    def __init__(self, config: str | None, code: LightCode = "rig") -> None:
+        from acquire.config import load_rig
+        from acquire.daemon.plan import with_code
+
+        self.config: RigConfig | None = with_code(load_rig(config), code) if config else None
+        self._rig: Rig | None = None
+        self._ending = threading.Event()
+        self._listener = threading.Thread(target=self._listen, name="acquire-look-trigger", daemon=True)
+
+    @property
+    def line_rate_hz(self) -> float:
+        return self.config.line_rate_hz if self.config else 1000.0
+
+    def opener(self, serial: str) -> CameraOpener:
+        if self._rig is None or self.config is None:
+            from acquire.camera.harvesters import HarvestersOpener
+            from acquire.camera.spec import GenicamSpec
+
+            return HarvestersOpener(GenicamSpec(serial))
+        return self._rig.openers()[self.arms(serial)[0]]
+
+    def arms(self, serial: str) -> list[str]:
+        """Those that the rig's camera with this serial number has. UsageError where it has none."""
+        from acquire.lines import ARMS
+
+        assert self.config is not None
+        serials = {arm: self.config.cameras.arm(arm).serial for arm in ARMS}
+        if serial not in serials.values():
+            raise UsageError(
+                f"the rig has no camera {serial!r}", possible=", ".join(dict.fromkeys(serials.values()))
+            )
+        return [arm for arm in ARMS if serials[arm] == serial]
+
+    def pulse(self) -> None:
+        """Let the rig's trigger run; a camera without a rig has its own."""
+        if self._rig is not None and self.config is not None:
+            from acquire.daemon.plan import trigger_run
+
+            self._rig.trigger.prepare(trigger_run(self.config, "look"))
+            self._rig.trigger.start()
+            self._listener.start()
+
+    def _listen(self) -> None:
+        """Take the trigger's tags, which keeps its watchdog quiet. A dead link is the camera's silence."""
+        assert self._rig is not None
+        with suppress(TriggerError):
+            while not self._ending.wait(_LISTEN_S):
+                self._rig.trigger.tags(_LISTEN_S)
+
+    def __enter__(self) -> Bench:
+        if self.config is not None:
+            from acquire.rig import Rig
+
+            self._rig = Rig(self.config)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ending.set()
+        if self._listener.ident is not None:
+            self._listener.join(OPEN_S)
+        if self._rig is not None:
+            self._rig.close()

@@ -1,0 +1,125 @@
+"""What ``acquire camera live`` shows: bars for the light, a running line for the focus, and what is wrong."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import TYPE_CHECKING
+
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from acquire.cli.output import quantity
+from acquire.text import visible
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from acquire.camera.gauge import Reading
+
+BAR, LABEL = 32, 9
+TURNS = 32
+"""Of the focus number that are shown."""
+_BLOCKS = "▁▂▃▄▅▆▇█"
+_EIGHTHS = " ▏▎▍▌▋▊▉█"
+STEADY = 0.02
+"""Spread of the focus number, beside itself, below which its line is flat: it would show noise."""
+SATURATED, DIM, BRIGHT = 1e-4, 0.05, 0.85
+"""Part of the pixels that are white, and levels, from which on something is said."""
+DARK = 0.01
+
+
+class Screen:
+    """A renderable; `show` changes what it is of."""
+
+    def __init__(self, names: dict[str, str], where: str, turn_s: float) -> None:
+        self._names, self._where, self._turn_s = names, where, turn_s
+        self._readings: dict[str, Reading] = {}
+        self._focus: dict[str, deque[float]] = {name: deque(maxlen=TURNS) for name in names}
+        self._best = dict.fromkeys(names, 0.0)
+
+    def show(self, readings: dict[str, Reading]) -> None:
+        self._readings = readings
+        for name, reading in readings.items():
+            if reading.focus is not None:
+                self._focus[name].append(reading.focus)
+                self._best[name] = max(self._best[name], reading.focus)
+
+    def __rich__(self) -> RenderableType:
+        parts: list[RenderableType] = []
+        for name, serial in self._names.items():
+            parts += [self._rows(name, serial), *self._said(name), Text("")]
+        return Group(*parts, Text(f"looking at {visible(self._where)}; Ctrl-C ends", style="dim"))
+
+    def _rows(self, name: str, serial: str) -> Table:
+        grid = Table.grid(padding=(0, 2))
+        grid.add_column(width=LABEL)
+        grid.add_column(width=BAR, no_wrap=True)
+        grid.add_column(justify="right", no_wrap=True, width=9)
+        grid.add_column(no_wrap=True)
+        reading = self._readings.get(name)
+        lines_hz = reading.lines / self._turn_s if reading else 0.0
+        title = Text(name if name == "camera" else f"camera {name}", style="bold")
+        grid.add_row(title, Text(visible(serial)), quantity(lines_hz, "Hz"), "lines")
+        if reading is None or reading.level is None or reading.brightest is None:
+            return grid
+        style = "red" if (reading.saturated or 0.0) > SATURATED else "green"
+        grid.add_row("level", Text(bar(reading.level), style), f"{reading.level:.1%}", "of white, mean")
+        grid.add_row("brightest", Text(bar(reading.brightest), style), f"{reading.brightest:.1%}")
+        grid.add_row("saturated", "", f"{reading.saturated or 0.0:.2%}", "of the pixels")
+        now, best = reading.focus, self._best[name]
+        line = Text(running(list(self._focus[name])), "cyan")
+        grid.add_row("focus", line, "–" if now is None else f"{now:.2%}", f"best {best:.2%}" if best else "")
+        return grid
+
+    def _said(self, name: str) -> list[Text]:
+        said = advice(self._readings.get(name))
+        return [Text(" " * (LABEL + 2) + said, style="yellow")] if said else []
+
+
+def bar(part: float) -> str:
+    """A bar of ``part`` of its whole length."""
+    eighths = round(min(max(part, 0.0), 1.0) * BAR * 8)
+    full, rest = divmod(eighths, 8)
+    return ("█" * full + (_EIGHTHS[rest] if rest else "")).ljust(BAR, "·")
+
+
+def running(values: list[float]) -> str:
+    """Values as heights, the newest last, between the least and the most of them."""
+    if not values:
+        return ""
+    low, high = min(values), max(values)
+    middle = (low + high) / 2
+    span = max(high - low, STEADY * middle)
+    low = middle - span / 2
+    steps = len(_BLOCKS) - 1
+    return "".join(_BLOCKS[round((value - low) / span * steps) if span else 0] for value in values)
+
+
+def advice(reading: Reading | None) -> str:
+    """What is wrong, and what to do; nothing where nothing is."""
+    if reading is None:
+        return "the camera tells nothing"
+    if reading.level is None:
+        return "no lines come: is the trigger running, and its cable on the camera's input?"
+    for wrong, text in (
+        (reading.lost > 0, f"{reading.lost} lines were lost: acquire status, or the camera's settings"),
+        ((reading.saturated or 0.0) > SATURATED, "saturated: less light, or a smaller aperture"),
+        (reading.level < DARK, "dark: is the light on, the lens open?"),
+        (reading.level < DIM, "dim: more light, or a larger aperture"),
+        (reading.level > BRIGHT, "very bright: less light, or a smaller aperture"),
+    ):
+        if wrong:
+            return text
+    return ""
+
+
+def words(reading: Reading | None) -> str:
+    """On one line."""
+    if reading is None or reading.level is None:
+        return advice(reading)
+    focus = "–" if reading.focus is None else f"{reading.focus:.2%}"
+    said = advice(reading)
+    return f"level {reading.level:.1%}, saturated {reading.saturated:.2%}, focus {focus}" + (
+        f" ({said})" if said else ""
+    )
