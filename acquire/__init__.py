@@ -18,6 +18,7 @@ The layers, top to bottom; imports point downwards only (checked by the tests)::
     sim           recon              simulated devices · solvers, priors
     stream        forward            capture path · Eq. (1)-(4) of the paper and their adjoints
     store  camera  trigger           recording format · device protocols
+    pattern                          lines that follow from their numbers alone
     config  lines  processes         what a rig is · what travels from camera to disk · children
     codes  geometry  clock           the code, the shear, the time: plain arithmetic
     arrays  cores                    whose arrays are computed with, and on how many cores
@@ -28,4 +29,34 @@ Equation numbers in docstrings refer to Li, Wang and Liu, "TDI-based continuous 
 spatio-temporal imaging capable of flexible voxels post-interpretation".
 """
 
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from acquire.client import Client
+    from acquire.config import load_rig, load_scene
+    from acquire.store import open_recording, open_video
+
 __version__ = "0.1.0"
+__all__ = ["Client", "__version__", "load_rig", "load_scene", "open_recording", "open_video"]
+
+_HOMES = {
+    "Client": "client",
+    "load_rig": "config",
+    "load_scene": "config",
+    "open_recording": "store",
+    "open_video": "store",
+}
+"""What is asked for first, and its package: imported when asked for, since each brings its libraries."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

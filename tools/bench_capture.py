@@ -18,7 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from acquire.capacity.load import Load, LoadReport, run_load
+from acquire.capacity.load import Load
+from acquire.capacity.run import LoadReport, run_load
 from acquire.capacity.search import best, search_rate
 
 LOADS = {

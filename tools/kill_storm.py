@@ -33,7 +33,7 @@ from acquire.config import builtin_directory
 from acquire.daemon.states import SEALED, State
 from acquire.errors import AcquireError
 from acquire.lines import ARMS, LineFlag
-from acquire.sim.pattern import Pattern
+from acquire.pattern import Pattern
 from acquire.store import open_recording
 
 if TYPE_CHECKING:

@@ -35,7 +35,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.camera.base import CameraBlock
-from acquire.capacity.load import Load, capture_plan, recording_spec
+from acquire.capacity.load import Load, recording_spec
+from acquire.capacity.run import capture_plan
 from acquire.config.device import TriggerConfig
 from acquire.errors import CameraLostError
 from acquire.lines import ARMS

@@ -1,54 +1,26 @@
-"""The whole capture path under a given load: real processes, ring, recorder, disk; cameras of stored lines.
-
-::
-
-    pattern ─▶ camera in its grabber's process ─▶ ring ─┐
-    pattern ─▶ camera in its grabber's process ─▶ ring ─┼─▶ recorder ─▶ recording, removed afterwards
-    simulated trigger, here ─▶ tags ────────────────────┘
-
-Nothing is computed while it runs: what is measured is what a host needs for capture and recording alone.
-"""
+"""What cameras deliver and how it is recorded, as measurements of a host are told it."""
 
 from __future__ import annotations
 
-import os
-import shutil
-import time
-from dataclasses import dataclass, replace
-from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from acquire.capacity.latency import Latencies, TimedOpener
 from acquire.codes import PrbsCode, mix_seed
-from acquire.config import GeometryConfig
-from acquire.config.device import CameraConfig, TriggerConfig
 from acquire.config.recording import usual_chunk_lines, usual_tag_chunks
-from acquire.errors import DataError, UsageError
+from acquire.errors import UsageError
 from acquire.lines import ARMS
-from acquire.sim.clock import Wire
-from acquire.sim.pattern import PatternCameraOpener
-from acquire.sim.trigger_model import TriggerModel
-from acquire.sim.twin_links import TwinTransport
-from acquire.store import RecordingSpec, RunCondition
+from acquire.store import RecordingSpec
 from acquire.store.codecs import CODECS
-from acquire.stream import Capture, CapturePlan
 from acquire.trigger.base import TriggerRun
-from acquire.trigger.driver import TriggerDriver
 
 if TYPE_CHECKING:
-    from acquire.camera.base import CameraOpener
     from acquire.clock import ClockFit
     from acquire.config import RigConfig
     from acquire.store.codecs import Codec
-    from acquire.stream import CaptureStatus
 
 CLOCK_HZ = 90_000_000
-_PIXEL_FORMAT: dict[str, Literal["Mono8", "Mono12"]] = {"uint8": "Mono8", "uint16": "Mono12"}
-_POLL_S = 0.05
-_GRACE_S = 30.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,144 +82,9 @@ class Load:
         return round(self.line_rate_hz * self.substeps * self.substep_ticks / CLOCK_HZ, 4)
 
 
-@dataclass(frozen=True, slots=True)
-class LoadReport:
-    """What came of a load. Latency is from a block's last line being due to its commit to the ring.
-
-    Attributes
-    ----------
-    lines, lost, unaccounted : of both arms: lines recorded; lost, whatever the cause; of neither kind
-    seconds : of recording, until the last line is on its way to the disk
-    ring_peak : the fuller ring's peak, as a part of it
-    cores : process → processor seconds per second: recorder, a, b, owner (with the simulated trigger)
-    latency_ms : p50, p99, p99.9, max of the slower grabber
-    bytes_written : of chunks, as encoded
-    condition : the recording's
-    """
-
-    load: Load
-    lines: int
-    lost: int
-    unaccounted: int
-    seconds: float
-    ring_peak: float
-    cores: dict[str, float]
-    latency_ms: dict[str, float]
-    bytes_written: int
-    condition: RunCondition
-
-    @property
-    def clean(self) -> bool:
-        """Not a line lost."""
-        return not (self.lost or self.unaccounted) and self.condition is RunCondition.GOOD
-
-    @property
-    def cpu_s_per_gb(self) -> float:
-        """Processor seconds of grabbers and recorder per GB of pixels."""
-        cores = sum(value for name, value in self.cores.items() if name != "owner")
-        return cores / (self.load.bytes_per_s / 1e9)
-
-
-def run_load(load: Load, directory: Path, seconds: float) -> LoadReport:
-    """Record for ``seconds`` below ``directory``, which has nothing of it afterwards."""
-    path = directory / f".load-{time.time_ns():x}.zarr"
-    wire = Wire()
-    latencies = {arm: Latencies() for arm in ARMS}
-    config = TriggerConfig(tag_every_lines=_tag_every(load))
-    model = TriggerModel(wire, CLOCK_HZ, load.speed)
-    trigger = TriggerDriver(partial(TwinTransport, model), config)
-    try:
-        plan = capture_plan(load, wire)
-        timed: dict[str, CameraOpener] = {
-            arm: TimedOpener(opener, latencies[arm]) for arm, opener in plan.openers.items()
-        }
-        capture = Capture(replace(plan, openers=timed), trigger)
-        try:
-            capture.arm()
-            return _measure(load, capture, path, seconds, latencies)
-        finally:
-            capture.close()
-    finally:
-        trigger.close()
-        wire.close()
-        for one in latencies.values():
-            one.close()
-        shutil.rmtree(path, ignore_errors=True)
-
-
-def _measure(
-    load: Load, capture: Capture, path: Path, seconds: float, latencies: dict[str, Latencies]
-) -> LoadReport:
-    pids = {name: pid for name, pid in capture.pids.items() if pid} | {"owner": None}
-    capture.start(path, recording_spec(load, capture.clock), max(1, round(load.line_rate_hz * seconds)))
-    for one in latencies.values():
-        one.clear()
-    before, begun = _cpu_s(pids), time.monotonic()
-    while not (seen := capture.poll()).draining and not seen.done:
-        _check(seen, begun + seconds)
-        time.sleep(_POLL_S)
-    elapsed_s = time.monotonic() - begun
-    cores = {name: (used - before[name]) / elapsed_s for name, used in _cpu_s(pids).items()}
-    while not (seen := capture.poll()).done:
-        _check(seen, begun + seconds)
-        time.sleep(_POLL_S)
-    worst = max((one.percentiles_ms() for one in latencies.values()), key=lambda found: found["p99.9"])
-    capture.close()
-    seen = capture.poll()
-    assert seen.condition is not None
-    return LoadReport(
-        load=load,
-        lines=sum(arm["recorded"] - arm["missing"] for arm in seen.lines.values()),
-        lost=sum(sum(arm["lost"].values()) for arm in seen.lines.values()),
-        unaccounted=sum(_unaccounted(arm) for arm in seen.lines.values()),
-        seconds=elapsed_s,
-        ring_peak=max(ring["peak"] / ring["slots"] for ring in seen.ring.values()),
-        cores=cores,
-        latency_ms=worst,
-        bytes_written=seen.ledger.get("store", {}).get("bytes_written", 0),
-        condition=seen.condition,
-    )
-
-
-def _check(seen: CaptureStatus, ends_s: float) -> None:
-    if seen.fault is not None:
-        raise DataError(f"the load could not be held: {seen.fault}")
-    if time.monotonic() > ends_s + _GRACE_S:
-        raise DataError(f"the load's recording did not end within {_GRACE_S:g} s of its time")
-
-
-def _unaccounted(arm: dict[str, Any]) -> int:
-    """Lines that were delivered, and of which the books do not say what became of them."""
-    told = arm["preroll"] + arm["lost"]["ring_full"] + arm["discarded"] + arm["recorded"] - arm["missing"]
-    return abs(int(arm["delivered"] - told))
-
-
-def _tag_every(load: Load) -> int:
+def tag_every_lines(load: Load) -> int:
+    """Tags at least once a block, and four times a ring."""
     return min(load.block_lines, load.ring_slots * load.block_lines // 4)
-
-
-def capture_plan(load: Load, wire: Wire) -> CapturePlan:
-    """A run whose cameras show patterns at the pulses of ``wire``; its white level is that of the format."""
-    geometry = GeometryConfig(stages=load.stages, substeps=load.substeps)
-    camera = CameraConfig(pixel_format=_PIXEL_FORMAT[load.dtype])
-    openers: dict[str, CameraOpener] = {
-        arm: PatternCameraOpener(
-            wire, arm, geometry, camera, load.block_lines, load.line_rate_hz, load.pixels
-        )
-        for arm in ARMS
-    }
-    return CapturePlan(
-        run=trigger_run(load),
-        stages=load.stages,
-        pixels=load.pixels,
-        dtype=load.dtype,
-        block_lines=load.block_lines,
-        ring_slots=load.ring_slots,
-        white_dn=camera.white_dn,
-        openers=openers,
-        line_period_ns=1e9 / load.line_rate_hz,
-        realtime=True,
-    )
 
 
 def _code() -> PrbsCode:
@@ -256,7 +93,7 @@ def _code() -> PrbsCode:
 
 def trigger_run(load: Load) -> TriggerRun:
     """What a trigger would be asked to do."""
-    return TriggerRun("load", _code(), load.substeps, load.substep_ticks, _tag_every(load))
+    return TriggerRun("load", _code(), load.substeps, load.substep_ticks, tag_every_lines(load))
 
 
 def recording_spec(load: Load, clock: ClockFit) -> RecordingSpec:
@@ -283,22 +120,3 @@ def recording_spec(load: Load, clock: ClockFit) -> RecordingSpec:
         codec=load.codec,
         fsync=load.fsync,
     )
-
-
-def _cpu_s(pids: dict[str, int | None]) -> dict[str, float]:
-    """Processor seconds of processes (None: this one) and all their threads, ended ones too.
-
-    Raises DataError where a process has ended, which none does in a load that is held.
-    """
-    used_s = {}
-    for name, pid in pids.items():
-        try:
-            used_s[name] = time.clock_gettime(_cpu_clock(pid or os.getpid()))
-        except OSError as error:
-            raise DataError(f"the load could not be held: process {name} ended") from error
-    return used_s
-
-
-def _cpu_clock(pid: int) -> int:
-    """The kernel's clock of a process's own time, as clock_getcpuclockid(3) makes it."""
-    return (~pid << 3) | 2

@@ -18,7 +18,7 @@ import numpy as np
 from acquire.capacity.load import recording_spec, trigger_run
 from acquire.clock import ClockFit
 from acquire.lines import ARMS, LineBlock
-from acquire.sim.pattern import Pattern
+from acquire.pattern import Pattern
 from acquire.store import RecordingWriter
 from acquire.store.codecs import crc32c, encode
 from acquire.stream.ring import Ring, RingShape

@@ -5,14 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from acquire.capacity.load import run_load
+from acquire.capacity.run import run_load
 from acquire.errors import DataError, DeviceError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from acquire.capacity.load import Load, LoadReport
+    from acquire.capacity.load import Load
+    from acquire.capacity.run import LoadReport
 
 RUN_S = 2.0
 NEAR = 1.08

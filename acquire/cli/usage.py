@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import sys
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -24,6 +25,10 @@ _WordsError = next(
 NARROW = 80
 """Columns that tables of options need."""
 _MARKUP = re.compile(r"\[(bold|/)\]")
+_PACKAGES = {"PIL": "pillow"}
+"""Modules that are named otherwise than the package that brings them."""
+_WHOLE = {"simulate": "simulate", "demo": "report", "paper": "report", "tradeoff": "report", "web": "web"}
+"""Command → the extra that brings all that it needs, where several bring what is missing."""
 _EXTRA = re.compile(r"extra == ['\"](\w+)['\"]")
 
 
@@ -59,16 +64,20 @@ def _make_plain(command: Any) -> None:
 
 
 def not_installed(error: ModuleNotFoundError) -> UsageError:
-    """The error for a package that is missing, with the smallest extra that brings it; ours is a defect."""
+    """The error for a package that is missing, with the extra that the command needs; ours is a defect."""
     module = (error.name or "").partition(".")[0]
     if module == "acquire":
         raise error
     from importlib import metadata
 
     requirements = metadata.requires("tdi-acquire") or []
-    wanted = (one for one in requirements if one.lower().replace("-", "_").startswith(module.lower()))
+    package = _PACKAGES.get(module, module).lower()
+    wanted = (one for one in requirements if one.lower().replace("-", "_").startswith(package))
     extras = {found[1] for one in wanted if (found := _EXTRA.search(one))}
-    extra = min(extras, key=lambda name: sum(name in one for one in requirements), default=None)
+    command = next((word for word in sys.argv[1:] if not word.startswith("-")), "")
+    extras -= {"all", "dev"}
+    whole = _WHOLE.get(command, "reconstruct")
+    extra = whole if whole in extras else min(extras, default=None)
     return UsageError(
         f"the Python package {module!r}, which this command needs, is not installed",
         hint=f"pip install 'tdi-acquire[{extra}]'" if extra else f"pip install {module}",

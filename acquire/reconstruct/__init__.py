@@ -6,11 +6,12 @@
     combine   Request ──▶ sub-segments ──▶ pool ──▶ stitched in order ──▶ video
     pools     where sub-segments are solved: here, in processes, on a cluster
     work      one sub-segment: cut, solve, bring to the grid
-    single    a reconstruction that is already in memory
+    single    a reconstruction that is already in memory, as `reconstruct` (of `acquire.recon`) makes one
 
 Memory is bounded by what the pool works on; the recording is read and the video written piece by piece.
 """
 
+from acquire.recon import reconstruct
 from acquire.reconstruct.combine import Outcome, Watcher, combine
 from acquire.reconstruct.pools import Pool, open_pool
 from acquire.reconstruct.select import Request, along_plan, by_lines, by_time, in_glimpses, in_voxels
@@ -31,5 +32,6 @@ __all__ = [
     "in_glimpses",
     "in_voxels",
     "open_pool",
+    "reconstruct",
     "save_reconstruction",
 ]

@@ -10,8 +10,9 @@ import pytest
 
 from acquire.capacity import search
 from acquire.capacity.latency import Latencies
-from acquire.capacity.load import Load, LoadReport, run_load
+from acquire.capacity.load import Load
 from acquire.capacity.parts import Pace, Parts, measure_parts
+from acquire.capacity.run import LoadReport, run_load
 from acquire.capacity.search import best, search_rate
 from acquire.config import load_rig
 from acquire.errors import DataError, UsageError

@@ -12,6 +12,7 @@ import pytest
 import zarr
 from s3_server import KEYS, S3Server
 
+from acquire.cli.usage import not_installed
 from acquire.store import write_video
 from acquire.store.remote import WAYS_IN, RemoteSource
 
@@ -216,12 +217,22 @@ def test_a_command_that_changes_a_recording_in_place_takes_no_url(cli: Cli, word
     assert (answer.code, "possible: a path on this machine" in answer.err) == (2, True)
 
 
+@pytest.mark.parametrize(
+    ("command", "module", "brought"),
+    [
+        ("info", "obstore", "tdi-acquire[remote]"),
+        ("reconstruct", "scipy", "tdi-acquire[reconstruct]"),
+        ("simulate", "numba", "tdi-acquire[simulate]"),
+        ("demo", "numba", "tdi-acquire[report]"),
+        ("calibrate", "matplotlib", "tdi-acquire[report]"),
+        ("web", "PIL", "tdi-acquire[web]"),
+        ("info", "elsewhere", "elsewhere"),
+    ],
+)
 def test_a_package_that_is_not_installed_is_named_with_the_extra_that_brings_it(
-    cli: Cli, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch, command: str, module: str, brought: str
 ) -> None:
-    def missing(_: object) -> None:
-        raise ModuleNotFoundError("No module named 'obstore'", name="obstore")
-
-    monkeypatch.setattr("acquire.store.open_recording", missing)
-    answer = cli("info", "s3://bucket/x.zarr")
-    assert (answer.code, "try: pip install 'tdi-acquire[remote]'" in answer.err) == (2, True)
+    monkeypatch.setattr("sys.argv", ["acquire", command, "run.zarr"])
+    error = not_installed(ModuleNotFoundError(f"No module named {module!r}", name=module))
+    assert (error.exit_code, error.hint.replace("'", "")) == (2, f"pip install {brought}")
+    assert module in error.message

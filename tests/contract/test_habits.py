@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+import acquire
+
 ROOT = Path(__file__).parents[2]
 
 TOOLS = {
@@ -27,11 +29,18 @@ def test_rule(rule: str) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+def test_types_and_the_front_door_are_shipped() -> None:
+    """`user_script` is typed strictly; a checker believes a package's types where it has py.typed."""
+    assert (ROOT / "acquire" / "py.typed").is_file()
+    for name in acquire.__all__:
+        assert getattr(acquire, name) is not None
+
+
 def test_commands_print_through_one_door() -> None:
     """`acquire.cli.output` makes foreign text harmless; what is printed past it is not."""
     past = [
         f"{path.name}: {line.strip()}"
-        for path in sorted((ROOT / "acquire/cli").glob("*.py"))
+        for path in sorted((ROOT / "acquire/cli").rglob("*.py"))
         if path.name != "output.py"
         for line in path.read_text(encoding="utf-8").splitlines()
         if re.search(r"\btyper\.(s?echo)\b|\bprint\(|sys\.stdout\.write", line)

@@ -26,11 +26,12 @@ from slow_disks import FailingDisk, SlowDisk
 from throttle import Throttle
 from waiting import until
 
-from acquire.capacity.load import CLOCK_HZ, Load, capture_plan, recording_spec
+from acquire.capacity.load import CLOCK_HZ, Load, recording_spec
+from acquire.capacity.run import capture_plan
 from acquire.config.device import TriggerConfig
 from acquire.lines import ARMS
+from acquire.pattern import Pattern
 from acquire.sim.clock import Wire
-from acquire.sim.pattern import Pattern
 from acquire.sim.trigger_model import TriggerModel
 from acquire.sim.twin_links import TwinTransport
 from acquire.store import open_recording, verify

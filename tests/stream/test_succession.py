@@ -17,9 +17,9 @@ from acquire.config import RigConfig, builtin_directory, load_rig
 from acquire.daemon.plan import Run
 from acquire.errors import DeviceError
 from acquire.lines import ARMS, LineFlag
+from acquire.pattern import Pattern
 from acquire.processes.nursery import nursery
 from acquire.rig import Rig
-from acquire.sim.pattern import Pattern
 from acquire.store import open_recording
 from acquire.store.recover import recover
 from acquire.stream import Orphan
