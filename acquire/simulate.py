@@ -241,11 +241,12 @@ def _spec(config: RigConfig, scene: SceneConfig) -> RecordingSpec:
 
 def _places(bench: Bench, code: Code) -> Sequence[tuple[str, str]]:
     """Effects of either arm, in the order in which they act, and where."""
-    from acquire.sim.effects import ORDER
+    from acquire.sim.effects import in_order
 
     stages = [stage for arm in ARMS for stage in bench.camera(arm, code).stages]
     found = {stage.effect: stage.place for stage in reversed(stages)}
-    return sorted(found.items(), key=lambda item: ORDER.index(item[0]))
+    kinds = [effect.kind for effect in in_order(bench.scene.effects)]
+    return [(kind, found[kind]) for kind in kinds if kind in found]
 
 
 def _sample(bench: Bench, code: Code, lines: int) -> NDArray[np.float64]:

@@ -14,7 +14,7 @@ from PIL import Image
 from acquire.config import load_rig, load_scene
 from acquire.config.scene import FunctionSceneConfig, LedSceneConfig
 from acquire.errors import UsageError
-from acquire.sim.effects import ORDER
+from acquire.sim.effects import kinds
 from acquire.sim.lines import StreamingArm
 from acquire.sim.scenes import build_scene
 from acquire.simulate import bench_of, simulate, study
@@ -119,7 +119,7 @@ def test_the_study_ranks_effects_by_what_they_do():
     )
     found = study(bench_of(RIG, scene), RIG.code.build())
     worth = {one.effect: one for one in found.effects}
-    assert [one.effect for one in found.effects] == [k for k in ORDER if k in worth]
+    assert [one.effect for one in found.effects] == [k for k in kinds() if k in worth]
     assert worth["read_noise"].noises < 0.1
     assert worth["beam_splitter"].noises > 1
     lines = [

@@ -33,7 +33,6 @@ import matplotlib as mpl
 import numpy as np
 
 from acquire.config import load_rig
-from acquire.config.effect import ReadNoise, ShotNoise
 from acquire.config.scene import SceneFile, VideoSceneConfig
 from acquire.evaluate.figures import DPI, STYLE
 from acquire.evaluate.metrics import psnr, ssim
@@ -42,6 +41,7 @@ from acquire.evaluate.paper.studio import true_voxels
 from acquire.geometry import Geometry
 from acquire.lines import ARMS
 from acquire.recon import Solver, reconstruct
+from acquire.sim.effects.charge import ReadNoise, ShotNoise
 from acquire.sim.media import open_media
 from acquire.simulate import simulate
 from acquire.store import open_recording

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -10,6 +10,8 @@ from acquire.cli.output import JsonFlag, json_text, print_facts, print_json, qua
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+    from pydantic import BaseModel
 
     from acquire.config import RigConfig
 
@@ -73,14 +75,24 @@ def show(file: FileArgument, json: JsonFlag = False) -> None:
         say(line)
 
 
-def schema() -> None:
-    """JSON schema of rig files, for editors: every key, its limits and default.
+def schema(
+    of: Annotated[
+        Literal["rig", "scene", "plan"], typer.Option("--of", help="The kind of file that it describes.")
+    ] = "rig",
+) -> None:
+    """JSON schema of rig, scene or plan files, for editors: every key, its limits and default.
+
+    It holds what is installed now, plug-ins with it.
 
     Example: [bold]acquire config schema > rig.schema.json[/]
     """
     from acquire.config import RigConfig
+    from acquire.config.plan import ReconstructionPlan
+    from acquire.config.scene import SceneFile
+    from acquire.config.variants import whole_schema
 
-    print_json(RigConfig.model_json_schema())
+    models: dict[str, type[BaseModel]] = {"rig": RigConfig, "scene": SceneFile, "plan": ReconstructionPlan}
+    print_json(whole_schema(models[of]))
 
 
 def _facts(rig: RigConfig) -> dict[str, Any]:

@@ -7,8 +7,9 @@ table of a rig file, a file for all that a scene file may hold::
     rig                                     a whole instrument
     device event recording service web      its tables
     scene plan                              what simulated cameras see · what a reconstruction combines
-    effect                                  what a scene may list
-    base builtin findings                   what all models refuse · what is to be mended, in words
+    effect                                  what all effects have in common
+    findings variants                       what is to be mended, in words · tables of an installed class
+    base builtin                            what all models refuse · the built-in files
 """
 
 from acquire.config.builtin import builtin_directory

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from acquire.config.variants import GROUP_KEY
+from acquire.plugins import GROUPS
 from acquire.text import shortened, shown
 
 if TYPE_CHECKING:
@@ -11,6 +13,7 @@ if TYPE_CHECKING:
 
     from pydantic import BaseModel, ValidationError
 
+_GROUPS = {group.name: group for group in GROUPS}
 MOST_LISTED = 20
 """Things to mend that one error lists."""
 
@@ -39,7 +42,8 @@ def explained(error: ValidationError, model: type[BaseModel], path: Path) -> str
 def _locate(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[list[str], list[str]]:
     """The key as the file writes it, and the keys allowed beside it.
 
-    pydantic's location also holds the tags of unions, which no file contains: the schema tells them apart.
+    pydantic's location also holds the tags of unions and groups, which no file contains: the schema tells
+    them apart.
     """
     schema = model.model_json_schema()
     node: dict[str, Any] = schema
@@ -48,6 +52,9 @@ def _locate(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[li
     for part in location:
         while "$ref" in node:
             node = schema["$defs"][node["$ref"].rsplit("/", 1)[1]]
+        if GROUP_KEY in node:
+            schema = node = _GROUPS[node[GROUP_KEY]].load(str(part)).model_json_schema()
+            continue
         if "mapping" in node.get("discriminator", {}) and part in node["discriminator"]["mapping"]:
             node = {"$ref": node["discriminator"]["mapping"][part]}
             continue

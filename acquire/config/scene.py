@@ -19,6 +19,8 @@ from pydantic import Field, RootModel, model_validator
 
 from acquire.config.base import MOST_LINES, SEED_END, FilePath, FrozenModel, Seconds
 from acquire.config.effect import EffectConfig
+from acquire.config.variants import OneOf
+from acquire.plugins import EFFECTS
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
@@ -179,7 +181,7 @@ class SceneBase(FrozenModel):
     system_gain_dn_per_e: float = Field(
         default=0.1, gt=0, description="K of EMVA 1288, for effects that count electrons"
     )
-    effects: tuple[EffectConfig, ...] = ()
+    effects: tuple[Annotated[EffectConfig, OneOf(EFFECTS, EffectConfig)], ...] = ()
 
     @model_validator(mode="after")
     def _effects_differ(self) -> SceneBase:

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 from two_squares import record_two_squares
 
-from acquire.config.effect import CodeErrors
 from acquire.config.scene import ArmOptics
+from acquire.sim.effects.light import CodeErrors
 from acquire.store import open_video
 
 Cli = Callable[..., Any]

@@ -8,12 +8,14 @@ from pathlib import Path
 import pytest
 from two_squares import record_two_squares
 
-from acquire.config.effect import CodeErrors, EffectConfig, StrayLight
+from acquire.config.effect import EffectConfig
 from acquire.config.scene import ArmOptics
 from acquire.recon.diagnosis import Diagnosis
 from acquire.recon.hypotheses import Hypothesis, Turn
 from acquire.recon.search import Standing
 from acquire.reconstruct.diagnose import diagnose_recording, stretch
+from acquire.sim.effects.image import StrayLight
+from acquire.sim.effects.light import CodeErrors
 from acquire.store import open_recording
 
 LINES = 150

@@ -8,15 +8,17 @@ from math import comb
 
 import numpy as np
 import pytest
-from effect_cases import FLAT, effects, electrons, setting, through
+from effect_cases import FLAT, PARAMETERS, effects, electrons, setting, through
 from sim_helpers import CODE
 from small_bench import DT, LIT, K, N, S, bench, blinking, flat, read
 
-from acquire.sim.effects import ORDER, in_order
+from acquire.sim.effects import in_order, kinds
 from acquire.sim.effects.light import delays
 from acquire.sim.effects.signal import tail
 from acquire.sim.light import Illumination
 from acquire.sim.scenes import build_scene
+
+ORDER = list(PARAMETERS)
 
 # What holds for all of them
 
@@ -85,6 +87,7 @@ def test_arms_seeds_and_realisations_draw_differently_and_patterns_stay():
 
 
 def test_effects_act_in_the_order_of_physics_whatever_the_list_says():
+    assert [kind for kind in kinds() if kind in ORDER] == ORDER
     forwards, backwards = blinking(effects(*ORDER)), blinking(effects(*ORDER[::-1]))
     assert [effect.kind for effect in in_order(backwards.effects)] == list(ORDER)
     np.testing.assert_array_equal(read(forwards, code=CODE).pixels, read(backwards, code=CODE).pixels)

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.config import RigConfig, load_plan, load_rig, load_scene
-from acquire.config.effect import ReadNoise, ShotNoise
 from acquire.config.scene import OpticsConfig, SceneFile
 from acquire.evaluate.metrics import psnr, ssim
 from acquire.recon import reconstruct
 from acquire.recon.segments import Voxels
 from acquire.reconstruct import Options, Watcher, along_plan, combine, in_voxels, open_pool
 from acquire.reconstruct.select import Selection, by_lines
+from acquire.sim.effects.charge import ReadNoise, ShotNoise
 from acquire.sim.voxels import truth
 from acquire.simulate import bench_of, simulate
 from acquire.store import open_recording, open_video

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import zlib
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 import numpy as np
+
+from acquire.config.effect import EffectConfig
 
 if TYPE_CHECKING:
     from acquire.sim.scene import Scene
 
-PLACES = ("light", "image", "signal", "charge", "readout", "stream")
+Place = Literal["light", "image", "signal", "charge", "readout", "stream"]
+PLACES: tuple[Place, ...] = get_args(Place)
 """Where in the chain a stage acts, in the order of the light's and the signal's way."""
 
 TILE_LINES = 256
@@ -66,9 +70,24 @@ class Stage:
     """
 
     effect: str
-    place: str
+    place: Place
     run: Callable[..., Any]
     lead: int = 0
+
+
+class Effect(EffectConfig, ABC):
+    """An effect: a model of its parameters, and the stages that these make. Named by an entry point.
+
+    ``place`` is where it acts first, ``rank`` when within that place: lower ranks act first. Ours are 10, 20
+    and so on; what says nothing acts after them.
+    """
+
+    place: ClassVar[Place]
+    rank: ClassVar[float] = 1000
+
+    @abstractmethod
+    def stages(self, setting: Setting) -> list[Stage]:
+        """What it does to one arm; empty where it does nothing there. Equal settings give equal stages."""
 
 
 def draws(effect: str, setting: Setting, tile: int, *, arm: str | None = None) -> np.random.Generator:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import ceil
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
+from pydantic import Field
 
-from acquire.sim.effects.base import Setting, Stage, draws
-from acquire.sim.kernels import follow
+from acquire.config.base import Part, Positive
+from acquire.sim.effects.base import Effect, Place, Setting, Stage, draws
 from acquire.sim.light import Illumination, Tiled
 from acquire.sim.scene import SeparableScene
 
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from acquire.config import effect as config
 
 _TILE = 1024
 """Sub-steps whose random numbers are drawn at once."""
@@ -26,100 +26,147 @@ _FORGOTTEN = 40.0
 """Time constants after which a beginning is forgotten: e⁻⁴⁰ is nothing beside 1 in double precision."""
 
 
-def code_errors(effect: config.CodeErrors, setting: Setting) -> list[Stage]:
-    """E′(t) = E(t − late), each bit flipped with probability ``flip_rate``; the same for both arms."""
+class CodeErrors(Effect):
+    """The light's code differs from the recorded one: bits flipped at random, or all of them late."""
 
-    def flips(first: int, count: int) -> NDArray[np.uint8]:
-        drawn = draws("code_errors", setting, first // _TILE, arm="light").random(count)
-        return (drawn < effect.flip_rate).astype(np.uint8) * (np.arange(first, first + count) >= 0)
+    kind: Literal["code_errors"]
+    place: ClassVar[Place] = "light"
+    rank: ClassVar[float] = 10
+    flip_rate: Part = Field(default=0.0, description="probability that a bit is wrong")
+    late_substeps: int = Field(default=0, ge=-64, le=64, description="by which the light is late")
 
-    tiled = Tiled(flips, _TILE)
+    def stages(self, setting: Setting) -> list[Stage]:
+        """E′(t) = E(t − late), each bit flipped with probability ``flip_rate``; the same for both arms."""
 
-    def wrap(light: Illumination) -> Illumination:
-        def bits(first: int, count: int) -> NDArray[Any]:
-            late = light.bits(first - effect.late_substeps, count)
-            return late ^ tiled(first, count) if effect.flip_rate else late
+        def flips(first: int, count: int) -> NDArray[np.uint8]:
+            drawn = draws("code_errors", setting, first // _TILE, arm="light").random(count)
+            return (drawn < self.flip_rate).astype(np.uint8) * (np.arange(first, first + count) >= 0)
 
-        return Illumination.gated(bits, light.drives)
+        tiled = Tiled(flips, _TILE)
 
-    return [Stage("code_errors", "light", wrap)]
+        def wrap(light: Illumination) -> Illumination:
+            def bits(first: int, count: int) -> NDArray[Any]:
+                late = light.bits(first - self.late_substeps, count)
+                return late ^ tiled(first, count) if self.flip_rate else late
 
+            return Illumination.gated(bits, light.drives)
 
-def pwm(effect: config.Pwm, setting: Setting) -> list[Stage]:
-    """Drive d becomes full light for round(d·2^bits)/2^bits of every carrier period, from its beginning.
-
-    A duty cycle is the mean of the drive over the carrier period; a sub-step gets what of the on-times falls
-    into it, exactly. A scene in steady light of one source is not changed: its duty cycle is 1.
-    """
-    scene, period_s, levels = setting.scene, 1 / effect.carrier_hz, 2**effect.bits
-    periods = setting.substep_s / period_s
-
-    def wrap(light: Illumination) -> Illumination:
-        if not isinstance(scene, SeparableScene):
-            return light
-
-        def drives(first: int, count: int) -> NDArray[Any]:
-            begin = int(np.floor(first * periods))
-            edges = np.arange(first, first + count + 1) * periods - begin
-            cycles = ceil(edges[-1]) + 1
-            duty = np.rint(scene.intensity(begin, cycles, period_s) * levels) / levels
-            before = np.concatenate([np.zeros((len(duty), 1)), np.cumsum(duty, axis=1)], axis=1)
-            whole = np.floor(edges).astype(np.int64)
-            area = before[:, whole] + np.minimum(edges - whole, duty[:, whole])
-            mean: NDArray[Any] = np.diff(area, axis=1) / periods
-            return mean
-
-        return Illumination.gated(light.bits, Tiled(drives, _TILE))
-
-    return [Stage("pwm", "light", wrap)]
+        return [Stage("code_errors", "light", wrap)]
 
 
-def led_nonlinearity(effect: config.LedNonlinearity, setting: Setting) -> list[Stage]:  # noqa: ARG001
-    """d → a·(1 − exp(−d/a)): slope 1 for small drives, never more than a (near saturation: Fig. 9c)."""
-    a = effect.saturation
-    return [_shaped("led_nonlinearity", lambda light: lambda *at: -a * np.expm1(-light.light(*at) / a))]
+class Pwm(Effect):
+    """The drivers really switch: duty cycles are held for a period of the carrier."""
+
+    kind: Literal["pwm"]
+    place: ClassVar[Place] = "light"
+    rank: ClassVar[float] = 20
+    carrier_hz: Positive
+    bits: int = Field(default=8, ge=1, le=16, description="resolution of the duty cycle")
+
+    def stages(self, setting: Setting) -> list[Stage]:
+        """Drive d becomes full light for round(d·2^bits)/2^bits of every carrier period, from its beginning.
+
+        A duty cycle is the mean of the drive over the carrier period; a sub-step gets what of the on-times
+        falls into it, exactly. A scene in steady light of one source is not changed: its duty cycle is 1.
+        """
+        scene, period_s, levels = setting.scene, 1 / self.carrier_hz, 2**self.bits
+        periods = setting.substep_s / period_s
+
+        def wrap(light: Illumination) -> Illumination:
+            if not isinstance(scene, SeparableScene):
+                return light
+
+            def drives(first: int, count: int) -> NDArray[Any]:
+                begin = int(np.floor(first * periods))
+                edges = np.arange(first, first + count + 1) * periods - begin
+                cycles = ceil(edges[-1]) + 1
+                duty = np.rint(scene.intensity(begin, cycles, period_s) * levels) / levels
+                before = np.concatenate([np.zeros((len(duty), 1)), np.cumsum(duty, axis=1)], axis=1)
+                whole = np.floor(edges).astype(np.int64)
+                area = before[:, whole] + np.minimum(edges - whole, duty[:, whole])
+                mean: NDArray[Any] = np.diff(area, axis=1) / periods
+                return mean
+
+            return Illumination.gated(light.bits, Tiled(drives, _TILE))
+
+        return [Stage("pwm", "light", wrap)]
 
 
-def led_rise_fall(effect: config.LedRiseFall, setting: Setting) -> list[Stage]:
-    """dL/dt = (d − L)/τ with τ = rise where L < d, else fall; a sub-step gets the mean of L, exactly."""
-    rise, fall = effect.rise_s / setting.substep_s, effect.fall_s / setting.substep_s
-    warm_up = ceil(_FORGOTTEN * max(rise, fall))
+class LedNonlinearity(Effect):
+    """Light of every LED = a·(1 − exp(−d/a)) for drive d."""
 
-    def lagged(light: Illumination) -> Callable[[int, int], NDArray[Any]]:
-        def compute(first: int, count: int) -> NDArray[Any]:
-            target = np.asarray(light.light(first - warm_up, count + warm_up), np.float64)
-            out = np.empty_like(target)
-            follow(target, rise, fall, np.zeros(len(target)), out)
-            return out[:, warm_up:]
+    kind: Literal["led_nonlinearity"]
+    place: ClassVar[Place] = "light"
+    rank: ClassVar[float] = 30
+    saturation: Positive = Field(description="a, in units of full drive")
 
-        return Tiled(compute, _TILE)
-
-    return [_shaped("led_rise_fall", lagged)]
+    def stages(self, setting: Setting) -> list[Stage]:  # noqa: ARG002
+        """d → a·(1 − exp(−d/a)): slope 1 for small drives, never more than a (near saturation: Fig. 9c)."""
+        a = self.saturation
+        return [_shaped("led_nonlinearity", lambda light: lambda *at: -a * np.expm1(-light.light(*at) / a))]
 
 
-def trigger_jitter(effect: config.TriggerJitter, setting: Setting) -> list[Stage]:
-    """Step t of the charge comes δ_t ~ N(0, σ) late, in sub-steps, cut off at half of one.
+class LedRiseFall(Effect):
+    """Light follows its drive exponentially, with one time constant up and one down."""
 
-    Between two steps a row gathers light of its own sub-step, and of a neighbour for as long as it is early
-    or late: g(t) ← max(0, −δ_t)·g(t−1) + (1 − max(0, δ_t) − max(0, −δ_{t+1}))·g(t) + max(0, δ_{t+1})·g(t+1).
-    """
-    delay = delays(effect, setting)
+    kind: Literal["led_rise_fall"]
+    place: ClassVar[Place] = "light"
+    rank: ClassVar[float] = 40
+    rise_s: Positive
+    fall_s: Positive
 
-    def moved(light: Illumination) -> Callable[[int, int], NDArray[Any]]:
-        def compute(first: int, count: int) -> NDArray[Any]:
-            g, step = light.light(first - 1, count + 2), delay(first, count + 1)
-            begin, end = step[:-1], step[1:]
-            own = 1 - np.maximum(0, begin) - np.maximum(0, -end)
-            early, late = np.maximum(0, -begin) * g[:, :-2], np.maximum(0, end) * g[:, 2:]
-            gathered: NDArray[Any] = early + own * g[:, 1:-1] + late
-            return gathered
+    def stages(self, setting: Setting) -> list[Stage]:
+        """dL/dt = (d − L)/τ with τ = rise where L < d, else fall; a sub-step gets the mean of L, exactly."""
+        from acquire.sim.kernels import follow  # compiled code, which reading a scene file does without
 
-        return compute
+        rise, fall = self.rise_s / setting.substep_s, self.fall_s / setting.substep_s
+        warm_up = ceil(_FORGOTTEN * max(rise, fall))
 
-    return [_shaped("trigger_jitter", moved)]
+        def lagged(light: Illumination) -> Callable[[int, int], NDArray[Any]]:
+            def compute(first: int, count: int) -> NDArray[Any]:
+                target = np.asarray(light.light(first - warm_up, count + warm_up), np.float64)
+                out = np.empty_like(target)
+                follow(target, rise, fall, np.zeros(len(target)), out)
+                return out[:, warm_up:]
+
+            return Tiled(compute, _TILE)
+
+        return [_shaped("led_rise_fall", lagged)]
 
 
-def delays(effect: config.TriggerJitter, setting: Setting) -> Tiled:
+class TriggerJitter(Effect):
+    """Charge moves early or late: normal, independent from step to step."""
+
+    kind: Literal["trigger_jitter"]
+    place: ClassVar[Place] = "light"
+    rank: ClassVar[float] = 50
+    sigma_s: Positive
+
+    def stages(self, setting: Setting) -> list[Stage]:
+        """Step t of the charge comes δ_t ~ N(0, σ) late, in sub-steps, cut off at half of one.
+
+        Between two steps a row gathers light of its own sub-step, and of a neighbour for as long as it is
+        early or late::
+
+            g(t) ← max(0, −δ_t)·g(t−1) + (1 − max(0, δ_t) − max(0, −δ_{t+1}))·g(t) + max(0, δ_{t+1})·g(t+1)
+        """
+        delay = delays(self, setting)
+
+        def moved(light: Illumination) -> Callable[[int, int], NDArray[Any]]:
+            def compute(first: int, count: int) -> NDArray[Any]:
+                g, step = light.light(first - 1, count + 2), delay(first, count + 1)
+                begin, end = step[:-1], step[1:]
+                own = 1 - np.maximum(0, begin) - np.maximum(0, -end)
+                early, late = np.maximum(0, -begin) * g[:, :-2], np.maximum(0, end) * g[:, 2:]
+                gathered: NDArray[Any] = early + own * g[:, 1:-1] + late
+                return gathered
+
+            return compute
+
+        return [_shaped("trigger_jitter", moved)]
+
+
+def delays(effect: TriggerJitter, setting: Setting) -> Tiled:
     """δ_t by sub-step, in sub-steps."""
     sigma = effect.sigma_s / setting.substep_s
 

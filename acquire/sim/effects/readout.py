@@ -2,65 +2,103 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
+from pydantic import Field
 
-from acquire.sim.effects.base import Setting, Stage, pattern
+from acquire.config.base import MOST_DN, Positive
+from acquire.sim.effects.base import Effect, Place, Setting, Stage, pattern
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    from acquire.config import effect as config
 
 
 SECONDS_PER_HOUR = 3600.0
 
 
-def drift(effect: config.Drift, setting: Setting) -> list[Stage]:
-    """DN ← black + (DN − black)·(1 + g·t) + o·t, t in hours: ``hours`` at line 0, and the lines' time."""
-    black, line_s = setting.black_level_dn, setting.substeps * setting.substep_s
+class Drift(Effect):
+    """Offset and gain move with time, as a camera does that warms up."""
 
-    def run(dn: NDArray[Any], first_line: int) -> NDArray[Any]:
-        line = first_line + np.arange(len(dn))[:, None]
-        hours = effect.hours + line * line_s / SECONDS_PER_HOUR
-        gain = 1 + effect.gain_per_hour * hours
-        moved: NDArray[Any] = black + (dn - black) * gain + effect.offset_dn_per_hour * hours
-        return moved
+    kind: Literal["drift"]
+    place: ClassVar[Place] = "readout"
+    rank: ClassVar[float] = 10
+    hours: float = Field(default=0.0, ge=0, le=1e5, description="since it was as configured, at line 0")
+    offset_dn_per_hour: float = Field(default=0.0, ge=-MOST_DN, le=MOST_DN)
+    gain_per_hour: float = Field(default=0.0, ge=-1, le=1, description="as a part of 1")
 
-    return [Stage("drift", "readout", run)]
+    def stages(self, setting: Setting) -> list[Stage]:
+        """DN ← black + (DN − black)·(1 + g·t) + o·t, t in hours: ``hours`` at line 0, and the lines' time."""
+        black, line_s = setting.black_level_dn, setting.substeps * setting.substep_s
 
+        def run(dn: NDArray[Any], first_line: int) -> NDArray[Any]:
+            line = first_line + np.arange(len(dn))[:, None]
+            hours = self.hours + line * line_s / SECONDS_PER_HOUR
+            gain = 1 + self.gain_per_hour * hours
+            moved: NDArray[Any] = black + (dn - black) * gain + self.offset_dn_per_hour * hours
+            return moved
 
-def column_offsets(effect: config.ColumnOffsets, setting: Setting) -> list[Stage]:
-    """+ N(0, σ) DN, fixed per read-out channel; pixel c is read by channel c modulo their number."""
-    channel = effect.sigma_dn * pattern("column_offsets", setting).standard_normal(effect.channels)
-    offset = channel[np.arange(setting.pixels) % effect.channels]
-
-    def run(dn: NDArray[Any], first_line: int) -> NDArray[Any]:  # noqa: ARG001
-        return dn + offset
-
-    return [Stage("column_offsets", "readout", run)]
-
-
-def adc_nonlinearity(effect: config.AdcNonlinearity, setting: Setting) -> list[Stage]:
-    """DN ← DN + 4·bow·w·x·(1 − x), with x = (DN − black)/w inside the range w from black to white."""
-    black, white = setting.black_level_dn, setting.white_dn - setting.black_level_dn
-
-    def run(dn: NDArray[Any], first_line: int) -> NDArray[Any]:  # noqa: ARG001
-        part = np.clip((dn - black) / white, 0, 1)
-        bent: NDArray[Any] = dn + 4 * effect.bow * white * part * (1 - part)
-        return bent
-
-    return [Stage("adc_nonlinearity", "readout", run)]
+        return [Stage("drift", "readout", run)]
 
 
-def adc(effect: config.Adc, setting: Setting) -> list[Stage]:
-    """DN in steps of (white + 1)/2^bits, rounded, and no more than ``saturation_dn``."""
-    step = max(1.0, (setting.white_dn + 1) / 2**effect.bits)
-    top = setting.white_dn if effect.saturation_dn is None else min(effect.saturation_dn, setting.white_dn)
+class ColumnOffsets(Effect):
+    """Every read-out channel adds its own offset."""
 
-    def run(dn: NDArray[Any], first_line: int) -> NDArray[Any]:  # noqa: ARG001
-        coarse: NDArray[Any] = np.minimum(np.rint(dn / step) * step, top)
-        return coarse
+    kind: Literal["column_offsets"]
+    place: ClassVar[Place] = "readout"
+    rank: ClassVar[float] = 20
+    sigma_dn: Positive
+    channels: int = Field(default=4, ge=1, le=2**16, description="columns c, c + channels … share one")
 
-    return [Stage("adc", "readout", run)]
+    def stages(self, setting: Setting) -> list[Stage]:
+        """+ N(0, σ) DN, fixed per read-out channel; pixel c is read by channel c modulo their number."""
+        channel = self.sigma_dn * pattern("column_offsets", setting).standard_normal(self.channels)
+        offset = channel[np.arange(setting.pixels) % self.channels]
+
+        def run(dn: NDArray[Any], first_line: int) -> NDArray[Any]:  # noqa: ARG001
+            return dn + offset
+
+        return [Stage("column_offsets", "readout", run)]
+
+
+class AdcNonlinearity(Effect):
+    """A converter whose line bends: right at black and at white, off between."""
+
+    kind: Literal["adc_nonlinearity"]
+    place: ClassVar[Place] = "readout"
+    rank: ClassVar[float] = 30
+    bow: float = Field(
+        ge=-0.2, le=0.2, description="of the range, by which the middle of it is read too high"
+    )
+
+    def stages(self, setting: Setting) -> list[Stage]:
+        """DN ← DN + 4·bow·w·x·(1 − x), with x = (DN − black)/w inside the range w from black to white."""
+        black, white = setting.black_level_dn, setting.white_dn - setting.black_level_dn
+
+        def run(dn: NDArray[Any], first_line: int) -> NDArray[Any]:  # noqa: ARG001
+            part = np.clip((dn - black) / white, 0, 1)
+            bent: NDArray[Any] = dn + 4 * self.bow * white * part * (1 - part)
+            return bent
+
+        return [Stage("adc_nonlinearity", "readout", run)]
+
+
+class Adc(Effect):
+    """A converter of fewer bits, or one that ends below white."""
+
+    kind: Literal["adc"]
+    place: ClassVar[Place] = "readout"
+    rank: ClassVar[float] = 40
+    bits: int = Field(ge=1, le=16, description="of the range up to white")
+    saturation_dn: float | None = Field(default=None, gt=0)
+
+    def stages(self, setting: Setting) -> list[Stage]:
+        """DN in steps of (white + 1)/2^bits, rounded, and no more than ``saturation_dn``."""
+        step = max(1.0, (setting.white_dn + 1) / 2**self.bits)
+        top = setting.white_dn if self.saturation_dn is None else min(self.saturation_dn, setting.white_dn)
+
+        def run(dn: NDArray[Any], first_line: int) -> NDArray[Any]:  # noqa: ARG001
+            coarse: NDArray[Any] = np.minimum(np.rint(dn / step) * step, top)
+            return coarse
+
+        return [Stage("adc", "readout", run)]

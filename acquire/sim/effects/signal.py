@@ -2,49 +2,65 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
+from pydantic import Field
 
-from acquire.sim.effects.base import Setting, Stage
+from acquire.sim.effects.base import Effect, Place, Setting, Stage
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from acquire.config import effect as config
 
 _TAIL = 1e-9
 """Part of the charge that may be forgotten."""
 
 
-def beam_splitter(effect: config.BeamSplitter, setting: Setting) -> list[Stage]:
-    """Y_A ← 2p·Y_A, Y_B ← 2(1 − p)·Y_B: a splitter of 50:50 is what the responsivities are stated for."""
-    part = effect.part_a if setting.arm == "a" else 1 - effect.part_a
+class BeamSplitter(Effect):
+    """Arm A gets ``part_a`` of the light, arm B the rest; 0.5 is what the responsivity is stated for."""
 
-    def run(lines: NDArray[Any], first_line: int) -> NDArray[Any]:  # noqa: ARG001
-        return lines * (2 * part)
+    kind: Literal["beam_splitter"]
+    place: ClassVar[Place] = "signal"
+    rank: ClassVar[float] = 10
+    part_a: float = Field(gt=0, lt=1)
 
-    return [Stage("beam_splitter", "signal", run)]
+    def stages(self, setting: Setting) -> list[Stage]:
+        """Y_A ← 2p·Y_A, Y_B ← 2(1 − p)·Y_B: a splitter of 50:50 is what the responsivities are stated for."""
+        part = self.part_a if setting.arm == "a" else 1 - self.part_a
+
+        def run(lines: NDArray[Any], first_line: int) -> NDArray[Any]:  # noqa: ARG001
+            return lines * (2 * part)
+
+        return [Stage("beam_splitter", "signal", run)]
 
 
-def cti(effect: config.ChargeTransfer, setting: Setting) -> list[Stage]:
-    """Y(ℓ) ← Σ_k p_k·Y(ℓ − k): every transfer leaves the part ε of the charge to the next line.
+class ChargeTransfer(Effect):
+    """Every transfer leaves a part of the charge behind, to the next line."""
 
-    After N transfers k of them have failed with negative binomial probability
-    p_k(N) = C(N + k − 1, k)·(1 − ε)^N·ε^k; charge that is gathered evenly over the n rows has made
-    N = 1 … n transfers, of which p_k is the mean (Janesick, Scientific CCDs, ch. 5). What is left behind is a
-    random part of Poisson electrons, hence Poisson again: the expected lines are all that changes.
-    """
-    weights = tail(effect.inefficiency, setting.stages * setting.substeps)
-    lead = len(weights) - 1
+    kind: Literal["cti"]
+    place: ClassVar[Place] = "signal"
+    rank: ClassVar[float] = 20
+    inefficiency: float = Field(gt=0, le=0.01, description="per transfer of a sub-step")
 
-    def run(lines: NDArray[Any], first_line: int) -> NDArray[Any]:  # noqa: ARG001
-        moved: NDArray[Any] = weights[0] * lines[lead:]
-        for k in range(1, len(weights)):
-            moved += weights[k] * lines[lead - k : len(lines) - k]
-        return moved
+    def stages(self, setting: Setting) -> list[Stage]:
+        """Y(ℓ) ← Σ_k p_k·Y(ℓ − k): every transfer leaves the part ε of the charge to the next line.
 
-    return [Stage("cti", "signal", run, lead=lead)]
+        After N transfers k of them have failed with negative binomial probability
+        p_k(N) = C(N + k − 1, k)·(1 − ε)^N·ε^k; charge that is gathered evenly over the n rows has made
+        N = 1 … n transfers, of which p_k is the mean (Janesick, Scientific CCDs, ch. 5). What is left behind
+        is a random part of Poisson electrons, hence Poisson again: the expected lines are all that changes.
+        """
+        weights = tail(self.inefficiency, setting.stages * setting.substeps)
+        lead = len(weights) - 1
+
+        def run(lines: NDArray[Any], first_line: int) -> NDArray[Any]:  # noqa: ARG001
+            moved: NDArray[Any] = weights[0] * lines[lead:]
+            for k in range(1, len(weights)):
+                moved += weights[k] * lines[lead - k : len(lines) - k]
+            return moved
+
+        return [Stage("cti", "signal", run, lead=lead)]
 
 
 def tail(inefficiency: float, transfers: int) -> NDArray[np.float64]:

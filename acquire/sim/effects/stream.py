@@ -2,44 +2,60 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
+from pydantic import Field
 
-from acquire.sim.effects.base import TILE_LINES, Setting, Stage, draws
+from acquire.sim.effects.base import TILE_LINES, Effect, Place, Setting, Stage, draws
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from numpy.typing import NDArray
 
-    from acquire.config import effect as config
+
+class DroppedLines(Effect):
+    """Lines that never arrive; the camera's count shows it."""
+
+    kind: Literal["dropped_lines"]
+    place: ClassVar[Place] = "stream"
+    rank: ClassVar[float] = 10
+    rate: float = Field(gt=0, lt=1, description="probability per line and arm")
+
+    def stages(self, setting: Setting) -> list[Stage]:
+        """Every line is lost with probability ``rate``; the camera's count jumps over it."""
+
+        def run(
+            pixels: NDArray[Any],
+            first_line: int,
+            before: Callable[[], NDArray[Any]],  # noqa: ARG001
+        ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+            drawn = draws("dropped_lines", setting, first_line // TILE_LINES).random(len(pixels))
+            return pixels, drawn < self.rate
+
+        return [Stage("dropped_lines", "stream", run)]
 
 
-def dropped_lines(effect: config.DroppedLines, setting: Setting) -> list[Stage]:
-    """Every line is lost with probability ``rate``; the camera's count jumps over it."""
+class DuplicatedLines(Effect):
+    """Lines that come with the pixels of the line before; nothing shows it."""
 
-    def run(
-        pixels: NDArray[Any],
-        first_line: int,
-        before: Callable[[], NDArray[Any]],  # noqa: ARG001
-    ) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-        drawn = draws("dropped_lines", setting, first_line // TILE_LINES).random(len(pixels))
-        return pixels, drawn < effect.rate
+    kind: Literal["duplicated_lines"]
+    place: ClassVar[Place] = "stream"
+    rank: ClassVar[float] = 20
+    rate: float = Field(gt=0, lt=1, description="probability per line and arm")
 
-    return [Stage("dropped_lines", "stream", run)]
+    def stages(self, setting: Setting) -> list[Stage]:
+        """With probability ``rate`` a line has the pixels of the line that was read out before it."""
 
+        def run(
+            pixels: NDArray[Any], first_line: int, before: Callable[[], NDArray[Any]]
+        ) -> tuple[NDArray[Any], None]:
+            drawn = draws("duplicated_lines", setting, first_line // TILE_LINES).random(len(pixels))
+            twice = drawn < self.rate
+            if twice.any():
+                shifted = np.concatenate([before() if twice[0] else pixels[:1], pixels[:-1]])
+                pixels = np.where(twice[:, None], shifted, pixels)
+            return pixels, None
 
-def duplicated_lines(effect: config.DuplicatedLines, setting: Setting) -> list[Stage]:
-    """With probability ``rate`` a line has the pixels of the line that was read out before it."""
-
-    def run(
-        pixels: NDArray[Any], first_line: int, before: Callable[[], NDArray[Any]]
-    ) -> tuple[NDArray[Any], None]:
-        twice = draws("duplicated_lines", setting, first_line // TILE_LINES).random(len(pixels)) < effect.rate
-        if twice.any():
-            shifted = np.concatenate([before() if twice[0] else pixels[:1], pixels[:-1]])
-            pixels = np.where(twice[:, None], shifted, pixels)
-        return pixels, None
-
-    return [Stage("duplicated_lines", "stream", run)]
+        return [Stage("duplicated_lines", "stream", run)]

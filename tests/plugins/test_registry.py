@@ -1,0 +1,154 @@
+"""What is installed, found by entry points: distributions of others, as their metadata and modules say."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from acquire import plugins
+from acquire.config import load_scene
+from acquire.config.scene import SceneFile
+from acquire.config.variants import whole_schema
+from acquire.errors import ConfigError
+from acquire.plugins import EFFECTS
+
+GLOW = """
+from typing import ClassVar, Literal
+from acquire.sim.effects.base import Effect, Stage
+
+class Glow(Effect):
+    '''Steady light of the room.'''
+    kind: Literal["glow"]
+    place: ClassVar = "signal"
+    level: float = 1.0
+
+    def stages(self, setting):
+        return [Stage("glow", "signal", lambda lines, first_line: lines + self.level)]
+"""
+
+Install = Callable[..., None]
+
+
+@pytest.fixture
+def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install]:
+    """Puts a distribution where Python finds it: name, entry points of effects, source of its module."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    modules = set(sys.modules)
+
+    def add(name: str, effects: dict[str, str], source: str = "") -> None:
+        about = tmp_path / f"{name.replace('-', '_')}-1.5.dist-info"
+        about.mkdir()
+        (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.5\n")
+        entries = "".join(f"{key} = {value}\n" for key, value in effects.items())
+        (about / "entry_points.txt").write_text(f"[acquire.effects]\n{entries}")
+        (tmp_path / f"{name.replace('-', '_')}.py").write_text(source)
+        plugins.forget()
+
+    plugins.forget()
+    yield add
+    for name in set(sys.modules) - modules:
+        if name in ("lab_light", "lab_other"):
+            del sys.modules[name]
+    monkeypatch.undo()
+    plugins.forget()
+
+
+def scene(tmp_path: Path, *effects: str) -> Path:
+    """A scene file that lists effects, each as TOML."""
+    path = tmp_path / "scene.toml"
+    path.write_text('kind = "usaf"\n' + "".join(f"[[effects]]\n{effect}\n" for effect in effects))
+    return path
+
+
+def test_an_effect_of_anybodys_is_found_without_being_imported_and_imported_when_listed(
+    install: Install, tmp_path: Path
+) -> None:
+    install("lab-light", {"glow": "lab_light:Glow"}, GLOW)
+    assert EFFECTS.names()[-1] == "glow"
+    assert "lab_light" not in sys.modules
+    listed = load_scene(scene(tmp_path, 'kind = "glow"\nlevel = 2.5')).effects[0]
+    assert (type(listed).__module__, listed.model_dump()) == ("lab_light", {"kind": "glow", "level": 2.5})
+    again = SceneFile.model_validate(load_scene(scene(tmp_path, 'kind = "glow"')).model_dump()).root
+    assert type(again.effects[0]) is EFFECTS.load("glow")
+
+
+def test_mistakes_in_its_table_are_named_as_those_in_ours(install: Install, tmp_path: Path) -> None:
+    install("lab-light", {"glow": "lab_light:Glow"}, GLOW)
+    with pytest.raises(ConfigError) as caught:
+        load_scene(scene(tmp_path, 'kind = "glow"\nlevel = "high"', 'kind = "glow"\nlevl = 3'))
+    assert "effects.0.level = 'high': " in str(caught.value)
+    assert "effects.1.levl: unknown key; allowed here: kind, level" in str(caught.value)
+
+
+def test_an_unknown_effect_is_told_with_what_there_is_and_from_where(
+    install: Install, tmp_path: Path
+) -> None:
+    install("lab-light", {"glow": "lab_light:Glow"}, GLOW)
+    with pytest.raises(ConfigError, match="did you mean 'read_noise'") as caught:
+        load_scene(scene(tmp_path, 'kind = "read_nose"'))
+    with pytest.raises(ConfigError, match="did you mean 'glow'") as near:
+        EFFECTS.load("glo")
+    assert "shot_noise, " in str(caught.value)
+    assert near.value.possible.endswith("glow (lab-light 1.5)")
+
+
+@pytest.mark.parametrize(
+    ("value", "source", "why"),
+    [
+        ("lab_light:Glow", "import nothing_of_this_name", "ModuleNotFoundError: No module named 'nothing"),
+        ("lab_light:Glow", "def broken(:", "SyntaxError"),
+        ("lab_light:Glow", "raise SystemExit('no licence')", "SystemExit: no licence"),
+        ("lab_light:Gone", GLOW, "has no attribute 'Gone'"),
+        ("lab_light:Stage", GLOW, "is no class that extends acquire.sim.effects.base.Effect"),
+        ("lab_light:Glow", GLOW.replace('"glow"]', '"glare"]'), r"needs kind: Literal\['glow'\]"),
+        ("lab_light:Glow", GLOW.replace("def stages", "def steps"), "does not define stages"),
+    ],
+)
+def test_a_broken_one_is_left_out_and_only_who_asks_for_it_is_refused(
+    install: Install, tmp_path: Path, value: str, source: str, why: str
+) -> None:
+    install("lab-light", {"glow": value}, source)
+    assert "glow" not in EFFECTS.working()
+    assert load_scene(scene(tmp_path, 'kind = "shot_noise"')).effects[0].kind == "shot_noise"
+    with pytest.raises(ConfigError, match=f"'glow' of lab-light 1.5 cannot be used: .*{why}"):
+        EFFECTS.load("glow")
+    with pytest.raises(ConfigError, match=r"effects\.0: effect 'glow' of lab-light 1\.5"):
+        load_scene(scene(tmp_path, 'kind = "glow"'))
+
+
+def test_our_names_stay_ours_and_a_name_of_two_is_nobodys(install: Install) -> None:
+    install("lab-light", {"glow": "lab_light:Glow", "psf": "lab_light:Glow"}, GLOW)
+    install("lab-other", {"glow": "lab_other:Glow"}, GLOW)
+    assert EFFECTS.load("psf").__module__ == "acquire.sim.effects.image"
+    with pytest.raises(ConfigError, match=r"lab-light 1.5 and lab-other 1.5 both have it.*uninstall one"):
+        EFFECTS.load("glow")
+    refused = {(each.name, each.distribution): each.refused for each in EFFECTS.found() if each.refused}
+    assert refused["psf", "lab-light"] == "the name is tdi-acquire's own"
+    assert set(refused) == {("psf", "lab-light"), ("glow", "lab-light"), ("glow", "lab-other")}
+    assert len(set(EFFECTS.names())) == len(EFFECTS.names())
+
+
+def test_the_schema_has_what_is_installed_told_apart_by_kind(install: Install) -> None:
+    install("lab-light", {"glow": "lab_light:Glow", "dull": "lab_light:Dull"}, GLOW)
+    schema = whole_schema(SceneFile)["$defs"]
+    mapping = schema["acquire.effects"]["discriminator"]["mapping"]
+    assert set(mapping) == {*EFFECTS.names()} - {"dull"}
+    glow = schema[mapping["glow"].removeprefix("#/$defs/")]
+    assert set(glow["properties"]) == {"kind", "level"}
+    assert glow["properties"]["kind"]["const"] == "glow"
+
+
+def test_a_checkout_that_is_newer_than_its_installation_says_so(
+    install: Install, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def none_yet(name: str) -> metadata.Distribution:
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "distribution", none_yet)
+    plugins.forget()
+    with pytest.raises(ConfigError, match=r"pip install -e \. --no-deps in .*pyproject.toml is newer"):
+        EFFECTS.load("shot_noise")
