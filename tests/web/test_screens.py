@@ -23,7 +23,7 @@ from acquire.daemon.service import Service
 from acquire.errors import CameraError
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser, Page
+    from playwright.sync_api import Browser, Page, Route
 
 pytestmark = pytest.mark.needs_chromium
 
@@ -39,6 +39,7 @@ class Instrument:
         self.run, self.server = FakeRun(), server
         self.service = Service(rig_config(home), lambda: self.run)
         self._stack = contextlib.ExitStack()
+        self.disk(seconds_to_full=1e6)
         socket = home / "c.sock"
         endpoint = self._stack.enter_context(contextlib.closing(Endpoint(socket)))
         self._stack.enter_context(api(self.service, endpoint))
@@ -46,6 +47,25 @@ class Instrument:
 
     def see(self, **changes: Any) -> None:
         self.run.see(**changes)
+        self.service.supervise()
+
+    def disk(self, *, seconds_to_full: float) -> None:
+        """What the disk under the test has left would be told as well."""
+        left = DiskStatus(
+            directory=Path("/d"),
+            free_bytes=10**9,
+            reserve_bytes=0,
+            bytes_per_s=4e6,
+            seconds_to_full=seconds_to_full,
+        )
+
+        class Disk:
+            status = left
+
+            def look(self, *, recording: bool) -> None: ...
+            def close(self) -> None: ...
+
+        self.service._disk = Disk()  # type: ignore[assignment]
         self.service.supervise()
 
     def close(self) -> None:
@@ -78,9 +98,7 @@ def page(browser: Browser, instrument: Instrument) -> Iterator[Page]:
     problems: list[str] = []
     page.on("pageerror", lambda error: problems.append(str(error)))
     page.goto(instrument.server.link)
-    page.wait_for_selector(
-        "body[data-level]:not([data-stale])", timeout=SEEN_MS
-    )  # a busy host may be a warning
+    page.wait_for_selector("#arm:enabled", timeout=SEEN_MS)  # who is there is known, and that it is idle
     yield page
     context.close()
     assert problems == []
@@ -110,19 +128,7 @@ def fail(instrument: Instrument) -> None:
 
 def fill_disk(instrument: Instrument) -> None:
     record(instrument)
-    directory = Path("/d")
-    full = DiskStatus(
-        directory=directory, free_bytes=10**9, reserve_bytes=0, bytes_per_s=4e6, seconds_to_full=240.0
-    )
-
-    class Disk:
-        status = full
-
-        def look(self, *, recording: bool) -> None: ...
-        def close(self) -> None: ...
-
-    instrument.service._disk = Disk()  # type: ignore[assignment]
-    instrument.service.supervise()
+    instrument.disk(seconds_to_full=240.0)
 
 
 def go_silent(instrument: Instrument) -> None:
@@ -215,6 +221,36 @@ def test_what_is_refused_is_told_in_the_daemons_words(page: Page, instrument: In
     assert "try: plug it in" in page.inner_text("#error")
 
 
+def test_a_key_that_does_nothing_says_why(browser: Browser, instrument: Instrument) -> None:
+    """Before the page knows anything, in another state, while the daemon is busy, and without a daemon."""
+    error = "#error:not([hidden])"
+    with contextlib.closing(browser.new_context()) as context:
+        page = context.new_page()
+        held: list[Route] = []
+        page.route("**/api/session", lambda route: held.append(route))  # noqa: PLW0108 - it is wrapped
+        page.goto(instrument.server.link)
+        assert page.locator(".controls button[aria-keyshortcuts]:enabled").count() == 0
+        page.keyboard.press("a")
+        page.locator(error, has_text="cannot arm: the page is still connecting").wait_for(timeout=SEEN_MS)
+        held[0].continue_()
+        page.wait_for_selector("#arm:enabled", timeout=SEEN_MS)
+        assert page.is_hidden("#error")  # out of date
+        page.keyboard.press("m")
+        page.locator(error, has_text="cannot mark while idle; possible: arm").wait_for(timeout=SEEN_MS)
+        instrument.run.may_arm.clear()
+        page.keyboard.press("a")
+        page.locator("#since", has_text="arm").wait_for(timeout=SEEN_MS)
+        page.keyboard.press("d")
+        page.locator(error, has_text="cannot disarm while the daemon is busy: arm").wait_for(timeout=SEEN_MS)
+        instrument.run.may_arm.set()
+        page.wait_for_selector("#record:enabled", timeout=SEEN_MS)
+        instrument.close()
+        page.wait_for_selector("body[data-stale]", timeout=SEEN_MS)
+        page.keyboard.press("s")
+        page.locator(error, has_text="cannot stop: The page's server has no daemon").wait_for(timeout=SEEN_MS)
+    assert instrument.run.names == ["arm"]
+
+
 def test_a_viewer_looks_and_a_stranger_is_asked(browser: Browser, instrument: Instrument) -> None:
     with contextlib.closing(browser.new_context()) as context:
         page = context.new_page()
@@ -225,8 +261,11 @@ def test_a_viewer_looks_and_a_stranger_is_asked(browser: Browser, instrument: In
         page.locator("#enter-error", has_text="token is wrong").wait_for(timeout=SEEN_MS)
         page.fill("#token", instrument.server.viewer)
         page.keyboard.press("Enter")
-        page.wait_for_selector("body[data-level=idle]", timeout=SEEN_MS)
+        page.wait_for_selector("#enter:not([open])", state="attached", timeout=SEEN_MS)
+        page.wait_for_selector("body[data-state=idle]", timeout=SEEN_MS)
         assert page.is_disabled("#arm")
+        page.keyboard.press("a")
+        page.locator("#error", has_text="looking only").wait_for(timeout=SEEN_MS)
         assert instrument.server.viewer not in page.url
         (cookie,) = context.cookies()
         assert (cookie["httpOnly"], cookie["sameSite"]) == (True, "Strict")
@@ -242,7 +281,7 @@ def test_nothing_is_loaded_from_elsewhere(browser: Browser, instrument: Instrume
         page = context.new_page()
         page.on("request", lambda request: asked.append(request.url))
         page.goto(instrument.server.link)
-        page.wait_for_selector("body[data-level=idle]", timeout=SEEN_MS)
+        page.wait_for_selector("body[data-state=idle]", timeout=SEEN_MS)
         for key in "2345":
             page.keyboard.press(key)
     assert len(asked) > 10

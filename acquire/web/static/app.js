@@ -16,7 +16,7 @@ let operator = false, setup = null, latest = null;
 
 function fail(text) { $("error").textContent = text; $("error").hidden = !text; }
 
-function stale(why) { band.stale(why); watch.stale(); }
+function stale(why) { band.stale(why); watch.stale(why); }
 
 async function enter(token) {
   await ask("POST", "session", { token });

@@ -6,12 +6,16 @@ import { $, clock, count, duration, fill, make, percent, quantity } from "./word
 
 const HOLD_MS = 600;
 const MOST_EVENTS = 60;
+/** Button → the daemon's command. */
+const COMMANDS = { arm: "arm", record: "start", mark: "mark", stop: "stop", disarm: "disarm" };
 
 export class Watch {
-  #arms = {}; #possible = new Set(); #operator = false; #fail; #hold = null; #setup = null; #events = [];
+  #arms = {}; #possible = new Set(); #operator = null; #fail; #hold = null; #setup = null; #events = [];
+  #status = null; #unknown = "the page is still connecting to the instrument"; #refused = null;
 
   constructor(fail) {
     this.#fail = fail;
+    this.#enable();
     for (const arm of ["a", "b"]) this.#arms[arm] = new Arm(arm);
     $("arms").replaceChildren(...Object.values(this.#arms).map((arm) => arm.element));
     $("arm").onclick = () => this.#do("arm");
@@ -41,6 +45,7 @@ export class Watch {
   }
 
   show(status) {
+    this.#status = status; this.#unknown = "";
     this.#possible = new Set(status.busy ? [] : status.possible);
     this.#enable();
     for (const [name, arm] of Object.entries(this.#arms)) arm.show(status.arms[name], status);
@@ -49,13 +54,25 @@ export class Watch {
   }
 
   /** What is shown is old: no command is given on the strength of it. */
-  stale() { this.#possible = new Set(); this.#enable(); }
+  stale(why) { this.#unknown = why; this.#possible = new Set(); this.#enable(); }
 
   key(key) {
-    const button = { a: "arm", r: "record", m: "mark", d: "disarm" }[key];
-    if (button) { if (!$(button).disabled) $(button).click(); return true; }
-    if (key === "s") { this.holdStop(); return true; }
-    return false;
+    const button = { a: "arm", r: "record", m: "mark", s: "stop", d: "disarm" }[key];
+    if (!button) return false;
+    if ($(button).disabled) this.#refuse(COMMANDS[button]);
+    else if (button === "stop") this.holdStop();
+    else $(button).click();
+    return true;
+  }
+
+  /** A button that cannot be pressed is seen; a key that does nothing is not. */
+  #refuse(command) {
+    const { state, busy, possible } = this.#status ?? {};
+    const why = this.#unknown ? `: ${this.#unknown}` : busy ? ` while the daemon is busy: ${busy}`
+      : !possible.includes(command) ? ` while ${state}; possible: ${possible.join(", ")}`
+        : `: ${this.#operator === null ? "the page does not know yet who is there" : "this token is for looking only"}`;
+    this.#refused = { command, text: `cannot ${command}${why}` };
+    this.#fail(this.#refused.text);
   }
 
   holdStop() {
@@ -67,8 +84,11 @@ export class Watch {
   releaseStop() { clearTimeout(this.#hold); this.#hold = null; $("stop").classList.remove("holding"); }
 
   #enable() {
-    for (const [id, command] of [["arm", "arm"], ["record", "start"], ["mark", "mark"], ["stop", "stop"], ["disarm", "disarm"]])
-      $(id).disabled = !this.#operator || !this.#possible.has(command);
+    for (const [id, command] of Object.entries(COMMANDS)) $(id).disabled = !this.#operator || !this.#possible.has(command);
+    if (this.#refused && this.#operator && this.#possible.has(this.#refused.command)) {
+      if ($("error").textContent === this.#refused.text) this.#fail("");
+      this.#refused = null;
+    }
   }
 
   async #do(command, body) {
@@ -85,7 +105,7 @@ export class Watch {
   }
 
   async #mark() {
-    if ($("mark").disabled) return;
+    if ($("mark").disabled) { this.#refuse("mark"); return; }
     await this.#do("mark", { text: $("mark-text").value });
     $("mark-text").value = "";
   }
