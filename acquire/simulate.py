@@ -101,7 +101,9 @@ def _unseen(done: int, total: int) -> None:
 def bench_of(config: RigConfig, scene: SceneConfig) -> Bench:
     """The simulated optics and cameras of a rig before a scene."""
     cameras = {arm: config.cameras.arm(arm) for arm in ARMS}
-    return Bench(scene, config.geometry, cameras, config.trigger.substep_ticks / config.trigger.clock_hz)
+    trigger = config.trigger
+    substep_s = trigger.substep_ticks / trigger.clock_hz
+    return Bench(scene, config.geometry, cameras, substep_s, settled_s=trigger.settled_s)
 
 
 def simulate(

@@ -88,6 +88,12 @@ class TriggerConfig(FrozenModel):
         """What the trigger counts: ``watchdog_s``, rounded up."""
         return math.ceil(self.watchdog_s * self.clock_hz)
 
+    @property
+    def settled_s(self) -> dict[str, float]:
+        """Arm → by how much its line starts after the light of the line's first sub-step is let on (s)."""
+        ticks = {"a": self.a.delay_ticks, "b": self.b.delay_ticks}
+        return {arm: (self.light.lead_ticks + delay) / self.clock_hz for arm, delay in ticks.items()}
+
     @model_validator(mode="before")
     @classmethod
     def _ticks_of_old(cls, table: Any) -> Any:

@@ -26,7 +26,7 @@ import threading
 import time
 import weakref
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from multiprocessing.context import assert_spawning
 from multiprocessing.reduction import DupFd
@@ -91,7 +91,8 @@ class PulseTrain:
     ``run`` counts the trains of a wire from 1; ``start_ns`` is CLOCK_MONOTONIC; ``line_period_ns`` is
     simulated time; ``code`` is what `acquire.codes.code_from_attrs` reads; ``stopped_after`` is the
     number of pulses after which the train ended, None while it lasts; ``budget`` is the number that it
-    does not exceed unless more are allowed, None where only a stop ends it.
+    does not exceed unless more are allowed, None where only a stop ends it; ``settled_s`` is by how much the
+    trigger starts an arm's line after the light of its first sub-step, by its lead and delays.
     """
 
     run: int
@@ -101,6 +102,7 @@ class PulseTrain:
     code: Mapping[str, Any]
     stopped_after: int | None = None
     budget: int | None = None
+    settled_s: Mapping[str, float] = field(default_factory=dict)
 
     def issued(self, now_ns: int) -> int:
         """Pulses issued by ``now_ns``, pulse 0 at the start included; 0 before the start."""
@@ -168,13 +170,15 @@ class Wire:
         code: Mapping[str, Any],
         start_ns: int | None = None,
         budget: int | None = None,
+        settled_s: Mapping[str, float] | None = None,
     ) -> PulseTrain:
         """Begin a train now, or at ``start_ns``; DeviceError while another one lasts."""
         with self._writing:
             sequence, latest = self._observe()
             if latest.running:
                 raise DeviceError(f"pulse train {latest.run} still runs", hint="stop it first")
-            train = PulseTrain(latest.run + 1, 0, line_period_ns, speed, dict(code), budget=budget)
+            run, settled = latest.run + 1, dict(settled_s or {})
+            train = PulseTrain(run, 0, line_period_ns, speed, dict(code), budget=budget, settled_s=settled)
             if len(_encode(train)) > _ROOM:
                 raise UsageError(f"code of {len(_encode(train))} bytes", possible=f"{_ROOM} on the wire")
             return self._write(
@@ -271,13 +275,13 @@ class Wire:
 
 
 def _encode(train: PulseTrain) -> bytes:
-    fields = (train.run, train.start_ns, str(train.line_period_ns), str(train.speed))
-    return json.dumps([*fields, dict(train.code), train.stopped_after, train.budget]).encode()
+    fields = (train.run, train.start_ns, str(train.line_period_ns), str(train.speed), dict(train.code))
+    return json.dumps([*fields, train.stopped_after, train.budget, dict(train.settled_s)]).encode()
 
 
 def _decode(payload: bytes) -> PulseTrain:
-    run, start_ns, line_period_ns, speed, code, stopped_after, budget = json.loads(payload)
-    return PulseTrain(run, start_ns, Fraction(line_period_ns), Fraction(speed), code, stopped_after, budget)
+    run, start_ns, line_period_ns, speed, code, *others = json.loads(payload)
+    return PulseTrain(run, start_ns, Fraction(line_period_ns), Fraction(speed), code, *others)
 
 
 def _receive(duplicate: Any) -> Wire:

@@ -67,7 +67,8 @@ class SimulatedOptics:
         from acquire.sim.pipeline import Bench  # with scenes, which other optics do without
 
         substep_s = float(train.line_period_ns / (self.geometry.substeps * NS_PER_S))
-        bench = Bench(self.scene, self.geometry, dict.fromkeys(ARMS, config), substep_s)
+        cameras = dict.fromkeys(ARMS, config)
+        bench = Bench(self.scene, self.geometry, cameras, substep_s, settled_s=train.settled_s)
         return bench.camera(self.arm, code)
 
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, assert_never
 
 from acquire.codes import ConstantCode
 from acquire.config import find, load_scene
+from acquire.errors import UsageError
 from acquire.lines import ARMS
 from acquire.sim import rtl
 from acquire.sim.clock import Wire
@@ -183,6 +184,10 @@ def _transport(config: RigConfig, wire: Wire, pins: PinPage | None) -> Callable[
 
 def _check_scene(config: RigConfig, scene: SceneConfig) -> None:
     """Raise UsageError here rather than in a camera's process."""
+    if config.trigger.driver == "rtl" and any(effect.kind == "delays" for effect in scene.effects):
+        raise UsageError(
+            "effect 'delays' on the pins of the gateware", possible="trigger.driver = 'simulated'"
+        )
     code = ConstantCode(0)
     substep_s = config.trigger.substep_ticks / config.trigger.clock_hz
     bench = Bench(scene, config.geometry, {arm: config.cameras.arm(arm) for arm in ARMS}, substep_s)

@@ -15,7 +15,7 @@ sensor under the fine scene.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,7 +31,7 @@ from acquire.sim.readout import Readout
 from acquire.sim.scenes import build_scene
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -76,6 +76,8 @@ class Bench:
     substep_s: float
     realisation: int = 0
     stopwatch: Stopwatch | None = None
+    settled_s: Mapping[str, float] = field(default_factory=dict)
+    """Arm → by how much the trigger starts the charge's moves after the light's (s); absent: not at all."""
 
     def without(self, *effects: str) -> Bench:
         """The same bench, some effects not listed."""
@@ -279,6 +281,7 @@ def _sensor(
         black_level_dn=converter.black_level_dn,
         responsivity_dn=converter.responsivity_dn,
         gain_dn_per_e=bench.scene.system_gain_dn_per_e,
+        settled_s=bench.settled_s.get(name[0], 0.0),
     )
     stages = _stages(bench, setting)
     images = []

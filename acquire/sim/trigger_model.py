@@ -255,7 +255,14 @@ class TriggerModel:
         self._hear(run.start_tick - self._lead() - RUN_CLOCKS)
         period_ns = Fraction(run.line_clocks * NS_PER_S, self._clock_hz)
         attrs = light_attrs(self.registers.get)
-        self._wire.start(period_ns, self._speed, attrs, start_ns, self._lines_allowed())
+        self._wire.start(period_ns, self._speed, attrs, start_ns, self._lines_allowed(), self._settled_s())
+
+    def _settled_s(self) -> dict[str, float]:
+        """Arm → how much later its line starts than the light of the line's first sub-step."""
+        delays = {"a": r.TRIGGER_A_DELAY, "b": r.TRIGGER_B_DELAY}
+        return {
+            arm: (self._lead() + self.registers.get(delay)) / self._clock_hz for arm, delay in delays.items()
+        }
 
     def _hear(self, tick: int) -> None:
         """The host lived at ``tick``: that is what it may be silent from.

@@ -14,6 +14,7 @@ PARAMETERS = {
     "pwm": {"carrier_hz": 37e3, "bits": 6},
     "led_nonlinearity": {"saturation": 0.8},
     "led_rise_fall": {"rise_s": 3e-6, "fall_s": 5e-6},
+    "delays": {"light_s": 7e-6, "a_s": 3e-6},
     "trigger_jitter": {"sigma_s": 1e-6},
     "misregistration": {"arm": "a", "rows": 0.4},
     "lens_distortion": {"part": 0.06},

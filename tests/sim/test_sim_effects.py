@@ -13,7 +13,7 @@ from sim_helpers import CODE
 from small_bench import DT, LIT, K, N, S, bench, blinking, flat, read
 
 from acquire.sim.effects import in_order, kinds
-from acquire.sim.effects.light import delays
+from acquire.sim.effects.light import jitter
 from acquire.sim.effects.signal import tail
 from acquire.sim.light import Illumination
 from acquire.sim.scenes import build_scene
@@ -216,7 +216,7 @@ def test_led_rise_and_fall_follow_the_exponentials():
 
 def test_jitter_has_its_histogram_and_moves_light_between_neighbours():
     config = flat(listed=effects("trigger_jitter")).effects[0]
-    delay = delays(config, setting())
+    delay = jitter(config, setting())
     steps = delay(-5000, 200_000)
     assert steps.std() == pytest.approx(0.1, rel=0.02)
     assert steps.mean() == pytest.approx(0, abs=0.001)
@@ -233,11 +233,28 @@ def test_jitter_has_its_histogram_and_moves_light_between_neighbours():
     assert moved.std() > 0.05
 
 
+def test_a_late_light_is_shared_with_the_sub_steps_after_and_the_trigger_takes_it_back():
+    late = flat(listed=effects("delays", light_s=1.4 * DT, a_s=0.0, b_s=0.3 * DT))
+    plain = read(flat(), code=CODE)
+    for arm, delay in (("a", 1.4), ("b", 1.1)):
+        light = bench(late).camera(arm, CODE)
+        seen = light.read(512, 2048).pixels.astype(float)
+        bits = CODE.bits(0, 8192).astype(float)
+        index = S * np.arange(512, 2560)[:, None, None] + np.arange(N)[:, None] + np.arange(S)
+        whole, part = int(delay), delay - int(delay)
+        shared = (1 - part) * bits[index - whole] + part * bits[index - whole - 1]
+        expected = 300.0 + S * shared.sum(axis=(1, 2))
+        np.testing.assert_allclose(seen, np.broadcast_to(expected[:, None], seen.shape), atol=0.51)
+    settled = replace(bench(late), settled_s={"a": 1.4 * DT, "b": 1.1 * DT})
+    for arm in "ab":
+        np.testing.assert_array_equal(settled.camera(arm, CODE).read(512, 2048).pixels, plain.pixels)
+
+
 def test_jitter_of_the_arms_differs_and_wrong_bits_are_common():
-    jitter, wrong = blinking(effects("trigger_jitter")), flat(listed=effects("code_errors"))
+    jittered, wrong = blinking(effects("trigger_jitter")), flat(listed=effects("code_errors"))
     lines = [bench(wrong).camera(arm, CODE).read(512, 256).pixels for arm in "ab"]
     np.testing.assert_array_equal(*lines)  # a flat scene is the same for both arms
-    steps = [delays(jitter.effects[0], setting(arm=arm))(0, 4000) for arm in "ab"]
+    steps = [jitter(jittered.effects[0], setting(arm=arm))(0, 4000) for arm in "ab"]
     assert abs(np.corrcoef(*steps)[0, 1]) < 0.05
 
 

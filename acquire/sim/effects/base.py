@@ -36,6 +36,7 @@ class Setting:
     substep_s : duration of a sub-step
     scene : what it looks at
     white_dn, black_level_dn, responsivity_dn, gain_dn_per_e : of its camera
+    settled_s : by which the trigger starts the charge's moves after the light's, on purpose
     """
 
     arm: str
@@ -50,6 +51,7 @@ class Setting:
     black_level_dn: float
     responsivity_dn: float
     gain_dn_per_e: float
+    settled_s: float = 0.0
 
     @property
     def exposure_s(self) -> float:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from math import ceil
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from math import ceil, floor
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 _TILE = 1024
 """Sub-steps whose random numbers are drawn at once."""
+Delay = Annotated[float, Field(ge=0, le=0.01)]
+"""Of a wire, an isolator, a driver (s)."""
 _FORGOTTEN = 40.0
 """Time constants after which a beginning is forgotten: e⁻⁴⁰ is nothing beside 1 in double precision."""
 
@@ -134,6 +136,38 @@ class LedRiseFall(Effect):
         return [_shaped("led_rise_fall", lagged)]
 
 
+class Delays(Effect):
+    """Light and charge come late on their wires, less what the trigger's lead and delays take back."""
+
+    kind: Literal["delays"]
+    place: ClassVar[Place] = "light"
+    rank: ClassVar[float] = 45
+    light_s: Delay = Field(default=0.0, description="from the trigger's output to the light")
+    a_s: Delay = Field(default=0.0, description="from the line trigger to camera A's charge")
+    b_s: Delay = Field(default=0.0, description="to camera B's")
+
+    def stages(self, setting: Setting) -> list[Stage]:
+        """The light of a sub-step comes δ sub-steps after the charge: g(t) ← g(t − δ), of two neighbours'.
+
+        δ = (light's delay − camera's − what the trigger leads the light by and delays the line start by) /
+        sub-step; below 0 the light is early. Of one sensor with both images camera A's delays count.
+        """
+        camera_s = self.b_s if setting.arm == "b" else self.a_s
+        late = (self.light_s - camera_s - setting.settled_s) / setting.substep_s
+        whole = floor(late)
+        part = late - whole
+
+        def moved(light: Illumination) -> Callable[[int, int], NDArray[Any]]:
+            def compute(first: int, count: int) -> NDArray[Any]:
+                g = light.light(first - whole - 1, count + 1)
+                shared: NDArray[Any] = (1 - part) * g[:, 1:] + part * g[:, :-1]
+                return shared
+
+            return compute
+
+        return [_shaped("delays", moved)]
+
+
 class TriggerJitter(Effect):
     """Charge moves early or late: normal, independent from step to step."""
 
@@ -150,7 +184,7 @@ class TriggerJitter(Effect):
 
             g(t) ← max(0, −δ_t)·g(t−1) + (1 − max(0, δ_t) − max(0, −δ_{t+1}))·g(t) + max(0, δ_{t+1})·g(t+1)
         """
-        delay = delays(self, setting)
+        delay = jitter(self, setting)
 
         def moved(light: Illumination) -> Callable[[int, int], NDArray[Any]]:
             def compute(first: int, count: int) -> NDArray[Any]:
@@ -166,7 +200,7 @@ class TriggerJitter(Effect):
         return [_shaped("trigger_jitter", moved)]
 
 
-def delays(effect: TriggerJitter, setting: Setting) -> Tiled:
+def jitter(effect: TriggerJitter, setting: Setting) -> Tiled:
     """δ_t by sub-step, in sub-steps."""
     sigma = effect.sigma_s / setting.substep_s
 
