@@ -60,6 +60,10 @@ TAPS: dict[int, tuple[int, ...]] = {
 """Degree → taps of a maximal-length register. Degree 64 never repeats: 3·10⁵ years at 1.8 MHz."""
 
 
+MOST_LISTED_BITS = 2**22
+"""Of a code that is no register's: they are a text in the recording's attributes."""
+
+
 class Code(Protocol):
     """The light's code of a run: bits by index, and what a recording must say to regenerate them."""
 
@@ -118,6 +122,46 @@ class ConstantCode:
         return {"kind": self.kind, "value": self.value, "start": 0}
 
 
+@dataclass(frozen=True, slots=True)
+class ListedCode:
+    """Any bits, listed one by one: the first is the most significant of ``digits`` (hexadecimal).
+
+    With ``repeats`` they come again and again; otherwise the light is off after the last.
+    """
+
+    digits: str
+    length: int
+    repeats: bool = False
+    kind: Literal["bits"] = "bits"
+
+    def __post_init__(self) -> None:
+        possible = f"1 to {MOST_LISTED_BITS} bits, four in each hexadecimal digit"
+        if not 1 <= self.length <= MOST_LISTED_BITS or len(self.digits) != -(-self.length // 8) * 2:
+            raise UsageError(f"code of {self.length} bits in {len(self.digits)} digits", possible=possible)
+        if set(self.digits) - set("0123456789abcdef"):
+            raise UsageError("code with digits that are not hexadecimal", possible=possible)
+
+    @classmethod
+    def of(cls, bits: NDArray[np.uint8], *, repeats: bool = False) -> ListedCode:
+        """The code whose bits, 0 or 1, are given one by one."""
+        return cls(np.packbits(bits).tobytes().hex(), len(bits), repeats)
+
+    def bits(self, start: int, length: int) -> NDArray[np.uint8]:
+        listed = np.unpackbits(np.frombuffer(bytes.fromhex(self.digits), np.uint8), count=self.length)
+        index = np.arange(start, start + length)
+        inside = (index >= 0) & (self.repeats | (index < self.length))
+        return np.where(inside, listed[index % self.length], 0).astype(np.uint8)
+
+    def to_attrs(self) -> dict[str, Any]:
+        return {
+            "kind": self.kind,
+            "bits": self.digits,
+            "length": self.length,
+            "repeats": self.repeats,
+            "start": 0,
+        }
+
+
 def code_from_attrs(attrs: Mapping[str, Any]) -> Code:
     """The code that a recording's ``code`` attribute describes."""
     kind = attrs.get("kind")
@@ -130,7 +174,9 @@ def code_from_attrs(attrs: Mapping[str, Any]) -> Code:
         return PrbsCode(degree, int(str(attrs["seed"]), 0))
     if kind == "constant":
         return ConstantCode(int(attrs["value"]))
-    raise UsageError(f"code of kind {kind!r}", possible="'prbs', 'constant'")
+    if kind == "bits":
+        return ListedCode(str(attrs["bits"]), int(attrs["length"]), bool(attrs["repeats"]))
+    raise UsageError(f"code of kind {kind!r}", possible="'prbs', 'constant', 'bits'")
 
 
 def prbs(degree: int, seed: int, start: int, length: int) -> NDArray[np.uint8]:

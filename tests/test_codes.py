@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from acquire.codes import TAPS, ConstantCode, PrbsCode, code_from_attrs, mix_seed, prbs
+from acquire.codes import TAPS, ConstantCode, ListedCode, PrbsCode, code_from_attrs, mix_seed, prbs
 from acquire.errors import UsageError
 
 
@@ -88,3 +88,18 @@ def test_refusals() -> None:
         code_from_attrs({"kind": "gold"})
     with pytest.raises(UsageError, match="taps"):
         code_from_attrs({"kind": "prbs", "degree": 7, "taps": [7, 1], "seed": "1"})
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.integers(0, 1), min_size=1, max_size=40), st.booleans(), st.integers(-50, 100))
+def test_listed_bits_come_back_one_by_one(listed: list[int], repeats: bool, start: int) -> None:
+    code = code_from_attrs(ListedCode.of(np.array(listed, np.uint8), repeats=repeats).to_attrs())
+    n = len(listed)
+    expected = [listed[i % n] if i >= 0 and (repeats or i < n) else 0 for i in range(start, start + 60)]
+    np.testing.assert_array_equal(code.bits(start, 60), expected)
+
+
+@pytest.mark.parametrize(("digits", "length"), [("", 0), ("a", 4), ("ag", 8), ("abcd", 8), ("AB", 8)])
+def test_listed_bits_that_are_none_are_refused(digits: str, length: int) -> None:
+    with pytest.raises(UsageError, match="code"):
+        ListedCode(digits, length)

@@ -12,6 +12,7 @@ from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, q
 from acquire.cli.places import local_path
 from acquire.cli.progress import stage_progress
 from acquire.errors import AcquireError, DataError
+from acquire.text import shortened
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -302,8 +303,8 @@ def _readable(facts: dict[str, Any]) -> dict[str, Any]:
         "started": _utc(facts["start_ns"]),
         "geometry": f"M = {sizes['stages']}, S = {sizes['substeps']}, {sizes['pixels']} pixels",
         "samples": facts["dtype"],
-        "code": ", ".join(f"{key} {value}" for key, value in facts["code"].items()),
-        "clock": f"{facts['clock']['clock_hz']} Hz, UTC known to {facts['clock']['uncertainty_ns']} ns",
+        "code": ", ".join(f"{key} {shortened(value, 60)}" for key, value in facts["code"].items()),
+        "clock": f"{facts['clock']['clock_hz']} Hz, {_known_to(facts['clock']['uncertainty_ns'])}",
         "size": quantity(facts["bytes"], "B"),
         "damaged": facts["damage"],
         "disk": _disk(facts["disk"]),
@@ -312,8 +313,21 @@ def _readable(facts: dict[str, Any]) -> dict[str, Any]:
         "in doubt": _suspect(facts["suspect"]),
         "calibration": _calibration(facts["calibration"]),
         "simulated": "yes" if facts["simulated"] else "no",
+        "imported": _imported(facts["imported"]),
         "written by": f"acquire {facts['versions']['acquire']}",
     }
+
+
+def _known_to(uncertainty_ns: int) -> str:
+    return "UTC not known" if uncertainty_ns >= MOST_NS else f"UTC known to {uncertainty_ns} ns"
+
+
+def _imported(found: dict[str, Any] | None) -> str | None:
+    """Where lines are from that were not recorded, and what is not known of them."""
+    if found is None:
+        return None
+    files = dict.fromkeys(str(file.get("path")) for file in dict(found.get("files", {})).values())
+    return f"from {', '.join(files)}; not known: {'; '.join(map(str, found.get('unknown', ())))}"
 
 
 def _calibration(found: dict[str, Any] | None) -> str | None:

@@ -3,15 +3,34 @@
 ::
 
     from_video, from_recording ─▶ content (in blocks) ─▶ tiff | hdf5 | arrays | movie ─▶ one file
-    line files ─▶ foreign (blocks of lines) ─▶ importing ─▶ a sealed recording
+    line files ─▶ foreign (blocks of lines) ─▶ importing, code_words ─▶ a sealed recording
 
 Nothing is read before it is written: memory stays bounded, however long a recording is. Libraries that only
 these files need are imported when one is asked for; the extra ``[export]`` brings them.
 """
 
+from acquire.exchange.code_words import parse_code
 from acquire.exchange.content import Content
 from acquire.exchange.export import SUFFIXES, check_export, export
+from acquire.exchange.foreign import Layout, LineFile, open_lines
 from acquire.exchange.from_recording import recording_content
 from acquire.exchange.from_video import video_content
+from acquire.exchange.importing import Arm, Imported, Instrument, clock_of, import_lines
 
-__all__ = ["SUFFIXES", "Content", "check_export", "export", "recording_content", "video_content"]
+__all__ = [
+    "SUFFIXES",
+    "Arm",
+    "Content",
+    "Imported",
+    "Instrument",
+    "Layout",
+    "LineFile",
+    "check_export",
+    "clock_of",
+    "export",
+    "import_lines",
+    "open_lines",
+    "parse_code",
+    "recording_content",
+    "video_content",
+]

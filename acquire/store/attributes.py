@@ -105,6 +105,11 @@ class _Versions(_Facts):
     acquire: str
 
 
+class _Imported(_Facts):
+    files: dict[str, dict[str, Any]]
+    unknown: list[str]
+
+
 class _Root(_Facts):
     state: Literal["recording", "sealed"]
     run_id: str
@@ -121,6 +126,7 @@ class _Root(_Facts):
     versions: _Versions
     config: dict[str, Any] = {}
     calibration: dict[str, Any] | None = None
+    imported: _Imported | None = None
     host: dict[str, str] = {}
     durability: _Durability | Annotated[dict[str, Any], Field(max_length=0)] = {}
     simulated: bool = False

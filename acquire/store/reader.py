@@ -262,6 +262,7 @@ class Recording:
             "events": len(self.events),
             "simulated": bool(self.attrs.get("simulated", False)),
             "cameras": self.attrs["cameras"],
+            "imported": self.attrs.get("imported"),
             "calibration": self.attrs.get("calibration"),
             "disk": self._disk_facts(),
             "ledger": self.attrs["ledger"],

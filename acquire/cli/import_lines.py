@@ -1,0 +1,240 @@
+"""``acquire import``: lines that other software captured, as a recording."""
+
+from __future__ import annotations
+
+import re
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from acquire.cli.moments import utc_ns
+from acquire.cli.output import JsonFlag, print_json, print_warning, say
+from acquire.cli.progress import stage_progress
+from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from acquire.codes import Code
+    from acquire.exchange import Arm, Instrument
+
+DTYPES = {"uint8": "u1", "u8": "u1", "uint16": "<u2", "u16": "<u2", "<u2": "<u2", ">u2": ">u2"}
+"""How bare numbers can be said to be stored → NumPy's name; ``>u2`` has the larger byte first."""
+
+
+def register(app: typer.Typer) -> None:
+    app.command("import", rich_help_panel="Recordings")(import_lines)
+
+
+def import_lines(
+    files: Annotated[
+        list[Path],
+        typer.Argument(metavar="FILE...", help="Arm a's lines, and arm b's: .npy, .h5, .tif, or .raw."),
+    ],
+    out: Annotated[str, typer.Option(metavar="RECORDING", help="New recording: NAME.zarr, or a URL.")],
+    config: Annotated[
+        str | None,
+        typer.Option(metavar="RIG", help="Rig file with geometry, code, trigger and cameras."),
+    ] = None,
+    stages: Annotated[int | None, typer.Option(help="M, stages of the sensor; pixels of a line.")] = None,
+    substeps: Annotated[int | None, typer.Option(help="S, charge-transfer steps in a line.")] = None,
+    line_rate: Annotated[float | None, typer.Option(metavar="HZ", help="Lines per second.")] = None,
+    code: Annotated[
+        str | None,
+        typer.Option(help="prbs:DEGREE:SEED, prbs:DEGREE:0xSTATE, bits:0x…, bits:FILE, constant:1."),
+    ] = None,
+    code_start: Annotated[
+        int, typer.Option(min=0, help="The code's bit in the first sub-step of line 0.")
+    ] = 0,
+    code_repeats: Annotated[
+        bool, typer.Option("--code-repeats", help="Listed bits begin anew after the last.")
+    ] = False,
+    first_line: Annotated[int, typer.Option(min=0, help="Number of the files' first line.")] = 0,
+    lines: Annotated[int | None, typer.Option(help="So many lines of each arm; else all.")] = None,
+    arm: Annotated[str, typer.Option(help="a or b: whose lines a single file has.")] = "a",
+    dtype: Annotated[
+        str | None, typer.Option(help="Of bare numbers: uint8, uint16, or >u2 (larger byte first).")
+    ] = None,
+    pixels: Annotated[int | None, typer.Option(help="Of bare numbers: pixels of a line.")] = None,
+    skip_bytes: Annotated[int, typer.Option(help="Of bare numbers: before the first line.")] = 0,
+    dataset: Annotated[
+        str | None, typer.Option(metavar="PATH", help="The array inside HDF5 files, as /entry/data/lines.")
+    ] = None,
+    columns_a: Annotated[
+        str | None, typer.Option(metavar="FIRST:END", help="Pixels of a line that are arm a's.")
+    ] = None,
+    columns_b: Annotated[
+        str | None, typer.Option(metavar="FIRST:END", help="Arm b's; also of the same file.")
+    ] = None,
+    white: Annotated[float | None, typer.Option(metavar="DN", help="Where a pixel is saturated.")] = None,
+    black: Annotated[float | None, typer.Option(metavar="DN", help="Of a pixel without light.")] = None,
+    responsivity: Annotated[
+        float | None, typer.Option(metavar="DN", help="Per unit of light and sub-step.")
+    ] = None,
+    start: Annotated[
+        str | None, typer.Option(metavar="UTC", help="When the first line was read out.")
+    ] = None,
+    json: JsonFlag = False,
+) -> None:
+    """Make a recording of lines that other software captured, to verify, cut and reconstruct it.
+
+    The recording says what is not known of such lines: nothing but your word ties them to the code.
+
+    Example: [bold]acquire import a.tif b.tif --out run.zarr --config rig.toml[/]
+    """
+    from acquire.exchange import Layout, import_lines
+    from acquire.store.delivery import check_new_place
+
+    if len(files) > 2:
+        raise UsageError(f"{len(files)} files of lines", possible="one for each arm, or one with both")
+    check_new_place(out)
+    said = {"white_dn": white, "black_level_dn": black, "responsivity_dn": responsivity}
+    instrument = _instrument(config, stages, substeps, line_rate, code, repeats=code_repeats)
+    instrument = replace(
+        instrument,
+        cameras={
+            each: {**instrument.cameras.get(each, {}), **{k: v for k, v in said.items() if v is not None}}
+            for each in ("a", "b")
+        },
+        code_start=code_start,
+        first_line=first_line,
+        start_ns=_utc_ns(start),
+    )
+    layout = Layout(_dtype(dtype), pixels, skip_bytes, dataset)
+    columns = {"a": _columns(columns_a), "b": _columns(columns_b)}
+    with ExitStack() as held:
+        arms = _arms(held, files, layout, columns, arm)
+        with stage_progress(f"importing {PurePosixPath(out).name}") as advance:
+            done = import_lines(arms, instrument, out, _run_id(out), advance, most_lines=lines)
+    if json:
+        facts = {"path": str(done.path), "lines": done.lines, "arms": done.arms, "unknown": done.unknown}
+        print_json(facts)
+        return
+    say(f"{done.path}: {done.lines} lines of arm{'s' * (len(done.arms) - 1)} {' and '.join(done.arms)}")
+    for text in done.unknown:
+        print_warning(f"not known: {text}")
+    say(f"  acquire diagnose {done.path} holds the lines against the code")
+
+
+def _run_id(out: str) -> str:
+    return re.sub(r"[^A-Za-z0-9._-]", "_", PurePosixPath(out).stem) or "imported"
+
+
+def _utc_ns(text: str | None) -> int | None:
+    if text is None:
+        return None
+    found = utc_ns(text)
+    if found is None:
+        raise UsageError(f"--start {text!r} is no time", possible="UTC as 2026-01-31T12:00:00.25")
+    return found
+
+
+def _dtype(text: str | None) -> str | None:
+    if text is not None and text not in DTYPES:
+        raise UsageError(f"--dtype {text!r} is not known", possible=", ".join(DTYPES))
+    return None if text is None else DTYPES[text]
+
+
+def _columns(text: str | None) -> tuple[int, int] | None:
+    if text is None:
+        return None
+    found = re.fullmatch(r"(\d+):(\d+)", text)
+    if found is None:
+        raise UsageError(f"columns {text!r} cannot be read", possible="FIRST:END, as 0:192")
+    return int(found[1]), int(found[2])
+
+
+def _arms(
+    held: ExitStack, files: list[Path], layout: Any, columns: dict[str, tuple[int, int] | None], arm: str
+) -> dict[str, Arm]:
+    """Which file, or which part of one, has the lines of each arm."""
+    from acquire.exchange import Arm, open_lines
+
+    if arm not in columns:
+        raise UsageError(f"arm {arm!r}", possible="a, b")
+    if len(files) == 2 or all(columns.values()):
+        paths = {"a": files[0], "b": files[-1]}
+        opened = {
+            name: held.enter_context(open_lines(path, replace(layout, columns=columns[name])))
+            for name, path in paths.items()
+        }
+        for file in opened.values():
+            if file.arms == 2:
+                raise UsageError(f"{file.path} has two arms, and there is a file for each", possible="one")
+        return {name: Arm(file) for name, file in opened.items()}
+    file = held.enter_context(open_lines(files[0], replace(layout, columns=columns[arm])))
+    return {arm: Arm(file)} if file.arms == 1 else {"a": Arm(file, 0), "b": Arm(file, 1)}
+
+
+def _instrument(
+    config: str | None,
+    stages: int | None,
+    substeps: int | None,
+    line_rate: float | None,
+    code: str | None,
+    *,
+    repeats: bool,
+) -> Instrument:
+    """As a rig file says, or the options; these count where both do."""
+    from acquire.exchange import clock_of, parse_code
+
+    light = None if code is None else parse_code(code, repeats=repeats)
+    if config is None:
+        found = _of_options(stages, substeps, line_rate, light)
+    else:
+        known = _of_rig(config)
+        found = replace(
+            known,
+            stages=stages or known.stages,
+            substeps=substeps or known.substeps,
+            code=light or known.code,
+        )
+        if line_rate is not None or found.substeps != known.substeps:
+            _check_sizes(found.stages, found.substeps, line_rate or known.line_rate_hz)
+            clock_hz, ticks = clock_of(line_rate or known.line_rate_hz, found.substeps)
+            found = replace(found, clock_hz=clock_hz, substep_ticks=ticks)
+    _check_sizes(found.stages, found.substeps, found.line_rate_hz)
+    return found
+
+
+def _of_options(
+    stages: int | None, substeps: int | None, line_rate: float | None, light: Code | None
+) -> Instrument:
+    from acquire.exchange import Instrument, clock_of
+
+    if stages is None or substeps is None or line_rate is None or light is None:
+        given = {"--stages": stages, "--substeps": substeps, "--line-rate": line_rate, "--code": light}
+        raise UsageError(
+            f"lines without {', '.join(name for name, value in given.items() if value is None)}",
+            possible="all of --stages, --substeps, --line-rate and --code, or --config RIG",
+        )
+    _check_sizes(stages, substeps, line_rate)
+    return Instrument(stages, substeps, light, *clock_of(line_rate, substeps), {})
+
+
+def _check_sizes(stages: int, substeps: int, line_rate_hz: float) -> None:
+    for name, value, low, high in (
+        ("--stages", stages, 1, 4096),
+        ("--substeps", substeps, 1, 8),
+        ("--line-rate", line_rate_hz, 1e-3, 1e7),
+    ):
+        if not low <= value <= high:
+            raise UsageError(f"{name} {value:g} is out of range", possible=f"{low:g} to {high:g}")
+
+
+def _of_rig(name: str) -> Instrument:
+    from acquire.config import load_rig
+    from acquire.exchange import Instrument
+
+    rig = load_rig(name)
+    keys = ("white_dn", "black_level_dn", "responsivity_dn")
+    return Instrument(
+        rig.geometry.stages,
+        rig.geometry.substeps,
+        rig.code.build(),
+        rig.trigger.clock_hz,
+        rig.trigger.substep_ticks,
+        {arm: {key: getattr(rig.cameras.arm(arm), key) for key in keys} for arm in ("a", "b")},
+        config=rig.model_dump(mode="json"),
+    )

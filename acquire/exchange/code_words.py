@@ -1,0 +1,77 @@
+"""Codes as a user says them: a register and its state, bits in a file or in hexadecimal, or a constant."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from acquire.codes import MOST_LISTED_BITS, ConstantCode, ListedCode, PrbsCode, mix_seed
+from acquire.errors import UsageError
+from acquire.reading import read_regular
+from acquire.store.refusals import refused
+from acquire.text import shortened
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.codes import Code
+
+POSSIBLE = (
+    "prbs:DEGREE:SEED with a seed as in a rig file, or the register's state as 0x…; bits:0x… (the first bit "
+    "is the highest of the first digit); bits:FILE, a text of 0 and 1, or of 0x…, or .npy; constant:1"
+)
+
+
+def parse_code(text: str, *, repeats: bool = False) -> Code:
+    """The code in words. ``repeats``: listed bits begin anew after the last. UsageError names what can be."""
+    kind, _, rest = text.partition(":")
+    if kind == "prbs" and (found := re.fullmatch(r"(\d{1,2}):(0x[0-9a-fA-F]+|\d+)", rest)):
+        degree, number = int(found[1]), found[2]
+        if number.startswith("0x"):
+            return PrbsCode(degree, int(number, 16))
+        return PrbsCode(degree, mix_seed(int(number), degree))
+    if kind == "constant" and rest in {"0", "1"}:
+        return ConstantCode(int(rest))
+    if kind == "bits" and rest:
+        return ListedCode.of(_bits(rest), repeats=repeats)
+    raise UsageError(f"code {shortened(text)!r} cannot be read", possible=POSSIBLE)
+
+
+def _bits(text: str) -> NDArray[np.uint8]:
+    if re.fullmatch("0x[0-9a-fA-F]+", text):
+        return _from_hex(text)
+    path = Path(text)
+    if path.suffix == ".npy":
+        return _from_array(path)
+    with refused(path, "read"):
+        raw = read_regular(path, MOST_LISTED_BITS * 2)
+    written = "".join(raw.decode("ascii", "replace").split())
+    if re.fullmatch("0x[0-9a-fA-F]+", written):
+        return _from_hex(written)
+    if not re.fullmatch("[01]+", written):
+        raise UsageError(f"{path} holds no bits", possible="0 and 1, with or without spaces, or 0x…")
+    return np.frombuffer(written.encode(), np.uint8) - ord("0")
+
+
+def _from_hex(text: str) -> NDArray[np.uint8]:
+    """Four bits for each digit."""
+    digits = text[2:]
+    padded = digits + "0" * (len(digits) % 2)
+    return np.unpackbits(np.frombuffer(bytes.fromhex(padded), np.uint8))[: 4 * len(digits)]
+
+
+def _from_array(path: Path) -> NDArray[np.uint8]:
+    with refused(path, "read"):
+        try:
+            found = np.load(path, mmap_mode="r", allow_pickle=False)
+        except ValueError as error:
+            raise UsageError(f"{path} is no array of NumPy's: {error}") from error
+    if found.ndim != 1 or not 0 < len(found) <= MOST_LISTED_BITS or not np.isin(found, (0, 1)).all():
+        raise UsageError(
+            f"{path} holds no bits: {found.dtype} {found.shape}",
+            possible=f"one axis of up to {MOST_LISTED_BITS} values, 0 or 1",
+        )
+    return np.asarray(found, np.uint8)

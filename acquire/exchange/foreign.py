@@ -1,0 +1,281 @@
+"""Files of lines that other programs wrote, read in blocks: NumPy, HDF5, TIFF, and bare numbers.
+
+::
+
+    FILE ─▶ LineFile: (line, pixel), or (arm, line, pixel)    .rows(arm, start, stop) ─▶ (line, pixel)
+
+Everything that can be wrong with a file's shape or type is found when it is opened; nothing is read before.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.errors import DataError, UsageError
+from acquire.exchange.libraries import library
+from acquire.store.camera_stream import DAMAGE
+from acquire.store.refusals import refused
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from numpy.typing import NDArray
+
+KINDS = {
+    ".npy": "NumPy",
+    ".h5": "HDF5",
+    ".hdf5": "HDF5",
+    ".nxs": "HDF5",
+    ".tif": "TIFF",
+    ".tiff": "TIFF",
+    ".raw": "raw",
+    ".bin": "raw",
+    ".dat": "raw",
+}
+"""What a file's name ends with → what it is."""
+TYPES = ("uint8", "uint16")
+MOST_PAGE_BYTES = 2**28
+"""Of one page of a TIFF file that is not in one piece: it is unpacked whole."""
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """What a file does not say itself.
+
+    Attributes
+    ----------
+    dtype, pixels, skip_bytes : of bare numbers: type (``uint8``, ``<u2``, ``>u2``), pixels of a line, and
+        what comes before the first
+    dataset : path of the array inside an HDF5 file; None: the only one that can be lines
+    columns : pixels of a line that are the arm's, first and after the last; None: all
+    """
+
+    dtype: str | None = None
+    pixels: int | None = None
+    skip_bytes: int = 0
+    dataset: str | None = None
+    columns: tuple[int, int] | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LineFile:
+    """``shape`` is (line, pixel) or (arm, line, pixel); ``read`` takes arm (None), start and stop."""
+
+    path: Path
+    kind: str
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    read: Callable[[int | None, int, int], NDArray[Any]]
+    facts: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def arms(self) -> int:
+        """1, or 2 where the file has both."""
+        return self.shape[0] if len(self.shape) == 3 else 1
+
+    @property
+    def lines(self) -> int:
+        return self.shape[-2]
+
+    @property
+    def pixels(self) -> int:
+        return self.shape[-1]
+
+    def rows(self, arm: int | None, start: int, stop: int) -> NDArray[Any]:
+        """Lines ``start`` to ``stop - 1`` (line, pixel), in the machine's byte order. Raises DataError."""
+        try:
+            found = np.asarray(self.read(arm, start, stop))
+        except DAMAGE as error:
+            raise DataError(f"{self.path}: lines {start} to {stop - 1} cannot be read: {error}") from error
+        if found.shape != (stop - start, self.pixels):
+            raise DataError(f"{self.path} ends before line {stop}: it was cut short")
+        return found.astype(self.dtype.newbyteorder("="), copy=False)
+
+
+@contextmanager
+def open_lines(path: Path, layout: Layout) -> Iterator[LineFile]:
+    """A file of lines. UsageError for what cannot be read as lines, PlaceError where there is no file."""
+    kind = _kind(path, layout)
+    openers = {"NumPy": _numpy, "HDF5": _hdf5, "TIFF": _tiff, "raw": _raw}
+    with ExitStack() as held:
+        with refused(path, "read"):
+            path.stat()
+        try:
+            file = openers[kind](path, layout, held)
+        except DAMAGE as error:
+            raise UsageError(f"{path} cannot be read as {kind}: {error}") from error
+        _check(file)
+        yield file if layout.columns is None else _cropped(file, layout.columns)
+
+
+def _kind(path: Path, layout: Layout) -> str:
+    if layout.dtype is not None or layout.pixels is not None:
+        return "raw"
+    kind = KINDS.get(path.suffix.lower())
+    if kind == "raw":
+        raise UsageError(f"{path}: bare numbers do not say what they are", hint="--dtype and --pixels")
+    if kind is None:
+        raise UsageError(
+            f"{path}: its name does not say what it is",
+            possible=", ".join(KINDS),
+            hint="--dtype and --pixels for bare numbers",
+        )
+    return kind
+
+
+def _check(file: LineFile) -> None:
+    shape = " x ".join(map(str, file.shape))
+    if len(file.shape) not in {2, 3} or 0 in file.shape or file.arms not in {1, 2}:
+        raise UsageError(
+            f"{file.path} has the shape {shape}", possible="(line, pixel), or (arm, line, pixel) of two arms"
+        )
+    if file.dtype.newbyteorder("=").name not in TYPES:
+        raise UsageError(
+            f"{file.path} holds {file.dtype.name}", possible=", ".join(TYPES), hint="raw values of the camera"
+        )
+
+
+def _cropped(file: LineFile, columns: tuple[int, int]) -> LineFile:
+    first, end = columns
+    if not 0 <= first < end <= file.pixels:
+        raise UsageError(f"columns {first}:{end} of {file.path}", possible=f"0:{file.pixels} or a part of it")
+
+    def read(arm: int | None, start: int, stop: int) -> NDArray[Any]:
+        return file.read(arm, start, stop)[:, first:end]
+
+    shape = (*file.shape[:-1], end - first)
+    return LineFile(file.path, file.kind, shape, file.dtype, read, file.facts | {"columns": [first, end]})
+
+
+def _sliced(array: Any) -> Callable[[int | None, int, int], NDArray[Any]]:
+    """Lines of an array that reads when it is sliced."""
+
+    def read(arm: int | None, start: int, stop: int) -> NDArray[Any]:
+        found: NDArray[Any] = array[start:stop] if array.ndim == 2 else array[arm or 0, start:stop]
+        return found
+
+    return read
+
+
+def _plain(
+    path: Path, dtype: np.dtype[Any], shape: tuple[int, ...], offset: int
+) -> Callable[[int | None, int, int], NDArray[Any]]:
+    """Lines that lie one after the other. They are read, not mapped: a file that shrinks is an error then."""
+    line_bytes = shape[-1] * dtype.itemsize
+
+    def read(arm: int | None, start: int, stop: int) -> NDArray[Any]:
+        begin = offset + ((arm or 0) * shape[-2] + start) * line_bytes
+        found = np.fromfile(path, dtype, (stop - start) * shape[-1], offset=begin)
+        return found[: len(found) // shape[-1] * shape[-1]].reshape(-1, shape[-1])
+
+    return read
+
+
+def _numpy(path: Path, _: Layout, __: ExitStack) -> LineFile:
+    array = np.load(path, mmap_mode="r", allow_pickle=False)
+    if not isinstance(array, np.memmap):
+        raise UsageError(f"{path} is an archive of several arrays", possible="one array in a .npy file")
+    in_order = array.flags.c_contiguous
+    read = _plain(path, array.dtype, array.shape, array.offset) if in_order else _sliced(array)
+    return LineFile(path, "NumPy", array.shape, array.dtype, read)
+
+
+def _hdf5(path: Path, layout: Layout, held: ExitStack) -> LineFile:
+    h5py = library("h5py", "export", "an HDF5 file")
+    file = held.enter_context(h5py.File(path, "r"))
+    name = layout.dataset or _only_dataset(path, file, h5py)
+    dataset = file.get(name)
+    if not isinstance(dataset, h5py.Dataset):
+        raise UsageError(f"{path} has no dataset {name!r}", possible=", ".join(_datasets(file, h5py)))
+    return LineFile(path, "HDF5", dataset.shape, dataset.dtype, _sliced(dataset), {"dataset": name})
+
+
+def _datasets(file: Any, h5py: Any) -> list[str]:
+    """Paths of the arrays that can be lines."""
+    found: list[str] = []
+
+    def visit(name: str, node: Any) -> None:
+        if isinstance(node, h5py.Dataset) and node.ndim in {2, 3} and node.dtype.name in TYPES:
+            found.append(f"/{name}")
+
+    file.visititems(visit)
+    return found
+
+
+def _only_dataset(path: Path, file: Any, h5py: Any) -> str:
+    found = [name for name in _datasets(file, h5py) if not name.endswith("/flags")]
+    if len(found) != 1:
+        raise UsageError(
+            f"{path} has {len(found)} arrays that could be lines",
+            possible=", ".join(found) or "arrays of uint8 or uint16, (line, pixel) or (arm, line, pixel)",
+            hint="--dataset PATH" if found else "",
+        )
+    return found[0]
+
+
+def _raw(path: Path, layout: Layout, _: ExitStack) -> LineFile:
+    if layout.dtype is None or layout.pixels is None:
+        raise UsageError(
+            f"{path}: of bare numbers, type and pixels of a line are needed", hint="--dtype and --pixels"
+        )
+    dtype, pixels = np.dtype(layout.dtype), layout.pixels
+    size, line_bytes = path.stat().st_size - layout.skip_bytes, dtype.itemsize * pixels
+    if pixels < 1 or layout.skip_bytes < 0 or size < line_bytes:
+        raise UsageError(f"{path} has {size} bytes of pixels", possible=f"{line_bytes} for every line")
+    if size % line_bytes:
+        raise UsageError(
+            f"{path}: {size} bytes are no whole number of lines of {pixels} pixels {dtype.name}",
+            possible=f"{size // line_bytes} lines, and {size % line_bytes} bytes are left",
+            hint="--skip-bytes for what comes before the first line, or another --pixels or --dtype",
+        )
+    shape = (size // line_bytes, pixels)
+    facts = {"dtype": dtype.str, "skip_bytes": layout.skip_bytes}
+    return LineFile(path, "raw", shape, dtype, _plain(path, dtype, shape, layout.skip_bytes), facts)
+
+
+def _tiff(path: Path, _: Layout, held: ExitStack) -> LineFile:
+    """Pages are stretches of lines, one after the other; two channels are the arms."""
+    tifffile = library("tifffile", "export", "a TIFF file")
+    file = held.enter_context(tifffile.TiffFile(path))
+    series = file.series[0]
+    shape, dtype = tuple(map(int, series.shape)), np.dtype(file.byteorder + series.dtype.str[1:])
+    arms = len(shape) == 3 and series.axes.startswith("C") and shape[0] == 2
+    lines = shape if arms else (math.prod(shape[:-1]), shape[-1])
+    if series.dataoffset is not None:
+        return LineFile(path, "TIFF", lines, dtype, _plain(path, dtype, lines, series.dataoffset))
+    return LineFile(path, "TIFF", lines, dtype, _pages(path, series, lines))
+
+
+def _pages(path: Path, series: Any, lines: tuple[int, ...]) -> Callable[[int | None, int, int], NDArray[Any]]:
+    """Lines out of pages that are packed, or scattered over the file."""
+    rows, pixels = (int(size) for size in series.pages[0].shape)
+    if rows * pixels * series.dtype.itemsize > MOST_PAGE_BYTES:
+        raise UsageError(
+            f"{path} is packed in pages of {rows} x {pixels} pixels",
+            possible=f"up to {MOST_PAGE_BYTES} bytes in a page",
+            hint="the file without compression",
+        )
+    last: dict[int, NDArray[Any]] = {}
+
+    def page(number: int) -> NDArray[Any]:
+        if number not in last:
+            last.clear()
+            last[number] = series.pages[number].asarray().reshape(rows, pixels)
+        return last[number]
+
+    def read(arm: int | None, start: int, stop: int) -> NDArray[Any]:
+        offset = (arm or 0) * lines[-2]
+        first, end = start + offset, stop + offset
+        parts = [
+            page(number)[max(0, first - number * rows) : end - number * rows]
+            for number in range(first // rows, -(-end // rows))
+        ]
+        return np.concatenate(parts)
+
+    return read

@@ -1,0 +1,298 @@
+"""Lines of other programs as a sealed recording, which says what is not known of them.
+
+No tag of a trigger stands behind such lines: which bit of the code belongs to which line, and when it was
+read out, follows from what the user says, and every line is flagged so (``code_unverified``,
+``time_estimated``). `acquire diagnose` holds the lines against the code.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.clock import ClockFit
+from acquire.codes import ListedCode, PrbsCode, state_at
+from acquire.config.recording import usual_chunk_lines
+from acquire.errors import UsageError
+from acquire.geometry import Geometry
+from acquire.lines import ARMS, LineBlock, LineFlag
+from acquire.store import RecordingSpec, RecordingWriter, RunCondition
+from acquire.store.delivery import delivery_to
+from acquire.stream.tagger import Tagger
+from acquire.trigger.base import TriggerRun
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from acquire.codes import Code
+    from acquire.exchange.foreign import LineFile
+
+BLOCK_LINES = 4096
+COMMIT_BLOCKS = 64
+SUBSTEP_TICKS = 1000
+"""Where only the line rate is known: the clock is then that many times as fast as the sub-steps."""
+UNKNOWN_NS = 2**62
+"""Uncertainty of a clock of which nothing is known."""
+NO_ARM = "not_imported"
+"""Why the lines of an arm are missing that no file has."""
+
+
+@dataclass(frozen=True, slots=True)
+class Instrument:
+    """What the lines were taken with.
+
+    Attributes
+    ----------
+    stages, substeps : M, S
+    code, code_start : the light's code; its bit in the first sub-step of line 0
+    clock_hz, substep_ticks : ticks per second, and of a sub-step
+    cameras : per arm ``white_dn``, ``black_level_dn`` and ``responsivity_dn``, as far as they are known
+    start_ns : UTC at which the first line's read-out begins; None: not known
+    config : the rig's configuration, where there is one
+    """
+
+    stages: int
+    substeps: int
+    code: Code
+    clock_hz: int
+    substep_ticks: int
+    cameras: Mapping[str, Mapping[str, float]]
+    code_start: int = 0
+    first_line: int = 0
+    start_ns: int | None = None
+    config: Mapping[str, Any] | None = None
+    layout: str = "dual"
+
+    @property
+    def line_rate_hz(self) -> float:
+        return self.clock_hz / (self.substep_ticks * self.substeps)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Arm:
+    """The lines of one arm: a file, and which of its arms where it has two."""
+
+    file: LineFile
+    number: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Imported:
+    """What was written."""
+
+    path: Path | str
+    lines: int
+    arms: tuple[str, ...]
+    unknown: tuple[str, ...]
+
+
+def clock_of(line_rate_hz: float, substeps: int) -> tuple[int, int]:
+    """Ticks per second, and per sub-step, of a clock that gives a line rate, to a part in 10⁸ or better."""
+    ticks = SUBSTEP_TICKS
+    while line_rate_hz * substeps * ticks < 1e8:
+        ticks *= 10
+    return round(line_rate_hz * substeps * ticks), ticks
+
+
+def import_lines(
+    arms: Mapping[str, Arm],
+    instrument: Instrument,
+    out: Path | str,
+    run_id: str,
+    progress: Callable[[float, float], object] | None = None,
+    *,
+    most_lines: int | None = None,
+) -> Imported:
+    """Write the lines of one or both arms, at most so many, as a new, sealed recording at a path or URL.
+
+    Whole or not at all. UsageError for lines, a code and a geometry that do not fit together, before anything
+    is touched; DataError for a file that cannot be read, StoreError where the disk refuses.
+    """
+    lines = _checked(arms, instrument, most_lines)
+    unknown = tuple(_unknown(arms, instrument))
+    spec = _spec(arms, instrument, run_id, unknown, lines)
+    delivery = delivery_to(out)
+    try:
+        with RecordingWriter.create(delivery.partial, spec) as writer:
+            _write(writer, arms, instrument, lines, progress)
+            stored = {arm: lines if arm in arms else 0 for arm in ARMS}
+            ledger = {arm: {"stored": stored[arm], "missing": {NO_ARM: lines - stored[arm]}} for arm in ARMS}
+            whole = len(arms) == len(ARMS)
+            condition = RunCondition.TAINTED if whole else RunCondition.INCOMPLETE
+            writer.seal(condition, "imported from files of another program", ledger)
+        delivery.deliver()
+    finally:
+        delivery.clear()
+    return Imported(out, lines, tuple(arms), unknown)
+
+
+def _checked(arms: Mapping[str, Arm], instrument: Instrument, most_lines: int | None) -> int:
+    """The number of lines, once all fits together."""
+    counts = {arm: source.file.lines for arm, source in arms.items()}
+    if most_lines is not None:
+        if not 1 <= most_lines <= min(counts.values()):
+            raise UsageError(f"{most_lines} lines to import", possible=f"1 to {min(counts.values())}")
+        counts = dict.fromkeys(counts, most_lines)
+    if len(set(counts.values())) > 1:
+        raise UsageError(
+            f"arm a has {counts['a']} lines, and arm b {counts['b']}",
+            possible="as many of one as of the other, line by line",
+            hint=f"--lines {min(counts.values())} takes so many of each",
+        )
+    if len({source.file.dtype.newbyteorder("=") for source in arms.values()}) > 1:
+        raise UsageError("arms of different types", possible="uint8 or uint16 for both")
+    for arm, source in arms.items():
+        if source.file.pixels != instrument.stages:
+            raise UsageError(
+                f"lines of arm {arm} have {source.file.pixels} pixels, with {instrument.stages} stages",
+                possible="as many pixels as stages, M: lines are as long as the image is high",
+                hint=f"--columns-{arm} FIRST:END chooses the pixels that are lit, --stages their number",
+            )
+    lines = next(iter(counts.values()))
+    _check_code(instrument, lines)
+    return lines
+
+
+def _check_code(instrument: Instrument, lines: int) -> None:
+    """Listed bits must last for all sub-steps that the lines touch."""
+    code = instrument.code
+    if not isinstance(code, ListedCode) or code.repeats:
+        return
+    span = Geometry(instrument.stages, instrument.substeps, lines).span
+    needed = instrument.code_start + instrument.substeps * instrument.first_line + span
+    if code.length < needed:
+        raise UsageError(
+            f"the code has {code.length} bits, and {lines} lines touch {needed}",
+            possible="S·(M + lines) − 1 bits from the first line's on",
+            hint="--code-repeats where the sequence begins anew, or fewer --lines",
+        )
+
+
+def shifted(code: Code, start: int) -> Code:
+    """The code whose bit 0 is bit ``start`` of another one."""
+    if start == 0:
+        return code
+    if isinstance(code, PrbsCode):
+        return PrbsCode(code.degree, state_at(code.degree, code.seed, start))
+    if isinstance(code, ListedCode):
+        count = code.length if code.repeats else code.length - start
+        if count < 1:
+            raise UsageError(f"--code-start {start} is after the last of {code.length} bits")
+        return ListedCode.of(code.bits(start, count), repeats=code.repeats)
+    return code
+
+
+def _unknown(arms: Mapping[str, Arm], instrument: Instrument) -> list[str]:
+    """What the recording cannot say of its lines, in words."""
+    found = ["the trigger's tags: code and time of every line follow from what was said at the import"]
+    found.append("lines that were lost before: a loss shifts the code of all that follow")
+    if instrument.start_ns is None:
+        found.append("UTC: the first line's is taken as 1970-01-01T00:00:00")
+    else:
+        found.append("how exact the UTC of the first line is")
+    for key, words in (
+        ("white_dn", "from which value on a pixel is saturated: the type's largest is taken"),
+        ("black_level_dn", "the black level: 0 is taken"),
+        ("responsivity_dn", "the responsivity: 1 is taken, and brightness is in DN"),
+    ):
+        if any(key not in instrument.cameras.get(arm, {}) for arm in arms):
+            found.append(words)
+    found += [f"arm {arm}: all its lines are missing" for arm in ARMS if arm not in arms]
+    return found
+
+
+def _cameras(instrument: Instrument, dtype: np.dtype[Any]) -> dict[str, Any]:
+    usual = {"white_dn": float(np.iinfo(dtype).max), "black_level_dn": 0.0, "responsivity_dn": 1.0}
+    return {
+        arm: {**usual, **instrument.cameras.get(arm, {}), "model": "another program's, imported"}
+        for arm in ARMS
+    }
+
+
+def _clock(instrument: Instrument) -> ClockFit:
+    """UTC of tick 0, so that the first line is read out when it is said to be."""
+    geometry = Geometry(instrument.stages, instrument.substeps, 1)
+    substep = instrument.substeps * instrument.first_line + geometry.readout_substep
+    relative = ClockFit(instrument.clock_hz, 0, UNKNOWN_NS)
+    first_ns = int(relative.time_ns(np.array([substep * instrument.substep_ticks], np.uint64))[0])
+    return ClockFit(instrument.clock_hz, (instrument.start_ns or 0) - first_ns, UNKNOWN_NS)
+
+
+def _spec(
+    arms: Mapping[str, Arm], instrument: Instrument, run_id: str, unknown: tuple[str, ...], lines: int
+) -> RecordingSpec:
+    file = next(iter(arms.values())).file
+    dtype = file.dtype.newbyteorder("=")
+    chunk_lines = min(
+        usual_chunk_lines(file.pixels * dtype.itemsize, instrument.line_rate_hz),
+        1 << max(4, lines.bit_length()),
+    )
+    return RecordingSpec(
+        run_id=run_id,
+        stages=instrument.stages,
+        substeps=instrument.substeps,
+        pixels=file.pixels,
+        dtype=dtype.name,
+        first_line=instrument.first_line,
+        clock=_clock(instrument),
+        code=shifted(instrument.code, instrument.code_start).to_attrs(),
+        substep_ticks=instrument.substep_ticks,
+        trigger={"model": "none: the lines are imported"},
+        cameras=_cameras(instrument, dtype),
+        config=dict(instrument.config or {}),
+        extra={
+            "imported": {
+                "files": {
+                    arm: {"path": str(source.file.path), "kind": source.file.kind, **source.file.facts}
+                    | ({} if source.number is None else {"arm": source.number})
+                    for arm, source in arms.items()
+                },
+                "code_start": instrument.code_start,
+                "unknown": list(unknown),
+            }
+        },
+        chunk_lines=chunk_lines,
+        codec="lz4",
+        layout=instrument.layout,
+    )
+
+
+def _write(
+    writer: RecordingWriter,
+    arms: Mapping[str, Arm],
+    instrument: Instrument,
+    lines: int,
+    progress: Callable[[float, float], object] | None,
+) -> None:
+    spec = writer.spec
+    code = shifted(instrument.code, instrument.code_start)
+    run = TriggerRun(spec.run_id, code, spec.substeps, spec.substep_ticks, 1)
+    tagger = Tagger(run, spec.stages, spec.clock)
+    for arm in ARMS:
+        if arm not in arms:
+            writer.add_gap(arm, spec.first_line, lines, NO_ARM)
+    for number, start in enumerate(range(0, lines, BLOCK_LINES)):
+        stop = min(lines, start + BLOCK_LINES)
+        for arm in ARMS:
+            block = _block(arms.get(arm), arm, spec, start, stop)
+            writer.append(tagger.tag(block))
+        if number % COMMIT_BLOCKS == 0:
+            writer.commit()
+        if progress is not None:
+            progress(stop, lines)
+
+
+def _block(source: Arm | None, arm: str, spec: RecordingSpec, start: int, stop: int) -> LineBlock:
+    first = spec.first_line + start
+    if source is None:
+        pixels: NDArray[Any] = np.zeros((stop - start, spec.pixels), spec.line_dtype)
+        flags = np.full(stop - start, LineFlag.MISSING, np.uint16)
+        return LineBlock(arm, first, pixels, flags)
+    pixels = np.ascontiguousarray(source.file.rows(source.number, start, stop))
+    full = (pixels >= spec.cameras[arm]["white_dn"]).any(axis=1)
+    return LineBlock(arm, first, pixels, np.where(full, LineFlag.SATURATED, 0).astype(np.uint16))
