@@ -275,6 +275,24 @@ def test_a_viewer_looks_and_a_stranger_is_asked(browser: Browser, instrument: In
     assert instrument.server.viewer not in log
 
 
+def test_who_has_entered_is_not_asked_again(browser: Browser, instrument: Instrument) -> None:
+    """The answer to a question from before the token comes after it."""
+    with contextlib.closing(browser.new_context()) as context:
+        page = context.new_page()
+        held: list[Route] = []
+        page.goto(instrument.server.address)
+        page.wait_for_selector("#enter[open]", timeout=SEEN_MS)
+        with page.expect_request("**/api/live*", timeout=SEEN_MS):
+            page.route("**/api/live*", lambda route: held.append(route), times=1)  # noqa: PLW0108 - wrapped
+        page.fill("#token", instrument.server.operator)
+        page.keyboard.press("Enter")
+        page.wait_for_selector("#enter:not([open])", state="attached", timeout=SEEN_MS)
+        with page.expect_request("**/api/live*", timeout=SEEN_MS):
+            held[0].fulfill(status=401)
+        page.wait_for_selector("#enter:not([open])", state="attached", timeout=SEEN_MS)
+        page.wait_for_selector("#arm:enabled", timeout=SEEN_MS)
+
+
 def test_nothing_is_loaded_from_elsewhere(browser: Browser, instrument: Instrument) -> None:
     asked: list[str] = []
     with contextlib.closing(browser.new_context()) as context:

@@ -42,7 +42,8 @@ function screen() {
   if (latest) showHealth(latest.status, latest.health, fail, operator);
 }
 
-link.addEventListener("begun", () => { if (!setup) admitted().catch(() => {}); });
+/** An answer to what was asked before the token may have come after it, and have asked for it once more. */
+link.addEventListener("begun", () => { if (!setup || $("enter").open) admitted().catch(() => {}); });
 link.addEventListener("locked", () => { if (!$("enter").open) $("enter").showModal(); });
 link.addEventListener("silent", ({ detail }) => stale(`No word from the page's server for ${Math.round(detail)} s.`));
 link.addEventListener("link", ({ detail }) => stale(`The page's server has no daemon: ${detail.header.why}`));
