@@ -25,6 +25,8 @@ The layers, top to bottom; imports point downwards only (checked by the tests)::
     logs  reading                    one line per entry · files that anybody may have put there
     errors  text                     failures that a user can meet, with exit codes · foreign text
 
+Why things are so, and what else was considered, is in `DECISIONS.md` beside this file.
+
 Equation numbers in docstrings refer to Li, Wang and Liu, "TDI-based continuous window compressed
 spatio-temporal imaging capable of flexible voxels post-interpretation".
 """

@@ -1,4 +1,4 @@
-"""The README's example of a script, word for word, on a real daemon."""
+"""The documented example of a script, word for word, on a real daemon."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 from live_daemon import Daemon
 
-README = Path(__file__).parents[2] / "README.md"
+DOCUMENT = Path(__file__).parents[2] / "acquire/client/SCRIPTING.md"
 
 
 def test_the_example_arms_records_marks_cuts_and_reconstructs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (example,) = re.findall(
-        r"```python\n(from acquire.client.*?)```", README.read_text(encoding="utf-8"), re.DOTALL
+        r"```python\n(from acquire.client.*?)```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL
     )
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
