@@ -427,12 +427,17 @@ def test_a_trigger_that_fails_is_a_fault(tmp_path: Path, error: Exception, fault
         ("trigger", TriggerError, "the run is too fast"),
     ],
 )
-def test_arm_undoes_everything_when_something_fails(fault: str, kind: type[AcquireError], text: str) -> None:
+def test_arm_undoes_everything_when_something_fails(
+    monkeypatch: pytest.MonkeyPatch, fault: str, kind: type[AcquireError], text: str
+) -> None:
+    if fault == "hang":  # until it is killed
+        monkeypatch.setattr("acquire.stream.capture._UNDO_S", 2.0)
+        monkeypatch.setattr("acquire.stream.capture._LEAST_END_S", 2.0)
     bench = make_bench(fault_b=fault)
     bench.trigger.refuse = fault == "trigger"
     capture = Capture(bench.plan, bench.trigger)
     with pytest.raises(kind) as failure:
-        capture.arm(timeout_s=10.0 if fault == "hang" else 60.0)
+        capture.arm(timeout_s=6.0 if fault == "hang" else 60.0)
     assert str(failure.value) == text
     assert bench.trigger.stops == (fault == "trigger")
     assert capture.poll() == CaptureStatus()
