@@ -11,7 +11,7 @@ the second lets numpy generate blocks that double in length.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
@@ -78,27 +78,37 @@ class Code(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class PrbsCode:
-    """Maximal-length pseudo-random code; ``seed`` is the register's state at index 0."""
+    """Maximal-length pseudo-random code: ``state`` of its register at index 0, from which all bits follow.
+
+    ``seed`` is the number that its user gave, where one did; see `from_seed`.
+    """
 
     degree: int
-    seed: int
+    state: int
+    seed: int | None = field(default=None, compare=False)
     kind: Literal["prbs"] = "prbs"
 
     def __post_init__(self) -> None:
-        _check_register(self.degree, self.seed)
+        _check_register(self.degree, self.state)
+
+    @classmethod
+    def from_seed(cls, degree: int, seed: int) -> PrbsCode:
+        """The code that configurations mean by a seed: its state is mixed from it."""
+        return cls(degree, mix_seed(seed, degree), seed)
 
     def bits(self, start: int, length: int) -> NDArray[np.uint8]:
         dark = min(max(-start, 0), length)
-        lit = prbs(self.degree, self.seed, max(start, 0), length - dark)
+        lit = prbs(self.degree, self.state, max(start, 0), length - dark)
         return np.concatenate([np.zeros(dark, np.uint8), lit])
 
     def to_attrs(self) -> dict[str, Any]:
-        # Seeds of degree 64 exceed what JSON readers in other languages keep exactly: hexadecimal text.
+        # States of degree 64 exceed what JSON readers in other languages keep exactly: hexadecimal text.
         return {
             "kind": self.kind,
             "degree": self.degree,
             "taps": list(TAPS[self.degree]),
-            "seed": f"{self.seed:#x}",
+            "state": f"{self.state:#x}",
+            **({} if self.seed is None else {"seed": self.seed}),
             "start": 0,
         }
 
@@ -171,7 +181,8 @@ def code_from_attrs(attrs: Mapping[str, Any]) -> Code:
             raise UsageError(
                 f"prbs code of degree {degree} with taps {attrs['taps']}", possible=f"taps {TAPS.get(degree)}"
             )
-        return PrbsCode(degree, int(str(attrs["seed"]), 0))
+        seed = attrs.get("seed") if "state" in attrs else None
+        return PrbsCode(degree, register_state(attrs), None if seed is None else int(seed))
     if kind == "constant":
         return ConstantCode(int(attrs["value"]))
     if kind == "bits":
@@ -179,34 +190,39 @@ def code_from_attrs(attrs: Mapping[str, Any]) -> Code:
     raise UsageError(f"code of kind {kind!r}", possible="'prbs', 'constant', 'bits'")
 
 
-def prbs(degree: int, seed: int, start: int, length: int) -> NDArray[np.uint8]:
+def register_state(attrs: Mapping[str, Any]) -> int:
+    """The register's state at index 0 of a pseudo-random code; recordings of format 1 call it ``seed``."""
+    return int(str(attrs["state"] if "state" in attrs else attrs["seed"]), 0)
+
+
+def prbs(degree: int, state: int, start: int, length: int) -> NDArray[np.uint8]:
     """Bits ``start .. start + length - 1`` of the pseudo-random code (uint8, 0 or 1).
 
     The cost of ``start`` is logarithmic, of ``length`` linear with numpy speed.
     """
-    _check_register(degree, seed)
+    _check_register(degree, state)
     if start < 0 or length < 0:
         raise UsageError(f"prbs start = {start}, length = {length}", possible="0 or more")
-    window = _window(degree, seed, start)
+    window = _window(degree, state, start)
     if length <= degree:
         return window[:length]
     return _extend(window, TAPS[degree], length)
 
 
-def state_at(degree: int, seed: int, index: int) -> int:
-    """The register's state when it is about to emit bit ``index``: the seed of the code from there on.
+def state_at(degree: int, state: int, index: int) -> int:
+    """The register's state when it is about to emit bit ``index``, of a code that begins with ``state``.
 
     Whatever the state was, after ``degree`` steps it is made of the bits emitted meanwhile alone.
     """
-    _check_register(degree, seed)
+    _check_register(degree, state)
     mask = sum(1 << (tap - 1) for tap in TAPS[degree])
     if index < degree:
-        state = seed
         for _ in range(index):
             state = state >> 1 ^ (mask if state & 1 else 0)
         return state
+    emitted = _window(degree, state, index - degree)
     state = 0
-    for bit in _window(degree, seed, index - degree).tolist():
+    for bit in emitted.tolist():
         state = state >> 1 ^ (mask if bit else 0)
     return state
 
@@ -222,17 +238,17 @@ def mix_seed(number: int, degree: int) -> int:
     return (z ^ (z >> 31)) & ((1 << degree) - 1) or 1
 
 
-def _check_register(degree: int, seed: int) -> None:
+def _check_register(degree: int, state: int) -> None:
     if degree not in TAPS:
         raise UsageError(f"prbs degree {degree}", possible=", ".join(map(str, TAPS)))
-    if not 0 < seed < 1 << degree:
-        raise UsageError(f"prbs seed {seed:#x} of degree {degree}", possible=f"1 to {(1 << degree) - 1:#x}")
+    if not 0 < state < 1 << degree:
+        raise UsageError(f"prbs state {state:#x} of degree {degree}", possible=f"1 to {(1 << degree) - 1:#x}")
 
 
-def _window(degree: int, seed: int, start: int) -> NDArray[np.uint8]:
+def _window(degree: int, state: int, start: int) -> NDArray[np.uint8]:
     """The ``degree`` output bits from index ``start``: o_{N+i} = Σ_j a_j·o_{j+i} with x^N ≡ Σ_j a_j·x^j."""
     head = 0  # o_0 .. o_{2·degree - 1}, bit k = o_k
-    state, mask = seed, sum(1 << (tap - 1) for tap in TAPS[degree])
+    mask = sum(1 << (tap - 1) for tap in TAPS[degree])
     for k in range(2 * degree):
         bit = state & 1
         head |= bit << k

@@ -33,6 +33,8 @@ class LineFlag(IntFlag):
     """No tag of the trigger confirmed tick and time; they are extrapolated."""
     CODE_UNVERIFIED = 16
     """No tag of the trigger confirmed the code index; it is extrapolated."""
+    CODE_CONTRADICTED = 32
+    """The arm's lines did not follow the code that they are tagged with (`acquire.stream.lightcheck`)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from acquire.codes import TAPS, ConstantCode, ListedCode, PrbsCode, code_from_attrs, mix_seed, prbs
+from acquire.config import PrbsConfig
 from acquire.errors import UsageError
 
 
@@ -73,12 +74,27 @@ def test_attributes_regenerate_the_code(code: PrbsCode | ConstantCode) -> None:
     assert code_from_attrs(code.to_attrs()) == code
 
 
+def test_a_recorded_seed_is_the_number_that_was_given() -> None:
+    attrs = PrbsConfig(seed=7).build().to_attrs()
+    assert attrs["seed"] == 7
+    assert PrbsConfig(seed=attrs["seed"]).build() == code_from_attrs(attrs)
+    assert code_from_attrs(attrs).to_attrs() == attrs
+
+
+def test_a_state_of_format_1_is_read_although_it_was_called_seed() -> None:
+    attrs = PrbsConfig(seed=7).build().to_attrs()
+    old = {name: attrs[name] for name in ("kind", "degree", "taps", "start")} | {"seed": attrs["state"]}
+    found = code_from_attrs(old)
+    assert found == code_from_attrs(attrs)
+    assert "seed" not in found.to_attrs()
+
+
 def test_refusals() -> None:
     with pytest.raises(UsageError, match="degree 40"):
         prbs(40, 1, 0, 10)
-    with pytest.raises(UsageError, match="seed"):
+    with pytest.raises(UsageError, match="state"):
         prbs(7, 128, 0, 10)
-    with pytest.raises(UsageError, match="seed"):
+    with pytest.raises(UsageError, match="state"):
         prbs(7, 0, 0, 10)
     with pytest.raises(UsageError, match="0 or more"):
         prbs(7, 1, -1, 10)

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from acquire.codes import PrbsCode, mix_seed
+from acquire.codes import PrbsCode
 from acquire.config import load_scene
 from acquire.evaluate.curves import compare_curve, region_mean
 from acquire.evaluate.metrics import psnr
@@ -70,7 +70,7 @@ def record(case: Case, seed: int) -> tuple[Scene, Segment]:
     g = case.geometry
     scene, code = (
         build_scene(load_scene(case.scene), g.size, case.substep_s),
-        PrbsCode(64, mix_seed(seed, 64)),
+        PrbsCode.from_seed(64, seed),
     )
     arms = [StreamingArm(scene, code, g.stages, g.substeps, arm) for arm in ARMS]
     light = np.stack([arm.lines(case.first_line, g.lines) for arm in arms])

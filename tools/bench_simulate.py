@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import sparse
 
-from acquire.codes import PrbsCode, mix_seed
+from acquire.codes import PrbsCode
 from acquire.config import GeometryConfig, load_scene
 from acquire.config.device import CameraConfig
 from acquire.config.scene import SceneFile
@@ -40,7 +40,7 @@ LINE_RATE_HZ = 100e3 / 3
 BLOCK_LINES = 4096
 DENSE_LINES = 512
 POOL_FRAMES = 1024
-CODE = PrbsCode(64, mix_seed(1, 64))
+CODE = PrbsCode.from_seed(64, 1)
 
 
 def best_s(seconds: float, *works: Callable[[], object]) -> list[float]:

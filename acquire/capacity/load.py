@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from acquire.codes import PrbsCode, mix_seed
+from acquire.codes import PrbsCode
 from acquire.config.recording import usual_chunk_lines, usual_tag_chunks
 from acquire.errors import UsageError
 from acquire.lines import ARMS
@@ -88,7 +88,7 @@ def tag_every_lines(load: Load) -> int:
 
 
 def _code() -> PrbsCode:
-    return PrbsCode(64, mix_seed(1, 64))
+    return PrbsCode.from_seed(64, 1)
 
 
 def trigger_run(load: Load) -> TriggerRun:

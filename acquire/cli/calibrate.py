@@ -280,9 +280,9 @@ def _any(place: str) -> Calibration:
     from acquire.calibrate import calibration_of
     from acquire.store import open_recording
     from acquire.store.opening import format_of
-    from acquire.store.spec import FORMAT
+    from acquire.store.spec import READABLE
 
-    if format_of(place) != FORMAT:
+    if format_of(place) not in READABLE:
         return _known(place)
     found = calibration_of(open_recording(place))
     if found is None:

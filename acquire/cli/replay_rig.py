@@ -83,7 +83,7 @@ def _code(stored: Recording) -> dict[str, Any]:
 
     code = replay_code(stored).to_attrs()
     if code["kind"] == "prbs":
-        return {"kind": "prbs", "degree": code["degree"], "state": code["seed"]}
+        return {"kind": "prbs", "degree": code["degree"], "state": code["state"]}
     return {"kind": "constant", "value": code["value"]}
 
 

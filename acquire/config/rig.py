@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
 
-from acquire.codes import TAPS, Code, ConstantCode, PrbsCode, mix_seed
+from acquire.codes import TAPS, Code, ConstantCode, PrbsCode
 from acquire.config.base import MOST_SECONDS, SEED_END, FilePath, FrozenModel
 from acquire.config.builtin import builtin_names
 from acquire.config.device import SEEING_CAMERAS, SIMULATED_CAMERAS, CamerasConfig, TriggerConfig
@@ -64,8 +64,9 @@ class PrbsConfig(FrozenModel):
         return self
 
     def build(self) -> Code:
-        state = mix_seed(self.seed, self.degree) if self.state is None else int(self.state, 16)
-        return PrbsCode(self.degree, state)
+        if self.state is not None:
+            return PrbsCode(self.degree, int(self.state, 16))
+        return PrbsCode.from_seed(self.degree, self.seed)
 
 
 class ConstantCodeConfig(FrozenModel):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from acquire.daemon.messages import RecoveryStatus
 from acquire.errors import AcquireError, DataError, StateError
-from acquire.store import FORMAT, Circumstances, recover
+from acquire.store import READABLE, Circumstances, recover
 from acquire.store.files import DISK, locked
 from acquire.store.host import has_run_on, is_here
 from acquire.store.links import refuse_link, refuse_links
@@ -82,7 +82,7 @@ def _look_at(path: Path, found: Found, *, known: bool) -> None:
         else:
             found.odd.append(RecoveryStatus(path=path, state="left", text=error.message))
         return
-    if (attributes.get("format"), attributes.get("state")) == (FORMAT, "recording"):
+    if attributes.get("format") in READABLE and attributes.get("state") == "recording":
         found.open.append(path)
 
 

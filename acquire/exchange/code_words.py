@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from acquire.codes import MOST_LISTED_BITS, ConstantCode, ListedCode, PrbsCode, mix_seed
+from acquire.codes import MOST_LISTED_BITS, ConstantCode, ListedCode, PrbsCode
 from acquire.errors import UsageError
 from acquire.reading import read_regular
 from acquire.store.refusals import refused
@@ -32,7 +32,7 @@ def parse_code(text: str, *, repeats: bool = False) -> Code:
         degree, number = int(found[1]), found[2]
         if number.startswith("0x"):
             return PrbsCode(degree, int(number, 16))
-        return PrbsCode(degree, mix_seed(int(number), degree))
+        return PrbsCode.from_seed(degree, int(number))
     if kind == "constant" and rest in {"0", "1"}:
         return ConstantCode(int(rest))
     if kind == "bits" and rest:

@@ -178,7 +178,7 @@ def shifted(code: Code, start: int) -> Code:
     if start == 0:
         return code
     if isinstance(code, PrbsCode):
-        return PrbsCode(code.degree, state_at(code.degree, code.seed, start))
+        return PrbsCode(code.degree, state_at(code.degree, code.state, start))
     if isinstance(code, ListedCode):
         count = code.length if code.repeats else code.length - start
         if count < 1:

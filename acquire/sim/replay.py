@@ -50,7 +50,7 @@ def replay_code(recording: Recording) -> Code:
     code = code_from_attrs(recording.attrs["code"])
     index = recording.geometry_for(1).substeps * recording.first_line
     if isinstance(code, PrbsCode):
-        return PrbsCode(code.degree, state_at(code.degree, code.seed, index))
+        return PrbsCode(code.degree, state_at(code.degree, code.state, index))
     if isinstance(code, ConstantCode):
         return code
     raise UsageError(

@@ -21,8 +21,8 @@ def light_attrs(get: Callable[[r.Register], int]) -> dict[str, Any]:
     degree = mask.bit_length()
     taps = TAPS.get(degree, ())
     if lit and kind == r.Source.PRBS and mask == sum(1 << tap - 1 for tap in taps):
-        seed = f"{get(r.PRBS_SEED):#x}"
-        return {"kind": "prbs", "degree": degree, "taps": list(taps), "seed": seed, "start": 0}
+        state = f"{get(r.PRBS_SEED):#x}"
+        return {"kind": "prbs", "degree": degree, "taps": list(taps), "state": state, "start": 0}
     value = r.CODE_SOURCE.value.of(source) if lit and kind == r.Source.CONSTANT else 0
     return {"kind": "constant", "value": value, "start": 0}
 

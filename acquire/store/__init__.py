@@ -20,7 +20,7 @@ from acquire.store.reader import Recording
 from acquire.store.recover import Circumstances, Recovery, recover
 from acquire.store.resume import next_segment
 from acquire.store.retention import Hold, hold
-from acquire.store.spec import FORMAT, RecordingSpec, RunCondition
+from acquire.store.spec import FORMAT, READABLE, RecordingSpec, RunCondition
 from acquire.store.suspect import Suspect, suspect_lines
 from acquire.store.table_reader import Event, Gap
 from acquire.store.terms import Continuation, Retention
@@ -30,6 +30,7 @@ from acquire.store.writer import RecordingWriter
 
 __all__ = [
     "FORMAT",
+    "READABLE",
     "CameraStream",
     "Circumstances",
     "Codec",

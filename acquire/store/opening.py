@@ -15,7 +15,7 @@ from acquire.store.layout import line_columns
 from acquire.store.reader import Recording
 from acquire.store.refusals import refusal, refused
 from acquire.store.source import source_of
-from acquire.store.spec import FORMAT
+from acquire.store.spec import READABLE
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -111,18 +111,18 @@ def _format(document: Document) -> str | None:
 
 
 def _check_format(source: Source, name: str | None) -> None:
-    if name == FORMAT:
+    if name in READABLE:
         return
-    if name is not None and name.startswith(FORMAT.split("/")[0] + "/"):
+    if name is not None and name.startswith(READABLE[0].split("/")[0] + "/"):
         raise PlaceError(
             f"{source} is a recording of format {name!r}",
-            possible=f"{FORMAT!r}",
+            possible=", ".join(map(repr, READABLE)),
             hint="a newer version of acquire",
         )
     video = name is not None and name.startswith("acquire-video/")
     raise PlaceError(
         f"{source} is a {'video' if video else 'Zarr group'}, but not a recording: format {name!r}",
-        possible=f"{FORMAT!r}",
+        possible=", ".join(map(repr, READABLE)),
         hint="acquire render, which shows videos" if video else "the path of a recording",
     )
 

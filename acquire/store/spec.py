@@ -24,7 +24,11 @@ if TYPE_CHECKING:
     from acquire.clock import ClockFit
     from acquire.store.terms import Continuation, Retention
 
-FORMAT = "acquire-recording/1"
+FORMAT = "acquire-recording/2"
+"""Of what is written. In format 1 the code's ``seed`` is the register's state, and the number that the user
+gave is not there; lines that contradict their code have the flag of lines without a tag.
+"""
+READABLE = ("acquire-recording/1", FORMAT)
 
 CAMERA_KEYS = ("white_dn", "black_level_dn", "responsivity_dn")
 """What a reader needs of each camera to turn DN into samples of Eq. (1)."""

@@ -347,7 +347,7 @@ class Session:
         tagged = self._tagger.tag(block)
         book = self.books[block.arm]
         if block.arm in self.doubted:
-            tagged = replace(tagged, flags=tagged.flags | np.uint16(LineFlag.CODE_UNVERIFIED))
+            tagged = replace(tagged, flags=tagged.flags | np.uint16(LineFlag.CODE_CONTRADICTED))
             book.doubted += len(tagged)
         (self._writer.lend if hurry or self._writer.packs else self._writer.append)(tagged)
         book.store(tagged.flags)
@@ -370,7 +370,7 @@ class Session:
             reasons[name] = self.trigger.get(name, 0)
         for arm, book in self.books.items():
             reasons |= {
-                f"unconfirmed_{arm}": book.unverified - book.doubted,
+                f"unconfirmed_{arm}": book.unverified,
                 f"code_contradicted_{arm}": book.doubted,
                 f"incomplete_{arm}": book.incomplete,
             }

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from acquire.codes import TAPS
+from acquire.codes import TAPS, register_state
 from acquire.errors import TriggerError
 from acquire.trigger import registers as r
 
@@ -208,13 +208,13 @@ def _code(attrs: Mapping[str, Any], device: Capabilities) -> dict[r.Register, in
         source = r.CODE_SOURCE.pack(kind=r.Source.MEMORY)
         return values | {r.CODE_SOURCE: source, r.CODE_LENGTH: int(attrs["length"])}
     if kind == "prbs" and tuple(attrs["taps"]) == TAPS.get(int(attrs["degree"])):
-        mask, seed = sum(1 << tap - 1 for tap in attrs["taps"]), int(str(attrs["seed"]), 0)
-        if 0 < seed < 1 << attrs["degree"]:
+        mask, state = sum(1 << tap - 1 for tap in attrs["taps"]), register_state(attrs)
+        if 0 < state < 1 << attrs["degree"]:
             source = r.CODE_SOURCE.pack(kind=r.Source.PRBS)
-            return values | {r.CODE_SOURCE: source, r.PRBS_MASK: mask, r.PRBS_SEED: seed}
+            return values | {r.CODE_SOURCE: source, r.PRBS_MASK: mask, r.PRBS_SEED: state}
     raise TriggerError(
         f"the trigger cannot generate the code: {dict(attrs)}",
-        possible=f"prbs with known taps and a seed, constant, memory of 1 to {device.code_bits} bits",
+        possible=f"prbs with known taps and a state, constant, memory of 1 to {device.code_bits} bits",
     )
 
 

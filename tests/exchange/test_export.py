@@ -141,7 +141,11 @@ def test_lines_and_tags_of_a_recording(
         missing = (saved["flags"] & LineFlag.MISSING) != 0
         assert [np.flatnonzero(arm).tolist() for arm in missing] == [[], [*range(10, 15)]]
         facts = json.loads(str(saved["facts"]))
-    assert (facts["first_line"], facts["run_condition"], facts["code"]["seed"]) == (120, "INCOMPLETE", "0x4d")
+    assert (facts["first_line"], facts["run_condition"], facts["code"]["state"]) == (
+        120,
+        "INCOMPLETE",
+        "0x4d",
+    )
     with tifffile.TiffFile(tmp_path / "l.tif") as file:
         assert file.series[0].axes == "CYX"
         np.testing.assert_array_equal(file.asarray(), cut.lines)

@@ -32,7 +32,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
 def galois_bits(code: dict[str, Any], count: int) -> np.ndarray:
     """The recorded code, one register step per bit."""
     mask = sum(1 << (tap - 1) for tap in code["taps"])
-    state, bits = int(code["seed"], 16), np.empty(count, np.int64)
+    state, bits = int(code["state"], 16), np.empty(count, np.int64)
     for k in range(count):
         bits[k] = state & 1
         state = (state >> 1) ^ (mask if bits[k] else 0)

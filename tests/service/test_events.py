@@ -170,7 +170,7 @@ def test_light_that_comes_late_is_told_flagged_and_taints(tmp_path: Path) -> Non
     told = recording.attrs["ledger"]["tainted_by"]
     assert told["code_contradicted_a"] == told["code_contradicted_b"] == 2000
     for arm in "ab":
-        assert np.all(recording.camera(arm).flags[:] & LineFlag.CODE_UNVERIFIED)
+        assert np.all(recording.camera(arm).flags[:] & LineFlag.CODE_CONTRADICTED)
     assert [event.text for event in recording.events if event.kind == "code_check"] == [
         "arm a shifted, arm b shifted"
     ]

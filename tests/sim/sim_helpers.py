@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.codes import PrbsCode, mix_seed
+from acquire.codes import PrbsCode
 from acquire.config import GeometryConfig
 from acquire.config.device import CameraConfig
 from acquire.config.scene import ConstantDrive, LedConfig, LedSceneConfig, SineDrive
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from acquire.sim.clock import Wire
     from acquire.sim.scene import Scene
 
-CODE = PrbsCode(23, mix_seed(7, 23))
+CODE = PrbsCode.from_seed(23, 7)
 LEDS = LedSceneConfig(
     kind="leds",
     title="two LEDs",

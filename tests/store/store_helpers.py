@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.clock import ClockFit
-from acquire.codes import PrbsCode, mix_seed
+from acquire.codes import PrbsCode
 from acquire.geometry import Geometry
 from acquire.lines import ARMS, TaggedBlock
 from acquire.store import RecordingSpec
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from acquire.store import RecordingWriter
 
 CLOCK = ClockFit(90_000_000, 1_790_000_000_123_456_789, 1500)
-CODE = PrbsCode(64, mix_seed(7, 64))
+CODE = PrbsCode.from_seed(64, 7)
 CAMERA = {"white_dn": 4095, "black_level_dn": 10.0, "responsivity_dn": 6.0, "DeviceSerialNumber": "S"}
 
 

@@ -18,7 +18,7 @@ from store_helpers import CLOCK, Truth, check_rows, fill, make_spec
 
 from acquire.errors import DataError, PlaceError, StoreError, UsageError
 from acquire.lines import ARMS, LineFlag
-from acquire.store import FORMAT, Event, Gap, RecordingWriter, RunCondition, open_recording
+from acquire.store import FORMAT, Event, Gap, RecordingWriter, RunCondition, open_recording, verify
 
 
 @pytest.fixture
@@ -167,7 +167,7 @@ def test_attributes_say_what_the_run_was(path):
     spec = make_spec()
     RecordingWriter.create(path, spec).close()
     attrs = dict(zarr.open_group(path, mode="r").attrs)
-    assert attrs["format"] == "acquire-recording/1"
+    assert attrs["format"] == "acquire-recording/2"
     assert attrs["layout"] == "dual"
     assert attrs["state"] == "recording"
     assert attrs["run_condition"] is None
@@ -377,7 +377,7 @@ def test_what_is_not_a_recording_says_so(path, tmp_path):
     with pytest.raises(PlaceError, match="not a recording: it holds no"):
         open_recording(tmp_path)
     zarr.create_group(tmp_path / "other.zarr")
-    with pytest.raises(PlaceError, match=r"format None.*possible: 'acquire-recording/1'"):
+    with pytest.raises(PlaceError, match=r"format None.*possible: 'acquire-recording/1', 'acq"):
         open_recording(tmp_path / "other.zarr")
 
 
@@ -403,8 +403,8 @@ def test_damaged_metadata_is_told(path, change, message):
 def test_a_newer_format_is_told(path):
     with RecordingWriter.create(path, make_spec()) as writer:
         seal(writer)
-    damage_root(path, lambda d: d["attributes"].update(format="acquire-recording/2"))
-    with pytest.raises(PlaceError, match=r"acquire-recording/2.*newer version"):
+    damage_root(path, lambda d: d["attributes"].update(format="acquire-recording/3"))
+    with pytest.raises(PlaceError, match=r"acquire-recording/3.*newer version"):
         open_recording(path)
 
 
@@ -451,3 +451,22 @@ def test_a_seal_that_failed_can_be_repeated(path):
     (path / "elsewhere").rename(flags)
     seal(writer, RunCondition.INCOMPLETE)
     check_rows(zarr.open_group(path, mode="r"), spec, 20)
+
+
+def test_a_recording_of_format_1_opens_and_has_the_same_code(path):
+    """There the register's state was called the seed."""
+    with RecordingWriter.create(path, make_spec()) as writer:
+        fill(writer, 400)
+        seal(writer)
+    code = open_recording(path).cut(1000, 100).code
+
+    def as_it_was(document):
+        attributes = document["attributes"]
+        attributes["format"] = "acquire-recording/1"
+        attributes["code"].update(seed=attributes["code"].pop("state"))
+
+    damage_root(path, as_it_was)
+    recording = open_recording(path)
+    assert recording.attrs["format"] == "acquire-recording/1"
+    np.testing.assert_array_equal(recording.cut(1000, 100).code, code)
+    assert (verify(path).damage, verify(path).contradictions) == ((), ())

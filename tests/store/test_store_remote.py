@@ -72,7 +72,7 @@ def test_a_recording_is_the_same_far_away(path, place):
     assert there.info()["path"] == place
     assert there.info()["bytes"] == done.bytes
     assert verify(place).damage == ()
-    assert format_of(place) == "acquire-recording/1"
+    assert format_of(place) == "acquire-recording/2"
     again = mirror(path, place)
     assert (again.shards, again.lines) == (0, 150)
 

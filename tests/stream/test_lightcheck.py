@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 
-from acquire.codes import Code, ConstantCode, PrbsCode, mix_seed
+from acquire.codes import Code, ConstantCode, PrbsCode
 from acquire.config import load_rig, load_scene
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
@@ -137,7 +137,7 @@ def test_a_constant_light_tells_nothing_of_a_code(value: int, verdict: Verdict) 
 def test_the_prediction_is_the_forward_model_s(substeps: int) -> None:
     """Of a scene that does not change, from the other arm's pixels, up to one factor."""
     geometry = Geometry(6, substeps, 40)
-    code = PrbsCode(20, mix_seed(1, 20)).bits(0, geometry.span)
+    code = PrbsCode.from_seed(20, 1).bits(0, geometry.span)
     row = np.repeat(np.random.default_rng(5).random(6), substeps)  # as fine as the other arm's pixels
     picture = np.outer(row, np.ones(geometry.size))
     lines = DualArm(geometry, code, dtype=np.float64).forward(

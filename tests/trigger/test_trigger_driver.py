@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from trigger_twins import CLOCK_HZ, CODE, run, wired_model
 
+from acquire.codes import code_from_attrs
 from acquire.config.device import TriggerConfig
 from acquire.errors import TriggerError
 from acquire.sim.clock import Wire
@@ -179,7 +180,10 @@ def test_the_wire_carries_what_the_registers_say() -> None:
     driver.prepare(run())
     driver.start()
     train = wire.look().train
-    assert (float(train.line_period_ns), dict(train.code)) == (30_000.0, CODE.to_attrs())
+    assert float(train.line_period_ns) == 30_000.0
+    assert (
+        code_from_attrs(train.code) == CODE
+    )  # whatever number its user gave is nothing that a register holds
     lines = driver.stop()
     assert (wire.look().issued, wire.look().stopped) == (lines, True)
     driver.close()

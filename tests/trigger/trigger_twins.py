@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from fake_bus import FakeBus
 
 import firmware.cxxrtl
-from acquire.codes import PrbsCode, mix_seed
+from acquire.codes import PrbsCode
 from acquire.config.device import TriggerConfig
 from acquire.sim.clock import Wire
 from acquire.sim.trigger_model import TriggerModel
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from acquire.trigger.transports import Transport
 
 CLOCK_HZ = 90_000_000
-CODE = PrbsCode(64, mix_seed(3, 64))
+CODE = PrbsCode.from_seed(64, 3)
 
 
 @dataclass

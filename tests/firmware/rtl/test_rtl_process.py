@@ -16,7 +16,7 @@ import acquire.sim.rtl
 from acquire.cli.demo.capture import record
 from acquire.cli.demo.plan import DemoPlan, trigger_settings
 from acquire.cli.journal import Journal
-from acquire.codes import PrbsCode, mix_seed
+from acquire.codes import PrbsCode
 from acquire.config import load_rig
 from acquire.config.device import TriggerConfig
 from acquire.errors import DeviceError, TriggerError, UsageError
@@ -29,7 +29,7 @@ from acquire.trigger.base import TriggerRun
 from acquire.trigger.driver import TriggerDriver
 
 CLOCK_HZ, TICKS = 6_000_000, 60
-CODE = PrbsCode(64, mix_seed(3, 64))
+CODE = PrbsCode.from_seed(64, 3)
 
 
 @pytest.fixture

@@ -77,9 +77,9 @@ def test_the_register_stands_where_the_host_says_it_does(bench: Bench) -> None:
     driver.start()
     until(lambda: driver.device().status().state == State.ENDED)
     state = driver.device().read(r.CODE_STATE)
-    assert state == prbs_state(MASK, CODE.seed, 3 * 299)
+    assert state == prbs_state(MASK, CODE.state, 3 * 299)
     ahead = [prbs_state(MASK, state, k) & 1 for k in range(3)]
-    assert ahead == prbs(64, CODE.seed, 3 * 299, 3).tolist()
+    assert ahead == prbs(64, CODE.state, 3 * 299, 3).tolist()
 
 
 @given(
