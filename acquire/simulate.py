@@ -231,7 +231,7 @@ def _spec(config: RigConfig, scene: SceneConfig) -> RecordingSpec:
         trigger={**trigger, "settings": config.trigger.model_dump(mode="json")},
         cameras=cameras,
         config=config.model_dump(mode="json"),
-        extra=describe(scene) | handed_on(config, scene.optics.layout),
+        extra=describe(scene) | handed_on(config, scene.optics.layout).attrs,
         chunk_lines=config.chunk_lines,
         shard_chunks=recording.shard_chunks,
         tag_chunks=config.tag_chunks,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -9,7 +10,7 @@ from acquire.calibrate.apply import calibration_of, check_fits
 from acquire.calibrate.calibration import Calibration, Instrument, differing
 from acquire.calibrate.file import open_calibration
 from acquire.calibrate.orientation import MODEL, view_named
-from acquire.errors import AcquireError, ConfigError
+from acquire.errors import AcquireError, ConfigError, PlaceError
 from acquire.lines import ARMS
 
 if TYPE_CHECKING:
@@ -73,25 +74,40 @@ def provenance(known: Calibration | None) -> dict[str, Any] | None:
     return {"corrected": corrected(known), "steps": steps}
 
 
-def handed_on(config: RigConfig, layout: str) -> dict[str, Any]:
-    """The attribute ``calibration`` that a rig's recordings get; nothing where the rig names none.
+@dataclass(frozen=True, slots=True)
+class Handed:
+    """What a rig's recordings get: attributes, and in words what they carry; None: the rig names none."""
 
-    Raises ConfigError where the calibration is not there, damaged, or of another instrument.
+    attrs: dict[str, Any]
+    place: Path | None = None
+    text: str | None = None
+
+
+def handed_on(config: RigConfig, layout: str) -> Handed:
+    """The attribute ``calibration`` that a rig's recordings get; ``calibration_missing``, its place, where it
+    is not there (yet): it is made with this rig, and can be put to the recordings afterwards.
+
+    Raises ConfigError where the calibration is damaged, cannot be read, or is of another instrument.
     """
-    if config.calibration is None:
-        return {}
+    place = config.calibration
+    if place is None:
+        return Handed({})
     try:
-        known = open_calibration(config.calibration)
+        known = open_calibration(place)
     except AcquireError as error:
+        if isinstance(error, PlaceError) and not os.path.lexists(place):
+            text = f"none: {place} is not there; acquire calibrate all --out {place} makes it"
+            return Handed({"calibration_missing": str(place)}, place, text)
         raise ConfigError(
             f"calibration: {error.message}", possible=error.possible, hint=error.hint
         ) from error
     if differences := differing(known.instrument, configured(config, layout)):
         raise ConfigError(
-            f"calibration: {config.calibration} is not of rig {config.name}: " + "; ".join(differences),
-            hint="acquire calibrate, to make one of it",
+            f"calibration: {place} is not of rig {config.name}: " + "; ".join(differences),
+            hint="acquire arm --without-calibration, and acquire calibrate all with another --out",
         )
-    return {"calibration": known.to_attrs()}
+    text = f"{place}: {', '.join(known.steps)}"
+    return Handed({"calibration": known.to_attrs()}, place, text)
 
 
 def configured(config: RigConfig, layout: str) -> Instrument:

@@ -142,7 +142,7 @@ def _record(daemon: Client, step: Step, directory: Path, lines: int) -> Exposure
 
     if daemon.status().state == "armed":
         daemon.disarm()
-    daemon.arm(code=step.code)
+    daemon.arm(code=step.code, calibration="none")
     path = _free(directory, step.name)
     status = daemon.start(path, lines=lines)
     rates = [arm.rate_hz for arm in status.arms.values() if arm.rate_hz > 0]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from acquire.cli.durations import seconds
-from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, quantity, say
+from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, print_warning, quantity, say
 from acquire.errors import DataError, UsageError
 
 if TYPE_CHECKING:
@@ -47,6 +47,12 @@ def arm(
     code: Annotated[
         str, typer.Option(help="What the light follows: rig, its code; dark, it stays off; steady, on.")
     ] = "rig",
+    without_calibration: Annotated[
+        bool,
+        typer.Option(
+            "--without-calibration", help="Recordings get no copy of the calibration in the rig file."
+        ),
+    ] = False,
     socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
@@ -60,7 +66,11 @@ def arm(
     Example: [bold]acquire arm[/]
     """
     with _daemon(socket) as daemon:
-        _show(daemon.arm(force=force, code=code), json)  # type: ignore[arg-type]  # checked there
+        calibration = "none" if without_calibration else "rig"
+        status = daemon.arm(force=force, code=code, calibration=calibration)  # type: ignore[arg-type]  # checked there
+    _show(status, json)
+    if status.calibration is not None and not status.calibration.carried:
+        print_warning(f"recordings carry no calibration: {status.calibration.text}")
 
 
 def start(
@@ -185,6 +195,7 @@ def _show(status: Status, json: bool) -> None:
             "disk": _disk(status.disk),
             "trigger": _trigger(status.trigger),
             "sustains": _capacity(status),
+            "calibration": status.calibration and status.calibration.text,
             "troubles": _troubles(status),
             "possible": ", ".join(status.possible),
         }

@@ -311,7 +311,7 @@ def _readable(facts: dict[str, Any]) -> dict[str, Any]:
         "at risk": _at_risk(facts["durability"]),
         "lost lines": ", ".join(f"{arm} {count}" for arm, count in facts["lost_lines"].items()),
         "in doubt": _suspect(facts["suspect"]),
-        "calibration": _calibration(facts["calibration"]),
+        "calibration": _calibration(facts["calibration"], facts["calibration_missing"]),
         "simulated": "yes" if facts["simulated"] else "no",
         "imported": _imported(facts["imported"]),
         "written by": f"acquire {facts['versions']['acquire']}",
@@ -330,8 +330,10 @@ def _imported(found: dict[str, Any] | None) -> str | None:
     return f"from {', '.join(files)}; not known: {'; '.join(map(str, found.get('unknown', ())))}"
 
 
-def _calibration(found: dict[str, Any] | None) -> str | None:
+def _calibration(found: dict[str, Any] | None, missing: str | None) -> str | None:
     """Which steps of a calibration the recording carries, and since when the newest is known."""
+    if missing is not None:
+        return f"none: {missing}, which the rig named, was not there"
     steps = {} if found is None else dict(found.get("steps", {}))
     if not steps:
         return None

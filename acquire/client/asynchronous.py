@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import ssl
 import time
-from typing import TYPE_CHECKING, Self, TypeVar
+from typing import TYPE_CHECKING, Literal, Self, TypeVar
 
 import h11
 from pydantic import BaseModel
@@ -14,7 +14,7 @@ from pydantic import BaseModel
 from acquire.client import core
 from acquire.client.core import Call, EventReader, Target
 from acquire.daemon.facts import Health, News, Rings, Setup, Version
-from acquire.daemon.messages import CapacityStatus, LightCode, Status
+from acquire.daemon.messages import CapacityStatus, LightCode, Status, TriggerDelays
 from acquire.daemon.peer import connect
 from acquire.errors import NoDaemonError
 
@@ -48,10 +48,17 @@ class AsyncClient:
         """A call has its own connection: nothing is left to be closed."""
 
     async def arm(
-        self, *, force: bool = False, code: LightCode = "rig", request_id: str | None = None
+        self,
+        *,
+        force: bool = False,
+        code: LightCode = "rig",
+        calibration: Literal["rig", "none"] = "rig",
+        delays: TriggerDelays | None = None,
+        request_id: str | None = None,
     ) -> Status:
         """idle → armed; the light follows ``code``."""
-        return await self.call(core.arm(force=force, code=code, request_id=request_id))
+        how = {"force": force, "code": code, "calibration": calibration, "delays": delays}
+        return await self.call(core.arm(request_id=request_id, **how))
 
     async def start(
         self,

@@ -8,14 +8,14 @@ import select
 import socket
 import ssl
 import time
-from typing import TYPE_CHECKING, Self, TypeVar
+from typing import TYPE_CHECKING, Literal, Self, TypeVar
 
 from pydantic import BaseModel
 
 from acquire.client import core
 from acquire.client.core import Call, EventReader, Target
 from acquire.daemon.facts import Health, News, Rings, Setup, Version
-from acquire.daemon.messages import CapacityStatus, LightCode, Status
+from acquire.daemon.messages import CapacityStatus, LightCode, Status, TriggerDelays
 from acquire.daemon.peer import connect
 from acquire.daemon.starting import is_one_starting
 from acquire.daemon.states import State
@@ -74,12 +74,23 @@ class Client:
 
     # ---- commands
 
-    def arm(self, *, force: bool = False, code: LightCode = "rig", request_id: str | None = None) -> Status:
+    def arm(
+        self,
+        *,
+        force: bool = False,
+        code: LightCode = "rig",
+        calibration: Literal["rig", "none"] = "rig",
+        delays: TriggerDelays | None = None,
+        request_id: str | None = None,
+    ) -> Status:
         """idle → armed: cameras and trigger run, nothing is written. ``force``: however slow the host.
 
         ``code``: what the light follows; ``"dark"`` is off and ``"steady"`` on, as calibration needs it.
+        ``calibration="none"``: recordings get no copy of the one that the rig names. ``delays``: of light and
+        cameras, in place of the rig's.
         """
-        return self._do(core.arm(force=force, code=code, request_id=request_id))
+        how = {"force": force, "code": code, "calibration": calibration, "delays": delays}
+        return self._do(core.arm(request_id=request_id, **how))
 
     def start(
         self,

@@ -23,7 +23,6 @@ from acquire.daemon.facts import News
 from acquire.daemon.messages import (
     ArmRequest,
     ErrorMessage,
-    LightCode,
     MarkRequest,
     StartRequest,
     Status,
@@ -149,8 +148,8 @@ def command(
     return Call("POST", name, answer, body, request_id=request_id or secrets.token_hex(16))
 
 
-def arm(*, force: bool, code: LightCode, request_id: str | None) -> Call[Status]:
-    return command("arm", Status, request("arm", ArmRequest, force=force, code=code), request_id)
+def arm(*, request_id: str | None, **how: Any) -> Call[Status]:
+    return command("arm", Status, request("arm", ArmRequest, **how), request_id)
 
 
 def start(path: Path | str | None, request_id: str | None, **budget: Any) -> Call[Status]:

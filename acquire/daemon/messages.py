@@ -40,6 +40,14 @@ LightCode = Literal["rig", "dark", "steady"]
 """What the light follows in a run: the rig's code, or off, or on, as calibration asks for."""
 
 
+class TriggerDelays(Message):
+    """When light and lines start beside each other, in ticks of the trigger's clock."""
+
+    light_lead: int = Field(ge=0, le=255, description="by which light precedes its sub-step")
+    a: int = Field(ge=0, lt=2**24, description="from a line's start to camera A's pulse")
+    b: int = Field(ge=0, lt=2**24)
+
+
 class ArmRequest(Message):
     """How to arm."""
 
@@ -48,6 +56,12 @@ class ArmRequest(Message):
         description="what the light follows: the rig's code; 'dark': it stays off; 'steady': it stays on",
     )
 
+    calibration: Literal["rig", "none"] = Field(
+        default="rig", description="'none': recordings get no copy of the one that the rig names"
+    )
+    delays: TriggerDelays | None = Field(
+        default=None, description="in place of the rig's, as a search for them asks"
+    )
     force: bool = Field(
         default=False,
         strict=True,
@@ -276,6 +290,14 @@ class TroubleStatus(Message):
     last: datetime
 
 
+class CalibrationStatus(Message):
+    """What recordings of this run carry of a calibration."""
+
+    path: Place | None = Field(description="of the calibration that the rig names")
+    carried: bool = Field(description="recordings get a copy")
+    text: Text
+
+
 class Status(Message):
     """What the daemon is doing, and how well."""
 
@@ -300,6 +322,9 @@ class Status(Message):
     trigger: TriggerStatus | None = Field(default=None, description="null: not armed")
     disk: DiskStatus | None = Field(default=None, description="null: it has not been seen yet")
     capacity: CapacityStatus | None = None
+    calibration: CalibrationStatus | None = Field(
+        default=None, description="null: not armed, or the rig names none"
+    )
     processes: dict[str, int] = Field(default={}, description="of the run: name → process number")
     recoveries: list[RecoveryStatus] = Field(
         default=[], description="the latest recordings that were not sealed"

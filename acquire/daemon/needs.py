@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from acquire.daemon.messages import CapacityStatus, LightCode
+    from acquire.daemon.messages import ArmRequest, CalibrationStatus, CapacityStatus
     from acquire.stream import CaptureStatus, Window
     from acquire.stream.messages import Note
     from acquire.stream.ring import RingShape
@@ -19,6 +19,8 @@ class Run(Protocol):
 
     run_id: str
 
+    @property
+    def calibration(self) -> CalibrationStatus | None: ...
     def arm(self, tell: Callable[[str], object]) -> None: ...
     def start(self, path: Path, lines: int | None, window: Window, *, resume: bool = False) -> Path: ...
     def mark(self, text: str) -> Note: ...
@@ -32,9 +34,9 @@ class Run(Protocol):
 
 
 class OpenRun(Protocol):
-    """Makes the next run, whose light follows ``code``."""
+    """Makes the next run, as it is asked to be armed."""
 
-    def __call__(self, code: LightCode = "rig") -> Run: ...
+    def __call__(self, request: ArmRequest) -> Run: ...
 
 
 class Prove(Protocol):

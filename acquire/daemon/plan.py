@@ -10,19 +10,21 @@ from typing import TYPE_CHECKING, Any
 
 from acquire.calibrate.choose import handed_on
 from acquire.config import ConstantCodeConfig
+from acquire.daemon.messages import CalibrationStatus
 from acquire.daemon.storage import choose_for, storage_settings
 from acquire.daemon.watching import watch_plan
 from acquire.store import RecordingSpec, next_segment
 from acquire.stream import NOW, Capture, CapturePlan
 from acquire.stream.messages import Note
-from acquire.trigger.base import TriggerRun
+from acquire.trigger.base import Delays, TriggerRun
+from acquire.trigger.settings import with_delays
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
     from acquire.config import RigConfig
-    from acquire.daemon.messages import LightCode
+    from acquire.daemon.messages import ArmRequest, LightCode
     from acquire.rig import Rig
     from acquire.store import Codec, CodecChoice
     from acquire.stream import CaptureStatus, Window
@@ -46,6 +48,14 @@ class Run:
         self._choice: CodecChoice | None = None
         self._calibration = handed_on(config, rig.layout)
         self._capture = Capture(capture_plan(config, rig, self.run_id), rig.trigger)
+
+    @property
+    def calibration(self) -> CalibrationStatus | None:
+        """What recordings carry of the calibration that the rig names; None where it names none."""
+        handed = self._calibration
+        if handed.text is None:
+            return None
+        return CalibrationStatus(path=handed.place, carried="calibration" in handed.attrs, text=handed.text)
 
     @property
     def _codec(self) -> Codec:
@@ -124,7 +134,7 @@ class Run:
             cameras={arm: self._camera(arm, facts) for arm, facts in self._capture.cameras.items()},
             config=config.model_dump(mode="json"),
             extra=self._rig.describe()
-            | self._calibration
+            | self._calibration.attrs
             | ({"codec_choice": self._choice.to_attrs()} if self._choice else {}),
             codec=self._codec,
             layout=self._rig.layout,
@@ -140,6 +150,18 @@ class Run:
         }
         lines = self._capture.poll().lines.get(arm, {})
         return {**calibration, **facts, "clock": lines.get("clock", {})}
+
+
+def armed_as(config: RigConfig, request: ArmRequest) -> RigConfig:
+    """The rig as a run of it is asked for."""
+    config = with_code(config, request.code)
+    if request.calibration == "none":
+        config = config.model_copy(update={"calibration": None})
+    if request.delays is None:
+        return config
+    delays = request.delays
+    trigger = with_delays(config.trigger, Delays(delays.light_lead, delays.a, delays.b))
+    return config.model_copy(update={"trigger": trigger})
 
 
 def with_code(config: RigConfig, code: LightCode) -> RigConfig:
@@ -190,6 +212,7 @@ def trigger_run(config: RigConfig, run_id: str) -> TriggerRun:
         substeps=config.geometry.substeps,
         substep_ticks=config.trigger.substep_ticks,
         tag_every_lines=config.trigger.tag_every_lines,
+        delays=Delays.of(config.trigger),
     )
 
 

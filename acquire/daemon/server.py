@@ -23,10 +23,10 @@ from acquire.daemon.control import build_app
 from acquire.daemon.ending import END_S, LastResort, leave
 from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.hooks import Hooks
-from acquire.daemon.messages import LightCode
+from acquire.daemon.messages import ArmRequest
 from acquire.daemon.notify import notify
 from acquire.daemon.page import Page
-from acquire.daemon.plan import Run, with_code, worker_modules
+from acquire.daemon.plan import Run, armed_as, worker_modules
 from acquire.daemon.proof import Proof
 from acquire.daemon.salvage import Salvage
 from acquire.daemon.service import Service
@@ -74,8 +74,8 @@ def serve(config: RigConfig, origin: str = "") -> int:
         uploads.begin()
         proof = Proof(config)
 
-        def open_run(code: LightCode = "rig") -> Run:
-            return Run(with_code(config, code), rig, proof.choose)
+        def open_run(request: ArmRequest) -> Run:
+            return Run(armed_as(config, request), rig, proof.choose)
 
         service = Service(config, open_run, proof, salvage, uploads, troubles)
         service.origin = origin

@@ -127,12 +127,14 @@ class Service:
             self._uploads.prove(force=request.force)
             if self._prove is not None:
                 self._capacity = self._prove(force=request.force, tell=self._tell)
-            run = self._open_run() if request.code == "rig" else self._open_run(request.code)
+            run = self._open_run(request)
             run.arm(self._tell)
             self._run, self._seen, self._rates = run, CaptureStatus(), Rates()
             self.armed_since = datetime.now(UTC)
             self._order = StandingOrder(self._config)
             self._go(Event.ARM, run.run_id)
+            if run.calibration is not None and not run.calibration.carried:
+                log.warning("calibration: %s", run.calibration.text)
             self.supervise()
 
     def start(self, request: StartRequest) -> None:
@@ -472,6 +474,7 @@ class Service:
             waiting=self._seen.waiting or None,
             fault=self._fault,
             capacity=self._capacity,
+            calibration=None if self._run is None else self._run.calibration,
             processes={} if self._run is None else self._seen.pids,
             recoveries=self._salvage.recoveries,
             uploads=self._uploads.statuses,

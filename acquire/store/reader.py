@@ -264,6 +264,7 @@ class Recording:
             "cameras": self.attrs["cameras"],
             "imported": self.attrs.get("imported"),
             "calibration": self.attrs.get("calibration"),
+            "calibration_missing": self.attrs.get("calibration_missing"),
             "disk": self._disk_facts(),
             "ledger": self.attrs["ledger"],
             "durability": self.attrs.get("durability", {}),

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 if TYPE_CHECKING:
     from acquire.clock import ClockFit
     from acquire.codes import Code
+    from acquire.config.device import TriggerConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,6 +27,20 @@ class TriggerIdentity:
 
 
 @dataclass(frozen=True, slots=True)
+class Delays:
+    """When light and camera lines start beside a line's own start, in ticks of the trigger's clock."""
+
+    light_lead_ticks: int
+    a_ticks: int
+    b_ticks: int
+
+    @classmethod
+    def of(cls, config: TriggerConfig) -> Delays:
+        """As a rig has them."""
+        return cls(config.light.lead_ticks, config.a.delay_ticks, config.b.delay_ticks)
+
+
+@dataclass(frozen=True, slots=True)
 class TriggerRun:
     """What one run asks of the trigger; a trigger that cannot honour it refuses in `Trigger.prepare`."""
 
@@ -36,6 +51,8 @@ class TriggerRun:
     substep_ticks: int
     """Duration of a sub-step in ticks of the trigger's clock."""
     tag_every_lines: int
+    delays: Delays | None = None
+    """In place of what the trigger was configured with."""
 
     @property
     def line_period_ticks(self) -> int:

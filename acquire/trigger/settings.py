@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.config.device import LightOutputConfig, LineOutputConfig, TriggerConfig
-    from acquire.trigger.base import TriggerRun
+    from acquire.trigger.base import Delays, TriggerRun
 
 _DEFAULT_WIDTH = 90
 _TWINS = (r.Board.NONE, r.Board.MODEL)
@@ -113,6 +113,8 @@ def register_values(
     run: TriggerRun, config: TriggerConfig, device: Capabilities, bytes_per_s: float
 ) -> dict[r.Register, int]:
     """Every config register's value. Raises TriggerError for what the device or its link cannot do."""
+    if run.delays is not None:
+        config = with_delays(config, run.delays)
     _check_timing(run, config, device)
     distance = run.substep_ticks if config.line_start == "per-substep" else run.line_period_ticks
     _check_pulses(config, distance)
@@ -138,6 +140,17 @@ def register_values(
             enable=config.external_start != "off", invert=config.external_start == "falling"
         ),
     }
+
+
+def with_delays(config: TriggerConfig, delays: Delays) -> TriggerConfig:
+    """The configuration with other delays."""
+    return config.model_copy(
+        update={
+            "light": config.light.model_copy(update={"lead_ticks": delays.light_lead_ticks}),
+            "a": config.a.model_copy(update={"delay_ticks": delays.a_ticks}),
+            "b": config.b.model_copy(update={"delay_ticks": delays.b_ticks}),
+        }
+    )
 
 
 def _check_timing(run: TriggerRun, config: TriggerConfig, device: Capabilities) -> None:

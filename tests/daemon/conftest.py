@@ -28,7 +28,7 @@ def run() -> FakeRun:
 
 @pytest.fixture
 def service(path: Path, run: FakeRun) -> Service:
-    return Service(rig_config(path.parent), lambda: run)
+    return Service(rig_config(path.parent), lambda _: run)
 
 
 @pytest.fixture

@@ -323,7 +323,7 @@ def test_commands_that_wait_are_bounded(path: Path, run: FakeRun, monkeypatch: p
 
     async def crowd() -> list[object]:
         with contextlib.closing(Endpoint(path)) as endpoint:
-            daemon = server_module.Daemon(Service(rig_config(path.parent), lambda: run), endpoint)
+            daemon = server_module.Daemon(Service(rig_config(path.parent), lambda _: run), endpoint)
             arming = [asyncio.create_task(daemon._command(daemon._service.arm)) for _ in range(5)]
             _, waiting = await asyncio.wait(arming, return_when=asyncio.FIRST_COMPLETED)
             run.may_arm.set()

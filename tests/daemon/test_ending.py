@@ -69,7 +69,7 @@ class Hung(FakeRun):
         threading.Event().wait()
 
 async def live():
-    service = Service(rig_config(socket.parent), Hung)
+    service = Service(rig_config(socket.parent), lambda _: Hung())
     daemon = server.Daemon(service, endpoint)
     service.arm()
     asyncio.get_running_loop().call_later(0.1, os.kill, os.getpid(), signal.SIGTERM)

@@ -160,7 +160,7 @@ def test_a_disk_that_fills_is_told_once() -> None:
 
 
 def test_what_nobody_foresaw_is_told_every_time_it_happens(tmp_path: Path) -> None:
-    service = Service(rig_config(tmp_path), FakeRun)
+    service = Service(rig_config(tmp_path), lambda _: FakeRun())
     for _ in range(2):
         service.troubles.note("thread x", ValueError("oh"))
         service.supervise()
@@ -171,7 +171,7 @@ def test_what_nobody_foresaw_is_told_every_time_it_happens(tmp_path: Path) -> No
 
 def test_the_service_tells_states_marks_and_faults(tmp_path: Path) -> None:
     run = FakeRun()
-    service = Service(rig_config(tmp_path), lambda: run)
+    service = Service(rig_config(tmp_path), lambda _: run)
     service.arm(ArmRequest())
     service.start(StartRequest(path=tmp_path / "x.zarr"))
     service.mark("the valve\nopens")

@@ -132,7 +132,7 @@ def test_every_alert_is_on_a_metric_that_there_is(tmp_path: Path) -> None:
     rules = (builtin_directory() / "prometheus-alerts.yml").read_text()
     named = set(re.findall(r"acquire_\w+", rules))
     assert len(named) >= 8
-    service = Service(rig_config(tmp_path), FakeRun)
+    service = Service(rig_config(tmp_path), lambda _: FakeRun())
     service.arm(ArmRequest())
     ledger = {"issued": 1, "preroll": 0, "stored": 1, "discarded": 0, "lost": {}, "waiting": 0, "pending": 0}
     check = {"verdict": "verified", "shift": 0, "checked_line": 1, "lapped": 0}

@@ -126,7 +126,7 @@ def test_the_service_stays_idle_and_asks_no_device(tmp_path: Path) -> None:
     def too_slow(*, force: bool, tell: Callable[[str], object]) -> CapacityStatus:
         raise UsageError(f"too slow, {force}")
 
-    def no_run() -> None:
+    def no_run(request: object) -> None:
         raise AssertionError("devices were opened")
 
     service = Service(load_rig("rig-demo"), no_run, too_slow)  # type: ignore[arg-type]

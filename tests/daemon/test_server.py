@@ -50,7 +50,7 @@ def live(path: Path, run: FakeRun, script: Script) -> int:
             os.kill(os.getpid(), signal.SIGTERM)
 
     async def both() -> int:
-        daemon = Daemon(Service(rig_config(path.parent), lambda: run), endpoint)
+        daemon = Daemon(Service(rig_config(path.parent), lambda _: run), endpoint)
         running = asyncio.ensure_future(daemon.run())
         await asyncio.sleep(0)  # signals are taken from here on
         acting.append(threads.submit(user))
@@ -133,7 +133,7 @@ def test_a_daemon_that_cannot_answer_is_never_ready(
     monkeypatch.setattr(ApiServer, "startup", fail)
 
     async def run() -> int:
-        return await Daemon(Service(rig_config(path.parent), FakeRun), endpoint).run()
+        return await Daemon(Service(rig_config(path.parent), lambda _: FakeRun()), endpoint).run()
 
     with (
         caplog.at_level("INFO"),

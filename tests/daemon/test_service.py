@@ -10,7 +10,7 @@ from fake_run import FakeRun, rig_config
 from waiting import until
 
 from acquire.config import load_rig
-from acquire.daemon.messages import StartRequest
+from acquire.daemon.messages import ArmRequest, StartRequest
 from acquire.daemon.service import Service
 from acquire.daemon.states import State
 from acquire.errors import CameraError, DeviceError, StateError, UsageError
@@ -27,7 +27,7 @@ class Bed:
         self.opened = 0
         self.service = Service(rig_config(directory, **settings), self._open)
 
-    def _open(self) -> FakeRun:
+    def _open(self, request: ArmRequest) -> FakeRun:
         self.opened += 1
         return self.run
 

@@ -100,9 +100,17 @@ def test_one_of_another_instrument_is_not_handed_on(cal: Path, tmp_path: Path) -
     other = {"cameras.a.serial": "ELSEWHERE", "calibration": str(cal)}
     with pytest.raises(ConfigError, match="serial SIM-A is ELSEWHERE"):
         record(tmp_path / "new.zarr", lit(), "target", 60, **other)
-    with pytest.raises(ConfigError, match="does not exist"):
-        record(tmp_path / "new.zarr", lit(), "target", 60, calibration="nowhere.zarr")
+    (tmp_path / "file.zarr").write_text("no calibration")
+    with pytest.raises(ConfigError, match=r"calibration: .*file.zarr"):
+        record(tmp_path / "new.zarr", lit(), "target", 60, calibration=str(tmp_path / "file.zarr"))
     assert not (tmp_path / "new.zarr").exists()
+
+
+def test_one_that_is_not_there_yet_is_said_to_be_missing(tmp_path: Path) -> None:
+    place = tmp_path / "later.zarr"
+    record(tmp_path / "new.zarr", lit(), "target", 60, calibration=str(place))
+    attrs = open_recording(tmp_path / "new.zarr").attrs
+    assert (attrs["calibration_missing"], "calibration" in attrs) == (str(place), False)
 
 
 def test_a_rig_file_names_one_beside_itself(cal: Path) -> None:

@@ -86,7 +86,8 @@ def bench(tmp_path: Path) -> Iterator[tuple[Daemon, Callable[[str], None]]]:
         fresh.replace(tmp_path / "scene.toml")
 
     put(WHITE)
-    daemon = Daemon(tmp_path, *SETTINGS, f"simulation.scene='{tmp_path}/scene.toml'")
+    scene, cal = f"simulation.scene='{tmp_path}/scene.toml'", f"calibration='{tmp_path}/cal.zarr'"
+    daemon = Daemon(tmp_path, *SETTINGS, scene, cal)  # which is not there yet
     try:
         yield daemon, put
     finally:
@@ -131,25 +132,27 @@ def test_dark_flat_target_by_hand(bench: tuple[Daemon, Callable[[str], None]], t
     assert [each.attrs["code"]["kind"] for each in taken] == ["constant", "constant", "prbs"]
     with daemon.client() as client:
         assert client.status().state == "idle"
-    daemon.close()
-    _handed_on(tmp_path)
+    _handed_on(daemon, tmp_path)
 
 
-def _handed_on(home: Path) -> None:
-    """A daemon whose rig names the calibration gives every recording a copy."""
-    scene, cal = f"simulation.scene='{home}/scene.toml'", f"calibration='{home}/cal.zarr'"
-    daemon = Daemon(home, *SETTINGS, scene, cal)
-    try:
-        with daemon.client() as client:
-            client.arm()
-            client.start(home / "run.zarr", lines=64)
-            client.wait(SEALED, timeout_s=120)
-        carried = calibration_of(open_recording(home / "run.zarr"))
-        assert carried is not None
-        assert carried.alignment == open_calibration(home / "cal.zarr").alignment
-        assert daemon("verify", home / "run.zarr").code == 0
-    finally:
-        daemon.close()
+def _handed_on(daemon: Daemon, home: Path) -> None:
+    """From then on every recording gets a copy, unless it is asked to have none."""
+    with daemon.client() as client:
+        told = client.arm().calibration
+        assert told is not None
+        assert told.carried
+        client.start(home / "run.zarr", lines=64)
+        client.wait(SEALED, timeout_s=120)
+        client.disarm()
+        assert client.arm(calibration="none").calibration is None
+        client.start(home / "without.zarr", lines=64)
+        client.wait(SEALED, timeout_s=120)
+        client.disarm()
+    carried = calibration_of(open_recording(home / "run.zarr"))
+    assert carried is not None
+    assert carried.alignment == open_calibration(home / "cal.zarr").alignment
+    assert calibration_of(open_recording(home / "without.zarr")) is None
+    assert daemon("verify", home / "run.zarr").code == 0
 
 
 def test_what_goes_wrong_leaves_the_instrument_as_it_was(
@@ -159,7 +162,12 @@ def test_what_goes_wrong_leaves_the_instrument_as_it_was(
     daemon, _ = bench
     cal = tmp_path / "c.zarr"
     with daemon.client() as client:
-        client.arm()
+        armed = daemon("arm")
+        assert "recordings carry no calibration: none" in armed.err
+        assert client.status().calibration.path == tmp_path / "cal.zarr"
+        client.start(tmp_path / "bare.zarr", lines=64)
+        client.wait(SEALED, timeout_s=120)
+        assert "which the rig named, was not there" in daemon("info", "bare.zarr").out
         answer = daemon("calibrate", "all", "--only", "flat", "--yes", "--lines", 64, "--out", cal)
         assert answer.code == 2
         assert "offsets of the columns first" in answer.err
