@@ -21,7 +21,7 @@ from acquire.recon.segments import Stitcher
 from acquire.reconstruct.budget import Budget
 from acquire.reconstruct.times import Times
 from acquire.reconstruct.work import Task
-from acquire.store import VideoWriter
+from acquire.store import VideoGrid, VideoWriter
 from acquire.store.remote import is_url
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
     from pathlib import Path
 
-    from acquire.recon.segments import SubSegment
+    from acquire.recon.segments import Grid, SubSegment
     from acquire.reconstruct.pools import Pool
     from acquire.reconstruct.select import Request
     from acquire.reconstruct.work import Options, Part
@@ -103,9 +103,7 @@ def combine(
         out,
         (grid.side, grid.side),
         np.dtype(np.float32),
-        float(grid.voxels.spatial_merge),
-        times.substep_ns * grid.voxels.temporal_merge,
-        pixel_unit=None,
+        _place(times, grid),
         quality=True,
     ) as writer:
         for part, task, following in _solved(tasks, pool, watcher, budget):
@@ -127,6 +125,13 @@ def combine(
         facts["trusted"] = _trusted_frames(request, writer.frames, whole)
         writer.finish(facts)
     return Outcome(out, (writer.frames, grid.side, grid.side), watcher.stopped, facts, cut)
+
+
+def _place(times: Times, grid: Grid) -> VideoGrid:
+    """Where the voxels lie: in pixels of the scene at full resolution, and seconds after the first line."""
+    side, begin_s = grid.voxels.spatial_merge, (grid.begin - times.first_substep) * times.substep_ns * 1e-9
+    step = (times.substep_ns * grid.voxels.temporal_merge * 1e-9, float(side), float(side))
+    return VideoGrid(step, (begin_s, (side - 1) / 2, (side - 1) / 2), None)
 
 
 def _solved(

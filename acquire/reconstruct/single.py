@@ -28,8 +28,18 @@ def save_reconstruction(
     """
     provenance = describe(result, recording, segment)
     interval_ns = segment.substep_ns * float(provenance["parameters"]["temporal_merge"])
+    since_ns = (segment.first_line - recording.first_line) * recording.line_period_ns
+    begin_s = (since_ns + float(result.time_ns[0] - segment.time_ns[0])) * 1e-9
+    centre = (spatial_merge - 1) / 2
     write_video(
-        path, result.video, result.time_ns, float(spatial_merge), interval_ns, provenance, pixel_unit=None
+        path,
+        result.video,
+        result.time_ns,
+        float(spatial_merge),
+        interval_ns,
+        provenance,
+        pixel_unit=None,
+        origin=(begin_s, centre, centre),
     )
     return provenance
 

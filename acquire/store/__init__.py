@@ -25,7 +25,9 @@ from acquire.store.suspect import Suspect, suspect_lines
 from acquire.store.table_reader import Event, Gap
 from acquire.store.terms import Continuation, Retention
 from acquire.store.verify import Verification, verify
-from acquire.store.video import VideoFile, VideoWriter, open_video, write_video
+from acquire.store.video import VideoFile, open_video, write_video
+from acquire.store.video_layout import VideoGrid
+from acquire.store.video_writer import VideoWriter
 from acquire.store.writer import RecordingWriter
 
 __all__ = [
@@ -49,6 +51,7 @@ __all__ = [
     "Suspect",
     "Verification",
     "VideoFile",
+    "VideoGrid",
     "VideoWriter",
     "choose_codec",
     "format_of",

@@ -7,8 +7,10 @@ import shlex
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
+import xarray
 
 from acquire.cli import main
 
@@ -19,6 +21,26 @@ COMMANDS = [
     for line in block.splitlines()
     if line.startswith("acquire ")
 ]
+
+EXAMPLES = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
+
+
+def test_its_examples_run(
+    recording: Path, video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if "acquire" not in xarray.backends.list_engines():
+        pytest.skip("the package is not installed as it stands: pip install -e .")
+    shutil.copytree(recording, tmp_path / "run.zarr")
+    shutil.copytree(video, tmp_path / "video.zarr")
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {}
+    for example in EXAMPLES:
+        exec(example, names)
+    assert names["some"].sizes == {"line": 11, "pixel": 6}
+    assert set(names["video"]["0"].coords) == {"t", "y", "x", "time", "trusted"}
+    assert names["arm"]["line"].values[[0, -1]].tolist() == [100, 189]
+    names["video"].close()
+    names["arm"].close()
 
 
 def test_its_commands_run(

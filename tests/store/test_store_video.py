@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 
 import numpy as np
+import ome_zarr_models.v05
 import pytest
 import xarray
 import zarr
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from ome_zarr_models.common.omero import Omero
 
 from acquire.errors import DataError, PlaceError, UsageError
-from acquire.store import open_video, write_video
+from acquire.store import open_video, video_layout, write_video
 
 TIME = np.int64(1_790_000_000_000_000_000)
 
@@ -52,9 +55,10 @@ def test_metadata_is_ome_zarr_0_5(tmp_path):
     (dataset,) = image["datasets"]
     array = zarr.open_group(path, mode="r")[dataset["path"]]
     assert array.metadata.dimension_names == ("t", "y", "x")
-    (transformation,) = dataset["coordinateTransformations"]
-    assert transformation["type"] == "scale"
-    assert transformation["scale"] == pytest.approx([30e-6, 5.0, 5.0])
+    scale, translation = dataset["coordinateTransformations"]
+    assert (scale["type"], translation["type"]) == ("scale", "translation")
+    assert scale["scale"] == pytest.approx([30e-6, 5.0, 5.0])
+    assert translation["translation"] == [0.0, 0.0, 0.0]
 
 
 def test_without_a_known_pixel_size_space_has_no_unit(tmp_path):
@@ -63,12 +67,85 @@ def test_without_a_known_pixel_size_space_has_no_unit(tmp_path):
     assert [axis.get("unit") for axis in axes] == ["second", None, None]
 
 
-def test_xarray_opens_a_video(tmp_path):
+def test_xarray_has_times_and_places_as_coordinates(tmp_path):
     video, time_ns = make()
-    write_video(tmp_path / "v.zarr", video, time_ns, 5.0, 30_000.0, {})
+    origin = (0.5, 2.0, 2.0)
+    provenance = {"trusted": [1, 4]}
+    write_video(tmp_path / "v.zarr", video, time_ns, 5.0, 30_000.0, provenance, origin=origin)
+    with xarray.open_zarr(tmp_path / "v.zarr", chunks=None, consolidated=False) as dataset:
+        image = dataset["0"]
+        assert image.dims == ("t", "y", "x")
+        assert set(image.coords) == {"t", "y", "x", "time", "trusted"}
+        np.testing.assert_array_equal(image["time"].values.astype(np.int64), time_ns)
+        np.testing.assert_allclose(image["t"], 0.5 + np.arange(5) * 30e-6)
+        np.testing.assert_array_equal(image.sel(y=7.0, x=12.0), video[:, 1, 2])
+        np.testing.assert_array_equal(image[image["trusted"]], video[1:4])
+        moment = np.datetime64(int(time_ns[3]), "ns")
+        np.testing.assert_array_equal(image.swap_dims(t="time").sel(time=moment), video[3])
     with xarray.open_zarr(tmp_path / "v.zarr", chunks=None) as dataset:
-        assert dataset["0"].dims == ("t", "y", "x")
-        np.testing.assert_array_equal(dataset["time"].values.astype(np.int64), time_ns)
+        assert list(dataset) == ["0"]
+
+
+def test_viewers_that_take_all_arrays_of_a_group_find_the_image_alone(tmp_path):
+    """As napari's own reader does: the groups of a group, or else all of its arrays, are levels."""
+    write_video(tmp_path / "v.zarr", *make(), 5.0, 30_000.0, {"trusted": [0, 5]})
+    group = zarr.open(tmp_path / "v.zarr", mode="r")
+    assert (list(group.group_keys()), sorted(group.array_keys())) == ([], ["0"])
+
+
+def test_the_validator_of_ome_zarr_is_content(tmp_path):
+    write_video(tmp_path / "v.zarr", *make(), 5.0, 30_000.0, {"trusted": [2, 4]}, origin=(0.1, 2.0, 2.0))
+    group = zarr.open_group(tmp_path / "v.zarr", mode="r")
+    image = ome_zarr_models.v05.Image.from_zarr(group)
+    assert [axis.name for axis in image.attributes.ome.multiscales[0].axes] == ["t", "y", "x"]
+    channels = Omero.model_validate(group.attrs["ome"]["omero"]).channels
+    video = make()[0]
+    assert (channels[0].window.min, channels[0].window.max) == (video.min(), video.max())
+    assert video.min() <= channels[0].window.start < channels[0].window.end <= video.max()
+    assert group.attrs["ome"]["omero"]["rdefs"]["defaultT"] == 2
+
+
+def test_a_large_video_has_smaller_copies(tmp_path, monkeypatch):
+    monkeypatch.setattr(video_layout, "LARGE", 8)
+    video, time_ns = make(5, 21, "uint8")
+    write_video(tmp_path / "v.zarr", video, time_ns, 5.0, 30_000.0, {})
+    group = zarr.open_group(tmp_path / "v.zarr", mode="r")
+    assert [group[name].shape[1:] for name in sorted(group.array_keys())] == [(21, 21), (11, 11), (6, 6)]
+    even = video[:, :20, :20].reshape(5, 10, 2, 10, 2).mean(axis=(2, 4))
+    np.testing.assert_allclose(group["1"][:, :10, :10], even, atol=0.5)
+    ome_zarr_models.v05.Image.from_zarr(group)
+    datasets = group.attrs["ome"]["multiscales"][0]["datasets"]
+    assert [each["coordinateTransformations"][1]["translation"][1] for each in datasets] == [0.0, 2.5, 7.5]
+    np.testing.assert_array_equal(open_video(tmp_path / "v.zarr").video[:], video)
+
+
+def test_what_a_viewer_shows_is_bounded_in_memory():
+    window = video_layout.Window()
+    generator = np.random.default_rng(3)
+    for _ in range(300):
+        window.add(generator.normal(10.0, 1.0, (4, 50, 50)).astype(np.float32))
+    window.add(np.full((1, 2, 2), np.nan, np.float32))
+    assert sum(map(len, window._kept)) <= 2 * video_layout.KEPT
+    shown = window.to_omero("v", 0)["channels"][0]["window"]
+    assert (shown["start"], shown["end"]) == (pytest.approx(6.9, abs=0.2), pytest.approx(13.1, abs=0.2))
+
+
+def test_a_video_of_an_older_version_opens(tmp_path):
+    """All its arrays were listed, and nothing beyond time and quality lay beside the image."""
+    video, time_ns = make()
+    path = tmp_path / "v.zarr"
+    write_video(path, video, time_ns, 5.0, 30_000.0, {"trusted": [1, 4]})
+    for name in ("t", "y", "x", "trusted"):
+        shutil.rmtree(path / name)
+    root = json.loads((path / "zarr.json").read_bytes())
+    root["consolidated_metadata"]["metadata"]["time"] = json.loads((path / "time" / "zarr.json").read_bytes())
+    image = root["attributes"]["ome"]["multiscales"][0]["datasets"][0]
+    del root["attributes"]["ome"]["omero"], image["coordinateTransformations"][1]
+    (path / "zarr.json").write_text(json.dumps(root))
+    file = open_video(path)
+    np.testing.assert_array_equal(file.video[:], video)
+    np.testing.assert_array_equal(file.time_ns, time_ns)
+    assert (file.origin, file.trusted, file.scale[1]) == ((0.0, 0.0, 0.0), range(1, 4), 5.0)
 
 
 def test_an_existing_path_is_refused(tmp_path):

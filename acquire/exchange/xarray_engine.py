@@ -1,0 +1,73 @@
+"""``xarray.open_dataset(PLACE, engine="acquire")``: videos and recordings with all their coordinates.
+
+xarray finds this by its entry point and imports it, nobody else does. What it adds to xarray's own engine is
+``line`` as a coordinate, which costs nothing however many lines there are, and a video's coordinates without
+a word about consolidated metadata.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+import xarray
+from xarray.backends import BackendEntrypoint
+
+from acquire.errors import UsageError
+from acquire.lines import ARMS
+from acquire.store import format_of, open_recording, open_video
+from acquire.store.source import source_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+
+    from acquire.store import Recording
+
+IMAGE = "video"
+"""What the image of a video is called; in the file it is the level 0."""
+
+
+class AcquireBackend(BackendEntrypoint):
+    """Opens lazily: nothing but metadata is read, and a video's time stamps."""
+
+    description = "recordings and videos of acquire, with their coordinates"
+    open_dataset_parameters = ("filename_or_obj", "drop_variables", "group")
+
+    def open_dataset(
+        self,
+        filename_or_obj: Any,
+        *,
+        drop_variables: str | Iterable[str] | None = None,
+        group: str | None = None,
+    ) -> xarray.Dataset:
+        """A video, or one arm of a recording (``group``, "a" or "b"; else a). Raises as `open_recording`."""
+        place = str(filename_or_obj)
+        if (format_of(place) or "").startswith("acquire-video/"):
+            dataset = _video(place, group)
+        else:
+            dataset = _arm(open_recording(place), ARMS[0] if group is None else group)
+        names = [drop_variables] if isinstance(drop_variables, str) else [*(drop_variables or ())]
+        return dataset.drop_vars(names)
+
+    def guess_can_open(self, _: Any) -> bool:
+        """Only where it is named: xarray's Zarr engine is not pushed aside."""
+        return False
+
+
+def _video(place: str, group: str | None) -> xarray.Dataset:
+    if group is not None:
+        raise UsageError(f"group {group!r} of {place}", possible="none: a video has no groups")
+    levels = open_video(place).attrs["ome"]["multiscales"][0]["datasets"]
+    smaller = [str(level["path"]) for level in levels[1:]]
+    store = source_of(place).zarr_store()
+    dataset: xarray.Dataset = xarray.open_zarr(store, consolidated=False, chunks=None, drop_variables=smaller)
+    return dataset.rename({"0": IMAGE})
+
+
+def _arm(recording: Recording, arm: str) -> xarray.Dataset:
+    if arm not in ARMS:
+        raise UsageError(f"group {arm!r} of {recording}", possible=", ".join(ARMS))
+    store = recording.source.zarr_store()
+    dataset: xarray.Dataset = xarray.open_zarr(store, group=arm, consolidated=True, chunks=None)
+    first = recording.first_line
+    return dataset.assign_coords(line=pd.RangeIndex(first, first + dataset.sizes["line"]))

@@ -1,0 +1,159 @@
+"""A video as OME-Zarr 0.5 metadata: pure functions from what is known to JSON documents and numbers.
+
+What viewers follow, the root's consolidated metadata, lists the image alone: those that take every array of a
+group for a part of the picture would stumble over the columns that lie beside it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+FORMAT = "acquire-video/1"
+LARGE = 1024
+"""Rows or columns of a level that get another one of half the size."""
+LOW, HIGH = 0.001, 0.999
+"""Quantiles of the voxels that a viewer shows as black and as white."""
+KEPT = 2**16
+"""Voxels of all frames that are kept to find them."""
+
+TIME_ATTRIBUTES: dict[str, Any] = {
+    "standard_name": "time",
+    "long_name": "UTC at which the frame begins",
+    "units": "nanoseconds since 1970-01-01T00:00:00",
+    "calendar": "proleptic_gregorian",
+}
+
+QUALITY_ATTRIBUTES: dict[str, Any] = {
+    "long_name": "relative RMS residual of the lines that see the frame",
+    "comment": "how well the lines are explained; the error of the frame itself may be many times larger",
+    "units": "1",
+}
+
+TRUSTED_ATTRIBUTES: dict[str, Any] = {
+    "long_name": "the lines sample the frame in full, and it was solved to its end",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class VideoGrid:
+    """Where the voxels of a video lie: steps along t (seconds), y and x, and where the first one does.
+
+    ``origin`` is when the first frame begins, and the centre of the first pixel. ``pixel_unit`` is a
+    UDUNITS-2 name of a length, or None where only ratios are known.
+    """
+
+    step: tuple[float, float, float]
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    pixel_unit: str | None = "micrometer"
+
+    def level(self, number: int) -> VideoGrid:
+        """The grid of a level whose pixels are 2^number wide."""
+        factor = 2**number
+        (t, height, width), (begin, y, x) = self.step, self.origin
+        origin = (begin, y + (factor - 1) * height / 2, x + (factor - 1) * width / 2)
+        return VideoGrid((t, factor * height, factor * width), origin, self.pixel_unit)
+
+
+def level_shapes(shape: tuple[int, int]) -> list[tuple[int, int]]:
+    """Rows and columns of the image and of its smaller copies."""
+    found = [shape]
+    while max(found[-1]) > LARGE:
+        rows, columns = found[-1]
+        found.append((-(-rows // 2), -(-columns // 2)))
+    return found
+
+
+def halved(frames: NDArray[Any]) -> NDArray[Any]:
+    """Frames (t, y, x) of half the size, means of 2 x 2 pixels; an odd edge counts twice."""
+    even = np.pad(frames, [(0, 0), *((0, size % 2) for size in frames.shape[1:])], mode="edge")
+    count, rows, columns = even.shape
+    mean = even.reshape(count, rows // 2, 2, columns // 2, 2).mean(axis=(2, 4), dtype=np.float64)
+    small: NDArray[Any] = (np.rint(mean) if frames.dtype.kind == "u" else mean).astype(frames.dtype)
+    return small
+
+
+@dataclass(slots=True)
+class Window:
+    """What a viewer shows as black and white, from some voxels of every stretch of frames."""
+
+    low: float = math.inf
+    high: float = -math.inf
+    _kept: list[NDArray[Any]] = field(default_factory=list)
+    _every: int = 1
+
+    def add(self, frames: NDArray[Any]) -> None:
+        """Look at frames; memory stays bounded, however many come."""
+        finite = frames[np.isfinite(frames)] if frames.dtype.kind == "f" else frames.reshape(-1)
+        if not finite.size:
+            return
+        self.low, self.high = min(self.low, float(finite.min())), max(self.high, float(finite.max()))
+        self._kept.append(finite[:: max(self._every, finite.size // KEPT)].copy())
+        while sum(map(len, self._kept)) > 2 * KEPT:
+            self._every *= 2
+            self._kept = [np.concatenate(self._kept)[::2]]
+
+    def to_omero(self, name: str, first_frame: int) -> dict[str, Any]:
+        """For the attribute ``omero``; ``first_frame`` is what is shown first."""
+        values = np.concatenate(self._kept) if self._kept else np.zeros(1)
+        start, end = (float(each) for each in np.quantile(values, (LOW, HIGH)))
+        low, high = (self.low, self.high) if self._kept else (0.0, 1.0)
+        window = {
+            "min": low,
+            "max": high if high > low else low + 1.0,
+            "start": start,
+            "end": end if end > start else start + 1.0,
+        }
+        channel = {"label": name, "color": "FFFFFF", "active": True, "window": window}
+        return {
+            "channels": [channel],
+            "rdefs": {"model": "greyscale", "defaultT": first_frame, "defaultZ": 0},
+        }
+
+
+def ome_attributes(
+    name: str, grid: VideoGrid, levels: int, window: Window, first_frame: int
+) -> dict[str, Any]:
+    """The attribute ``ome``."""
+    space = {"type": "space"} | ({"unit": grid.pixel_unit} if grid.pixel_unit else {})
+    axes = [{"name": "t", "type": "time", "unit": "second"}, {"name": "y", **space}, {"name": "x", **space}]
+    datasets = [
+        {"path": str(number), "coordinateTransformations": _transformations(grid.level(number))}
+        for number in range(levels)
+    ]
+    multiscale = {"name": name, "axes": axes, "datasets": datasets} | ({"type": "mean"} if levels > 1 else {})
+    return {"version": "0.5", "multiscales": [multiscale], "omero": window.to_omero(name, first_frame)}
+
+
+def _transformations(grid: VideoGrid) -> list[dict[str, Any]]:
+    return [
+        {"type": "scale", "scale": list(grid.step)},
+        {"type": "translation", "translation": list(grid.origin)},
+    ]
+
+
+def coordinate_attributes(axis: str, grid: VideoGrid) -> dict[str, Any]:
+    """Of the coordinates of an axis t, y or x."""
+    if axis == "t":
+        return {"long_name": "begin of the frame, since the recording's first line", "units": "s"}
+    unit = {"units": grid.pixel_unit} if grid.pixel_unit else {}
+    return {"long_name": "centre of the pixel", "axis": axis.upper(), **unit}
+
+
+def along(axis: str, grid: VideoGrid, count: int) -> NDArray[np.float64]:
+    """Coordinates of pixels along y or x."""
+    number = "tyx".index(axis)
+    return np.float64(grid.origin[number]) + grid.step[number] * np.arange(count, dtype=np.float64)
+
+
+def coordinates_of(columns: Sequence[str]) -> str:
+    """What xarray takes as coordinates of the image, beside those of its axes."""
+    return " ".join(name for name in columns if name not in {"t", "y", "x"})

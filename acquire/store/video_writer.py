@@ -1,0 +1,192 @@
+"""Writes a video as its frames come, for videos longer than memory."""
+
+from __future__ import annotations
+
+import json
+from pathlib import PurePosixPath
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import zarr
+from zarr.codecs import BloscCodec, Crc32cCodec
+
+from acquire.errors import UsageError
+from acquire.store import video_layout as layout
+from acquire.store.delivery import delivery_to
+from acquire.store.layout import group_document, to_json
+from acquire.store.refusals import refused
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+    from types import TracebackType
+
+    from numpy.typing import NDArray
+
+CHUNK_BYTES = 4 * 2**20
+
+COLUMN_CHUNK = 65536
+"""Values of a column in a chunk."""
+
+
+class VideoWriter:
+    """A video that grows: beside its name until `finish`, and then whole at its name.
+
+    Leaving the ``with`` block without `finish` leaves nothing. One thread at a time.
+    """
+
+    def __init__(
+        self,
+        place: Path | str,
+        shape: tuple[int, int],
+        dtype: np.dtype[Any],
+        grid: layout.VideoGrid,
+        *,
+        quality: bool = False,
+    ) -> None:
+        self._place, self._delivery, self._grid = place, delivery_to(place), grid
+        self._name = PurePosixPath(str(place)).stem
+        self._window, self._begin_ns = layout.Window(), 0
+        with refused(place, "written"):
+            self._group = zarr.create_group(self._delivery.partial, zarr_format=3)
+            frames = max(1, CHUNK_BYTES // (shape[0] * shape[1] * dtype.itemsize))
+            self._levels = [
+                _image(self._group, str(number), (frames, *each), dtype)
+                for number, each in enumerate(layout.level_shapes(shape))
+            ]
+            self._columns = {
+                "time": _column(self._group, "time", "int64", layout.TIME_ATTRIBUTES),
+                "t": _column(self._group, "t", "float64", layout.coordinate_attributes("t", grid)),
+            }
+            if quality:
+                self._columns["quality"] = _column(
+                    self._group, "quality", "float32", layout.QUALITY_ATTRIBUTES
+                )
+            for axis, count in zip("yx", shape, strict=True):
+                _whole(self._group, axis, layout.along(axis, grid, count), axis, grid)
+        self._chunk: list[tuple[NDArray[Any], ...]] = []
+        self.frames = 0
+
+    def append(
+        self, video: NDArray[Any], time_ns: NDArray[np.int64], quality: NDArray[np.float32] | None = None
+    ) -> None:
+        """The next frames (t, y, x). Whole chunks go to the disk; StoreError when it refuses."""
+        if not self.frames and len(time_ns):
+            self._begin_ns = int(time_ns[0])
+        since_s = self._grid.origin[0] + (time_ns - self._begin_ns) * 1e-9
+        columns = (time_ns, since_s) if quality is None else (time_ns, since_s, quality)
+        self._chunk.append((video, *columns))
+        self._window.add(video)
+        self.frames += len(video)
+        if sum(len(part[0]) for part in self._chunk) >= self._levels[0].chunks[0]:
+            self._flush(whole_chunks=True)
+
+    def finish(self, provenance: Mapping[str, Any]) -> None:
+        """The video appears under its name. UsageError for one without frames.
+
+        ``provenance["trusted"]``, first frame and the one after the last, marks the frames.
+        """
+        if not self.frames:
+            raise UsageError(f"{self._place}: a video without a frame")
+        check_provenance(provenance)
+        self._flush(whole_chunks=False)
+        first, end = provenance.get("trusted") or (0, 0)
+        with refused(self._place, "written"):
+            if "trusted" in provenance:
+                self._mark(int(first), int(end))
+            self._publish(provenance, min(int(first), self.frames - 1))
+        self._delivery.deliver()
+
+    def _mark(self, first: int, end: int) -> None:
+        frame = np.arange(self.frames)
+        column = _column(self._group, "trusted", "bool", layout.TRUSTED_ATTRIBUTES)
+        column.resize((self.frames,))
+        column[:] = (first <= frame) & (frame < end)
+        self._columns["trusted"] = column
+
+    def _publish(self, provenance: Mapping[str, Any], first_frame: int) -> None:
+        """Consolidated by hand: the columns are not listed, and zarr-python would warn."""
+        self._levels[0].update_attributes({"coordinates": layout.coordinates_of(tuple(self._columns))})
+        count = len(self._levels)
+        ome = layout.ome_attributes(self._name, self._grid, count, self._window, first_frame)
+        attributes = {"format": layout.FORMAT, "ome": ome, "provenance": dict(provenance)}
+        partial = self._delivery.partial
+        nodes = {str(n): json.loads((partial / str(n) / "zarr.json").read_bytes()) for n in range(count)}
+        (partial / "zarr.json").write_bytes(to_json(group_document(attributes, nodes)))
+
+    def _flush(self, *, whole_chunks: bool) -> None:
+        video, *columns = (np.concatenate(parts) for parts in zip(*self._chunk, strict=True))
+        chunk, waiting = self._levels[0].chunks[0], len(video)
+        count = waiting // chunk * chunk if whole_chunks else waiting
+        self._chunk = [(video[count:], *(values[count:] for values in columns))]
+        with refused(self._place, "written"):
+            for array, values in zip(self._columns.values(), columns, strict=True):
+                _append(array, values[:count])
+            frames = video[:count]
+            for level in self._levels:
+                _append(level, frames)
+                frames = layout.halved(frames) if level is not self._levels[-1] else frames
+
+    def __enter__(self) -> VideoWriter:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._delivery.clear()
+
+
+def check_provenance(provenance: Mapping[str, Any]) -> None:
+    """UsageError for what is not JSON."""
+    try:
+        json.dumps(dict(provenance), allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise UsageError(
+            f"provenance is not JSON: {error}", possible="text, finite numbers, lists"
+        ) from error
+
+
+def _append(array: zarr.Array[Any], values: NDArray[Any]) -> None:
+    first = array.shape[0]
+    array.resize((first + len(values), *array.shape[1:]))
+    array[first:] = values
+
+
+def _image(
+    group: zarr.Group, name: str, chunk: tuple[int, int, int], dtype: np.dtype[Any]
+) -> zarr.Array[Any]:
+    """A level whose chunks are whole frames; all levels have as many in each."""
+    return group.create_array(
+        name,
+        shape=(0, *chunk[1:]),
+        dtype=dtype,
+        chunks=chunk,
+        compressors=[BloscCodec(cname="zstd", clevel=3, shuffle="bitshuffle"), Crc32cCodec()],
+        dimension_names=("t", "y", "x"),
+    )
+
+
+def _column(group: zarr.Group, name: str, dtype: str, attributes: dict[str, Any]) -> zarr.Array[Any]:
+    return group.create_array(
+        name,
+        shape=(0,),
+        dtype=dtype,
+        chunks=(COLUMN_CHUNK,),
+        compressors=[Crc32cCodec()],
+        dimension_names=("t",),
+        attributes=attributes,
+    )
+
+
+def _whole(group: zarr.Group, name: str, values: NDArray[Any], axis: str, grid: layout.VideoGrid) -> None:
+    """Coordinates of an axis, all at once."""
+    array = group.create_array(
+        name,
+        shape=values.shape,
+        dtype=values.dtype,
+        chunks=values.shape,
+        compressors=[Crc32cCodec()],
+        dimension_names=(axis,),
+        attributes=layout.coordinate_attributes(axis, grid),
+    )
+    array[:] = values
