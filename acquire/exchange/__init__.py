@@ -4,6 +4,7 @@
 
     from_video, from_recording ─▶ content (in blocks) ─▶ tiff | hdf5 | arrays | movie ─▶ one file
     line files ─▶ foreign (blocks of lines) ─▶ importing, code_words ─▶ a sealed recording
+    napari_reader, lazy · xarray_engine   found by their programs through entry points
 
 Nothing is read before it is written: memory stays bounded, however long a recording is. Libraries that only
 these files need are imported when one is asked for; the extra ``[export]`` brings them.

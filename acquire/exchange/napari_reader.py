@@ -1,0 +1,101 @@
+"""Videos and recordings in napari: ``napari --plugin tdi-acquire NAME.zarr``.
+
+``napari.toml`` beside this file is the manifest that napari finds by its entry point. Nothing here imports
+napari: a reader answers with plain tuples of data, options and the kind of layer.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.errors import AcquireError
+from acquire.exchange.lazy import PAGE_LINES, Stack, frames, pages
+from acquire.lines import ARMS
+from acquire.store import format_of, open_recording, open_video
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from acquire.store import Recording, VideoFile
+
+Layer = tuple[Any, dict[str, Any], str]
+SAMPLED = 5
+"""Pages that are looked at to find what is black and white."""
+GAP = 8
+"""Pixels between the arms, which lie side by side."""
+
+
+def reader_for(path: str | list[str]) -> Callable[[Any], list[Layer]] | None:
+    """What reads a path; None for what is no recording and no video of ours, which other readers may know."""
+    if not isinstance(path, str):
+        return None
+    try:
+        kind = format_of(path) or ""
+    except AcquireError:
+        return None
+    if kind.startswith("acquire-video/"):
+        return read_video
+    return read_recording if kind.startswith("acquire-recording/") else None
+
+
+def read_video(path: Any) -> list[Layer]:
+    """The trusted frames as one image; all of them where none is, and its name says so."""
+    file = open_video(str(path))
+    trusted = file.trusted
+    kept = trusted or range(len(file.time_ns))
+    words = "not known which frames are trusted" if trusted is None else "no frame is trusted"
+    name = f"{_name(path)} ({f'frames {kept.start} to {kept.stop - 1}' if trusted else words})"
+    step, origin = file.scale, file.origin
+    options = {
+        "name": name,
+        "scale": list(step),
+        "translate": [origin[0] + step[0] * kept.start, *origin[1:]],
+        "contrast_limits": _window(file),
+        "multiscale": False,
+        "rgb": False,
+        "metadata": {
+            "provenance": file.attrs.get("provenance"),
+            "time_ns": file.time_ns[kept.start : kept.stop],
+        },
+    }
+    return [(frames(file, kept), options, "image")]
+
+
+def read_recording(path: Any) -> list[Layer]:
+    """The lines of both arms side by side, in pages that the slider turns."""
+    recording = open_recording(str(path))
+    return [_arm(recording, arm, number) for number, arm in enumerate(ARMS)]
+
+
+def _arm(recording: Recording, arm: str, number: int) -> Layer:
+    stack = pages(recording, arm)
+    options = {
+        "name": f"{_name(recording)}, arm {arm}",
+        "translate": [0, 0, number * (stack.shape[2] + GAP)],
+        "contrast_limits": _limits(stack),
+        "multiscale": False,
+        "rgb": False,
+        "metadata": {"first_line": recording.first_line, "lines_of_a_page": PAGE_LINES, **recording.info()},
+    }
+    return stack, options, "image"
+
+
+def _name(path: object) -> str:
+    return str(path).rstrip("/").rpartition("/")[2].removesuffix(".zarr")
+
+
+def _window(file: VideoFile) -> tuple[float, float]:
+    """Black and white as the video says, or, of an older one, from some of its frames."""
+    channels = file.attrs["ome"].get("omero", {}).get("channels", ())
+    for channel in channels:
+        return float(channel["window"]["start"]), float(channel["window"]["end"])
+    return _limits(frames(file, range(len(file.time_ns))))
+
+
+def _limits(stack: Stack) -> tuple[float, float]:
+    chosen = np.unique(np.linspace(0, len(stack) - 1, SAMPLED).astype(int))
+    values = np.stack([stack.picture(int(number)) for number in chosen])
+    low, high = (float(each) for each in np.quantile(values, (0.001, 0.999)))
+    return low, high if high > low else low + 1.0
