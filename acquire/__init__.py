@@ -22,7 +22,7 @@ The layers, top to bottom; imports point downwards only (checked by the tests)::
     config  lines  processes         what a rig is · what travels from camera to disk · children
     codes  geometry  clock           the code, the shear, the time: plain arithmetic
     arrays  cores                    whose arrays are computed with, and on how many cores
-    logs  reading                    one line per entry · files that anybody may have put there
+    logs  reading  showing           one line per entry · files that anybody may have put there · reprs
     errors  text                     failures that a user can meet, with exit codes · foreign text
 
 Why things are so, and what else was considered, is in `DECISIONS.md` beside this file.

@@ -10,6 +10,7 @@ import numpy as np
 
 from acquire.errors import UsageError
 from acquire.geometry import Geometry
+from acquire.showing import in_words
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -135,6 +136,17 @@ class Segment:
             raise UsageError(
                 f"segment with {self.time_ns.shape} time stamps", possible=f"{self.geometry.lines}"
             )
+
+    def __repr__(self) -> str:
+        sizes = self.geometry
+        return in_words(
+            "Segment",
+            lines=f"{self.first_line} to {self.first_line + sizes.lines - 1} of each arm",
+            geometry=f"M = {sizes.stages}, S = {sizes.substeps}",
+            sub_steps=f"{sizes.span} of {self.substep_ns:.6g} ns",
+            samples=f"{self.lines.dtype.name}, {self.mask.mean():.2%} usable",
+            arm_b=None if self.alignment is None else "aligned",
+        )
 
     def samples(self, dtype: type[np.floating[Any]] = np.float32) -> NDArray[Any]:
         """Y of Eq. (1) (2, L_R, M): black level removed, in units of the scene; 0 where masked."""

@@ -26,6 +26,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from acquire.alignment import Alignment
 from acquire.errors import DataError, UsageError
 from acquire.lines import ARMS
+from acquire.showing import in_words
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -65,6 +66,10 @@ class Measured:
 
     value: NDArray[np.float64]
     uncertainty: NDArray[np.float64]
+
+    def __repr__(self) -> str:
+        mean, doubt = (float(each.mean()) if each.size else 0.0 for each in (self.value, self.uncertainty))
+        return in_words("Measured", mean=f"{mean:.6g} ± {doubt:.2g} each", shape=self.value.shape)
 
     def __post_init__(self) -> None:
         if self.value.shape != self.uncertainty.shape:
@@ -130,6 +135,16 @@ class Calibration:
     orientation: str | None = None
     alignment: AlignmentFound | None = None
     steps: Mapping[str, dict[str, Any]] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        sizes = self.instrument
+        return in_words(
+            "Calibration",
+            geometry=f"M = {sizes.stages}, S = {sizes.substeps}, {sizes.layout}",
+            steps=" ".join(self.steps) or "none yet",
+            quantities=" ".join(self.quantities) or "none yet",
+            arm_b=None if self.alignment is None else "aligned",
+        )
 
     def __post_init__(self) -> None:
         sizes = {"arm": len(ARMS), "column": self.instrument.stages}

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from acquire.showing import as_picture, as_table, in_words
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -87,3 +89,24 @@ class Reconstruction:
     compiled_s: float = 0.0
     processor_s: float = 0.0
     parameters: dict[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return in_words("Reconstruction", **self._holds(), warnings=len(self.warnings))
+
+    def _repr_html_(self) -> str:
+        """With the frame in the middle of those that are trusted."""
+        shown = range(len(self.video))[self.trusted] or range(len(self.video))
+        number = shown[len(shown) // 2]
+        words = {**self._holds(), "warnings": "; ".join(self.warnings) or None}
+        return as_table("Reconstruction", words, as_picture(self.video[number], f"frame {number}"))
+
+    def _holds(self) -> dict[str, str]:
+        """What it holds, in words."""
+        frames, rows, columns = self.video.shape
+        trusted = range(frames)[self.trusted] if self.believed else range(0)
+        return {
+            "frames": f"{frames} of {rows} x {columns} {self.video.dtype.name}",
+            "trusted": f"frames {trusted.start} to {trusted.stop - 1}" if trusted else "none",
+            "solver": f"{self.solver}, {self.iterations} iterations, {self.seconds:.3g} s ({self.ended})",
+            "misfit": f"{self.quality.misfit:.2%}",
+        }

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import zarr
 
+from acquire.showing import in_words
 from acquire.store.chunks import ChunkReader
 from acquire.store.layout import line_columns
 from acquire.store.stretch import Stretch
@@ -51,6 +52,10 @@ class CameraStream:
 
     def __str__(self) -> str:
         return f"{self._source}/{self.arm}"
+
+    def __repr__(self) -> str:
+        count = f"{len(self)} from {self.first_line} on"
+        return in_words("CameraStream", str(self), lines=count, samples=f"{self.pixels} {self.dtype.name}")
 
     @property
     def dtype(self) -> np.dtype[Any]:

@@ -19,6 +19,7 @@ from acquire.codes import code_from_attrs
 from acquire.errors import DataError, UsageError
 from acquire.geometry import Geometry
 from acquire.lines import ARMS, LineFlag, Segment
+from acquire.showing import as_table, in_words
 from acquire.store.camera_stream import CameraStream
 from acquire.store.files import DISK
 from acquire.store.layout import line_columns
@@ -64,6 +65,26 @@ class Recording:
 
     def __str__(self) -> str:
         return str(self.source)
+
+    def __repr__(self) -> str:
+        state = self.attrs["run_condition"] or self.state
+        return in_words("Recording", str(self), state, **self._holds())
+
+    def _repr_html_(self) -> str:
+        facts = {"run": self.attrs["run_id"], "state": self.attrs["run_condition"] or self.state}
+        return as_table(str(self), {**facts, **self._holds(), "end": self.attrs["end_reason"]})
+
+    def _holds(self) -> dict[str, str]:
+        """What it holds, in words; nothing is read for it."""
+        first, count, sizes = self.first_line, self.lines, self.attrs["geometry"]
+        period_ns = self.line_period_ns
+        return {
+            "lines": f"{first} to {first + count - 1} of each arm" if count else "none yet",
+            "duration": f"{count * period_ns / NS_PER_S:.6g} s at {NS_PER_S / period_ns:.6g} lines/s",
+            "geometry": f"M = {sizes['stages']}, S = {sizes['substeps']}",
+            "samples": f"{self.arms[ARMS[0]].pixels} pixels {self.arms[ARMS[0]].dtype.name}",
+            "code": self.attrs["code"]["kind"],
+        }
 
     @property
     def path(self) -> Path:

@@ -27,6 +27,7 @@ import zarr
 from zarr.errors import GroupNotFoundError
 
 from acquire.errors import DataError, PlaceError, UsageError
+from acquire.showing import as_picture, as_table, in_words
 from acquire.store.camera_stream import DAMAGE, child_array
 from acquire.store.opening import read_root
 from acquire.store.refusals import refused
@@ -55,6 +56,31 @@ class VideoFile:
     time_ns: NDArray[np.int64]
     attrs: dict[str, Any]
     quality: NDArray[np.float32] | None = None
+
+    def __repr__(self) -> str:
+        return in_words("VideoFile", **self._holds())
+
+    def _repr_html_(self) -> str:
+        """With the frame in the middle of those that are trusted."""
+        shown = self.trusted or range(len(self.time_ns))
+        number = shown[len(shown) // 2]
+        try:
+            picture = as_picture(np.asarray(self.video[number]), f"frame {number}")
+        except DAMAGE:  # said when the frame is asked for
+            picture = ""
+        return as_table("Video", self._holds(), picture)
+
+    def _holds(self) -> dict[str, str]:
+        """What it holds, in words."""
+        count, rows, columns = self.video.shape
+        trusted = self.trusted
+        span = trusted and f"frames {trusted.start} to {trusted.stop - 1}"
+        each = f"{self.interval_ns / 1000:.6g} us each"
+        return {
+            "frames": f"{count} of {rows} x {columns} {self.video.dtype.name}, {each}",
+            "pixel": f"{self.scale[1]:.6g} x {self.scale[2]:.6g} {self.pixel_unit or 'fine pixels'}",
+            "trusted": "not known" if trusted is None else span or "none",
+        }
 
     @property
     def interval_ns(self) -> float:
