@@ -126,8 +126,10 @@ class Group:
 
 
 EFFECTS = Group("acquire.effects", "effect", "acquire.sim.effects.base:Effect")
+SOLVERS = Group("acquire.solvers", "solver", "acquire.recon.solver:Solver")
+DENOISERS = Group("acquire.denoisers", "denoiser", "acquire.recon.denoisers:Denoiser")
 
-GROUPS = (EFFECTS,)
+GROUPS = (EFFECTS, SOLVERS, DENOISERS)
 
 
 def forget() -> None:

@@ -29,7 +29,6 @@ from acquire.evaluate.metrics import psnr
 from acquire.geometry import Geometry
 from acquire.lines import ARMS, Segment
 from acquire.recon import Reconstruction, reconstruct
-from acquire.recon.request import Solver
 from acquire.sim.leds import LedScene
 from acquire.sim.lines import StreamingArm
 from acquire.sim.scene import Scene, SeparableScene
@@ -135,7 +134,7 @@ def against_twist(name: str, case: Case, seed: int) -> None:
     scene, segment = record(case, seed)
     voxels = truth(scene, case.geometry.substeps * case.first_line, case.geometry.span, *case.merges)
 
-    def attempt(solver: Solver, iterations: int, budget_s: float | None = None) -> Trial:
+    def attempt(solver: str, iterations: int, budget_s: float | None = None) -> Trial:
         began = time.process_time()
         result = reconstruct(segment, *case.merges, "best", budget_s, solver=solver, iterations=iterations)
         processor_s = time.process_time() - began

@@ -79,7 +79,18 @@ def reconstruct(
     preset: Annotated[
         str | None, typer.Option(help="fast, balanced or best; else balanced, or what --budget learned.")
     ] = None,
-    solver: Annotated[str, typer.Option(help="admm; twist, the paper's; twist-band.")] = "admm",
+    solver: Annotated[
+        str,
+        typer.Option(help="admm; twist, the paper's; twist-band; or one that acquire plugins lists."),
+    ] = "admm",
+    settings: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="An option of the solver's own, repeatable."),
+    ] = None,
+    denoiser: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="In place of total variation: haar, or another that is installed."),
+    ] = None,
     budget: Annotated[float | None, typer.Option(metavar="SECONDS", help="For the whole command.")] = None,
     iterations: Annotated[int | None, typer.Option(help="Instead of the preset's.")] = None,
     dtype: Annotated[str, typer.Option(help="float32 or float64: how exactly it is computed.")] = "float32",
@@ -112,12 +123,19 @@ def reconstruct(
     from acquire.calibrate.choose import choose
     from acquire.cli.reconstruct_explain import explain_calibration
     from acquire.cli.reconstruct_request import Asked, prepare
+    from acquire.config import parse_settings
+    from acquire.recon.denoisers import open_denoiser
+    from acquire.recon.solver import open_solver
     from acquire.reconstruct import Options
     from acquire.store import open_recording
     from acquire.store.delivery import check_new_place
 
     _check_something_asked(out, auto, explain)
     began = time.monotonic() - _age_s()
+    solver_options = parse_settings(settings or ())
+    open_solver(solver, solver_options)
+    if denoiser is not None:
+        open_denoiser(denoiser)
     open_arrays(device if dask is None else "cpu", dtype)  # a cluster's devices are not here
     opened = open_recording(recording)
     chosen = choose(opened, calibration)
@@ -136,13 +154,15 @@ def reconstruct(
         preset=preset,
         options=Options(
             "balanced",
-            solver,  # type: ignore[arg-type]  # checked there
+            solver,
             iterations,
             budget,
             None,
             dtype,  # type: ignore[arg-type]  # checked there
             device,
             None if chosen is None else chosen.calibration,
+            solver_options=solver_options,
+            denoiser=denoiser,
         ),
     )
     explained = explain_calibration(opened, chosen, asked, wanted=explain, json=json and out is None)

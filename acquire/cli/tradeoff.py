@@ -70,13 +70,13 @@ def tradeoff(
     from acquire.cli.reconstruct_request import parse_voxels
     from acquire.evaluate.tradeoff import table
     from acquire.evaluate.tradeoff_page import write_page
-    from acquire.recon import ITERATIONS
-    from acquire.recon.request import preset_iterations
+    from acquire.plugins import SOLVERS
+    from acquire.recon.solver import preset_iterations
     from acquire.reconstruct.learned import remember
 
     kinds = tuple(parse_voxels(text) for text in voxels or ["3x1"])
     asked = list(
-        itertools.product(solver or ITERATIONS, preset or ("fast", "balanced"), dtype or ("float32",))
+        itertools.product(solver or SOLVERS.working(), preset or ("fast", "balanced"), dtype or ("float32",))
     )
     for each, kind, exact in asked:
         preset_iterations(each, kind)

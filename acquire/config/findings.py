@@ -18,7 +18,7 @@ MOST_LISTED = 20
 """Things to mend that one error lists."""
 
 
-def explained(error: ValidationError, model: type[BaseModel], path: Path) -> str:
+def explained(error: ValidationError, model: type[BaseModel], path: Path | str) -> str:
     """Every finding on a line: its key, what stands there, why it cannot, and what is allowed."""
     lines = [f"{path}: {error.error_count()} thing(s) to mend"]
     found = error.errors()

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from acquire.arrays import Dtype
     from acquire.lines import Segment
-    from acquire.recon import Look, Preset, Solver
+    from acquire.recon import Look, Preset
     from acquire.recon.segments import Voxels
     from acquire.store import Recording
 
@@ -77,7 +77,7 @@ class Run:
     knows nothing of time.
     """
 
-    solver: Solver
+    solver: str
     voxels: Voxels
     dtype: str
     voxel_count: int
@@ -196,7 +196,7 @@ def amplitude_error(video: NDArray[Any], truth: NDArray[Any]) -> float | None:
 
 def measure(
     judge: Judge,
-    solver: Solver,
+    solver: str,
     voxels: Voxels,
     preset: Preset = "balanced",
     longest_s: float | None = None,

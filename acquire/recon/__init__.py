@@ -3,11 +3,10 @@
 from acquire.recon.api import reconstruct
 from acquire.recon.basis import TemporalBasis
 from acquire.recon.denoisers import Denoiser, HaarShrink
-from acquire.recon.request import ITERATIONS, Preset, Solver
 from acquire.recon.result import Look, Progress, Quality, Reconstruction
+from acquire.recon.solver import Preset, Solver
 
 __all__ = [
-    "ITERATIONS",
     "Denoiser",
     "HaarShrink",
     "Look",

@@ -11,18 +11,19 @@ import numpy as np
 
 from acquire.arrays import Dtype, open_arrays
 from acquire.cores import idle_cores, limit_threads
-from acquire.recon.choose import solve_admm
 from acquire.recon.clock import IterationClock
+from acquire.recon.denoisers import open_denoiser
 from acquire.recon.judge import frame_error, judge
 from acquire.recon.least import check_budget, least_seconds
 from acquire.recon.problem import pose
-from acquire.recon.request import Preset, Request, Solver, Stop, preset_iterations
+from acquire.recon.request import Request, Stop
 from acquire.recon.result import Look, Progress, Quality, Reconstruction
-from acquire.recon.solve import Lit, solve_twist
+from acquire.recon.solve import Lit
+from acquire.recon.solver import Preset, Solver, open_solver, preset_iterations
 from acquire.recon.told import Told, tell
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
 
@@ -43,13 +44,14 @@ def reconstruct(
     budget_s: float | None = None,
     progress: Callable[[Progress], None] | None = None,
     *,
-    solver: Solver = "admm",
+    solver: str = "admm",
+    solver_options: Mapping[str, Any] | None = None,
     bandwidth: float | None = None,
     iterations: int | None = None,
     tv_weight: float | None = None,
     initial: NDArray[Any] | None = None,
     static_image: NDArray[Any] | None = None,
-    denoiser: Denoiser | None = None,
+    denoiser: Denoiser | str | None = None,
     dtype: Dtype = "float32",
     device: str = "cpu",
     stop: Stop | None = None,
@@ -67,13 +69,15 @@ def reconstruct(
         the preset's if need be (at least one is made). Compiling (once after installation) is no part of it
     progress : called after every iteration
     solver : ``"admm"`` (default), ``"twist"``, the paper's, which knows neither bandwidth nor sign, or
-        ``"twist-band"``, which knows both
+        ``"twist-band"``, which knows both; or one that is installed (``acquire plugins``)
+    solver_options : of that solver, where it has some
     bandwidth : share of the frames' Nyquist frequency that the video may hold; found from the lines unless
         given (not TwIST)
     iterations, tv_weight : in place of the preset's and the solver's
     initial : a video (⌈T/T_m⌉, ⌈n/N_m⌉, ⌈n/N_m⌉) in scene units to start from: a warm start (ADMM)
     static_image : (n, n), the scene at rest: only its light s(t) is solved for, in any units
-    denoiser : in place of total variation (ADMM); see `acquire.recon.denoisers`
+    denoiser : in place of total variation (ADMM), itself or the name of an installed one; see
+        `acquire.recon.denoisers`
     dtype : of the video and all that leads to it; sums that need it are float64 anyway
     device : ``"cpu"`` or ``"gpu"``, where iterations are made; see `acquire.arrays`
     stop : asked after every iteration; once set, the best so far is returned
@@ -88,8 +92,10 @@ def reconstruct(
     NumericsError : a dark code, or iterates that are not finite
     """
     began = time.monotonic()
-    count = iterations if iterations is not None else preset_iterations(solver, preset)
-    preset_iterations(solver, preset)
+    chosen = open_solver(solver, solver_options)
+    count = preset_iterations(solver, preset)
+    if iterations is not None:
+        count = iterations
     request = Request(
         spatial_merge,
         temporal_merge,
@@ -100,12 +106,12 @@ def reconstruct(
         budget_s,
         initial,
         static_image,
-        denoiser,
+        open_denoiser(denoiser) if isinstance(denoiser, str) else denoiser,
     )
     arrays = open_arrays(device, dtype)
     request.check_shapes(segment.geometry.size, segment.geometry.video_shape(spatial_merge, temporal_merge))
     clock = IterationClock(count, budget_s, progress, stop, began)
-    held_out = HOLD_OUT if solver != "twist" and static_image is None else 0.0
+    held_out = HOLD_OUT if chosen.holds_out and static_image is None else 0.0
     # threads that wait for a core that others use make times that nobody can foresee
     with limit_threads(idle_cores()) if budget_s is not None else nullcontext():
         if budget_s is not None and refuse and arrays.compiled:
@@ -113,32 +119,35 @@ def reconstruct(
             check_budget(clock, budget_s, least_s)
         problem = pose(segment, spatial_merge, temporal_merge, hold_out=held_out, arrays=arrays)
         if look is not None:
-            clock.looks = _looking(look, problem, request)
-        estimate = _solve(segment, problem, request, clock)
-        return _finish(segment, problem, request, estimate, clock, check=check)
+            clock.looks = _looking(look, problem, chosen)
+        estimate = _solve(segment, problem, request, chosen, clock)
+        return _finish(segment, problem, request, chosen, estimate, clock, check=check)
 
 
-def _solve(segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> Estimate:
+def _solve(
+    segment: Segment, problem: Problem, request: Request, solver: Solver, clock: IterationClock
+) -> Estimate:
     if request.static_image is not None:
         return Lit(segment, problem, request, np.asarray(request.static_image), clock)
-    return (solve_admm if request.solver == "admm" else solve_twist)(segment, problem, request, clock)
+    return solver.solve(segment, problem, request, clock)
 
 
-def _looking(look: Callable[[Look], object], problem: Problem, request: Request) -> Callable[[Look], object]:
+def _looking(look: Callable[[Look], object], problem: Problem, solver: Solver) -> Callable[[Look], object]:
     """``look`` for videos in scene units."""
-    return lambda seen: look(replace(seen, video=lambda: _scaled(seen.video(), problem, request)))
+    return lambda seen: look(replace(seen, video=lambda: _scaled(seen.video(), problem, solver)))
 
 
-def _scaled(video: NDArray[Any], problem: Problem, request: Request) -> NDArray[Any]:
+def _scaled(video: NDArray[Any], problem: Problem, solver: Solver) -> NDArray[Any]:
     """In scene units, and not negative where the solver knows the sign."""
     video = video * problem.scale
-    return video if request.solver == "twist" else np.maximum(video, 0, out=video)
+    return video if solver.signed else np.maximum(video, 0, out=video)
 
 
 def _finish(
     segment: Segment,
     problem: Problem,
     request: Request,
+    solver: Solver,
     estimate: Estimate,
     clock: IterationClock,
     *,
@@ -146,7 +155,7 @@ def _finish(
 ) -> Reconstruction:
     T_m = request.temporal_merge
     predicted = estimate.predict()
-    video = _scaled(estimate.video(), problem, request)
+    video = _scaled(estimate.video(), problem, solver)
     held_out = estimate.held_out_error
     prediction = problem.prediction_error(predicted) if held_out is None else held_out
     quality = Quality(problem.misfit(predicted), prediction, problem.coverage)
@@ -173,6 +182,7 @@ def _finish(
             "spatial_merge": request.spatial_merge,
             "temporal_merge": T_m,
             "dtype": problem.arrays.dtype,
+            **solver.model_dump(mode="json"),
             **estimate.facts(),
         },
     )

@@ -12,15 +12,18 @@ where searches begin.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from acquire.arrays import host
 from acquire.recon.blinking import go_on, look_in_cosines, solve_blinking
 from acquire.recon.holdout import HeldOut
 from acquire.recon.patterns import find_patterns
+from acquire.recon.solver import Preset, Solver
 from acquire.recon.workbench import CALM, FIRST_ITERATIONS, SEARCH_SHARE, SMOOTH, STILL, VOLUME, Workbench
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from acquire.lines import Segment
     from acquire.recon.clock import IterationClock
     from acquire.recon.estimates import Estimate, InBand
@@ -40,6 +43,16 @@ CLEARLY = 0.97
 """Of a still's error, what a volume must reach to be preferred."""
 CLOSE, DOUBTFUL = 1.1, 2.0
 """Of the best trial's error: where cosines are gone on with, and where they are if patterns stand out."""
+
+
+class AdmmSolver(Solver):
+    """Ridge ADMM with whichever prior predicts best; ends sooner when the held-out samples say so."""
+
+    iterations: ClassVar[Mapping[Preset, int]] = {"fast": 40, "balanced": 150, "best": 300}
+    takes: ClassVar[frozenset[str]] = frozenset({"initial", "denoiser"})
+
+    def solve(self, segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> Estimate:
+        return solve_admm(segment, problem, request, clock)
 
 
 def solve_admm(segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> Estimate:

@@ -9,23 +9,34 @@ of `admm`; any other denoiser makes it plug-and-play ADMM (Venkatakrishnan, Boum
             return cleaned                # same shape and dtype
 
     reconstruct(segment, 3, 1, denoiser=Mine())
+
+One that an entry point of the group ``acquire.denoisers`` names, made without arguments, goes by its name:
+``reconstruct(…, denoiser="haar")``, ``acquire reconstruct --denoiser haar``.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 from acquire.arrays import namespace
 from acquire.errors import NumericsError, UsageError
+from acquire.plugins import DENOISERS
 
 if TYPE_CHECKING:
     from acquire.arrays import Array
 
 
+@runtime_checkable
 class Denoiser(Protocol):
     """Cleans frames (K, row, column); ``weight`` says how strongly, in the units of TV's."""
 
     def prox(self, frames: Array, weight: float | Array, /) -> Array: ...
+
+
+def open_denoiser(name: str) -> Denoiser:
+    """The installed denoiser of that name. Raises ConfigError where there is none that works."""
+    found: Denoiser = DENOISERS.load(name)()
+    return found
 
 
 class Checked:

@@ -16,6 +16,7 @@ from acquire.cores import slowness
 from acquire.errors import UsageError
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
+from acquire.plugins import SOLVERS
 
 if TYPE_CHECKING:
     from acquire.recon.clock import IterationClock
@@ -24,8 +25,6 @@ PROBED_SHARE = 6
 """The pass is over one of so many lines."""
 LOOK_S = 0.005
 """Of processor time, for which passes are repeated."""
-PASSES = {"admm": 14.0, "twist-band": 14.0, "twist": 18.0}
-"""A reconstruction of one iteration without a search for the bandwidth, in passes of the operator."""
 MARGIN, MARGIN_S = 0.1, 0.3
 """A budget may be exceeded by so much of it, and so long."""
 
@@ -42,7 +41,8 @@ def least_seconds(geometry: Geometry, spatial_merge: int, temporal_merge: int, s
         operator.adjoint(operator.forward(video))
         passes += 1
     once_s = (time.thread_time() - used) / passes
-    return PASSES[solver] * once_s * geometry.lines / few.lines * slowness()
+    passes_of_all: float = SOLVERS.load(solver).passes
+    return passes_of_all * once_s * geometry.lines / few.lines * slowness()
 
 
 def check_budget(clock: IterationClock, budget_s: float, least_s: float) -> None:

@@ -1,30 +1,20 @@
-"""A checked call of `reconstruct`: solvers, presets, limits."""
+"""A checked call of `reconstruct`: what is asked, and its limits."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from acquire.errors import UsageError
 from acquire.geometry import is_integer
+from acquire.plugins import SOLVERS
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.recon.denoisers import Denoiser
-
-Solver = Literal["admm", "twist", "twist-band"]
-Preset = Literal["fast", "balanced", "best"]
-
-ITERATIONS: dict[str, dict[str, int]] = {
-    "admm": {"fast": 40, "balanced": 150, "best": 300},
-    "twist": {"fast": 60, "balanced": 200, "best": 400},
-    "twist-band": {"fast": 60, "balanced": 200, "best": 400},
-}
-"""Most iterations per solver and preset; ADMM ends sooner when the held-out samples say so."""
-
 
 NEGATIVE_SHARE = 0.01
 """Of the largest value: what solvers without a sign leave below zero is no mistake."""
@@ -42,7 +32,7 @@ class Request:
 
     spatial_merge: int
     temporal_merge: int
-    solver: Solver
+    solver: str
     iterations: int
     bandwidth: float | None = None
     tv_weight: float | None = None
@@ -68,9 +58,10 @@ class Request:
                 f"{self.iterations!r} iterations are not possible", possible="an integer of at least 1"
             )
         for option, given in (("initial", self.initial), ("denoiser", self.denoiser)):
-            if given is not None and self.solver != "admm":
+            if given is not None and option not in SOLVERS.load(self.solver).takes:
+                able = [repr(name) for name, each in SOLVERS.working().items() if option in each.takes]
                 raise UsageError(
-                    f"{option} for solver {self.solver!r} is not known", possible="solver 'admm'"
+                    f"{option} for solver {self.solver!r} is not known", possible=f"solver {', '.join(able)}"
                 )
 
     def check_shapes(self, size: int, video_shape: tuple[int, int, int]) -> None:
@@ -79,15 +70,6 @@ class Request:
         _check_array("static image", self.static_image, (size, size))
         if self.static_image is not None and not np.any(self.static_image):
             raise UsageError("static image that is dark everywhere", possible="the scene at rest, lit")
-
-
-def preset_iterations(solver: str, preset: str) -> int:
-    """Most iterations of a preset; UsageError for names that are none."""
-    if solver not in ITERATIONS:
-        raise UsageError(f"solver {solver!r} is not known", possible=", ".join(ITERATIONS))
-    if preset not in ITERATIONS[solver]:
-        raise UsageError(f"preset {preset!r} is not known", possible=", ".join(ITERATIONS[solver]))
-    return ITERATIONS[solver][preset]
 
 
 def _check_array(what: str, given: NDArray[Any] | None, shape: tuple[int, ...]) -> None:

@@ -8,7 +8,7 @@ twist-band  the same algorithm with the default's band and sign
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from acquire.recon.basis import TemporalBasis
 from acquire.recon.blinking import find_band
 from acquire.recon.curves import CurveFit, CurveOperator
 from acquire.recon.estimates import InBand
+from acquire.recon.solver import Solver
 from acquire.recon.twist import Twist, TwistParameters
 
 if TYPE_CHECKING:
@@ -31,11 +32,30 @@ if TYPE_CHECKING:
     from acquire.recon.request import Request
 
 
-def solve_twist(segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> Estimate:
-    """The paper's solver; ``twist-band`` with the band and the sign of the default."""
+class TwistSolver(Solver):
+    """The paper's: TwIST on all frames, which knows neither a band nor a sign."""
+
+    passes: ClassVar[float] = 18.0
+    signed: ClassVar[bool] = True
+    holds_out: ClassVar[bool] = False
+
+    def solve(self, segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> Estimate:
+        return solve_twist(segment, problem, request, clock, banded=False)
+
+
+class BandedTwistSolver(Solver):
+    """The paper's algorithm with the band and the sign of the default."""
+
+    def solve(self, segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> Estimate:
+        return solve_twist(segment, problem, request, clock, banded=True)
+
+
+def solve_twist(
+    segment: Segment, problem: Problem, request: Request, clock: IterationClock, *, banded: bool
+) -> Estimate:
+    """The paper's algorithm; ``banded`` in the band that the lines show."""
     N_m, T_m = request.spatial_merge, request.temporal_merge
     shape = segment.geometry.video_shape(N_m, T_m)
-    banded = request.solver == "twist-band"
     count = find_band(segment, problem, request, clock) if banded else shape[0]
     basis = TemporalBasis(shape[0], count, problem.arrays)
     make = band_operator if banded else InBasis

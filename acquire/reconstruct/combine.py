@@ -199,6 +199,8 @@ def describe_parts(
         "spatial_merge": voxels.spatial_merge,
         "temporal_merge": voxels.temporal_merge,
         "solver": options.solver,
+        "solver_options": dict(options.solver_options),
+        "denoiser": options.denoiser,
         "preset": options.preset,
         "dtype": options.dtype,
         "device": options.device,

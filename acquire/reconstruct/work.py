@@ -16,11 +16,13 @@ from acquire.recon.judge import POOR_MISFIT
 from acquire.store import open_recording
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from acquire.arrays import Dtype
     from acquire.calibrate import Calibration
-    from acquire.recon import Preset, Progress, Reconstruction, Solver
+    from acquire.recon import Preset, Progress, Reconstruction
     from acquire.recon.hypotheses import Turn
     from acquire.recon.segments import Grid, SubSegment
 
@@ -33,11 +35,12 @@ class Options:
     """How to solve; see `acquire.recon.reconstruct`. ``budget_s`` is for all that is asked for.
 
     ``calibration`` is what lines are read with; None: as the cameras' configuration says. ``turn`` is how the
-    arms are to be put right beyond that, and ``check`` whether what is not explained is looked into.
+    arms are to be put right beyond that, and ``check`` whether what is not explained is looked into. The
+    options of the solver and the denoiser's name are those of whoever's solver that is.
     """
 
     preset: Preset = "balanced"
-    solver: Solver = "admm"
+    solver: str = "admm"
     iterations: int | None = None
     budget_s: float | None = None
     bandwidth: float | None = None
@@ -46,6 +49,8 @@ class Options:
     calibration: Calibration | None = None
     turn: Turn = AS_BUILT
     check: bool = True
+    solver_options: Mapping[str, Any] = field(default_factory=dict)
+    denoiser: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +107,8 @@ def solve(task: Task, watch: Watch) -> Part:
         options.budget_s if task.due is None else max(task.due - time.monotonic(), LEAST_BUDGET_S),
         advanced,
         solver=options.solver,
+        solver_options=options.solver_options,
+        denoiser=options.denoiser,
         iterations=options.iterations,
         bandwidth=options.bandwidth,
         dtype=options.dtype,
