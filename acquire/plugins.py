@@ -126,10 +126,11 @@ class Group:
 
 
 EFFECTS = Group("acquire.effects", "effect", "acquire.sim.effects.base:Effect")
+SCENES = Group("acquire.scenes", "scene", "acquire.sim.scene:SceneModel")
 SOLVERS = Group("acquire.solvers", "solver", "acquire.recon.solver:Solver")
 DENOISERS = Group("acquire.denoisers", "denoiser", "acquire.recon.denoisers:Denoiser")
 
-GROUPS = (EFFECTS, SOLVERS, DENOISERS)
+GROUPS = (EFFECTS, SCENES, SOLVERS, DENOISERS)
 
 
 def forget() -> None:

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from acquire.config import load_rig
-from acquire.config.scene import LedSceneConfig, VideoSceneConfig
+from acquire.sim.leds import LedSceneConfig
+from acquire.sim.media import VideoSceneConfig
 from acquire.simulate import bench_of, simulate
 
 M, S = 24, 3

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from acquire.config import builtin_directory, load_rig, load_scene
-from acquire.config.scene import LedSceneConfig
 from acquire.errors import ConfigError, UsageError
 from acquire.geometry import Geometry
 from acquire.rig import Rig, open_trigger
 from acquire.sim import build_scene, truth
+from acquire.sim.leds import LedSceneConfig
 from acquire.simulate import simulate
 from acquire.store import open_recording
 from acquire.trigger.base import TriggerRun

@@ -12,9 +12,10 @@ import xarray
 from PIL import Image
 
 from acquire.config import load_rig, load_scene
-from acquire.config.scene import FunctionSceneConfig, LedSceneConfig
 from acquire.errors import UsageError
 from acquire.sim.effects import kinds
+from acquire.sim.functions import FunctionSceneConfig
+from acquire.sim.leds import LedSceneConfig
 from acquire.sim.lines import StreamingArm
 from acquire.sim.scenes import build_scene
 from acquire.simulate import bench_of, simulate, study

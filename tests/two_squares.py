@@ -7,7 +7,8 @@ from pathlib import Path
 
 from acquire.config import load_rig
 from acquire.config.effect import EffectConfig
-from acquire.config.scene import ArmOptics, ConstantDrive, LedConfig, LedSceneConfig, OpticsConfig, SineDrive
+from acquire.config.scene import ArmOptics, ConstantDrive, OpticsConfig, SineDrive
+from acquire.sim.leds import LedConfig, LedSceneConfig
 from acquire.simulate import simulate
 
 

@@ -33,9 +33,10 @@ from acquire.calibrate.orientation import VIEWS
 from acquire.calibrate.target import alignment, orientation
 from acquire.calibrate.transfer import transfer
 from acquire.config import load_rig
-from acquire.config.scene import LedSceneConfig, VideoSceneConfig
 from acquire.forward import merge_video
 from acquire.recon import reconstruct
+from acquire.sim.leds import LedSceneConfig
+from acquire.sim.media import VideoSceneConfig
 from acquire.sim.scenes import build_scene
 from acquire.simulate import bench_of, simulate
 from acquire.store import open_recording

@@ -33,7 +33,7 @@ import matplotlib as mpl
 import numpy as np
 
 from acquire.config import load_rig
-from acquire.config.scene import SceneFile, VideoSceneConfig
+from acquire.config.scene import SceneFile
 from acquire.evaluate.figures import DPI, STYLE
 from acquire.evaluate.metrics import psnr, ssim
 from acquire.evaluate.paper.drawing import strips
@@ -42,7 +42,7 @@ from acquire.geometry import Geometry
 from acquire.lines import ARMS
 from acquire.recon import reconstruct
 from acquire.sim.effects.charge import ReadNoise, ShotNoise
-from acquire.sim.media import open_media
+from acquire.sim.media import VideoSceneConfig, open_media
 from acquire.simulate import simulate
 from acquire.store import open_recording
 

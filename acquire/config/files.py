@@ -13,13 +13,16 @@ from acquire.config.builtin import builtin_directory, builtin_names
 from acquire.config.findings import explained
 from acquire.config.plan import ReconstructionPlan
 from acquire.config.rig import RigConfig
-from acquire.config.scene import SceneConfig, SceneFile, VideoSceneConfig, anchored
+from acquire.config.scene import SceneFile
 from acquire.errors import ConfigError
+from acquire.plugins import SCENES
 from acquire.reading import read_regular
 from acquire.text import shortened, shown
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
+    from acquire.config.scene import SceneBase
 
 MOST_FILE_BYTES = 2**20
 """Of a file of this kind; written by hand, they have some kilobytes."""
@@ -106,17 +109,18 @@ def parse_settings(settings: Sequence[str]) -> dict[str, Any]:
     return overrides
 
 
-def load_scene(name: str | Path) -> SceneConfig:
+def load_scene(name: str | Path) -> SceneBase:
     """Read and validate a scene file; a picture or video file is a scene that shows it.
 
     Relative paths in it are resolved against the file.
     """
     path = find(name, kind="scene")
     if path.suffix != ".toml":
-        return VideoSceneConfig(kind="video", title=path.name, path=path.resolve())
+        scene: SceneBase = SCENES.load("video")(kind="video", title=path.name, path=path.resolve())
+        return scene
     table = _read(path)
     _check_kind(table, "scene", path)
-    return anchored(_validate(SceneFile, table, path).root, path.parent)
+    return _validate(SceneFile, table, path).root.anchored(path.parent)
 
 
 def load_plan(name: str | Path) -> ReconstructionPlan:

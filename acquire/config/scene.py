@@ -1,11 +1,13 @@
-"""Models of scene files: what a scene shows, what stands before it, and which effects its simulation has.
+"""What scene files have in common: what stands before a scene, and which effects its simulation has.
 
 ::
 
-    scene = one kind  (leds, usaf, digits, sprites, video, function, sum of parts)
+    scene = one kind  (leds, usaf, digits, sprites, video, function, sum of parts, or anybody's)
             seen through shutters (window, chopper), in order
             + optics (which layout, how each arm is turned)
             + effects (`acquire.config.effect`), each absent unless listed
+
+What a kind shows, and its own keys, are a class that an entry point names (`acquire.sim.scene.SceneModel`).
 
 Positions and sizes are fractions of the scene's side unless their name says otherwise.
 """
@@ -13,14 +15,14 @@ Positions and sizes are fractions of the scene's side unless their name says oth
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, RootModel, model_validator
 
-from acquire.config.base import MOST_LINES, SEED_END, FilePath, FrozenModel, Seconds
+from acquire.config.base import MOST_LINES, SEED_END, FrozenModel, Seconds
 from acquire.config.effect import EffectConfig
 from acquire.config.variants import OneOf
-from acquire.plugins import EFFECTS
+from acquire.plugins import EFFECTS, SCENES
 
 Fraction = Annotated[float, Field(ge=0, le=1)]
 
@@ -66,47 +68,6 @@ class TriangleDrive(FrozenModel):
 DriveConfig = Annotated[
     SineDrive | ConstantDrive | PulseDrive | TriangleDrive, Field(discriminator="waveform")
 ]
-
-
-class LedConfig(FrozenModel):
-    """One LED behind a mask. Positions and sizes are fractions of the scene's side."""
-
-    name: str
-    shape: Literal["x", "triangle", "circle", "equals", "square"]
-    row: float = Field(ge=0, le=1, description="centre")
-    column: float = Field(ge=0, le=1, description="centre")
-    size: float = Field(gt=0, le=1, description="side of the bounding square")
-    drive: DriveConfig
-    saturation: float | None = Field(
-        default=None,
-        gt=0,
-        description="drive at which the LED gives 1 − 1/e of its asymptote; absent: linear",
-    )
-
-
-class DisplayConfig(FrozenModel):
-    """One seven-segment display: a digit per period, its intensity a triangle 0 → 1 → 0."""
-
-    digits: str = Field(pattern=r"^[0-9]+$", description="shown one after the other, in a loop")
-    row: Fraction = 0.5
-    column: Fraction
-    height: float = Field(default=0.7, gt=0, le=1, description="of the digit; it is 0.58 as wide")
-    phase_deg: float = Field(default=0.0, description="of the display's period")
-
-
-class SpriteConfig(FrozenModel):
-    """A picture that moves: its centre on a circle, itself turning. Positive is counter-clockwise."""
-
-    picture: str = Field(description='"broad-finned" or "zebra" goldfish, or an image file')
-    row: Fraction = Field(description="centre of the orbit")
-    column: Fraction = Field(description="centre of the orbit")
-    size: float = Field(gt=0, le=1, description="side of the picture's square")
-    orbit_radius: float = Field(default=0.0, ge=0, le=1)
-    orbit_hz: float = 0.0
-    orbit_phase_deg: float = Field(default=0.0, description="at sub-step 0; 0 is right, 90 above the centre")
-    turn_hz: float | None = Field(default=None, description="absent: it heads along its orbit")
-    turn_phase_deg: float = 0.0
-    level: float = Field(default=1.0, gt=0, le=1)
 
 
 class WindowPhase(FrozenModel):
@@ -170,8 +131,9 @@ class OpticsConfig(FrozenModel):
 
 
 class SceneBase(FrozenModel):
-    """What every scene file may say."""
+    """What every scene file may say. ``kind`` is the name of the scene's entry point."""
 
+    kind: str
     title: str = ""
     rig: str = Field(default="rig-demo", description="the rig that `acquire simulate` takes for it")
     lines: int = Field(default=33_334, ge=1, le=MOST_LINES, description="that `acquire simulate` writes")
@@ -183,6 +145,15 @@ class SceneBase(FrozenModel):
     )
     effects: tuple[Annotated[EffectConfig, OneOf(EFFECTS, EffectConfig)], ...] = ()
 
+    @property
+    def sources(self) -> int:
+        """About how many pictures it holds at once: what its memory is foreseen by."""
+        return 4
+
+    def anchored(self, directory: Path) -> Self:  # noqa: ARG002
+        """The scene with its files named from ``directory`` on, so that any process finds them."""
+        return self
+
     @model_validator(mode="after")
     def _effects_differ(self) -> SceneBase:
         kinds = [effect.kind for effect in self.effects]
@@ -191,132 +162,9 @@ class SceneBase(FrozenModel):
         return self
 
 
-class LedSceneConfig(SceneBase):
-    """LEDs behind masks, each with its own drive (Fig. 9)."""
-
-    kind: Literal["leds"]
-    leds: tuple[LedConfig, ...] = Field(min_length=1)
-
-    @model_validator(mode="after")
-    def _names_differ(self) -> LedSceneConfig:
-        names = [led.name for led in self.leds]
-        if len(set(names)) < len(names):
-            raise ValueError(f"LEDs need different names, not {', '.join(names)}")
-        return self
-
-
-class UsafSceneConfig(SceneBase):
-    """USAF 1951 target (MIL-STD-150A): bars of 1/(2·2^(g + (e − 1)/6)) mm, bright on dark (Fig. 6, 8, 11)."""
-
-    kind: Literal["usaf"]
-    field_mm: float = Field(default=6.4, gt=0, description="side of the scene in the target's plane")
-    groups: tuple[int, ...] = Field(
-        default=(2, 3, 4, 5), min_length=1, description="pairs of groups, the outermost even one first"
-    )
-    dark: float = Field(default=0.0, ge=0, le=1, description="light between the bars")
-    drive: DriveConfig = ConstantDrive(waveform="constant")
-
-    @model_validator(mode="after")
-    def _pairs(self) -> UsafSceneConfig:
-        first = self.groups[0]
-        if first % 2 or list(self.groups) != list(range(first, first + len(self.groups))):
-            raise ValueError("groups count upwards from an even one, as 2, 3, 4, 5")
-        return self
-
-
-class DigitsSceneConfig(SceneBase):
-    """Seven-segment displays whose digits come and go with triangular intensity (Fig. 10)."""
-
-    kind: Literal["digits"]
-    period_s: float = Field(default=1.28e-3, gt=0)
-    displays: tuple[DisplayConfig, ...] = Field(min_length=1)
-
-
-class SpritesSceneConfig(SceneBase):
-    """Moving pictures, a later one over an earlier one (Fig. 7)."""
-
-    kind: Literal["sprites"]
-    background: Fraction = 0.0
-    sprites: tuple[SpriteConfig, ...] = Field(min_length=1)
-
-
-class VideoSceneConfig(SceneBase):
-    """A file of the user: a picture, a video, or an array (time, row, column) of 0 to 1 as .npy."""
-
-    kind: Literal["video"]
-    path: FilePath = Field(description="relative to the scene file")
-    frame_rate_hz: float | None = Field(default=None, gt=0, description="absent: the file's own")
-    fit: Literal["fill", "pad", "stretch"] = Field(default="fill", description="how it becomes square")
-    between: Literal["hold", "blend"] = Field(default="blend", description="light between two frames")
-    end: Literal["loop", "last"] = "loop"
-    gamma: float = Field(default=1.0, gt=0, le=5, description="light = (pixel / white)^gamma")
-
-
-class FunctionSceneConfig(SceneBase):
-    """A Python function of the user: (time_s (k,), row (n, 1), column (n,)) → light (k, n, n).
-
-    Rows and columns are the pixels' centres, 0 to 1. ``file.py:name`` is relative to the scene file.
-    """
-
-    kind: Literal["function"]
-    function: str = Field(pattern=r"^.+:[A-Za-z_]\w*$", description="module:name or file.py:name")
-
-
-class SumSceneConfig(SceneBase):
-    """The light of several scenes added; optics and effects are those of the sum."""
-
-    kind: Literal["sum"]
-    parts: tuple[SceneConfig, ...] = Field(min_length=1)
-
-    @model_validator(mode="after")
-    def _parts_are_only_light(self) -> SumSceneConfig:
-        for part in self.parts:
-            if part.effects or part.optics != OpticsConfig():
-                raise ValueError("effects and optics belong to the sum, not to a part of it")
-        return self
-
-
-SceneConfig = Annotated[
-    LedSceneConfig
-    | UsafSceneConfig
-    | DigitsSceneConfig
-    | SpritesSceneConfig
-    | VideoSceneConfig
-    | FunctionSceneConfig
-    | SumSceneConfig,
-    Field(discriminator="kind"),
-]
-SumSceneConfig.model_rebuild()
+SceneConfig = Annotated[SceneBase, OneOf(SCENES, SceneBase)]
+"""Any scene that is installed, by its ``kind``."""
 
 
 class SceneFile(RootModel[SceneConfig]):
     """The whole of a scene file."""
-
-
-GOLDFISH = ("broad-finned", "zebra")
-"""Pictures that come with the program."""
-
-
-def anchored(scene: SceneConfig, directory: Path) -> SceneConfig:
-    """The scene with its files named from ``directory`` on, so that any process finds them."""
-    match scene:
-        case VideoSceneConfig():
-            return scene.model_copy(update={"path": (directory / scene.path).resolve()})
-        case FunctionSceneConfig():
-            place, _, name = scene.function.rpartition(":")
-            if place.endswith(".py"):
-                return scene.model_copy(update={"function": f"{(directory / place).resolve()}:{name}"})
-        case SpritesSceneConfig():
-            sprites = tuple(_anchored_sprite(sprite, directory) for sprite in scene.sprites)
-            return scene.model_copy(update={"sprites": sprites})
-        case SumSceneConfig():
-            return scene.model_copy(
-                update={"parts": tuple(anchored(part, directory) for part in scene.parts)}
-            )
-    return scene
-
-
-def _anchored_sprite(sprite: SpriteConfig, directory: Path) -> SpriteConfig:
-    if sprite.picture in GOLDFISH:
-        return sprite
-    return sprite.model_copy(update={"picture": str((directory / sprite.picture).resolve())})

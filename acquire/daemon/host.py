@@ -15,7 +15,6 @@ import numpy as np
 
 from acquire.clock import ClockFit
 from acquire.config import check_directory, load_scene
-from acquire.config.scene import LedSceneConfig
 from acquire.daemon.storage import storage_settings
 from acquire.errors import ConfigError, UsageError
 from acquire.lines import ARMS
@@ -114,8 +113,7 @@ def _scene_bytes(config: RigConfig) -> int:
     size = config.geometry.stages * config.geometry.substeps
     if scene.optics.layout == "interline":
         size *= scene.optics.baseline_factor
-    masks = len(scene.leds) if isinstance(scene, LedSceneConfig) else 4
-    return size * size * max(SCENE_BYTES, SCENE_BYTES // 4 * masks)
+    return size * size * max(SCENE_BYTES, SCENE_BYTES // 4 * scene.sources)
 
 
 def memory_bytes() -> int:

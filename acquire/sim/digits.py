@@ -13,18 +13,19 @@ A segment is a source of its own: its intensity is the sum of the triangles of t
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from pydantic import Field
 
+from acquire.config.base import FrozenModel
+from acquire.config.scene import Fraction
 from acquire.sim.drives import phase, triangle_within
-from acquire.sim.scene import MaskScene
+from acquire.sim.scene import MaskScene, SceneModel
 from acquire.sim.targets import overlap
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    from acquire.config.scene import DisplayConfig
 
 SEGMENTS = ("abcdef", "bc", "abdeg", "abcdg", "bcfg", "acdfg", "acdefg", "abc", "abcdefg", "abcdfg")
 """Segments of each digit."""
@@ -41,6 +42,27 @@ _PLACES = {
     "g": (0.5 - _STROKE / 2, _STROKE, _STROKE, _WIDTH - 2 * _STROKE),
 }
 """Segment → top, left, height, width, in heights of the digit from its corner."""
+
+
+class DisplayConfig(FrozenModel):
+    """One seven-segment display: a digit per period, its intensity a triangle 0 → 1 → 0."""
+
+    digits: str = Field(pattern=r"^[0-9]+$", description="shown one after the other, in a loop")
+    row: Fraction = 0.5
+    column: Fraction
+    height: float = Field(default=0.7, gt=0, le=1, description="of the digit; it is 0.58 as wide")
+    phase_deg: float = Field(default=0.0, description="of the display's period")
+
+
+class DigitsSceneConfig(SceneModel):
+    """Seven-segment displays whose digits come and go with triangular intensity (Fig. 10)."""
+
+    kind: Literal["digits"]
+    period_s: float = Field(default=1.28e-3, gt=0)
+    displays: tuple[DisplayConfig, ...] = Field(min_length=1)
+
+    def build(self, size: int, substep_s: float) -> DigitScene:
+        return DigitScene(self.displays, self.period_s, size, substep_s)
 
 
 class DigitScene(MaskScene):

@@ -5,11 +5,13 @@ from __future__ import annotations
 import importlib
 import runpy
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
+from pydantic import Field
 
 from acquire.errors import UsageError
+from acquire.sim.scene import SceneModel
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -17,6 +19,25 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     LightFunction = Callable[[NDArray[Any], NDArray[Any], NDArray[Any]], Any]
+
+
+class FunctionSceneConfig(SceneModel):
+    """A Python function of the user: (time_s (k,), row (n, 1), column (n,)) → light (k, n, n).
+
+    Rows and columns are the pixels' centres, 0 to 1. ``file.py:name`` is relative to the scene file.
+    """
+
+    kind: Literal["function"]
+    function: str = Field(pattern=r"^.+:[A-Za-z_]\w*$", description="module:name or file.py:name")
+
+    def build(self, size: int, substep_s: float) -> FunctionScene:
+        return FunctionScene(load_function(self.function), size, substep_s)
+
+    def anchored(self, directory: Path) -> Self:
+        place, _, name = self.function.rpartition(":")
+        if not place.endswith(".py"):
+            return self
+        return self.model_copy(update={"function": f"{(directory / place).resolve()}:{name}"})
 
 
 class FunctionScene:

@@ -2,22 +2,60 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from pydantic import Field, model_validator
 
+from acquire.config.base import FrozenModel
+from acquire.config.scene import DriveConfig
 from acquire.sim.drives import mean_drive
-from acquire.sim.scene import MaskScene
+from acquire.sim.scene import MaskScene, SceneModel
 from acquire.sim.shapes import coverage
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from acquire.config.scene import LedConfig
-
 
 _EDGE = 2
 """Pixels by which a shape's smooth edge can reach over its square."""
+
+
+class LedConfig(FrozenModel):
+    """One LED behind a mask. Positions and sizes are fractions of the scene's side."""
+
+    name: str
+    shape: Literal["x", "triangle", "circle", "equals", "square"]
+    row: float = Field(ge=0, le=1, description="centre")
+    column: float = Field(ge=0, le=1, description="centre")
+    size: float = Field(gt=0, le=1, description="side of the bounding square")
+    drive: DriveConfig
+    saturation: float | None = Field(
+        default=None,
+        gt=0,
+        description="drive at which the LED gives 1 − 1/e of its asymptote; absent: linear",
+    )
+
+
+class LedSceneConfig(SceneModel):
+    """LEDs behind masks, each with its own drive (Fig. 9)."""
+
+    kind: Literal["leds"]
+    leds: tuple[LedConfig, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _names_differ(self) -> LedSceneConfig:
+        names = [led.name for led in self.leds]
+        if len(set(names)) < len(names):
+            raise ValueError(f"LEDs need different names, not {', '.join(names)}")
+        return self
+
+    def build(self, size: int, substep_s: float) -> LedScene:
+        return LedScene(self.leds, size, substep_s)
+
+    @property
+    def sources(self) -> int:
+        return len(self.leds)
 
 
 class LedScene(MaskScene):

@@ -13,20 +13,21 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Literal, Protocol, Self
 
 import numpy as np
+from pydantic import Field
 
+from acquire.config.base import FilePath
 from acquire.errors import DataError, UsageError
 from acquire.sim.functions import checked_light
+from acquire.sim.scene import SceneModel
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
-
-    from acquire.config.scene import VideoSceneConfig
 
     Light = NDArray[np.floating[Any]]
 
@@ -51,6 +52,24 @@ class Source(Protocol):
     def frame(self, index: int) -> Light:
         """(row, column) float32."""
         ...
+
+
+class VideoSceneConfig(SceneModel):
+    """A file of the user: a picture, a video, or an array (time, row, column) of 0 to 1 as .npy."""
+
+    kind: Literal["video"]
+    path: FilePath = Field(description="relative to the scene file")
+    frame_rate_hz: float | None = Field(default=None, gt=0, description="absent: the file's own")
+    fit: Literal["fill", "pad", "stretch"] = Field(default="fill", description="how it becomes square")
+    between: Literal["hold", "blend"] = Field(default="blend", description="light between two frames")
+    end: Literal["loop", "last"] = "loop"
+    gamma: float = Field(default=1.0, gt=0, le=5, description="light = (pixel / white)^gamma")
+
+    def build(self, size: int, substep_s: float) -> VideoScene:
+        return VideoScene(self, size, substep_s)
+
+    def anchored(self, directory: Path) -> Self:
+        return self.model_copy(update={"path": (directory / self.path).resolve()})
 
 
 class VideoScene:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
+from acquire.config.scene import SceneBase
 from acquire.errors import UsageError
 
 if TYPE_CHECKING:
@@ -68,6 +69,20 @@ def frames_at(scene: Scene, substeps: NDArray[np.int64]) -> NDArray[np.float32]:
         return np.empty((0, scene.size, scene.size), np.float32)
     first = int(substeps[0])
     return scene.frames(first, int(substeps[-1]) - first + 1)[substeps - first]
+
+
+class SceneModel(SceneBase, ABC):
+    """A kind of scene: a model of its keys, and what it shows. Named by an entry point.
+
+    A scene of files also extends `acquire.config.scene.SceneBase.anchored`.
+    """
+
+    @abstractmethod
+    def build(self, size: int, substep_s: float) -> Scene:
+        """What it shows at ``size`` rows and columns, sub-step 0 at the run's begin; without its shutters.
+
+        Raises UsageError for files and values that are no scene.
+        """
 
 
 class MaskScene(ABC):

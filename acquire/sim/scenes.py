@@ -1,24 +1,27 @@
-"""From a scene's description to the scene."""
+"""From a scene's description to the scene, and the sum of several."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, Self, cast
 
-from acquire.sim.leds import LedScene
-from acquire.sim.scene import add
+from pydantic import Field, model_validator
+
+from acquire.config.scene import OpticsConfig, SceneConfig
+from acquire.sim.scene import SceneModel, add
 
 if TYPE_CHECKING:
-    from acquire.config.scene import SceneConfig
+    from pathlib import Path
+
+    from acquire.config.scene import SceneBase
     from acquire.sim.scene import Scene
 
 
-def build_scene(config: SceneConfig, size: int, substep_s: float) -> Scene:
-    """The scene that a configuration describes, at ``size`` rows and columns.
+def build_scene(config: SceneBase, size: int, substep_s: float) -> Scene:
+    """The scene that a configuration describes, at ``size`` rows and columns, behind its shutters.
 
-    What a scene needs beyond this module is imported when it is asked for. UsageError for files, pictures and
-    functions that are no scene.
+    UsageError for files, pictures and functions that are no scene.
     """
-    scene = _source(config, size, substep_s)
+    scene = cast("SceneModel", config).build(size, substep_s)
     if not config.shutters:
         return scene
     from acquire.sim.shutters import ShutteredScene, build_shutter
@@ -26,30 +29,21 @@ def build_scene(config: SceneConfig, size: int, substep_s: float) -> Scene:
     return ShutteredScene(scene, [build_shutter(shutter, size, substep_s) for shutter in config.shutters])
 
 
-def _source(config: SceneConfig, size: int, substep_s: float) -> Scene:  # noqa: PLR0911  # a table
-    match config.kind:
-        case "leds":
-            return LedScene(config.leds, size, substep_s)
-        case "usaf":
-            from acquire.sim.targets import TargetScene, usaf_picture
+class SumSceneConfig(SceneModel):
+    """The light of several scenes added; optics and effects are those of the sum."""
 
-            picture = usaf_picture(config.groups, size, config.field_mm, config.dark)
-            return TargetScene(picture, config.drive, substep_s)
-        case "digits":
-            from acquire.sim.digits import DigitScene
+    kind: Literal["sum"]
+    parts: tuple[SceneConfig, ...] = Field(min_length=1)
 
-            return DigitScene(config.displays, config.period_s, size, substep_s)
-        case "sprites":
-            from acquire.sim.sprites import SpriteScene
+    @model_validator(mode="after")
+    def _parts_are_only_light(self) -> SumSceneConfig:
+        for part in self.parts:
+            if part.effects or part.optics != OpticsConfig():
+                raise ValueError("effects and optics belong to the sum, not to a part of it")
+        return self
 
-            return SpriteScene(config.sprites, config.background, size, substep_s)
-        case "video":
-            from acquire.sim.media import VideoScene
+    def build(self, size: int, substep_s: float) -> Scene:
+        return add([build_scene(part, size, substep_s) for part in self.parts])
 
-            return VideoScene(config, size, substep_s)
-        case "function":
-            from acquire.sim.functions import FunctionScene, load_function
-
-            return FunctionScene(load_function(config.function), size, substep_s)
-        case "sum":
-            return add([build_scene(part, size, substep_s) for part in config.parts])
+    def anchored(self, directory: Path) -> Self:
+        return self.model_copy(update={"parts": tuple(part.anchored(directory) for part in self.parts)})

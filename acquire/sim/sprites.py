@@ -7,23 +7,59 @@ the fish is at the middle of the sub-step.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
+from pydantic import Field
 
-from acquire.sim.kernels import paste
+from acquire.config.base import FrozenModel
+from acquire.config.scene import Fraction
+from acquire.sim.scene import SceneModel
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from numpy.typing import NDArray
 
-    from acquire.config.scene import SpriteConfig
-
     Grid = NDArray[Any]
     Picture = tuple[Grid, Grid]
 
 _TEXELS = 256
+
+
+class SpriteConfig(FrozenModel):
+    """A picture that moves: its centre on a circle, itself turning. Positive is counter-clockwise."""
+
+    picture: str = Field(description='"broad-finned" or "zebra" goldfish, or an image file')
+    row: Fraction = Field(description="centre of the orbit")
+    column: Fraction = Field(description="centre of the orbit")
+    size: float = Field(gt=0, le=1, description="side of the picture's square")
+    orbit_radius: float = Field(default=0.0, ge=0, le=1)
+    orbit_hz: float = 0.0
+    orbit_phase_deg: float = Field(default=0.0, description="at sub-step 0; 0 is right, 90 above the centre")
+    turn_hz: float | None = Field(default=None, description="absent: it heads along its orbit")
+    turn_phase_deg: float = 0.0
+    level: float = Field(default=1.0, gt=0, le=1)
+
+    def anchored(self, directory: Path) -> Self:
+        """With its picture named from ``directory`` on."""
+        if self.picture in _GOLDFISH:
+            return self
+        return self.model_copy(update={"picture": str((directory / self.picture).resolve())})
+
+
+class SpritesSceneConfig(SceneModel):
+    """Moving pictures, a later one over an earlier one (Fig. 7)."""
+
+    kind: Literal["sprites"]
+    background: Fraction = 0.0
+    sprites: tuple[SpriteConfig, ...] = Field(min_length=1)
+
+    def build(self, size: int, substep_s: float) -> SpriteScene:
+        return SpriteScene(self.sprites, self.background, size, substep_s)
+
+    def anchored(self, directory: Path) -> Self:
+        return self.model_copy(update={"sprites": tuple(one.anchored(directory) for one in self.sprites)})
 
 
 class SpriteScene:
@@ -58,6 +94,8 @@ class _Sprite:
         self._reach_texels = float(np.hypot(*covered.T).max(initial=0)) + 1
 
     def draw(self, frames: NDArray[np.float32], substeps: NDArray[np.int64]) -> None:
+        from acquire.sim.kernels import paste  # compiled code, which reading a scene file does without
+
         scale = len(self._picture) / (self._config.size * self._size)
         paste(frames, self._picture, self._alpha, self._places(substeps), scale, self._reach_texels / scale)
 

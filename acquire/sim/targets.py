@@ -14,12 +14,14 @@ Bars are rectangles along the axes, so how far a pixel is covered is exact: the 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from pydantic import Field, model_validator
 
+from acquire.config.scene import ConstantDrive, DriveConfig
 from acquire.sim.drives import mean_drive
-from acquire.sim.scene import MaskScene
+from acquire.sim.scene import MaskScene, SceneModel
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -27,6 +29,29 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.sim.drives import Drive
+
+
+class UsafSceneConfig(SceneModel):
+    """USAF 1951 target (MIL-STD-150A): bars of 1/(2·2^(g + (e − 1)/6)) mm, bright on dark (Fig. 6, 8, 11)."""
+
+    kind: Literal["usaf"]
+    field_mm: float = Field(default=6.4, gt=0, description="side of the scene in the target's plane")
+    groups: tuple[int, ...] = Field(
+        default=(2, 3, 4, 5), min_length=1, description="pairs of groups, the outermost even one first"
+    )
+    dark: float = Field(default=0.0, ge=0, le=1, description="light between the bars")
+    drive: DriveConfig = ConstantDrive(waveform="constant")
+
+    @model_validator(mode="after")
+    def _pairs(self) -> UsafSceneConfig:
+        first = self.groups[0]
+        if first % 2 or list(self.groups) != list(range(first, first + len(self.groups))):
+            raise ValueError("groups count upwards from an even one, as 2, 3, 4, 5")
+        return self
+
+    def build(self, size: int, substep_s: float) -> TargetScene:
+        picture = usaf_picture(self.groups, size, self.field_mm, self.dark)
+        return TargetScene(picture, self.drive, substep_s)
 
 
 @dataclass(frozen=True, slots=True)

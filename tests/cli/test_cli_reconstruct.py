@@ -15,7 +15,8 @@ import pytest
 from PIL import Image
 
 from acquire.config import load_rig
-from acquire.config.scene import ConstantDrive, LedConfig, LedSceneConfig, SineDrive
+from acquire.config.scene import ConstantDrive, SineDrive
+from acquire.sim.leds import LedConfig, LedSceneConfig
 from acquire.simulate import simulate
 from acquire.store import open_video
 

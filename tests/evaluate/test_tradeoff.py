@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 
 from acquire.config import load_rig
-from acquire.config.scene import LedConfig, LedSceneConfig, SineDrive
+from acquire.config.scene import SineDrive
 from acquire.errors import UsageError
 from acquire.evaluate.cases import full_wells, procedural
 from acquire.evaluate.tradeoff import Judge, Point, Run, amplitude_error, measure, pareto, table
 from acquire.evaluate.tradeoff_page import write_page
 from acquire.recon.segments import Voxels
+from acquire.sim.leds import LedConfig, LedSceneConfig
 from acquire.simulate import simulate
 from acquire.store import open_recording
 

@@ -7,12 +7,8 @@ from pathlib import Path
 import pytest
 
 from acquire.config import RigConfig, load_rig
-from acquire.config.scene import (
-    ConstantDrive,
-    LedConfig,
-    LedSceneConfig,
-    SineDrive,
-)
+from acquire.config.scene import ConstantDrive, SineDrive
+from acquire.sim.leds import LedConfig, LedSceneConfig
 from acquire.simulate import simulate
 
 STAGES, SUBSTEPS, LINES = 12, 2, 400

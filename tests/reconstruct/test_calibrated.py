@@ -14,9 +14,9 @@ from acquire.calibrate.columns import dark, flat
 from acquire.calibrate.exposure import open_exposure
 from acquire.calibrate.target import alignment
 from acquire.config import load_rig
-from acquire.config.scene import LedSceneConfig
 from acquire.errors import ConfigError
 from acquire.recon import reconstruct
+from acquire.sim.leds import LedSceneConfig
 from acquire.sim.scenes import build_scene
 from acquire.store import open_recording
 

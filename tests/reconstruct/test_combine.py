@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 from acquire.config.plan import ReconstructionPlan
-from acquire.config.scene import LedSceneConfig
 from acquire.errors import UsageError
 from acquire.recon.judge import POOR_MISFIT
 from acquire.recon.segments import Voxels
@@ -29,6 +28,7 @@ from acquire.reconstruct import (
     open_pool,
 )
 from acquire.reconstruct.budget import Budget
+from acquire.sim.leds import LedSceneConfig
 from acquire.sim.scenes import build_scene
 from acquire.sim.voxels import truth
 from acquire.store import open_recording, open_video

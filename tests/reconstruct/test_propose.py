@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from acquire.config.scene import ConstantDrive, LedConfig, LedSceneConfig, SineDrive
+from acquire.config.scene import ConstantDrive, SineDrive
 from acquire.recon.auto import Tempo
 from acquire.recon.segments import Voxels
 from acquire.reconstruct import by_lines
 from acquire.reconstruct.propose import PLACES, _alike, _tempos, propose
+from acquire.sim.leds import LedConfig, LedSceneConfig
 from acquire.simulate import simulate
 from acquire.store import open_recording
 

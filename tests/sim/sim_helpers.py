@@ -12,8 +12,9 @@ import numpy as np
 from acquire.codes import PrbsCode
 from acquire.config import GeometryConfig
 from acquire.config.device import CameraConfig
-from acquire.config.scene import ConstantDrive, LedConfig, LedSceneConfig, SineDrive
+from acquire.config.scene import ConstantDrive, SineDrive
 from acquire.sim.devices import SimulatedOptics
+from acquire.sim.leds import LedConfig, LedSceneConfig
 from acquire.trigger.base import TriggerRun
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from acquire.codes import ConstantCode
 from acquire.config import GeometryConfig
 from acquire.config.device import CameraConfig
-from acquire.config.scene import LedSceneConfig
+from acquire.sim.leds import LedSceneConfig
 from acquire.sim.pipeline import Bench
 
 M, S, DT = 8, 3, 1e-5

@@ -11,7 +11,8 @@ from sim_helpers import CODE
 from small_bench import DT, LIT, N, bench, blinking, flat, read
 
 from acquire.codes import ConstantCode
-from acquire.config.scene import FunctionSceneConfig, LedSceneConfig
+from acquire.sim.functions import FunctionSceneConfig
+from acquire.sim.leds import LedSceneConfig
 from acquire.sim.scenes import build_scene
 
 

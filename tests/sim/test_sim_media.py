@@ -8,10 +8,10 @@ import pytest
 from PIL import Image
 
 from acquire.config import load_scene
-from acquire.config.scene import SpriteConfig, SpritesSceneConfig, VideoSceneConfig
 from acquire.errors import DataError, UsageError
-from acquire.sim.media import _KEPT_FRAMES, VideoScene, resample
+from acquire.sim.media import _KEPT_FRAMES, VideoScene, VideoSceneConfig, resample
 from acquire.sim.scenes import build_scene
+from acquire.sim.sprites import SpriteConfig, SpritesSceneConfig
 
 RNG = np.random.default_rng(3)
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from acquire.config import builtin_directory, load_scene
-from acquire.config.scene import ChopperConfig, DisplayConfig, PulseDrive, TriangleDrive, WindowConfig
+from acquire.config.scene import ChopperConfig, PulseDrive, TriangleDrive, WindowConfig
 from acquire.errors import ConfigError
-from acquire.sim.digits import DigitScene
+from acquire.sim.digits import DigitScene, DisplayConfig
 from acquire.sim.drives import mean_drive
 from acquire.sim.scene import ArrayScene, SeparableScene, SumScene, frames_at
 from acquire.sim.scenes import build_scene

@@ -11,9 +11,9 @@ from sim_helpers import CODE, ManualClock
 from acquire.camera.base import CameraBlock
 from acquire.codes import ConstantCode, PrbsCode, mix_seed, prbs, state_at
 from acquire.config import load_rig, load_scene
-from acquire.config.scene import LedSceneConfig
 from acquire.errors import CameraError
 from acquire.sim.clock import Wire
+from acquire.sim.leds import LedSceneConfig
 from acquire.sim.replay import ReplayCameraOpener, describe_replay, replay_code
 from acquire.simulate import simulate
 from acquire.store import open_recording

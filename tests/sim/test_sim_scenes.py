@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from sim_helpers import LEDS
 
 from acquire.config import load_scene
-from acquire.config.scene import LedConfig, LedSceneConfig, SineDrive
+from acquire.config.scene import SineDrive
 from acquire.errors import UsageError
-from acquire.sim.leds import LedScene
+from acquire.sim.leds import LedConfig, LedScene, LedSceneConfig
 from acquire.sim.scene import ArrayScene, SeparableScene
 from acquire.sim.scenes import build_scene
 from acquire.sim.shapes import SHAPES

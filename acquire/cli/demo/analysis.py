@@ -10,7 +10,7 @@ import numpy as np
 
 from acquire.cli.demo.plan import N_M, SEGMENT_LINES, T_M, segment_row
 from acquire.cli.progress import stage_progress
-from acquire.config.scene import LedSceneConfig, SineDrive
+from acquire.config.scene import SineDrive
 from acquire.cores import idle_cores, limit_blas
 from acquire.evaluate.report import (
     ArmLedger,
@@ -23,7 +23,7 @@ from acquire.evaluate.report import (
 )
 from acquire.recon import Reconstruction, reconstruct
 from acquire.reconstruct import save_reconstruction
-from acquire.sim.leds import LedScene
+from acquire.sim.leds import LedScene, LedSceneConfig
 from acquire.sim.scenes import build_scene
 from acquire.sim.voxels import truth
 from acquire.store import Recording, open_recording, write_video
