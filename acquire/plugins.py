@@ -129,8 +129,10 @@ EFFECTS = Group("acquire.effects", "effect", "acquire.sim.effects.base:Effect")
 SCENES = Group("acquire.scenes", "scene", "acquire.sim.scene:SceneModel")
 SOLVERS = Group("acquire.solvers", "solver", "acquire.recon.solver:Solver")
 DENOISERS = Group("acquire.denoisers", "denoiser", "acquire.recon.denoisers:Denoiser")
+CAMERAS = Group("acquire.cameras", "camera driver", "acquire.camera.variant:CameraVariant")
+TRIGGERS = Group("acquire.triggers", "trigger driver", "acquire.trigger.variant:TriggerVariant")
 
-GROUPS = (EFFECTS, SCENES, SOLVERS, DENOISERS)
+GROUPS = (EFFECTS, SCENES, CAMERAS, TRIGGERS, SOLVERS, DENOISERS)
 
 
 def forget() -> None:

@@ -6,35 +6,23 @@ through the wire that the rig lays between simulated ones.
 
 from __future__ import annotations
 
-from dataclasses import replace
-from functools import partial
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, cast
 
-from acquire.camera.aravis import AravisOpener
-from acquire.camera.harvesters import HarvestersOpener
-from acquire.camera.spec import spec_of
 from acquire.config.device import LightOutputConfig
-from acquire.errors import ConfigError, TriggerError, UsageError
+from acquire.errors import ConfigError, UsageError
 from acquire.lines import ARMS
-from acquire.trigger.base import TriggerRun
-from acquire.trigger.driver import TriggerDriver
-from acquire.trigger.settings import GATEWARE, register_values
-from acquire.trigger.transports.serial import BITS_PER_BYTE, SerialTransport
-from acquire.trigger.transports.usb import UsbTransport
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from types import TracebackType
 
     from acquire.camera.base import CameraOpener
+    from acquire.camera.variant import CameraVariant
     from acquire.config import RigConfig
     from acquire.config.device import TriggerConfig
     from acquire.sim.instrument import SimulatedDevices
     from acquire.sim.scene import Scene
     from acquire.trigger.base import Trigger
-    from acquire.trigger.transports import Transport
-
-REAL_TRIGGERS = ("serial", "usb")
+    from acquire.trigger.variant import TriggerVariant
 
 
 class Rig:
@@ -49,7 +37,7 @@ class Rig:
         self.config = config
         self._simulated = _simulated_devices(config)
         self._closed = False
-        self.trigger: Trigger = TriggerDriver(_transport(config, self._simulated), config.trigger)
+        self.trigger: Trigger = _trigger(config).open(config, self._simulated)
 
     def openers(self) -> dict[str, CameraOpener]:
         """Arm → what opens its camera, here or in a process being spawned."""
@@ -60,13 +48,8 @@ class Rig:
     def _opener(self, arm: str) -> CameraOpener:
         if self.config.simulation.replay is not None:
             return self.simulated.replay(arm)
-        match self.config.cameras.arm(arm).driver:
-            case "harvesters":
-                return HarvestersOpener(spec_of(self.config, arm))
-            case "aravis":
-                return AravisOpener(spec_of(self.config, arm))
-            case driver:
-                return self.simulated.opener(arm, driver)
+        variant = cast("CameraVariant", self.config.cameras.arm(arm).options)
+        return variant.opener(self.config, arm, self._simulated)
 
     @property
     def simulated(self) -> SimulatedDevices:
@@ -110,7 +93,7 @@ class Rig:
 
 def _simulated_devices(config: RigConfig) -> SimulatedDevices | None:
     """None where there are none: the simulator is then not even imported."""
-    if config.trigger.driver in REAL_TRIGGERS and not config.simulates_cameras:
+    if not _trigger(config).simulated and not config.simulates_cameras:
         return None  # nor is a recording replayed, see `check_rig`
     from acquire.sim.instrument import SimulatedDevices
 
@@ -124,49 +107,22 @@ def check_rig(config: RigConfig) -> None:
         raise ConfigError(
             f"trigger.driver = {trigger.driver!r} with simulation.replay", possible="'simulated'"
         )
-    if trigger.driver in REAL_TRIGGERS and config.simulation.speed != 1:
+    if not _trigger(config).simulated and config.simulation.speed != 1:
         raise ConfigError(
             f"simulation.speed = {config.simulation.speed:g} with trigger.driver = {trigger.driver!r}",
             possible="1: its time is real",
         )
-    run = TriggerRun(
-        "check",
-        config.code.build(),
-        config.geometry.substeps,
-        trigger.substep_ticks,
-        trigger.tag_every_lines,
-    )
-    possible = replace(GATEWARE, clock_hz=trigger.clock_hz)
-    if trigger.driver == "simulated":
-        from acquire.sim.trigger_registers import INPUTS
-
-        possible = replace(possible, inputs=INPUTS)
-    try:
-        register_values(run, trigger, possible, _link_bytes_per_s(trigger))
-    except TriggerError as error:
-        raise ConfigError(error.message, possible=error.possible, hint=error.hint) from error
+    _trigger(config).check(config)
     if config.simulates_cameras:
-        _check_simulated_cameras(trigger)
+        _check_simulated_cameras(trigger, simulated=_trigger(config).simulated)
 
 
-def _link_bytes_per_s(trigger: TriggerConfig) -> float:
-    match trigger.driver:
-        case "serial":
-            return trigger.baud / BITS_PER_BYTE
-        case "rtl":
-            from acquire.sim import rtl
-
-            return rtl.baud(trigger.clock_hz) / BITS_PER_BYTE
-        case "simulated" | "usb":
-            return float("inf")
-
-
-def _check_simulated_cameras(trigger: TriggerConfig) -> None:
+def _check_simulated_cameras(trigger: TriggerConfig, *, simulated: bool) -> None:
     """They see when lines begin and which code the light follows; a simulated trigger has no inputs."""
     light, plain = trigger.light, LightOutputConfig()
     same = (light.open_ticks, light.close_ticks) == (plain.open_ticks, plain.close_ticks)
     for ignored, key, possible in (
-        (trigger.driver in REAL_TRIGGERS, f"driver = {trigger.driver!r}", "'simulated'"),
+        (not simulated, f"driver = {trigger.driver!r}", "'simulated'"),
         (trigger.external_start != "off", f"external_start = {trigger.external_start!r}", "'off'"),
         (trigger.line_start != "per-line", f"line_start = {trigger.line_start!r}", "'per-line'"),
         (not trigger.a.enable, "a.enable = false", "true"),
@@ -181,21 +137,8 @@ def _check_simulated_cameras(trigger: TriggerConfig) -> None:
 
 def open_trigger(config: RigConfig) -> Trigger:
     """The rig's trigger without its cameras; connected when first used."""
-    return TriggerDriver(_transport(config, None), config.trigger)
+    return _trigger(config).open(config, None)
 
 
-def _transport(config: RigConfig, simulated: SimulatedDevices | None) -> Callable[[], Transport]:
-    """What opens the way to the trigger's device."""
-    trigger = config.trigger
-    match trigger.driver:
-        case "serial":
-            return partial(
-                SerialTransport, trigger.url, trigger.baud, rts_cts=trigger.flow_control == "rts-cts"
-            )
-        case "usb":
-            return partial(UsbTransport, serial=trigger.serial)
-        case "simulated" | "rtl" if simulated is not None:
-            return simulated.transport()
-    from acquire.sim.instrument import lonely_transport
-
-    return lonely_transport(config)
+def _trigger(config: RigConfig) -> TriggerVariant:
+    return cast("TriggerVariant", config.trigger.options)  # which the configuration has made sure of

@@ -39,13 +39,16 @@ from acquire.camera.frames import FrameFacts, Tally
 from acquire.camera.genapi import GenapiFeatures, Words, is_gone, told
 from acquire.camera.producers import find_producers
 from acquire.camera.settings import apply_settings
+from acquire.camera.spec import spec_of
+from acquire.camera.variant import CameraVariant
 from acquire.errors import CameraError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from acquire.camera.base import CameraBlock
+    from acquire.camera.base import CameraBlock, CameraOpener
     from acquire.camera.spec import GenicamSpec
+    from acquire.config import RigConfig
 
 _ALIVE_S = 0.5
 """How often a silent camera is asked whether it is still there."""
@@ -72,6 +75,13 @@ class HarvestersOpener:
 
     def __call__(self) -> HarvestersCamera:
         return HarvestersCamera(self.spec)
+
+
+class HarvestersCameras(CameraVariant):
+    """Any GenICam camera, through its maker's GenTL producer (.cti)."""
+
+    def opener(self, config: RigConfig, arm: str, bench: Any) -> CameraOpener:  # noqa: ARG002
+        return HarvestersOpener(spec_of(config, arm))
 
 
 def list_cameras(cti: str = "") -> list[FoundCamera]:

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from acquire.errors import UsageError
+
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
@@ -42,7 +44,11 @@ def device_of(
         overrides |= {"trigger.driver": "serial", "trigger.url": url}
     rig = load_rig(config, overrides)
     driver = open_trigger(rig)
-    assert isinstance(driver, TriggerDriver)
+    if not isinstance(driver, TriggerDriver):
+        raise UsageError(
+            f"trigger.driver = {rig.trigger.driver!r} is no board with this project's gateware",
+            possible="'simulated', 'rtl', 'serial', 'usb'; for others: acquire devices, acquire serve",
+        )
     try:
         yield driver, rig
     finally:

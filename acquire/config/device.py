@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
 from acquire.config.base import MOST_DN, FrozenModel
+from acquire.config.variants import NameOf, Options, options_of
+from acquire.plugins import CAMERAS, TRIGGERS
 
 PIXEL_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16}
 """SFNC PixelFormat → significant bits of an (unpacked) pixel."""
 
 
-SimulatedDriver = Literal["simulated", "pattern", "gentl-simulated", "gige-simulated"]
-"""Drivers of cameras that only a simulated trigger, or the compiled gateware, can pulse."""
-SIMULATED_CAMERAS: tuple[SimulatedDriver, ...] = get_args(SimulatedDriver)
-SEEING_CAMERAS = ("simulated", "gentl-simulated", "gige-simulated")
-"""Those of them whose lines are computed from a scene."""
 GentlModule = Literal["remote", "interface", "device", "stream", "system"]
 """Where a camera's features are: in the camera itself, or in a module of the host's side."""
 
@@ -51,7 +48,14 @@ class LightOutputConfig(FrozenModel):
 class TriggerConfig(FrozenModel):
     """The sync trigger and its timing."""
 
-    driver: Literal["simulated", "rtl", "serial", "usb"] = "simulated"
+    driver: Annotated[str, NameOf(TRIGGERS)] = Field(
+        default="simulated",
+        description="'simulated'; 'rtl', the compiled gateware; 'serial', 'usb'; or one that "
+        "`acquire plugins` lists",
+    )
+    options: Annotated[Options, options_of(TRIGGERS)] = Field(
+        default=None, validate_default=True, description="of the driver's own"
+    )
     url: str = Field(default="", description="driver 'serial': /dev/tty…, socket://host:port")
     baud: int = Field(default=3_000_000, ge=9600, le=10**9, description="driver 'serial'")
     flow_control: Literal["none", "rts-cts"] = Field(
@@ -115,11 +119,15 @@ class TriggerConfig(FrozenModel):
 class CameraConfig(FrozenModel):
     """One camera. DN = black level + responsivity · Y, with Y of Eq. (1)."""
 
-    driver: SimulatedDriver | Literal["harvesters", "aravis"] = Field(
+    driver: Annotated[str, NameOf(CAMERAS)] = Field(
         default="simulated",
         description="'harvesters': through the maker's GenTL producer; 'aravis': GigE and USB3 Vision; "
         "'gentl-simulated', 'gige-simulated': simulated cameras through either; "
-        "'pattern': stored lines in place of the scene, at any rate, for loads",
+        "'pattern': stored lines in place of the scene, at any rate, for loads; or one that "
+        "`acquire plugins` lists",
+    )
+    options: Annotated[Options, options_of(CAMERAS)] = Field(
+        default=None, validate_default=True, description="of the driver's own"
     )
     serial: str = "simulated"
     model: str = Field(default="", description="what the camera must be; absent: any")

@@ -27,7 +27,7 @@ def explained(error: ValidationError, model: type[BaseModel], path: Path | str) 
         key = shortened(".".join(keys)) or "(file)"
         why = shortened(item["msg"].removeprefix("Value error, "), 400)
         if item["type"] == "extra_forbidden":
-            lines.append(f"  {key}: unknown key; allowed here: {', '.join(allowed)}")
+            lines.append(f"  {key}: unknown key; allowed here: {', '.join(allowed) or 'none'}")
         elif item["type"] == "missing":
             lines.append(f"  {key}: missing")
         elif isinstance(item["input"], dict):

@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field, model_validator
 from acquire.codes import TAPS, Code, ConstantCode, PrbsCode
 from acquire.config.base import MOST_SECONDS, SEED_END, FilePath, FrozenModel
 from acquire.config.builtin import builtin_names
-from acquire.config.device import SEEING_CAMERAS, SIMULATED_CAMERAS, CamerasConfig, TriggerConfig
+from acquire.config.device import CamerasConfig, TriggerConfig
 from acquire.config.event import CheckConfig, EventsConfig
 from acquire.config.recording import USUAL_CHUNK_BYTES, RecordingConfig, usual_chunk_lines, usual_tag_chunks
 from acquire.config.service import HooksConfig, ServiceConfig
@@ -19,6 +19,7 @@ from acquire.config.web import WebConfig
 from acquire.errors import ConfigError
 from acquire.geometry import Geometry
 from acquire.place import default_socket
+from acquire.plugins import CAMERAS
 
 if TYPE_CHECKING:
     pass
@@ -225,13 +226,13 @@ class RigConfig(FrozenModel):
     @property
     def simulates_cameras(self) -> bool:
         """Whether the trigger's pulses go to a camera that is simulated."""
-        return any(camera.driver in SIMULATED_CAMERAS for camera in (self.cameras.a, self.cameras.b))
+        return any(CAMERAS.load(camera.driver).simulated for camera in (self.cameras.a, self.cameras.b))
 
     @property
     def needs_scene(self) -> bool:
         """Whether an arm's lines are computed from what its camera sees."""
         return self.simulation.replay is None and any(
-            camera.driver in SEEING_CAMERAS for camera in (self.cameras.a, self.cameras.b)
+            CAMERAS.load(camera.driver).sees_scene for camera in (self.cameras.a, self.cameras.b)
         )
 
     def scene_file(self) -> str:

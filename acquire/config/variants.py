@@ -10,9 +10,17 @@ from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel, GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    SerializeAsAny,
+    ValidationInfo,
+)
 from pydantic_core import PydanticCustomError, SchemaValidator, core_schema
 
+from acquire.config.base import FrozenModel
 from acquire.errors import ConfigError
 from acquire.plugins import GROUPS, Group
 
@@ -60,11 +68,56 @@ class OneOf:
         if kind is None:
             kinds = ", ".join(self.group.names())
             raise PydanticCustomError("no_kind", "kind is missing; possible: {kinds}", {"kinds": kinds})
-        try:
-            model = self.group.load(kind if isinstance(kind, str) else str(kind))
-        except ConfigError as error:
-            raise PydanticCustomError("unknown_kind", "{why}", {"why": str(error)}) from error
+        model = _class_of(self.group, str(kind))
         return _tagged(kind, model).validate_python(value)
+
+
+@dataclass(frozen=True, slots=True)
+class NameOf:
+    """Annotates a text: the name of a class of a group."""
+
+    group: Group
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> core_schema.CoreSchema:
+        return core_schema.no_info_after_validator_function(self._known, handler(source))
+
+    def __get_pydantic_json_schema__(
+        self,
+        schema: core_schema.CoreSchema,
+        handler: GetJsonSchemaHandler,
+    ) -> JsonSchemaValue:
+        return {"type": "string", "enum": list(self.group.names())}
+
+    def _known(self, name: str) -> str:
+        _class_of(self.group, name)
+        return name
+
+
+Options = SerializeAsAny[FrozenModel | None]
+"""A table of whichever class's options `options_of` says; None before that."""
+
+
+def options_of(group: Group) -> BeforeValidator:
+    """Annotates ``options``: those of the class that the field ``driver`` before it names."""
+
+    def validated(value: Any, info: ValidationInfo) -> Any:
+        if "driver" not in info.data:
+            return None  # what it is was refused
+        model = _class_of(group, info.data["driver"])
+        return value if isinstance(value, model) else model.model_validate({} if value is None else value)
+
+    return BeforeValidator(validated)
+
+    return validated
+
+
+def _class_of(group: Group, name: str) -> Any:
+    try:
+        return group.load(name)
+    except ConfigError as error:
+        raise PydanticCustomError("unknown_kind", "{why}", {"why": str(error)}) from error
 
 
 @cache

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from acquire.lines import ARMS
+from acquire.plugins import CAMERAS
 from acquire.stream.lightcheck import Judge
 from acquire.stream.threshold import ThresholdPlan
 from acquire.stream.watcher import WatchPlan
@@ -33,7 +34,7 @@ def watch_plan(config: RigConfig) -> WatchPlan | None:
 
 def _sees_light(config: RigConfig) -> bool:
     """A camera that shows a pattern has no light whose code could be checked."""
-    return all(config.cameras.arm(arm).driver != "pattern" for arm in ARMS)
+    return all(CAMERAS.load(config.cameras.arm(arm).driver).sees_light for arm in ARMS)
 
 
 def judge_of(config: RigConfig) -> Judge:

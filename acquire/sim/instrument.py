@@ -7,7 +7,7 @@ or on the pins of the compiled gateware.
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any, assert_never
+from typing import TYPE_CHECKING, Any
 
 from acquire.codes import ConstantCode
 from acquire.config import find, load_scene
@@ -33,7 +33,6 @@ if TYPE_CHECKING:
 
     from acquire.camera.base import CameraOpener
     from acquire.config import RigConfig
-    from acquire.config.device import SimulatedDriver
     from acquire.config.scene import SceneConfig
     from acquire.sim.scene import Scene
     from acquire.trigger.transports import Transport
@@ -58,18 +57,13 @@ class SimulatedDevices:
         """What opens the way to the trigger."""
         return _transport(self.config, self._wire, self._pins)
 
-    def opener(self, arm: str, driver: SimulatedDriver) -> CameraOpener:
-        """What opens the arm's camera."""
-        match driver:
-            case "gentl-simulated":
-                return self._gentl.opener(arm, self._sensor)
-            case "gige-simulated":
-                return self._gige.opener(arm, self._sensor)
-            case "simulated":
-                return self._sensor(arm)
-            case "pattern":
-                return self._pattern(arm)
-        assert_never(driver)
+    def gentl(self, arm: str) -> CameraOpener:
+        """The arm's camera behind our GenTL producer. Raises DeviceError without a C compiler."""
+        return self._gentl.opener(arm, self.sensor)
+
+    def gige(self, arm: str) -> CameraOpener:
+        """The arm's camera behind our GigE Vision port."""
+        return self._gige.opener(arm, self.sensor)
 
     def replay(self, arm: str) -> CameraOpener:
         """A camera that gives the lines of the recording to be replayed."""
@@ -97,7 +91,7 @@ class SimulatedDevices:
             _check_scene(self.config, scene)
             self._scene, self._read = scene, (place.st_mtime_ns, place.st_ino)
 
-    def _sensor(self, arm: str) -> CameraOpener:
+    def sensor(self, arm: str) -> CameraOpener:
         """The model of the arm's camera, in the process that opens it."""
         parts = {arm: self._part(arm) for arm in ARMS}
         columns = self.config.columns
@@ -114,13 +108,14 @@ class SimulatedDevices:
         optics = SimulatedOptics(arm, config.geometry, self._scene)
         camera = config.cameras.arm(arm)
         return SimulatedCameraOpener(
-            self._pulses(arm), optics, camera, config.stream.block_lines, config.line_rate_hz
+            self.pulses(arm), optics, camera, config.stream.block_lines, config.line_rate_hz
         )
 
-    def _pattern(self, arm: str) -> CameraOpener:
+    def pattern(self, arm: str) -> CameraOpener:
+        """A camera with stored lines."""
         config = self.config
         return PatternCameraOpener(
-            self._pulses(arm),
+            self.pulses(arm),
             arm,
             config.geometry,
             config.cameras.arm(arm),
@@ -128,7 +123,7 @@ class SimulatedDevices:
             config.line_rate_hz,
         )
 
-    def _pulses(self, arm: str) -> Wire | PinWire:
+    def pulses(self, arm: str) -> Wire | PinWire:
         """Where an arm's camera sees its trigger's pulses."""
         return self._wire if self._pins is None else PinWire(self._pins, arm)
 

@@ -1,0 +1,88 @@
+"""The drivers of simulated devices. What computes is imported when a rig opens one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, ClassVar
+
+from acquire.camera.variant import CameraVariant
+from acquire.trigger.variant import GatewareTrigger
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from acquire.camera.base import CameraOpener
+    from acquire.config import RigConfig
+    from acquire.config.device import TriggerConfig
+    from acquire.sim.instrument import SimulatedDevices
+    from acquire.trigger.settings import Capabilities
+    from acquire.trigger.transports import Transport
+
+
+class SimulatedCameras(CameraVariant):
+    """Lines computed from the scene, in the process that takes them."""
+
+    simulated: ClassVar[bool] = True
+    sees_scene: ClassVar[bool] = True
+
+    def opener(self, config: RigConfig, arm: str, bench: SimulatedDevices) -> CameraOpener:  # noqa: ARG002
+        return bench.sensor(arm)
+
+
+class PatternCameras(CameraVariant):
+    """Stored lines in place of the scene, at any rate, for loads."""
+
+    simulated: ClassVar[bool] = True
+    sees_light: ClassVar[bool] = False
+
+    def opener(self, config: RigConfig, arm: str, bench: SimulatedDevices) -> CameraOpener:  # noqa: ARG002
+        return bench.pattern(arm)
+
+
+class GentlCameras(CameraVariant):
+    """Simulated cameras behind a GenTL producer of ours, through harvesters."""
+
+    simulated: ClassVar[bool] = True
+    sees_scene: ClassVar[bool] = True
+
+    def opener(self, config: RigConfig, arm: str, bench: SimulatedDevices) -> CameraOpener:  # noqa: ARG002
+        return bench.gentl(arm)
+
+
+class GigeCameras(CameraVariant):
+    """Simulated cameras behind a GigE Vision port of ours, through Aravis."""
+
+    simulated: ClassVar[bool] = True
+    sees_scene: ClassVar[bool] = True
+
+    def opener(self, config: RigConfig, arm: str, bench: SimulatedDevices) -> CameraOpener:  # noqa: ARG002
+        return bench.gige(arm)
+
+
+class SimulatedTrigger(GatewareTrigger):
+    """A model of the gateware, in this process."""
+
+    simulated: ClassVar[bool] = True
+
+    def transport(self, config: RigConfig, bench: SimulatedDevices | None) -> Callable[[], Transport]:
+        from acquire.sim.instrument import lonely_transport
+
+        return lonely_transport(config) if bench is None else bench.transport()
+
+    def possible(self, trigger: TriggerConfig) -> Capabilities:
+        from acquire.sim.trigger_registers import INPUTS
+
+        return replace(super().possible(trigger), inputs=INPUTS)
+
+
+class CompiledTrigger(SimulatedTrigger):
+    """The gateware itself, compiled, with the pins that its cameras see."""
+
+    def bytes_per_s(self, trigger: TriggerConfig) -> float:
+        from acquire.sim import rtl
+        from acquire.trigger.transports.serial import BITS_PER_BYTE
+
+        return rtl.baud(trigger.clock_hz) / BITS_PER_BYTE
+
+    def possible(self, trigger: TriggerConfig) -> Capabilities:
+        return GatewareTrigger.possible(self, trigger)
