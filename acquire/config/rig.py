@@ -152,7 +152,7 @@ class RigConfig(FrozenModel):
     code: Annotated[
         PrbsConfig | ConstantCodeConfig, Field(discriminator="kind"), BeforeValidator(_prbs_unless_said)
     ] = PrbsConfig()
-    trigger: TriggerConfig = TriggerConfig()
+    trigger: TriggerConfig = Field(default_factory=TriggerConfig)
     cameras: CamerasConfig
     stream: StreamConfig = StreamConfig()
     recording: RecordingConfig = RecordingConfig()

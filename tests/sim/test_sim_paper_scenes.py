@@ -167,7 +167,7 @@ def test_scenes_add_up_and_stay_separable_where_they_can():
         ('kind = "usaf"\ngroups = [3, 4]', "even one"),
         ('kind = "usaf"\ndrive = { waveform = "pulse", frequency_hz = -3.0 }', "frequency_hz = -3.0"),
         ('kind = "usaf"\ndrive = { waveform = "pulse", frequency_hz = nan }', "finite"),
-        ('kind = "stars"', "kind"),
+        ('kind = "stars"', "scene 'stars' is not known"),
         ('kind = "usaf"\n[[effects]]\nkind = "read_noise"\nsigma_e = -2.0', "sigma_e = -2.0"),
         ('kind = "usaf"\n[[effects]]\nkind = "shot_noise"\n[[effects]]\nkind = "shot_noise"', "listed once"),
         ('kind = "usaf"\ncolour = 3', "unknown key; allowed here: dark"),

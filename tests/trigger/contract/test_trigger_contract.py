@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from trigger_twins import CLOCK_HZ, CODE, TWINS, Bench, run
 from waiting import until
 
-from acquire.codes import ConstantCode, PrbsCode, prbs
+from acquire.codes import ConstantCode, prbs
 from acquire.errors import TriggerError
 from acquire.sim.trigger_model import prbs_state
+from acquire.testing.triggers import TriggerContract, collect
 from acquire.trigger import registers as r
 from acquire.trigger.base import LineTag
 from acquire.trigger.driver import TriggerDriver, run_number
@@ -24,13 +25,12 @@ from acquire.trigger.registers import Command, EndReason, ErrorCode, State
 MASK = sum(1 << tap - 1 for tap in (64, 63, 61, 60))
 
 
-def collect(driver: TriggerDriver, lines: int, limit_s: float = 300.0) -> list:
-    """Tags until one of line ``lines`` or later has come."""
-    tags, deadline = [], time.monotonic() + limit_s
-    while not tags or tags[-1].line < lines:
-        assert time.monotonic() < deadline, f"{len(tags)} tags"
-        tags += driver.tags(0.5)
-    return tags
+class TestAnyTrigger(TriggerContract):
+    """What is asked of every trigger, asked of every twin."""
+
+    @pytest.fixture
+    def trigger(self, bench: Bench) -> TriggerDriver:
+        return bench.driver()
 
 
 def test_the_device_says_who_it_is(bench: Bench) -> None:
@@ -106,28 +106,6 @@ def test_a_line_budget_is_kept_exactly(bench: Bench, substeps, substep_ticks, bu
     driver.close()
 
 
-def test_a_second_run_starts_from_zero(bench: Bench) -> None:
-    driver = bench.driver()
-    for name in ("first", "second"):
-        driver.prepare(run(name))
-        driver.start()
-        tags = collect(driver, 64)
-        assert tags[0] == LineTag(0, 0, 0)
-        driver.stop()
-
-
-def test_preparing_the_same_run_again_changes_nothing(bench: Bench) -> None:
-    driver = bench.driver()
-    driver.prepare(run())
-    driver.prepare(run())
-    driver.start()
-    driver.prepare(run())
-    assert driver.device().status().state == State.RUNNING
-    with pytest.raises(TriggerError, match="another one runs"):
-        driver.prepare(run("other"))
-    driver.stop()
-
-
 def test_commands_may_be_repeated(bench: Bench) -> None:
     driver = bench.driver()
     driver.prepare(run())
@@ -148,13 +126,6 @@ def test_commands_may_be_repeated(bench: Bench) -> None:
     assert driver.device().status().state == State.ENDED
     with pytest.raises(RefusedError, match="RUN_OVER"):
         driver.device().command(Command.ARM, number)
-
-
-def test_stop_before_start_leaves_no_line(bench: Bench) -> None:
-    driver = bench.driver()
-    driver.prepare(run())
-    assert driver.stop() == 0
-    assert driver.device().status().state == State.ENDED
 
 
 def test_configuration_is_locked_while_armed(bench: Bench) -> None:
@@ -286,26 +257,6 @@ def test_no_external_edge_is_an_error_in_time(bench: Bench) -> None:
     with pytest.raises(TriggerError, match=r"did not start within 0\.1 s"):
         driver.start()
     assert driver.stop() == 0
-
-
-def test_stop_ends_a_wait_for_tags(bench: Bench) -> None:
-    driver = bench.driver()
-    driver.prepare(run(tag_every_lines=60_000, code=PrbsCode(15, 9)))
-    driver.start()
-    collect(driver, 0)
-    waited = []
-
-    def wait() -> None:
-        begun = time.monotonic()
-        driver.tags(600.0)
-        waited.append(time.monotonic() - begun)
-
-    waiter = threading.Thread(target=wait)
-    waiter.start()
-    driver.stop()
-    waiter.join(300)
-    assert waited
-    assert waited[0] < 300
 
 
 def test_unplugging_is_told_to_everyone_at_once(bench: Bench) -> None:

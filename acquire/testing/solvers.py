@@ -1,0 +1,141 @@
+"""What every solver must do: extend `SolverContract`; `DenoiserContract` for denoisers."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from acquire.codes import prbs
+from acquire.forward import DualArm
+from acquire.geometry import Geometry
+from acquire.lines import Segment
+from acquire.plugins import SOLVERS
+from acquire.recon import reconstruct
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from acquire.recon import Reconstruction
+    from acquire.recon.denoisers import Denoiser
+
+GEOMETRY = Geometry(8, 2, 80)
+SPATIAL_MERGE, TEMPORAL_MERGE = 2, 4
+NOISE_PART = 0.01
+"""Standard deviation of the lines' noise, of their mean."""
+
+
+def blinking_segment(seed: int = 5) -> tuple[Segment, NDArray[np.float64]]:
+    """Noisy lines of two squares that blink at different rates, and the true video (t, y, x)."""
+    draws = np.random.default_rng(seed)
+    code = prbs(23, 77, 0, GEOMETRY.span)
+    operator = DualArm(GEOMETRY, code, SPATIAL_MERGE, TEMPORAL_MERGE, np.float64)
+    frames, rows, columns = operator.video_shape
+    t = np.arange(frames) / frames
+    video = np.full((frames, rows, columns), 0.05)
+    video[:, 1:4, 1:4] += (0.5 + 0.4 * np.sin(2 * np.pi * 3 * t))[:, None, None]
+    video[:, 4:7, 3:7] += (0.5 + 0.4 * np.cos(2 * np.pi * 2 * t))[:, None, None]
+    lines = operator.forward(video)
+    lines = lines + NOISE_PART * lines.mean() * draws.standard_normal(lines.shape)
+    segment = Segment(
+        lines=lines.astype(np.float32),
+        mask=np.ones(lines.shape, bool),
+        code=code,
+        geometry=GEOMETRY,
+        time_ns=np.arange(GEOMETRY.lines, dtype=np.int64) * 20_000,
+        substep_ns=10_000.0,
+    )
+    return segment, video
+
+
+class SolverContract:
+    """Needs ``solver``, the name of an installed solver; ``options`` are its own.
+
+    ``most_error`` is what its video may miss of the truth on noisy lines, relative to the truth's RMS, in the
+    frames that are trusted; a solver without any prior does well to reach 0.5.
+    """
+
+    solver: ClassVar[str]
+    options: ClassVar[Mapping[str, Any]] = {}
+    iterations: ClassVar[int] = 40
+    most_error: ClassVar[float] = 0.5
+
+    def solve(self, segment: Segment, **more: Any) -> Reconstruction:
+        """The segment's video, with ``iterations`` unless something else is asked."""
+        asked = {"iterations": self.iterations, "check": False} | more
+        return reconstruct(
+            segment,
+            SPATIAL_MERGE,
+            TEMPORAL_MERGE,
+            solver=self.solver,
+            solver_options=self.options,
+            **asked,
+        )
+
+    def test_it_finds_what_blinks_in_noisy_lines(self) -> None:
+        segment, truth = blinking_segment()
+        result = self.solve(segment)
+        assert result.video.shape == truth.shape
+        assert np.isfinite(result.video).all()
+        if not SOLVERS.load(self.solver).signed:
+            assert result.video.min() >= 0
+        found, true = result.video[result.trusted], truth[result.trusted]
+        error = float(np.linalg.norm(found - true) / np.linalg.norm(true))
+        assert error < self.most_error, f"the video misses {error:.0%} of the truth"
+        assert result.quality.misfit < 0.2, f"its lines are {result.quality.misfit:.0%} off"
+
+    def test_masked_samples_have_no_influence_and_twice_the_light_is_twice_the_video(self) -> None:
+        segment, _ = blinking_segment()
+        mask = segment.mask.copy()
+        mask[0, 20:24] = mask[1, :, 3] = False
+        clean = self.solve(replace(segment, mask=mask))
+        lines = np.where(mask, segment.lines, np.float32(1e6))
+        spoilt = self.solve(replace(segment, mask=mask, lines=lines))
+        np.testing.assert_array_equal(spoilt.video, clean.video)
+        bright = self.solve(replace(segment, mask=mask, lines=2 * segment.lines))
+        scale = float(np.abs(clean.video).max())
+        np.testing.assert_allclose(bright.video, 2 * clean.video, atol=0.02 * scale)
+
+    def test_a_stop_ends_it_with_the_best_so_far_and_every_iteration_is_told(self) -> None:
+        segment, _ = blinking_segment()
+        stop, told = threading.Event(), []
+
+        def progress(step: Any) -> None:
+            told.append(step.iteration)
+            stop.set()
+
+        result = self.solve(segment, iterations=10_000, progress=progress, stop=stop)
+        assert result.ended == "stopped"
+        assert len(told) == result.iterations < 1000, "iterations go on after a stop: count them by its clock"
+        assert np.isfinite(result.video).all()
+
+
+class DenoiserContract:
+    """Needs ``make``, what gives the denoiser."""
+
+    def make(self) -> Denoiser:
+        """The denoiser to be tried."""
+        raise NotImplementedError
+
+    def test_no_strength_changes_nothing_and_more_leaves_less_noise(self) -> None:
+        draws = np.random.default_rng(2)
+        flat = np.ones((3, 16, 12), np.float32)
+        noisy = flat + 0.1 * draws.standard_normal(flat.shape).astype(np.float32)
+        kept = noisy.copy()
+        np.testing.assert_allclose(self.make().prox(noisy, 0.0), noisy, atol=1e-5)
+        cleaned = self.make().prox(noisy, 0.1)
+        assert cleaned.shape == noisy.shape
+        assert cleaned.dtype == noisy.dtype
+        assert np.std(cleaned - flat) < 0.8 * np.std(noisy - flat)
+        np.testing.assert_array_equal(noisy, kept, "it wrote into the frames that it was given")
+
+    def test_one_strength_per_frame_is_possible(self) -> None:
+        frames = np.random.default_rng(3).standard_normal((2, 8, 8)).astype(np.float32)
+        weights = np.array([0.0, 0.3], np.float32)
+        mixed = self.make().prox(frames, weights)
+        np.testing.assert_allclose(mixed[0], frames[0], atol=1e-5)
+        assert not np.allclose(mixed[1], frames[1], atol=1e-3)
