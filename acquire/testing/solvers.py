@@ -56,7 +56,7 @@ class SolverContract:
     """Needs ``solver``, the name of an installed solver; ``options`` are its own.
 
     ``most_error`` is what its video may miss of the truth on noisy lines, relative to the truth's RMS, in the
-    frames that are trusted; a solver without any prior does well to reach 0.5.
+    frames that are trusted. Without any prior about 0.6 can be had; ours reach 0.15 to 0.5.
     """
 
     solver: ClassVar[str]

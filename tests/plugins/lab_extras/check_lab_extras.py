@@ -1,0 +1,55 @@
+"""The suites of acquire, for what the laboratory adds: pytest check_lab_extras.py."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from lab_extras import Flicker
+
+from acquire.codes import ConstantCode
+from acquire.config import load_rig
+from acquire.sim.instrument import SimulatedDevices
+from acquire.testing.cameras import CameraContract, CameraStand
+from acquire.testing.effects import EffectContract
+from acquire.testing.solvers import SolverContract
+
+STAGES = 16
+
+
+class TestFlicker(EffectContract):
+    @pytest.fixture
+    def effect(self):
+        return Flicker(kind="flicker", depth=0.3)
+
+
+class TestLeastSquares(SolverContract):
+    solver = "least-squares"
+    most_error = 0.65
+
+
+class TestRamp(CameraContract):
+    @pytest.fixture
+    def stand(self):
+        rig = load_rig(
+            "rig-demo",
+            {
+                "geometry.stages": STAGES,
+                "stream.block_lines": 32,
+                "cameras.a.driver": "ramp",
+                "cameras.b.driver": "ramp",
+                "cameras.a.options": {"step": 3},
+            },
+        )
+        bench = SimulatedDevices(rig)
+        wire, opener = bench.pulses("a"), rig.cameras.a.options.opener(rig, "a", bench)
+
+        def lines(first, count):
+            line = np.arange(first, first + count)[:, None] - STAGES - 1
+            return (3 * line + np.arange(STAGES)) % rig.cameras.a.white_dn
+
+        start = lambda: wire.start(Fraction(30_000), Fraction(1), ConstantCode(1).to_attrs())  # noqa: E731
+        yield CameraStand(opener, start, wire.stop, "SIM-A", lines, sent=opener.ramp)
+        bench.close_cameras()
+        bench.close_wires()

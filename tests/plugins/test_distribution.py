@@ -1,0 +1,146 @@
+"""A distribution of somebody else's adds an effect, a scene, a camera and a solver; another one is broken."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from packed import install
+
+HERE = Path(__file__).parent
+RIG = """
+name = "lab"
+[geometry]
+stages = 8
+substeps = 2
+[trigger]
+substep_ticks = 4500
+tag_every_lines = 64
+[cameras.a]
+serial = "A"
+responsivity_dn = 50.0
+{driver}
+[cameras.b]
+serial = "B"
+responsivity_dn = 50.0
+{driver}
+[simulation]
+scene = "stars.toml"
+"""
+SCENE = """
+kind = "stars"
+count = 5
+{more}
+[[effects]]
+kind = "flicker"
+depth = 0.4
+[[effects]]
+kind = "read_noise"
+sigma_e = 5.0
+"""
+
+Run = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture(scope="module")
+def target(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where both distributions are installed."""
+    place = tmp_path_factory.mktemp("site")
+    for name in ("lab_extras", "lab_broken"):
+        install(HERE / name, place, place.parent / "wheels")
+    return place
+
+
+@pytest.fixture
+def acquire(target: Path, tmp_path: Path) -> Run:
+    """A command of the installed program, in an environment that has both."""
+    (tmp_path / "rig.toml").write_text(RIG.format(driver=""))
+    (tmp_path / "stars.toml").write_text(SCENE.format(more=""))
+
+    def run(*words: str, program: tuple[str, ...] = ("-m", "acquire")) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, *program, *words],
+            check=False,
+            capture_output=True,
+            text=True,
+            timeout=300,
+            cwd=tmp_path,
+            env=os.environ | {"PYTHONPATH": str(target)},
+        )
+
+    return run
+
+
+def test_what_is_there_is_listed_with_whose_it_is_and_what_is_broken_with_its_error(acquire: Run) -> None:
+    done = acquire("plugins", "--json")
+    rows: list[dict[str, Any]] = json.loads(done.stdout)
+    theirs = {(row["kind"], row["name"]): row for row in rows if row["distribution"] == "lab-extras"}
+    assert set(theirs) == {
+        ("effect", "flicker"),
+        ("scene", "stars"),
+        ("camera driver", "ramp"),
+        ("solver", "least-squares"),
+    }
+    assert all(row["works"] and row["version"] == "0.3" and row["about"] for row in theirs.values())
+    broken = [row for row in rows if not row["works"]]
+    assert {row["name"] for row in broken} == {"haze", "haze-free"}
+    assert all("No module named 'library_that_nobody_installed'" in row["state"] for row in broken)
+    assert sum(row["distribution"] == "tdi-acquire" for row in rows) >= 45
+
+
+def test_its_scene_with_its_effect_is_simulated_and_solved_by_its_solver(
+    acquire: Run, tmp_path: Path
+) -> None:
+    made = acquire("simulate", "stars.toml", "--config", "rig.toml", "--lines", "160", "--out", "run.zarr")
+    assert made.returncode == 0, made.stderr
+    attrs = json.loads((tmp_path / "run.zarr/zarr.json").read_text())["attributes"]
+    assert [effect["kind"] for effect in attrs["effects"]] == ["flicker", "read_noise"]
+    assert (attrs["scene"]["kind"], attrs["scene"]["fastest_hz"]) == ("stars", 2000.0)
+    solved = acquire(
+        *("reconstruct", "run.zarr", "--out", "video.zarr", "--nm", "1", "--tm", "4", "--json"),
+        *(
+            "--lines",
+            "60",
+            "--workers",
+            "1",
+            "--solver",
+            "least-squares",
+            "--set",
+            "ridge=0.002",
+            "--iterations",
+            "60",
+        ),
+    )
+    assert solved.returncode == 0, solved.stderr
+    facts = json.loads(solved.stdout)
+    assert (facts["solver"], facts["solver_options"]) == ("least-squares", {"ridge": 0.002})
+    assert facts["quality"]["misfit"] < 0.2
+
+
+def test_options_of_its_camera_are_checked(acquire: Run, tmp_path: Path) -> None:
+    (tmp_path / "wrong.toml").write_text(RIG.format(driver='driver = "ramp"\noptions = { step = 0 }'))
+    refused = acquire("config", "check", "wrong.toml")
+    assert refused.returncode == 2
+    assert "cameras.a.options.step = 0" in refused.stderr
+
+
+def test_mistakes_and_broken_ones_are_told_by_name(acquire: Run, tmp_path: Path) -> None:
+    (tmp_path / "bad.toml").write_text(SCENE.format(more='[[effects]]\nkind = "haze"').replace('er"', 'r"'))
+    refused = acquire("simulate", "bad.toml", "--config", "rig.toml", "--lines", "9", "--out", "x.zarr")
+    assert refused.returncode == 2
+    assert "effect 'haze' of lab-broken 0.1 cannot be used: ModuleNotFoundError" in refused.stderr
+    assert "effect 'flickr' is not known: did you mean 'flicker'?" in refused.stderr
+    assert not (tmp_path / "x.zarr").exists()
+
+
+def test_it_passes_the_suites_that_are_public(acquire: Run) -> None:
+    suite = ("-q", "-p", "no:cacheprovider", "--numprocesses=0", str(HERE / "lab_extras/check_lab_extras.py"))
+    done = acquire(*suite, program=("-m", "pytest"))
+    assert done.returncode == 0, done.stdout
+    assert "skipped" not in done.stdout

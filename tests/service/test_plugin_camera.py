@@ -1,0 +1,40 @@
+"""A camera driver of somebody else's under the real daemon: recorded lines are what it is known to give."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from live_daemon import Daemon
+from packed import install
+
+from acquire.store import open_recording
+
+EXTRAS = Path(__file__).parents[1] / "plugins" / "lab_extras"
+
+
+def test_lines_of_a_driver_that_was_installed_are_recorded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site = tmp_path / "site"
+    install(EXTRAS, site, tmp_path / "wheels")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH")])))
+    cameras = [f"cameras.{arm}.driver='ramp'" for arm in "ab"]
+    daemon = Daemon(tmp_path, *cameras, "cameras.b.options={step = 2}")
+    try:
+        assert daemon("arm").code == 0, daemon.log.read_text()
+        assert daemon("start", "ramp.zarr", "--lines", 600).code == 0
+        assert daemon("status", "--wait", "sealed").code == 0
+        assert daemon("disarm").code == 0
+    finally:
+        daemon.close()
+    recording = open_recording(tmp_path / "ramp.zarr")
+    for arm, step in (("a", 1), ("b", 2)):
+        camera = recording.camera(arm)
+        assert recording.attrs["config"]["cameras"][arm]["driver"] == "ramp"
+        assert recording.attrs["config"]["cameras"][arm]["options"] == {"step": step}
+        line = np.asarray(camera.line_number).astype(np.int64)[:, None]
+        expected = (step * line + np.arange(8)) % 4095
+        np.testing.assert_array_equal(np.asarray(camera.lines), expected)
