@@ -8,8 +8,13 @@ not UTF-8 cannot be encoded at all.
 
 from __future__ import annotations
 
+import difflib
 import re
 import reprlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 _ALLOWED = " \u00a0\u202f"
 """Spaces that typography needs; every other separator and control character is escaped."""
@@ -36,6 +41,12 @@ def shortened(text: object, characters: int = 120) -> str:
     """``text``, visible, and at most so many characters of it, with a mark where it was cut."""
     shown = visible(text)
     return shown if len(shown) <= characters else f"{shown[: characters - 1]}…"
+
+
+def did_you_mean(word: str, possible: Iterable[str]) -> str:
+    """``; did you mean 'start'?`` for a word that is close to a possible one; empty for any other."""
+    near = difflib.get_close_matches(word, list(possible), n=1)
+    return f"; did you mean {near[0]!r}?" if near else ""
 
 
 _REPR = reprlib.Repr()

@@ -2,7 +2,7 @@
 
 A command prints facts to stdout (``--json`` for programs) and raises what goes wrong; only `main` turns an
 AcquireError into words on stderr and an exit code. Heavy libraries are imported inside the commands that
-need them, so that help and status come at once.
+need them, and only the module of the command that is asked for, so that help and status come at once.
 
 What the system refuses (a name too long, a full disk under stdout) becomes words there too; a reader that
 goes away ends a command without any.
@@ -13,90 +13,34 @@ from __future__ import annotations
 import errno
 import os
 import sys
+from typing import TYPE_CHECKING, Any
 
-import typer
-
-from acquire.cli import (
-    bench,
-    calibrate,
-    camera,
-    config,
-    control,
-    demo,
-    devices,
-    diagnose,
-    doctor,
-    export,
-    import_lines,
-    install_service,
-    paper,
-    plugins,
-    reconstruct,
-    recordings,
-    render,
-    replay,
-    serve,
-    simulate,
-    tradeoff,
-    trigger,
-    web,
-)
 from acquire.cli.interrupts import interrupts_answered
-from acquire.cli.output import json_asked, print_error, say
-from acquire.cli.usage import not_installed, run
+from acquire.cli.output import json_asked, print_error
+from acquire.cli.usage import build, not_installed, run
 from acquire.errors import EXIT_INTERRUPTED, AcquireError, DeviceError, UsageError
 
-MODULES = (
-    demo,
-    serve,
-    web,
-    control,
-    recordings,
-    reconstruct,
-    diagnose,
-    render,
-    export,
-    import_lines,
-    simulate,
-    paper,
-    tradeoff,
-    replay,
-    config,
-    devices,
-    doctor,
-    plugins,
-    install_service,
-    trigger,
-    camera,
-    calibrate,
-    bench,
-)
-"""Modules of commands, in the order of the help; each has ``register(app)``. New groups are added here."""
+if TYPE_CHECKING:
+    import typer
+
+    app: typer.Typer
 
 HOST_ERRORS = (errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.EMFILE, errno.ENFILE, errno.ENOMEM)
 """What a host runs out of, or fails at, whatever is asked for."""
 
-app = typer.Typer(
-    name="acquire",
-    help="Record and reconstruct with TDI-based compressed video.",
-    epilog="Example: [bold]acquire serve --config rig-demo[/], then in another terminal "
-    "[bold]acquire arm[/], [bold]acquire start --lines 100000[/]",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
 
-for module in MODULES:
-    module.register(app)
+def __getattr__(name: str) -> Any:
+    """``app``: all commands, made when somebody asks for them."""
+    if name != "app":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return build()
 
 
 def main() -> int:
     """Entry point; the exit code is `acquire.errors`'."""
     try:
         with interrupts_answered():
-            return run(app)
+            return run(sys.argv[1:])
     except AcquireError as error:
         return _failed(error)
     except ModuleNotFoundError as error:
@@ -128,14 +72,3 @@ def _give_up_stdout() -> None:
         sys.stdout.flush()
     except OSError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-
-
-@app.callback(invoke_without_command=True)
-def _options(
-    version: bool = typer.Option(False, "--version", help="Print the version and end."),
-) -> None:
-    if version:
-        from acquire import __version__
-
-        say(__version__)
-        raise typer.Exit

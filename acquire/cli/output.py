@@ -48,6 +48,12 @@ def json_text(value: Any, indent: int | None = None) -> str:
 
 
 def print_facts(facts: Mapping[str, Any]) -> None:
+    """`fact_lines`, printed."""
+    for line in fact_lines(facts):
+        say(line)
+
+
+def fact_lines(facts: Mapping[str, Any]) -> list[str]:
     """``name  value`` per line, aligned; None is left out, several values stand side by side.
 
     What is longer than its line (`room`) goes on below itself, by whole words; for other programs a fact
@@ -55,9 +61,11 @@ def print_facts(facts: Mapping[str, Any]) -> None:
     """
     shown = {name: value for name, value in facts.items() if value is not None}
     width = max(map(len, shown), default=0)
-    for name, value in shown.items():
-        for line in _wrapped(f"{name:<{width}}  {visible(_words(value))}", width + 2, room()):
-            say(line)
+    return [
+        line
+        for name, value in shown.items()
+        for line in _wrapped(f"{name:<{width}}  {visible(_words(value))}", width + 2, room())
+    ]
 
 
 def room(*, err: bool = False) -> int:
@@ -90,6 +98,12 @@ def _words(value: Any) -> str:
 
 
 def print_table(columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
+    """`table_lines`, printed."""
+    for line in table_lines(columns, rows):
+        say(line)
+
+
+def table_lines(columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> list[str]:
     """A plain table, aligned; numbers to the right. Never cut: it is read by people and by grep.
 
     What is wider than the line (`room`) is shown row by row, a cell in a line, and no word is broken.
@@ -98,18 +112,16 @@ def print_table(columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
     titles = list(columns)
     widths = [max(map(len, column)) for column in zip(titles, *cells, strict=True)]
     if sum(widths) + 2 * (len(widths) - 1) > room():
-        for number, row in enumerate(cells):
-            if number:
-                say()
-            print_facts({title: cell for title, cell in zip(titles, row, strict=True) if cell})
-        return
+        blocks = [fact_lines({t: cell for t, cell in zip(titles, row, strict=True) if cell}) for row in cells]
+        return [line for block in blocks for line in ("", *block)][1:]
     right = [bool(cells) and all(row[i][:1].isdigit() for row in cells) for i in range(len(titles))]
-    for line in (titles, *cells):
-        padded = (
+    return [
+        "  ".join(
             cell.rjust(width) if to_right else cell.ljust(width)
             for cell, width, to_right in zip(line, widths, right, strict=True)
-        )
-        say("  ".join(padded).rstrip())
+        ).rstrip()
+        for line in (titles, *cells)
+    ]
 
 
 def json_asked() -> bool:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import importlib
 import re
-import shutil
 import sys
 from typing import TYPE_CHECKING, Any
 
 import typer
 
+from acquire.cli.coercion import ease
+from acquire.cli.commands import BY_NAME, MODULES
+from acquire.cli.help import EXAMPLE, SUMMARY, make_plain, overview
 from acquire.cli.output import say
 from acquire.errors import EXIT_INTERRUPTED, UsageError
+from acquire.text import did_you_mean
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator, Sequence
 
 _WordsError = next(
     kind
@@ -22,45 +26,77 @@ _WordsError = next(
 )
 """What typer raises for words that it cannot take: click's, or the copy of click that typer brings."""
 
-NARROW = 80
-"""Columns that tables of options need."""
-_MARKUP = re.compile(r"\[(bold|/)\]")
+_EXTRA = re.compile(r"extra == ['\"](\w+)['\"]")
+_HELP = ("-h", "--help")
 _PACKAGES = {"PIL": "pillow"}
 """Modules that are named otherwise than the package that brings them."""
 _WHOLE = {"simulate": "simulate", "demo": "report", "paper": "report", "tradeoff": "report", "web": "web"}
 """Command → the extra that brings all that it needs, where several bring what is missing."""
-_EXTRA = re.compile(r"extra == ['\"](\w+)['\"]")
 
 
-def run(app: typer.Typer) -> int:
+def build(modules: Iterable[str] = MODULES) -> typer.Typer:
+    """The commands of some modules of `acquire.cli`, or all of them."""
+    app = typer.Typer(
+        name="acquire",
+        help=SUMMARY,
+        epilog=EXAMPLE,
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        context_settings={"help_option_names": list(_HELP)},
+    )
+    app.callback()(_options)
+    for module in modules:
+        importlib.import_module(f"acquire.cli.{module}").register(app)
+    return app
+
+
+def run(words: Sequence[str]) -> int:
     """Run the command that the words name; its exit code. Raises UsageError for words that are wrong."""
+    first = words[0] if words else ""
+    if first in ("", *_HELP):
+        say_lines(overview(), err=not first)
+        return 0 if first else UsageError.exit_code
+    if first == "--version":
+        from acquire import __version__
+
+        say(__version__)
+        return 0
     try:
-        code = _command(app)(standalone_mode=False)
+        code = command_of(_module_of(first))(args=list(words), prog_name="acquire", standalone_mode=False)
     except typer.Abort:
         return EXIT_INTERRUPTED
     except _WordsError as error:
         if type(error).__name__ == "NoArgsIsHelpError":
-            say(error.format_message(), err=True)  # type: ignore[attr-defined]
+            say_lines(error.format_message(), err=True)  # type: ignore[attr-defined]
             return UsageError.exit_code
         raise _as_ours(error) from error
     return code if isinstance(code, int) else 0
 
 
-def _command(app: typer.Typer) -> Any:
-    """The commands; on a narrow terminal with plain help, since tables would break words and cut names."""
-    command = typer.main.get_command(app)
-    if shutil.get_terminal_size().columns < NARROW:
-        _make_plain(command)
+def say_lines(text: str, *, err: bool = False) -> None:
+    """Several lines of our own."""
+    for line in text.splitlines():
+        say(line, err=err)
+
+
+def command_of(modules: Iterable[str]) -> Any:
+    """The commands of some modules, ready to be called: help in plain words, and values taken quickly."""
+    command = typer.main.get_command(build(modules))
+    make_plain(command)
+    ease(command)
     return command
 
 
-def _make_plain(command: Any) -> None:
-    command.rich_markup_mode = None
-    for name in ("help", "short_help", "epilog"):
-        text = getattr(command, name)
-        setattr(command, name, text and _MARKUP.sub("", text))
-    for below in getattr(command, "commands", {}).values():
-        _make_plain(below)
+def _module_of(word: str) -> tuple[str, ...]:
+    if word in BY_NAME:
+        return (BY_NAME[word].module,)
+    what = "no such option" if word.startswith("-") else "no such command"
+    shown = f": {word}" if word.startswith("-") else f" {word!r}"
+    known = ("--version", *_HELP) if word.startswith("-") else tuple(BY_NAME)
+    raise UsageError(
+        f"{what}{shown}{did_you_mean(word, known)}", possible=", ".join(sorted(known)), hint="acquire --help"
+    )
 
 
 def not_installed(error: ModuleNotFoundError) -> UsageError:
@@ -90,14 +126,26 @@ def _as_ours(error: Any) -> UsageError:
     command = context.command_path if context is not None else "acquire"
     said = (error.message if near else error.format_message()).partition(" Did you mean")[0].rstrip(".")
     where = f"{command.removeprefix('acquire').lstrip()}: ".removeprefix(": ")
+    meant = f"; did you mean {near[0]!r}?" if near else did_you_mean(_mistaken(said), _choices(context))
     return UsageError(
-        f"{where}{said[:1].lower()}{said[1:]}",
+        f"{where}{said[:1].lower()}{said[1:]}{meant}",
         possible=", ".join(sorted(near) if near else _choices(context)),
         hint=f"{command} --help",
     )
+
+
+def _mistaken(said: str) -> str:
+    """The word that an error quotes."""
+    return said.partition("'")[2].partition("'")[0]
 
 
 def _choices(context: Any) -> Iterator[str]:
     """The commands of a group whose name alone was given, or one that is none of them."""
     commands = getattr(context.command, "commands", {}) if context is not None else {}
     yield from commands
+
+
+def _options(
+    version: bool = typer.Option(False, "--version", help="Print the version and end."),
+) -> None:
+    """Options of the program itself; `run` answers them."""

@@ -9,10 +9,9 @@ table of a rig file, a file for all that a scene file may hold::
     scene plan                              what simulated cameras see · what a reconstruction combines
     effect                                  what all effects have in common
     findings variants                       what is to be mended, in words · tables of an installed class
-    base builtin                            what all models refuse · the built-in files
+    base                                    what all models refuse
 """
 
-from acquire.config.builtin import builtin_directory
 from acquire.config.files import (
     check_directory,
     check_plan,
@@ -23,6 +22,7 @@ from acquire.config.files import (
     parse_settings,
 )
 from acquire.config.rig import ConstantCodeConfig, GeometryConfig, PrbsConfig, RigConfig
+from acquire.place import builtin_directory
 
 __all__ = [
     "ConstantCodeConfig",

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from acquire.config.builtin import builtin_directory, builtin_names
 from acquire.config.findings import explained
 from acquire.config.plan import ReconstructionPlan
 from acquire.config.rig import RigConfig
 from acquire.config.scene import SceneFile
 from acquire.errors import ConfigError
+from acquire.place import builtin_directory, builtin_names
 from acquire.plugins import SCENES
 from acquire.reading import read_regular
-from acquire.text import shortened, shown
+from acquire.text import did_you_mean, shortened, shown
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -58,7 +58,10 @@ def find(name: str | Path, beside: Path | None = None, kind: str = "") -> Path:
     else:
         why = "is no regular file" if os.path.lexists(name) else "does not exist"
     what = f"{kind} file" if kind else "configuration file"
-    raise ConfigError(f"{what} {shown(str(name))} {why}", possible=f"a path, or one of the built-in {have}")
+    near = did_you_mean(str(name), builtin_names(kind))
+    raise ConfigError(
+        f"{what} {shown(str(name))} {why}{near}", possible=f"a path, or one of the built-in {have}"
+    )
 
 
 def load_rig(name: str | Path, overrides: Mapping[str, Any] | None = None) -> RigConfig:

@@ -10,7 +10,6 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from acquire.codes import TAPS, Code, ConstantCode, PrbsCode
 from acquire.config.base import MOST_SECONDS, SEED_END, FilePath, FrozenModel
-from acquire.config.builtin import builtin_names
 from acquire.config.device import CamerasConfig, TriggerConfig
 from acquire.config.event import CheckConfig, EventsConfig
 from acquire.config.recording import USUAL_CHUNK_BYTES, RecordingConfig, usual_chunk_lines, usual_tag_chunks
@@ -18,7 +17,7 @@ from acquire.config.service import HooksConfig, ServiceConfig
 from acquire.config.web import WebConfig
 from acquire.errors import ConfigError
 from acquire.geometry import Geometry
-from acquire.place import default_socket
+from acquire.place import builtin_names, default_socket
 from acquire.plugins import CAMERAS
 
 if TYPE_CHECKING:

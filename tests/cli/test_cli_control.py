@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import sys
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -88,6 +89,7 @@ def answering(monkeypatch: pytest.MonkeyPatch) -> Callable[[Status], FakeClient]
     def use(answer: Status) -> FakeClient:
         client = FakeClient(answer)
         monkeypatch.setattr(control, "_daemon", lambda _: client)
+        monkeypatch.setattr(control, "status_document", lambda _: json.loads(answer.model_dump_json()))
         return client
 
     return use

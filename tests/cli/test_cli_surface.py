@@ -148,7 +148,7 @@ def test_interrupted(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(control, "_daemon", interrupted)
+    monkeypatch.setattr(control, "status_document", interrupted)
     assert cli("status").code == EXIT_INTERRUPTED
 
 

@@ -1,0 +1,66 @@
+"""Help in plain words that fit the terminal: nothing is loaded to draw it, and nothing is cut."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import textwrap
+from itertools import groupby
+from typing import TYPE_CHECKING, Any
+
+from acquire.cli.commands import COMMANDS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+SUMMARY = "Record and reconstruct with TDI-based compressed video."
+EXAMPLE = (
+    "Example: acquire serve --config rig-demo, then in another terminal: "
+    "acquire arm, acquire start --duration 2s"
+)
+OPTIONS = (
+    ("--version", "Print the version and end."),
+    ("-h, --help", "Show this message; after a command, that command's."),
+)
+WIDEST = 120
+"""Longer lines are hard to read."""
+NAMES = max(len(command.name) for command in COMMANDS)
+_MARKUP = re.compile(r"\[(bold|/)\]")
+
+
+def columns() -> int:
+    """Of the terminal, as far as lines should go."""
+    return min(WIDEST, shutil.get_terminal_size().columns)
+
+
+def overview() -> str:
+    """The commands, by what they are for."""
+    lines = ["Usage: acquire COMMAND [OPTIONS]...", "", SUMMARY, "", "Options:", *_rows(OPTIONS)]
+    for panel, commands in groupby(COMMANDS, lambda command: command.panel):
+        lines += ["", f"{panel}:", *_rows((command.name, command.summary) for command in commands)]
+    lines += ["", *textwrap.wrap(EXAMPLE, columns(), break_on_hyphens=False)]
+    return "\n".join(lines)
+
+
+def _rows(rows: Any) -> Iterator[str]:
+    for name, text in rows:
+        yield from textwrap.wrap(
+            text,
+            columns(),
+            initial_indent=f"  {name:<{NAMES}}  ",
+            subsequent_indent=" " * (NAMES + 4),
+            break_on_hyphens=False,
+        )
+
+
+def make_plain(command: Any) -> None:
+    """Have a command of typer's tell its help in plain words, as wide as the terminal is."""
+    command.rich_markup_mode = None
+    command.context_settings["max_content_width"] = columns()
+    for name in ("help", "short_help", "epilog"):
+        text = getattr(command, name)
+        setattr(command, name, text and _MARKUP.sub("", text))
+    if command.help and not command.short_help:
+        command.short_help = command.help.partition("\n\n")[0].replace("\n", " ")
+    for below in getattr(command, "commands", {}).values():
+        make_plain(below)

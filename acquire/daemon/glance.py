@@ -1,0 +1,46 @@
+"""The daemon's status without the models that check it: for a command that is typed again and again.
+
+The models take longer to import than the daemon takes to answer. What is not as expected is left to
+`acquire.client.Client`, which has patience with a daemon that is starting and words for one that refuses.
+"""
+
+from __future__ import annotations
+
+import http.client
+import json
+from typing import TYPE_CHECKING, Any
+
+from acquire.daemon.peer import connect
+from acquire.errors import NoDaemonError
+from acquire.place import default_socket
+
+if TYPE_CHECKING:
+    import socket
+    from pathlib import Path
+
+CONNECT_TIMEOUT_S = 5.0
+NO_ANSWER = (NoDaemonError, OSError, http.client.HTTPException, LookupError, TypeError, ValueError)
+"""What `status_document`, and showing a document of another version, raise."""
+
+
+def status_document(place: Path | None) -> dict[str, Any]:
+    """The status of the daemon on a Unix socket, the default one for None, as JSON. Raises `NO_ANSWER`."""
+    connection = _Connection("acquire", timeout=CONNECT_TIMEOUT_S)
+    connection.sock = connect(place or default_socket(), CONNECT_TIMEOUT_S)
+    try:
+        connection.request("GET", "/status", headers={"Connection": "close"})
+        answer = connection.getresponse()
+        if answer.status != http.HTTPStatus.OK:
+            raise ValueError(f"HTTP {answer.status}")
+        document = json.loads(answer.read())
+    finally:
+        connection.close()
+    if not isinstance(document, dict):
+        raise TypeError("the status is no object")
+    return document
+
+
+class _Connection(http.client.HTTPConnection):
+    """One over a socket that is connected already."""
+
+    sock: socket.socket
