@@ -8,7 +8,7 @@ The way of the data is one direction::
 
 The layers, top to bottom; imports point downwards only (checked by the tests)::
 
-    cli                              commands: one file per group
+    cli           testing            commands: one file per group · suites for everybody's variants
     web                              the operator's page, a process of its own
     client                           the service from a script, blocking or awaited
     daemon        evaluate           the capture service · metrics, report
@@ -22,6 +22,7 @@ The layers, top to bottom; imports point downwards only (checked by the tests)::
     config  lines  processes         what a rig is · what travels from camera to disk · children
     codes  geometry  clock           the code, the shear, the time: plain arithmetic
     arrays  cores                    whose arrays are computed with, and on how many cores
+    plugins                          classes that entry points name, ours and others'
     logs  reading  showing           one line per entry · files that anybody may have put there · reprs
     errors  text                     failures that a user can meet, with exit codes · foreign text
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -44,6 +45,8 @@ depth = 0.4
 kind = "read_noise"
 sigma_e = 5.0
 """
+
+DOCUMENT = Path(__file__).parents[2] / "acquire" / "PLUGINS.md"
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -144,3 +147,12 @@ def test_it_passes_the_suites_that_are_public(acquire: Run) -> None:
     done = acquire(*suite, program=("-m", "pytest"))
     assert done.returncode == 0, done.stdout
     assert "skipped" not in done.stdout
+
+
+def test_the_document_shows_what_is_installed_here() -> None:
+    shown = re.findall(r"```(?:python|toml)\n(.*?)\n```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL)
+    files = [path.read_text(encoding="utf-8") for path in sorted((HERE / "lab_extras").glob("*.*"))]
+    assert len(shown) >= 6
+    for block in shown:
+        for part in block.split("\n\n\n"):
+            assert any(part in text for text in files), part
