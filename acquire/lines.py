@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.alignment import Alignment
+    from acquire.noise import Noise
 
 ARMS = ("a", "b")
 """Names of the two arms, in the order of the ``arm`` axis."""
@@ -103,6 +104,7 @@ class Segment:
     black_level_dn, responsivity_dn : DN = black level + responsivity · Y, with Y of Eq. (1);
         one number for both arms, one per arm, or one per arm and pixel (2, M)
     alignment : where arm B's image lies beside arm A's; None: on it
+    noise : of the samples in DN; None: it is not known
     """
 
     lines: NDArray[Any]
@@ -115,6 +117,7 @@ class Segment:
     black_level_dn: float | tuple[float, float] | NDArray[np.float64] = 0.0
     responsivity_dn: float | tuple[float, float] | NDArray[np.float64] = 1.0
     alignment: Alignment | None = None
+    noise: Noise | None = None
 
     def __post_init__(self) -> None:
         shape = self.geometry.lines_shape
@@ -153,6 +156,15 @@ class Segment:
         black, gain = (_beside_lines(value, dtype) for value in (self.black_level_dn, self.responsivity_dn))
         scaled = (self.lines.astype(dtype) - black) / gain
         return np.where(self.mask, scaled, dtype(0))
+
+    def variance(self) -> NDArray[np.float64] | None:
+        """Of the noise in `samples` (2, L_R, M), in squared units of the scene; None: not known."""
+        if self.noise is None:
+            return None
+        known = self.black_level_dn, self.responsivity_dn
+        black, gain = (_beside_lines(value, np.float64) for value in known)
+        in_dn2 = self.noise.variance_dn2(self.lines.astype(np.float64) - black)
+        return np.asarray(in_dn2 / gain**2)
 
     def frame_time_ns(self, temporal_merge: int = 1) -> NDArray[np.int64]:
         """UTC at which each frame of T_m sub-steps begins.
@@ -207,4 +219,5 @@ def merged(segment: Segment, count: int) -> Segment:
         first_line=segment.first_line // count,
         black_level_dn=tuple(black.tolist()) if black.ndim else float(black),
         responsivity_dn=1.0 if columns else segment.responsivity_dn,
+        noise=None if columns or segment.noise is None else segment.noise.merged(count),
     )

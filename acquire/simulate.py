@@ -215,6 +215,7 @@ def _spec(config: RigConfig, scene: SceneConfig) -> RecordingSpec:
     cameras = {
         arm: {key: getattr(config.cameras.arm(arm), key) for key in keys}
         | {"PixelFormat": config.cameras.arm(arm).pixel_format}
+        | config.cameras.arm(arm).noise_facts
         for arm in ARMS
     }
     recording = config.recording

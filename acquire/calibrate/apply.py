@@ -12,6 +12,7 @@ from acquire.calibrate.calibration import Calibration, differing
 from acquire.calibrate.exposure import instrument_of
 from acquire.calibrate.orientation import oriented, view_named
 from acquire.errors import UsageError
+from acquire.noise import Noise
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -68,6 +69,8 @@ def calibrated(segment: Segment, calibration: Calibration) -> Segment:
         changes["responsivity_dn"] = responsivity
     if calibration.usable is not None and not calibration.usable.all():
         changes["mask"] = segment.mask & calibration.usable[:, None, :]
+    if (noise := _noise(calibration)) is not None:
+        changes["noise"] = noise
     corrected = replace(segment, **changes)
     if calibration.orientation is not None:
         corrected = oriented(corrected, view_named(calibration.orientation))
@@ -83,6 +86,19 @@ def black_level(segment: Segment, calibration: Calibration) -> NDArray[np.float6
         return None
     base = _columns(segment.black_level_dn, segment) if offset is None else offset
     return base if ambient is None else base + ambient
+
+
+def _noise(calibration: Calibration) -> Noise | None:
+    """Of the samples, with the shot noise of the light that is always there; None without DN per electron."""
+    K, read = calibration.value("dn_per_electron"), calibration.value("read_noise_e")
+    if K is None or read is None:
+        return None
+    known = Noise((float(K[0]), float(K[1])), (float(K[0] * read[0]), float(K[1] * read[1])))
+    ambient = calibration.value("ambient_dn")
+    if ambient is None:
+        return known
+    a, b = ambient.mean(axis=1).tolist()
+    return known.beside((a, b))
 
 
 def _responsivity(segment: Segment, calibration: Calibration) -> NDArray[np.float64] | None:

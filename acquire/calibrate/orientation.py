@@ -96,7 +96,8 @@ def oriented(segment: Segment, view: View) -> Segment:
     if view.mirrored:
         segment = _mapped(segment, _mirror_b)
     if view.swapped:
-        segment = _mapped(segment, _swap)
+        noise = None if segment.noise is None else segment.noise.swapped()
+        segment = replace(_mapped(segment, _swap), noise=noise)
     return segment
 
 

@@ -300,8 +300,16 @@ def _readable(outcome: Outcome) -> dict[str, Any]:
         else None,
         "misfit": f"{quality['misfit']:.2%} of the samples' RMS",
         "prediction": None if prediction is None else f"{prediction:.2%} at samples kept from the solver",
+        "noise": None if quality.get("noise") is None else _beside_noise(quality),
         "coverage": f"{quality['coverage']:.2%} of the samples usable",
     }
+
+
+def _beside_noise(quality: dict[str, Any]) -> str:
+    from acquire.recon import Quality
+
+    known = {key: float("nan") if value is None else value for key, value in quality.items()}
+    return f"{quality['noise']:.2%} is the cameras': the lines are {Quality(**known).standing}"
 
 
 def _iterations(facts: dict[str, Any]) -> str:

@@ -153,6 +153,28 @@ class CameraConfig(FrozenModel):
     responsivity_dn: float = Field(
         default=1.0, gt=0, le=MOST_DN, description="DN per unit of scene light and sub-step"
     )
+    dn_per_electron: float | None = Field(
+        default=None,
+        gt=0,
+        le=MOST_DN,
+        description="system gain K of EMVA 1288, where it is known and no calibration says it",
+    )
+    read_noise_e: float | None = Field(
+        default=None, ge=0, le=MOST_DN, description="temporal dark noise of EMVA 1288, likewise"
+    )
+
+    @model_validator(mode="after")
+    def _noise_whole(self) -> CameraConfig:
+        if (self.dn_per_electron is None) != (self.read_noise_e is None):
+            raise ValueError("dn_per_electron and read_noise_e belong together: both, or neither")
+        return self
+
+    @property
+    def noise_facts(self) -> dict[str, float]:
+        """What a recording is told of the camera's noise; nothing where nothing is known."""
+        if self.dn_per_electron is None or self.read_noise_e is None:
+            return {}
+        return {"dn_per_electron": self.dn_per_electron, "read_noise_e": self.read_noise_e}
 
     @property
     def bits(self) -> int:

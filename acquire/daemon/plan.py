@@ -147,6 +147,7 @@ class Run:
             "white_dn": camera.white_dn,
             "black_level_dn": camera.black_level_dn,
             "responsivity_dn": camera.responsivity_dn,
+            **camera.noise_facts,
         }
         lines = self._capture.poll().lines.get(arm, {})
         return {**calibration, **facts, "clock": lines.get("clock", {})}

@@ -158,7 +158,8 @@ def _finish(
     video = _scaled(estimate.video(), problem, solver)
     held_out = estimate.held_out_error
     prediction = problem.prediction_error(predicted) if held_out is None else held_out
-    quality = Quality(problem.misfit(predicted), prediction, problem.coverage)
+    noise = problem.noise(segment)
+    quality = Quality(problem.misfit(predicted), prediction, problem.coverage, noise)
     trusted = segment.geometry.trusted_frames(T_m)
     asked = check and request.static_image is None and clock.ended != "stopped"
     told = tell(segment, quality, clock) if asked else Told()

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 POOR_MISFIT = 0.15
 """Too few iterations, and lines that are no TDI's, end above it. Below it all may be wrong nevertheless: a
 wrong code or orientation ends at 2 to 7 %, since the voxels are many; `diagnosis` tells them apart."""
+WORTH_SAYING = 0.01
+"""Of the lines, beyond their noise: less is a detail, 40 dB below them, which noise-free lines have, too."""
 POOR_COVERAGE = 0.8
 DENSITY = (0.1, 0.9)
 """Codes outside leave frames unseen, or all alike."""
@@ -60,6 +62,17 @@ def judge(segment: Segment, problem: Problem, quality: Quality, trusted: slice) 
         found.append(
             f"the video misses the lines by {missed:.0%}: too few iterations, or the code's place, "
             "the arms' orientation or the black level is wrong"
+        )
+    if quality.standing == "over-fitted":
+        found.append(
+            f"the video follows the noise of its lines: it misses {quality.misfit:.2%} of the samples used, "
+            f"where noise alone is {quality.noise:.2%}, and {quality.prediction:.2%} of those kept from the "
+            "solver; larger voxels have less of it"
+        )
+    if quality.standing == "not explained" and WORTH_SAYING < missed <= POOR_MISFIT:
+        found.append(
+            f"the video misses {missed:.2%} of the lines, and noise is {quality.noise:.2%} of them: what is "
+            "left may be light faster than the frames, finer than the pixels, or in need of more time"
         )
     if quality.coverage < POOR_COVERAGE:
         causes = ", ".join(f"{cause} {count}" for cause, count in problem.masked_by.items() if count)

@@ -82,6 +82,14 @@ class Problem:
         """RMS of ``predicted − samples`` over the samples used, relative to their RMS."""
         return _relative_rms(predicted, self.samples, self.weight > 0)
 
+    def noise(self, segment: Segment) -> float:
+        """RMS of the cameras' noise in all usable samples, relative to theirs; NaN where it is unknown."""
+        variance, usable = segment.variance(), (self.weight > 0) | self.held_out
+        if variance is None or not usable.any():
+            return float("nan")
+        level = np.square(segment.samples(np.float64)[usable]).mean()
+        return float(np.sqrt(variance[usable].mean() / level)) if level > 0 else float("inf")
+
     def prediction_error(self, predicted: NDArray[Any]) -> float:
         """The same over the samples held out; NaN without any."""
         return _relative_rms(predicted, self.samples, self.held_out)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from acquire.showing import as_picture, as_table, in_words
 
@@ -12,6 +13,13 @@ if TYPE_CHECKING:
 
     import numpy as np
     from numpy.typing import NDArray
+
+
+EXPLAINED, NEARLY = 1.25, 2.0
+"""Residuals, in units of the noise, up to which the video's own error is below 0.75 and 1.7 σ of a sample."""
+
+
+Standing = Literal["explained", "nearly explained", "over-fitted", "not explained", "unknown"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,12 +51,35 @@ class Quality:
     """What can be said without the truth.
 
     ``misfit`` is the relative RMS residual of the samples used, ``prediction`` that of samples kept from the
-    solver (NaN where none were), ``coverage`` the share of samples that were usable.
+    solver (NaN where none were), ``coverage`` the share of samples that were usable. ``noise`` is what the
+    cameras' noise alone gives of a residual, relative likewise; NaN where nothing is known of it.
     """
 
     misfit: float
     prediction: float
     coverage: float
+    noise: float = float("nan")
+
+    @property
+    def standing(self) -> Standing:
+        """What the residuals are beside the noise. Samples that were kept from the solver judge; without any,
+        those that it was given.
+
+        explained : what is left is noise
+        nearly explained : what is left is noise for the greater part
+        over-fitted : the samples given are met more closely than their noise allows, those kept are missed:
+            a good part of the video is noise
+        not explained : more than noise is left even where the solver was given the samples
+        unknown : nothing is known of the noise
+        """
+        judged = self.misfit if math.isnan(self.prediction) else self.prediction
+        if not self.noise > 0 or math.isnan(judged):
+            return "unknown"
+        if judged <= EXPLAINED * self.noise:
+            return "explained"
+        if judged <= NEARLY * self.noise:
+            return "nearly explained"
+        return "over-fitted" if self.misfit < self.noise else "not explained"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

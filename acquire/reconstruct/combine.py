@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 LOOK_S = 0.1
 """How often the one who waits looks at the progress and at Ctrl-C."""
-QUALITY_KEYS = ("misfit", "prediction", "coverage")
+QUALITY_KEYS = ("misfit", "prediction", "coverage", "noise")
 
 
 @dataclass(frozen=True, slots=True)

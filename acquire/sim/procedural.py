@@ -35,6 +35,7 @@ from acquire.codes import mix_seed, prbs
 from acquire.forward import DualArm, merge_video
 from acquire.geometry import Geometry
 from acquire.lines import Segment
+from acquire.noise import Noise
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -54,6 +55,13 @@ class Camera:
 
     full_well_e: float = 1e4
     read_noise_e: float = 10.0
+
+    @property
+    def noise(self) -> Noise:
+        """Of its samples in DN, of both arms."""
+        K = TOP_DN / self.full_well_e
+        dark = 0.0 if np.isinf(self.full_well_e) else K * self.read_noise_e
+        return Noise((K, K), (dark, dark))
 
 
 CLEAN = Camera(np.inf, 0.0)
@@ -341,6 +349,7 @@ def expose(
         substep_ns=1e9 / SUBSTEP_HZ,
         black_level_dn=BLACK_DN,
         responsivity_dn=TOP_DN / top,
+        noise=camera.noise,
     )
 
 

@@ -59,6 +59,8 @@ class _Camera(_Facts):
     white_dn: Positive
     black_level_dn: Annotated[float, Field(allow_inf_nan=False)]
     responsivity_dn: Positive
+    dn_per_electron: Positive | None = None
+    read_noise_e: Annotated[float, Field(ge=0, allow_inf_nan=False)] | None = None
 
 
 class _Cameras(_Facts):

@@ -19,6 +19,7 @@ from acquire.codes import code_from_attrs
 from acquire.errors import DataError, UsageError
 from acquire.geometry import Geometry
 from acquire.lines import ARMS, LineFlag, Segment
+from acquire.noise import Noise
 from acquire.showing import as_table, in_words
 from acquire.store.camera_stream import CameraStream
 from acquire.store.files import DISK
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 CUT_COLUMNS = ("lines", "flags", "code", "code_index", "time")
 """Arrays that a segment is made of."""
 
+NOISE_KEYS = ("dn_per_electron", "read_noise_e")
 UNUSABLE = LineFlag.MISSING | LineFlag.INCOMPLETE
 
 
@@ -244,6 +246,7 @@ class Recording:
             substep_ns=self.line_period_ns / geometry.substeps,
             black_level_dn=self._per_arm("black_level_dn"),
             responsivity_dn=self._per_arm("responsivity_dn"),
+            noise=self._noise(),
         )
 
     def _fetched(self, start: int, stop: int) -> dict[str, dict[str, Stretch]]:
@@ -331,6 +334,14 @@ class Recording:
 
     def _camera_numbers(self, key: str) -> list[float]:
         return [float(self.attrs["cameras"][arm][key]) for arm in ARMS]
+
+    def _noise(self) -> Noise | None:
+        """What the rig said of the cameras' noise; None where it said nothing."""
+        cameras = [self.attrs["cameras"][arm] for arm in ARMS]
+        if any(camera.get(key) is None for camera in cameras for key in NOISE_KEYS):
+            return None
+        (K_a, read_a), (K_b, read_b) = ([float(camera[key]) for key in NOISE_KEYS] for camera in cameras)
+        return Noise((K_a, K_b), (K_a * read_a, K_b * read_b))
 
     def _per_arm(self, key: str) -> float | tuple[float, float]:
         a, b = self._camera_numbers(key)

@@ -1,0 +1,56 @@
+"""Temporal noise of a camera's samples: what is left to explain when everything else is explained."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+QUANTISATION_DN2 = 1 / 12
+"""Variance of rounding to whole DN."""
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """σ² = σ_q² + σ_d² + K·(light in DN), EMVA 1288 release 4.0, Eq. (9) with K·σ_d in DN.
+
+    Attributes
+    ----------
+    dn_per_electron : K of arms a and b
+    dark_noise_dn : standard deviation without light, of arms a and b
+    """
+
+    dn_per_electron: tuple[float, float]
+    dark_noise_dn: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        numbers = np.array([*self.dn_per_electron, *self.dark_noise_dn])
+        if not (np.isfinite(numbers).all() and (numbers >= 0).all()):
+            raise UsageError(f"noise {self}", possible="numbers from 0 on")
+
+    def variance_dn2(self, light_dn: NDArray[Any]) -> NDArray[np.float64]:
+        """Of samples (arm, line, pixel) that are so far above their black level."""
+        K, dark = (np.reshape(each, (2, 1, 1)) for each in (self.dn_per_electron, self.dark_noise_dn))
+        variance: NDArray[np.float64] = QUANTISATION_DN2 + dark**2 + K * np.maximum(light_dn, 0.0)
+        return variance
+
+    def swapped(self) -> Noise:
+        """Of an instrument whose arms have changed places."""
+        return Noise(self.dn_per_electron[::-1], self.dark_noise_dn[::-1])
+
+    def merged(self, count: int) -> Noise:
+        """Of sums of ``count`` × ``count`` samples."""
+        a, b = self.dark_noise_dn
+        return Noise(self.dn_per_electron, (a * count, b * count))
+
+    def beside(self, light_dn: tuple[float, float]) -> Noise:
+        """With the shot noise of light that is always there, as much in each arm."""
+        rows = zip(self.dn_per_electron, self.dark_noise_dn, light_dn, strict=True)
+        a, b = (float(np.sqrt(dark**2 + K * max(light, 0.0))) for K, dark, light in rows)
+        return Noise(self.dn_per_electron, (a, b))

@@ -1,0 +1,73 @@
+"""What is said of a residual beside the cameras' noise: against noise that was drawn, and on videos."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from acquire.calibrate.orientation import VIEWS, oriented
+from acquire.errors import UsageError
+from acquire.lines import merged
+from acquire.noise import Noise
+from acquire.recon import Quality, reconstruct
+from acquire.sim.procedural import Camera, record
+
+NOISE = Noise((0.4, 0.2), (3.0, 5.0))
+
+
+def test_variance_is_that_of_drawn_samples() -> None:
+    """Electrons of Poisson's law, Gaussian read-out, rounded: EMVA 1288, Eq. (9)."""
+    rng = np.random.default_rng(5)
+    light = np.array([[0.0, 200.0, 3000.0], [0.0, 200.0, 3000.0]])[:, None, :]
+    K = np.reshape(NOISE.dn_per_electron, (2, 1, 1))
+    drawn = rng.poisson(np.broadcast_to(light / K, (2, 40_000, 3))) * K
+    drawn = np.rint(drawn + rng.standard_normal(drawn.shape) * np.reshape(NOISE.dark_noise_dn, (2, 1, 1)))
+    np.testing.assert_allclose(drawn.var(axis=1), NOISE.variance_dn2(light)[:, 0], rtol=0.03)
+
+
+@pytest.mark.parametrize("bad", [-1.0, float("nan"), float("inf")])
+def test_noise_that_cannot_be_is_refused(bad: float) -> None:
+    with pytest.raises(UsageError, match="noise"):
+        Noise((bad, 1.0), (1.0, 1.0))
+
+
+def test_merging_and_swapping_arms_take_their_noise_along() -> None:
+    segment = record("still", 1, stages=12, substeps=1, lines=24, camera=Camera(1e4)).segment
+    whole = replace(segment, noise=NOISE, lines=segment.lines.astype(np.float64), mask=segment.mask | True)
+    summed = merged(whole, 3).variance()
+    each = whole.variance()
+    assert each is not None
+    assert summed is not None
+    total = each.reshape(2, 8, 3, 4, 3).sum(axis=(2, 4)) - 8 / 12 / np.square(whole.responsivity_dn)
+    np.testing.assert_allclose(summed, total, rtol=1e-9)  # rounded once, as what a sensor had merged
+    views = [view for view in VIEWS if view.crosses]
+    assert {view.swapped for view in views} == {False, True}
+    for view in views:
+        assert oriented(whole, view).noise == (NOISE.swapped() if view.swapped else NOISE)
+
+
+@pytest.mark.parametrize(
+    ("misfit", "prediction", "noise", "standing"),
+    [
+        (0.010, 0.011, 0.010, "explained"),
+        (0.009, 0.017, 0.010, "nearly explained"),
+        (0.007, 0.050, 0.010, "over-fitted"),
+        (0.030, 0.050, 0.010, "not explained"),
+        (0.011, float("nan"), 0.010, "explained"),
+        (0.010, 0.011, float("nan"), "unknown"),
+    ],
+)
+def test_standings(misfit: float, prediction: float, noise: float, standing: str) -> None:
+    assert Quality(misfit, prediction, 1.0, noise).standing == standing
+
+
+def test_a_still_is_explained_at_any_light_and_text_in_motion_is_not() -> None:
+    def standing(scene: str, full_well_e: float) -> str:
+        segment = record(scene, 77, stages=32, lines=100, camera=Camera(full_well_e)).segment
+        return reconstruct(segment, 3, 3).quality.standing
+
+    assert standing("still", 1e4) == "explained"
+    assert standing("still", 300) in ("explained", "nearly explained")
+    assert standing("text", 1e4) in ("over-fitted", "not explained")
