@@ -103,7 +103,7 @@ class RecordingConfig(FrozenModel):
         gt=0,
         le=3600,
         description="longest time in which nothing more of an ending recording reaches the disk, though "
-        "nobody waits for the disk; beyond it, a fault",
+        "nobody waits for the disk; beyond it, a fault; nor does the end of a daemon wait for longer",
     )
     retention: RetentionConfig | None = Field(default=None, description="absent: all is kept")
     upload_to: str | None = Field(

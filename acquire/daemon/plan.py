@@ -14,7 +14,7 @@ from acquire.daemon.messages import CalibrationStatus
 from acquire.daemon.storage import choose_for, storage_settings
 from acquire.daemon.watching import watch_plan
 from acquire.store import RecordingSpec, next_segment
-from acquire.stream import NOW, Capture, CapturePlan
+from acquire.stream import END_S, NOW, Capture, CapturePlan
 from acquire.stream.messages import Note
 from acquire.trigger.base import Delays, TriggerRun
 from acquire.trigger.settings import with_delays
@@ -202,6 +202,7 @@ def capture_plan(config: RigConfig, rig: Rig, run_id: str) -> CapturePlan:
         line_period_ns=1e9 / config.line_rate_hz / config.simulation.speed,
         patience_s=config.recording.patience_s,
         goes_on=config.recording.on_disk_trouble == "continue",
+        seal_timeout_s=min(config.recording.seal_timeout_s, END_S),
     )
 
 

@@ -32,10 +32,13 @@ if TYPE_CHECKING:
     from multiprocessing.connection import Connection
     from types import FrameType
 
-_KILL_WAIT_S = 30.0
-"""For the kernel to end a process that was killed: one that waits for a disk goes when the disk answers."""
+_STOPPED_WAIT_S = 5.0
+"""For somebody to let a process go on that a signal has stopped: it hears nothing, and ends by force only."""
+_KILL_WAIT_S = 10.0
+"""For the kernel to end a process that was killed, which takes milliseconds: one that stays waits for a disk,
+and goes when the disk answers."""
 _LAST_WORD_S = 0.1
-_FLUSH_S = 0.1
+_LOOK_S = 0.1
 _IMPORTANT = -15
 """Niceness; threads that are started later have it as well."""
 
@@ -178,14 +181,13 @@ class Worker:
     def end(self, deadline: float) -> None:
         """End the process: by word until the monotonic ``deadline``, then by force. Idempotent.
 
+        One that stands still, stopped by a signal, is not waited for as long as one that may be at work.
         Raises DeviceError, after the end, when it took force.
         """
         if self.pipe.closed:
             return
         self.post(Quit())
-        while self._child.exit_code() is None and (left_s := deadline - time.monotonic()) > 0:
-            self.flush()
-            self._child.exit_code(min(left_s, _FLUSH_S) if self._outbox else left_s)
+        self._await_end(deadline)
         forced = self._child.exit_code() is None
         if forced:
             self._child.kill()
@@ -200,6 +202,17 @@ class Worker:
         self._child.close()
         if forced:
             raise DeviceError(f"{self.name}: the process did not end when told to, and was killed")
+
+    def _await_end(self, deadline: float) -> None:
+        """Until the process has ended, the monotonic ``deadline``, or it has stood still for too long."""
+        ran_s = time.monotonic()
+        while self._child.exit_code() is None and (now_s := time.monotonic()) < deadline:
+            if not self.is_stopped:
+                ran_s = now_s
+            elif now_s - ran_s > _STOPPED_WAIT_S:
+                return
+            self.flush()
+            self._child.exit_code(min(deadline - now_s, _LOOK_S))
 
 
 def become_urgent() -> bool:

@@ -17,8 +17,8 @@ counted · `ledger` of every pulse · `plan` · `succession` of what was killed 
 """
 
 from acquire.stream.capture import Capture
-from acquire.stream.plan import CapturePlan, CaptureStatus
+from acquire.stream.plan import END_S, CapturePlan, CaptureStatus
 from acquire.stream.succession import Orphan
 from acquire.stream.window import NOW, Window
 
-__all__ = ["NOW", "Capture", "CapturePlan", "CaptureStatus", "Orphan", "Window"]
+__all__ = ["END_S", "NOW", "Capture", "CapturePlan", "CaptureStatus", "Orphan", "Window"]

@@ -26,7 +26,7 @@ from acquire.stream.kept import Kept
 from acquire.stream.ledger import Counted, account
 from acquire.stream.losses import Cause
 from acquire.stream.messages import Begin, Interrupt, Note, RunStarted
-from acquire.stream.plan import CaptureStatus
+from acquire.stream.plan import END_S, CaptureStatus
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.succession import Succession
 from acquire.stream.supervisor import RECORDER, Supervisor
@@ -160,19 +160,18 @@ class Capture:
         """Process numbers: of the recorder, and of each grabber."""
         return {name: worker.pid for name, worker in self._workers.items()}
 
-    def close(self, timeout_s: float = 30.0) -> None:
+    def close(self, timeout_s: float = END_S) -> None:
         """End everything, in the module's order; a recording under way is sealed as interrupted. Idempotent.
 
         What has not ended in ``timeout_s`` is killed; a recorder that still writes what the rings hold is
-        given as long again from its latest commit on. Raises the first error that it met, after everything
-        has ended.
+        given that, or the plan's ``seal_timeout_s``, again from its latest commit on. Raises the first error.
         """
         if self._closed:
             return
         self._closed = True
         deadline = time.monotonic() + timeout_s
         _run_all(
-            lambda: self._end_recording(timeout_s),
+            lambda: self._end_recording(min(timeout_s, self._plan.seal_timeout_s)),
             self._end_tags,
             self._end_trigger,
             lambda: self._end_workers(deadline),
@@ -406,9 +405,8 @@ class Capture:
         if WATCHER not in self._counters:
             return {}
         seen = self._counters[WATCHER]
-        verdict = str(watcher.VERDICTS[seen[f"verdict_{arm}"]])
         return {
-            "verdict": verdict,
+            "verdict": str(watcher.VERDICTS[seen[f"verdict_{arm}"]]),
             **{name: seen[f"{name}_{arm}"] for name in ("shift", "checked_line", "lapped")},
         }
 
@@ -448,12 +446,14 @@ class Capture:
             self._pulses = self._trigger.stop()
 
     def _end_workers(self, deadline: float) -> None:
-        deadline = max(deadline, time.monotonic() + _LEAST_END_S)
-        grabbers = [name for name in self._workers if name != RECORDER]
-        order = [self._workers[name] for name in (*grabbers, RECORDER) if name in self._workers]
-        for worker in order:
+        least = time.monotonic() + _LEAST_END_S
+        deadlines = dict.fromkeys(self._workers, max(deadline, least))
+        if self._supervisor is not None and self._supervisor.recording:
+            deadlines[RECORDER] = least  # it has had its time to seal
+        for worker in self._workers.values():
             worker.post(Quit())
-        _run_all(*(partial(worker.end, deadline) for worker in order))
+        order = sorted(self._workers, key=RECORDER.__eq__)  # the recorder comes last
+        _run_all(*(partial(self._workers[name].end, deadlines[name]) for name in order))
 
     def _settle_books(self, arms: tuple[str, ...]) -> None:
         for arm in arms:

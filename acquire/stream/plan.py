@@ -28,6 +28,9 @@ MAX_SUBSTEPS = 8
 TAG_DELAY_S = 0.5
 """How late a tag may come."""
 
+END_S = 30.0
+"""For what a capture has started to end in order, before it is ended by force."""
+
 PATIENT_RINGS = 3
 """A recorder is given up once lines of so many rings have come since its last sign of life."""
 
@@ -52,6 +55,8 @@ class CapturePlan:
         another reason is replaced; None: the disk as long as it takes, the recorder for `PATIENT_RINGS` times
         what the rings hold, and for ``stall_timeout_s`` at least
     goes_on : a recording that ended since the disk was too slow goes on in a further segment
+    seal_timeout_s : at the capture's end, a recording of which nothing more reaches the disk for so long is
+        given up: it is left to be recovered
     tag_wait_s : how long lines wait for the tag that confirms them before they are flagged
     reopen_timeout_s : how long a camera that is gone is waited for; less than ``stall_timeout_s``, or the
         arm counts as stalled first
@@ -83,6 +88,7 @@ class CapturePlan:
     disk: Disk = DISK
     patience_s: float | None = None
     goes_on: bool = False
+    seal_timeout_s: float = END_S
 
     def __post_init__(self) -> None:
         if tuple(sorted(self.openers)) != ARMS:

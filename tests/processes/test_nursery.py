@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,7 +21,7 @@ from acquire.errors import AcquireError, DeviceError
 from acquire.processes.messages import Ready
 from acquire.processes.nursery import Nursery, Own, nursery
 from acquire.processes.shared import Counters
-from acquire.processes.worker import Mailbox, Worker
+from acquire.processes.worker import Mailbox, OwnerGone, Worker
 
 LIMIT_S = 60.0
 
@@ -45,6 +47,15 @@ def count(mailbox: Mailbox, counters: Counters) -> None:
     while True:
         mailbox.take()
         time.sleep(0.005)
+
+
+def finish_slowly(mailbox: Mailbox) -> None:
+    """At its end there is something left to do."""
+    try:
+        tell(mailbox)
+    except OwnerGone:
+        time.sleep(1.5)
+        raise
 
 
 def fail(_: Mailbox, error: BaseException) -> None:
@@ -111,6 +122,31 @@ def test_a_worker_that_is_killed_and_one_that_does_not_end() -> None:
     with pytest.raises(DeviceError, match="did not end when told to"):
         worker.end(time.monotonic())
     assert not psutil.pid_exists(pid)
+
+
+def test_a_worker_that_stands_still_is_not_waited_for_as_one_at_work(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Until it goes on, should that come soon; what works is not ended by force before its time."""
+    monkeypatch.setattr("acquire.processes.worker._STOPPED_WAIT_S", 0.5)
+    still, busy = Worker("still", tell), Worker("busy", finish_slowly)
+    for worker in (still, busy):
+        worker.expect(Ready, deadline())
+    assert still.pid is not None
+    os.kill(still.pid, signal.SIGSTOP)
+    with pytest.raises(DeviceError, match="still: the process did not end when told to, and was killed"):
+        still.end(math.inf)
+    busy.end(math.inf)
+    monkeypatch.setattr("acquire.processes.worker._STOPPED_WAIT_S", LIMIT_S)
+    paused = Worker("paused", tell)
+    paused.expect(Ready, deadline())
+    pid = paused.pid
+    assert pid is not None
+    os.kill(pid, signal.SIGSTOP)
+    goes_on = threading.Timer(0.3, os.kill, (pid, signal.SIGCONT))
+    goes_on.start()
+    paused.end(math.inf)
+    goes_on.join()
 
 
 @pytest.fixture

@@ -66,6 +66,10 @@ def lab(tmp_path: Path, server: S3Server) -> Iterator[Lab]:
 
 def record(daemon: Daemon, name: str = "x.zarr") -> Path:
     assert daemon("arm").code == 0
+    return start(daemon, name)
+
+
+def start(daemon: Daemon, name: str = "x.zarr") -> Path:
     with daemon.client() as client:
         client.start(daemon.home / name)
     return daemon.home / name
@@ -160,8 +164,9 @@ def test_a_killed_daemon_and_recorder_and_all_of_it_arrives(lab: Lab, tmp_path: 
 
 def test_retention_waits_for_a_slow_store(lab: Lab, tmp_path: Path) -> None:
     daemon = lab.start("recording.retention.max_age_s=0.2", "recording.commit_s=0.2")
+    assert daemon("arm").code == 0  # which asks the store, and would wait for it
     lab.server.open.clear()  # before anything is copied
-    path = record(daemon)
+    path = start(daemon)
     until(lambda: committed(daemon) > 3 * SHARD_LINES)
     assert open_recording(path).dropped == ()
     lab.server.open.set()
