@@ -126,6 +126,15 @@ def load_scene(name: str | Path) -> SceneBase:
     return _validate(SceneFile, table, path).root.anchored(path.parent)
 
 
+def load_recorded(attrs: Mapping[str, Any], origin: str | Path) -> tuple[RigConfig, SceneBase]:
+    """The rig and the scene that a recording was simulated with; ``origin`` is what errors name.
+
+    Raises ConfigError where a plug-in that made them is not installed here.
+    """
+    where = f"{origin}, as it was recorded"
+    return _validate(RigConfig, attrs["config"], where), _validate(SceneFile, attrs["scene"], where).root
+
+
 def load_plan(name: str | Path) -> ReconstructionPlan:
     """Read and validate the plan of a combinatorial reconstruction."""
     path = find(name, kind="plan")
@@ -174,7 +183,7 @@ def _set(table: dict[str, Any], dotted: str, value: Any) -> None:
     table[last] = value
 
 
-def _validate(model: type[M], table: dict[str, Any], path: Path) -> M:
+def _validate(model: type[M], table: dict[str, Any], path: Path | str) -> M:
     try:
         return model.model_validate(table)
     except ValidationError as error:

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.config import RigConfig
-from acquire.config.scene import SceneFile, SineDrive
+from acquire.config import load_recorded
+from acquire.config.scene import SineDrive
 from acquire.evaluate.curves import compare_curve, region_mean
 from acquire.evaluate.metrics import psnr, ssim
 from acquire.forward import merge_video
@@ -113,8 +113,7 @@ class Judge:
         attrs = recording.attrs
         if not attrs.get("simulated") or "scene" not in attrs:
             return cls(segment, None)
-        rig = RigConfig.model_validate(attrs["config"])
-        return cls(segment, bench_of(rig, SceneFile.model_validate(attrs["scene"]).root).fine_scene())
+        return cls(segment, bench_of(*load_recorded(attrs, str(recording))).fine_scene())
 
     def frames(self, voxels: Voxels) -> slice:
         """What is judged: the trusted frames, or all where none is."""

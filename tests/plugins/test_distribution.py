@@ -14,6 +14,10 @@ from typing import Any
 import pytest
 from packed import install
 
+from acquire.config import load_recorded
+from acquire.errors import ConfigError
+from acquire.store import open_recording
+
 HERE = Path(__file__).parent
 RIG = """
 name = "lab"
@@ -105,25 +109,16 @@ def test_its_scene_with_its_effect_is_simulated_and_solved_by_its_solver(
     attrs = json.loads((tmp_path / "run.zarr/zarr.json").read_text())["attributes"]
     assert [effect["kind"] for effect in attrs["effects"]] == ["flicker", "read_noise"]
     assert (attrs["scene"]["kind"], attrs["scene"]["fastest_hz"]) == ("stars", 2000.0)
-    solved = acquire(
-        *("reconstruct", "run.zarr", "--out", "video.zarr", "--nm", "1", "--tm", "4", "--json"),
-        *(
-            "--lines",
-            "60",
-            "--workers",
-            "1",
-            "--solver",
-            "least-squares",
-            "--set",
-            "ridge=0.002",
-            "--iterations",
-            "60",
-        ),
-    )
+    words = "run.zarr --out video.zarr --nm 1 --tm 4 --lines 60 --workers 1 --json --solver least-squares"
+    solved = acquire("reconstruct", *words.split(), "--set", "ridge=0.002", "--iterations", "60")
     assert solved.returncode == 0, solved.stderr
     facts = json.loads(solved.stdout)
     assert (facts["solver"], facts["solver_options"]) == ("least-squares", {"ridge": 0.002})
     assert facts["quality"]["misfit"] < 0.2
+    recording = open_recording(tmp_path / "run.zarr")  # here, where nothing of theirs is installed
+    assert recording.cut(0, 100).mask.all()
+    with pytest.raises(ConfigError, match=r"run\.zarr, as it was recorded: .*\n.*scene 'stars' is not known"):
+        load_recorded(recording.attrs, str(recording))
 
 
 def test_options_of_its_camera_are_checked(acquire: Run, tmp_path: Path) -> None:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.config import RigConfig, load_plan, load_rig, load_scene
-from acquire.config.scene import OpticsConfig, SceneFile
+from acquire.config import load_plan, load_recorded, load_rig, load_scene
+from acquire.config.scene import OpticsConfig
 from acquire.evaluate.metrics import psnr, ssim
 from acquire.recon import reconstruct
 from acquire.recon.segments import Voxels
@@ -216,8 +216,7 @@ class Studio:
 
 def scene_of(recording: Recording) -> Scene:
     """The scene as the recording describes it, as fine as its cameras can tell."""
-    rig = RigConfig.model_validate(recording.attrs["config"])
-    return bench_of(rig, SceneFile.model_validate(recording.attrs["scene"]).root).fine_scene()
+    return bench_of(*load_recorded(recording.attrs, str(recording))).fine_scene()
 
 
 def true_voxels(
