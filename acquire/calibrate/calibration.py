@@ -10,6 +10,7 @@
     dn_per_electron  (arm)           K of EMVA 1288
     read_noise_e     (arm)           σ_d of EMVA 1288
     full_well_e      (arm)           μ_e.sat of EMVA 1288
+    light_late_ticks (arm)           by which light comes after the charge's moves, without lead and delays
 
 and ``usable`` (arm, column), the orientation of arm B, and its alignment on arm A.
 """
@@ -57,6 +58,11 @@ QUANTITIES = {
     "dn_per_electron": Quantity(ARM, "DN", "system gain K of EMVA 1288"),
     "read_noise_e": Quantity(ARM, "electron", "temporal dark noise of EMVA 1288"),
     "full_well_e": Quantity(ARM, "electron", "saturation capacity of EMVA 1288"),
+    "light_late_ticks": Quantity(
+        ARM,
+        "1",
+        "by which light comes after the charge's moves without lead and delays, in the trigger's ticks",
+    ),
 }
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from acquire.cli.calibrate_all import calibrate_all
+from acquire.cli.calibrate_delay import delay
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, print_warning, say
 from acquire.cli.progress import stage_progress
 from acquire.errors import PlaceError, UsageError
@@ -34,7 +35,7 @@ CHANGED = 1
 
 def register(app: typer.Typer) -> None:
     group = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
-    for command in (dark, ambient, flat, transfer, orientation, align, show, check):
+    for command in (dark, ambient, flat, transfer, orientation, align, delay, show, check):
         group.command()(command)
     group.command("all")(calibrate_all)
     app.add_typer(

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from acquire.cli.calibrate_live import instrument, kept, record, wait_for_enter
 from acquire.cli.control import SocketOption
 from acquire.cli.output import JsonFlag, note, print_facts, print_json, print_warning, say
-from acquire.errors import StateError, UsageError
+from acquire.errors import UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 
 LINES = 1024
 """That each recording has; see `acquire calibrate dark --help` and its neighbours for what they give."""
-SEALED_S = 120.0
-"""Longest wait for a recording to be sealed, beside the time that its lines take."""
 TRIES = 3
 """Of a step, where somebody can mend what was wrong."""
 
@@ -85,29 +83,13 @@ def calibrate_all(
         raise UsageError(f"step {wrong[0]!r} is not known", possible=", ".join(names))
     steps = [step for step in STEPS if not only or step.name in only]
     found: list[Finding] = []
-    with _daemon(socket) as daemon:
-        was = daemon.status().state
-        if was not in ("idle", "armed"):
-            raise StateError(f"the daemon is {was}", possible="idle or armed", hint="acquire stop, or disarm")
-        directory.mkdir(parents=True, exist_ok=True)
-        run_id = daemon.status().run_id
-        try:
-            for step in steps:
-                found += _step(daemon, step, out, directory, lines, ask=not yes, quiet=json)
-        finally:
-            if daemon.status().run_id != run_id:
-                _leave(daemon, armed=was == "armed")
+    with instrument(socket, directory) as daemon:
+        for step in steps:
+            found += _step(daemon, step, out, directory, lines, ask=not yes, quiet=json)
     if json:
         print_json({"calibration": out, "steps": {each.step: each.facts for each in found}})
     else:
         say(f"kept in  {out}; acquire calibrate show {out} --out DIR draws it")
-
-
-def _daemon(socket: Path | None) -> Client:
-    from acquire.cli.progress import teller
-    from acquire.client import Client
-
-    return Client(socket, teller())
 
 
 def _step(
@@ -117,12 +99,12 @@ def _step(
     for left in reversed(range(TRIES)):
         note(f"{step.name}: {step.prepare} {lines} lines.")
         if ask:
-            _wait_for_enter()
+            wait_for_enter()
         try:
-            exposure = _record(daemon, step, directory, lines)
+            exposure = record(daemon, step.name, directory, lines, code=step.code)
             found = []
             for look in _looks(step, exposure):
-                found.append(_kept(out, exposure, look))
+                found.append(kept(out, exposure, look))
                 if not quiet:
                     _tell(found[-1])
         except UsageError as error:
@@ -133,30 +115,6 @@ def _step(
             continue
         return found
     raise AssertionError  # the last try returns or raises
-
-
-def _record(daemon: Client, step: Step, directory: Path, lines: int) -> Exposure:
-    """Arm with the step's light, record, disarm."""
-    from acquire.calibrate.exposure import open_exposure
-    from acquire.client import SEALED
-
-    if daemon.status().state == "armed":
-        daemon.disarm()
-    daemon.arm(code=step.code, calibration="none")
-    path = _free(directory, step.name)
-    status = daemon.start(path, lines=lines)
-    rates = [arm.rate_hz for arm in status.arms.values() if arm.rate_hz > 0]
-    daemon.wait(SEALED, timeout_s=SEALED_S + lines / min(rates, default=1000.0))
-    daemon.disarm()
-    return open_exposure(path)
-
-
-def _free(directory: Path, name: str) -> Path:
-    """A name that nothing has yet: what was recorded before stays."""
-    number = 1
-    while (path := directory.absolute() / f"{name}-{number}.zarr").exists():
-        number += 1
-    return path
 
 
 def _looks(step: Step, exposure: Exposure) -> Iterator[Callable[[Calibration], Finding]]:
@@ -174,19 +132,6 @@ def _looks(step: Step, exposure: Exposure) -> Iterator[Callable[[Calibration], F
     return (looks[name] for name in step.finds)
 
 
-def _kept(out: str, exposure: Exposure, look: Callable[[Calibration], Finding]) -> Finding:
-    """Look, and add what was found to the calibration at a place."""
-    from acquire.calibrate import Calibration, open_calibration, save_calibration
-    from acquire.store.source import source_of
-
-    known = open_calibration(out) if source_of(out).exists() else Calibration(exposure.instrument)
-    found = look(known)
-    if found.step == "orientation" and found.orientation is None:
-        raise UsageError(f"orientation: {found.warnings[0]}")
-    save_calibration(out, known.with_step(found))
-    return found
-
-
 def _tell(found: Finding) -> None:
     from acquire.cli.calibrate_words import found_facts
 
@@ -194,24 +139,3 @@ def _tell(found: Finding) -> None:
     for text in found.warnings:
         print_warning(text)
     say()
-
-
-def _wait_for_enter() -> None:
-    """StateError where nobody can press it."""
-    note("Enter goes on, Ctrl-C ends; what was found so far is kept")
-    if not sys.stdin.readline():
-        raise StateError("nobody is there to press Enter", hint="--yes, where everything is in place")
-
-
-def _leave(daemon: Client, *, armed: bool) -> None:
-    """The instrument as it was before."""
-    from acquire.client import SEALED
-
-    status = daemon.status()
-    if status.state == "recording":
-        daemon.stop()
-        status = daemon.wait(SEALED, timeout_s=SEALED_S)
-    if status.state == "armed":
-        daemon.disarm()
-    if armed:
-        daemon.arm()

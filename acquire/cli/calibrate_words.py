@@ -15,6 +15,7 @@ PER_ARM = {
     "dn_per_electron": ("DN per electron", ""),
     "read_noise_e": ("read noise", " e"),
     "full_well_e": ("full well", " e"),
+    "light_late_ticks": ("light is late without delays by", " ticks"),
 }
 PER_COLUMN = {
     "offset_dn": ("offset", " DN"),
@@ -30,6 +31,11 @@ def found_facts(found: Finding) -> dict[str, Any]:
     if found.step == "flat":
         facts["arm A's part of the light"] = f"{found.facts['part_a']:.2%}"
         facts["hidden by the optics"] = _columns(found.facts["optics_hide_columns"])
+    if found.step == "delay":
+        tick_ns = 1e9 / found.facts["clock_hz"]
+        late = found.quantities["light_late_ticks"].value * tick_ns
+        facts["that is"] = ", ".join(f"{arm} {each:.0f} ns" for arm, each in zip("ab", late, strict=True))
+        facts["in the rig file"] = "; ".join(f"trigger.{k} = {v}" for k, v in found.facts["rig"].items())
     if found.usable is not None and not found.usable.all():
         bad = {arm: np.flatnonzero(~row).tolist() for arm, row in zip("ab", found.usable, strict=True)}
         facts["left out"] = _columns(bad)

@@ -261,8 +261,13 @@ def _light(light: LightOutputConfig, substep_ticks: int, device: Capabilities) -
     return {r.LED: led, r.WINDOW_OPEN: light.open_ticks, r.WINDOW_CLOSE: closes}
 
 
+def pulse_width_ticks(configured: int | None, distance: int) -> int:
+    """Of a line trigger, whose pulses are ``distance`` ticks apart."""
+    return configured or max(1, min(_DEFAULT_WIDTH, distance // 3))
+
+
 def _output(output: LineOutputConfig, arm: str, distance: int, device: Capabilities) -> dict[r.Register, int]:
-    width = output.width_ticks or max(1, min(_DEFAULT_WIDTH, distance // 3))
+    width = pulse_width_ticks(output.width_ticks, distance)
     if output.enable and output.delay_ticks + width >= distance:
         raise TriggerError(
             f"pulse {arm} {width} ticks wide, {output.delay_ticks} late",

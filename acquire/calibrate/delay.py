@@ -1,0 +1,193 @@
+"""The step ``delay``: how late the light is beside the charge's moves, for either camera.
+
+Nothing of the scene lights a packet of charge before it enters the sensor or after it has left. So, of a
+scene at rest under a pseudo-random code, only sub-steps 0 to n + S − 2 of a line have a part in it (Eq. 1),
+whatever the scene is, and what lies beyond says how far light and charge are apart. Light that is late by δ
+sub-steps gives every packet what belongs to the sub-step before::
+
+    part of sub-step m in a line, summed over the columns      z(m) = Σ_u X(m − u),   0 elsewhere
+    light late by 0 ≤ δ < 1                                    z′(m) = (1 − δ)·z(m) + δ·z(m + 1)
+    light early by 0 ≤ −δ < 1                                  z′(m) = (1 + δ)·z(m) − δ·z(m − 1)
+
+All parts z′ follow from the lines by linear regression on the code's bits. At the ends they are, with the
+light X_0, X_1 on the sensor's first rows and Y_0, Y_1 on its last::
+
+                  z′(−1)      z′(0)           z′(n + S − 2)     z′(n + S − 1)
+    late by δ     δ·X_0       X_0 + δ·X_1     (1 − δ)·Y_0       0
+    early by δ    0           (1 − δ)·X_0     Y_0 + δ·Y_1       δ·Y_0
+
+A sweep of the trigger's delays finds these rows' light along with the delay, so that nothing need be known of
+the scene but that it is not dark there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.linalg import LinAlgError, cho_factor, cho_solve
+
+from acquire.codes import ConstantCode, code_from_attrs
+from acquire.errors import UsageError
+from acquire.lines import ARMS
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.calibrate.exposure import Exposure
+    from acquire.codes import Code
+    from acquire.geometry import Geometry
+
+GUARD = 6
+"""Sub-steps beyond a line's own, to either side, whose part is found."""
+SPARE = 2.0
+"""Lines per part below which noise makes nothing of them."""
+PASSES = 2
+"""Passes over the sensor by which light may be late, or early, at first sight."""
+LIT = 0.2
+"""Light on the first and last rows, beside the mean row's, without which nothing is seen there."""
+CERTAIN = 8.0
+"""Standard deviations by chance that the correlation with a line's sub-steps must have."""
+AT_SIGHT = 4096
+"""Lines that the first sight is of."""
+BLOCK = 4096
+"""Lines of a regression that are taken at once."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Beyond:
+    """What of one arm's lines comes from sub-steps that are none of theirs, in units of a row's light.
+
+    Attributes
+    ----------
+    whole : sub-steps by which the light is late, to the nearest; the others are beside this
+    before, first, last, after : parts of the sub-step before the line's first, of its first and last, and of
+        the one after it
+    error : standard deviation of any of them
+    """
+
+    whole: int
+    before: float
+    first: float
+    last: float
+    after: float
+    error: float
+
+    @property
+    def late_substeps(self) -> float:
+        """By which the light is late, at first sight: if the edge rows are as bright as the mean row."""
+        return self.whole + self.before - self.after
+
+
+def beyond(exposure: Exposure) -> tuple[Beyond, Beyond]:
+    """Of both arms. UsageError for another code than a pseudo-random one, and too few or too dark lines."""
+    code = code_from_attrs(exposure.recording.attrs["code"])
+    if isinstance(code, ConstantCode):
+        raise UsageError(
+            f"{exposure.recording} has steady light, which is never late",
+            possible="a pseudo-random code",
+            hint="a run with the rig's code",
+        )
+    parts = []
+    for segment in exposure.blocks():
+        sums = segment.lines.sum(axis=2, dtype=np.float64)
+        parts.append(np.where(segment.mask.all(axis=2), sums, np.nan))
+    geometry = exposure.recording.geometry_for(1)
+    found = []
+    for arm, sums in zip(ARMS, np.concatenate(parts, axis=1), strict=True):
+        try:
+            found.append(beyond_of(sums, code, exposure.first_line, geometry))
+        except UsageError as error:
+            raise UsageError(
+                f"arm {arm} of {exposure.recording}: {error.message}",
+                possible=error.possible,
+                hint=error.hint,
+            ) from error
+    return found[0], found[1]
+
+
+def beyond_of(sums: NDArray[np.float64], code: Code, first_line: int, geometry: Geometry) -> Beyond:
+    """Of one arm: ``sums`` (line,) over a line's columns from ``first_line`` on, NaN for those that are not
+    whole.
+    """
+    S, width = geometry.substeps, geometry.size + geometry.substeps - 1
+    lines = np.flatnonzero(np.isfinite(sums))
+    needed = int(SPARE * (width + 2 * GUARD + 1))
+    if len(lines) < needed:
+        raise UsageError(f"{len(lines)} whole lines do not tell", possible=f"{needed} or more")
+    change = sums[lines] - sums[lines].mean()
+    whole = _whole(code, S * first_line, S * lines, change, width)
+    begin = S * first_line - whole - GUARD
+    span = width + 2 * GUARD
+    bits = code.bits(begin, S * len(sums) + span).astype(np.float64)
+    view = np.lib.stride_tricks.sliding_window_view(bits, span)
+    return _parts(view, S * lines, change, whole, geometry)
+
+
+def _whole(code: Code, first: int, starts: NDArray[np.int64], y: NDArray[np.float64], width: int) -> int:
+    """By how many sub-steps the light is late, to some: where the lines follow the code best together."""
+    reach, y, starts = PASSES * width, y[:AT_SIGHT], starts[:AT_SIGHT]
+    bits = code.bits(first - reach, int(starts[-1]) + width + 2 * reach).astype(np.float64)
+    view = np.lib.stride_tricks.sliding_window_view(bits, width + 2 * reach)
+    along = np.zeros(width + 2 * reach)
+    for at in range(0, len(y), BLOCK):
+        along += y[at : at + BLOCK] @ (view[starts[at : at + BLOCK]] - 0.5)
+    sums = np.convolve(along, np.ones(width), "valid")
+    best = int(sums.argmax())
+    chance = 0.5 * float(y.std()) * (len(y) * width) ** 0.5
+    if sums[best] < CERTAIN * chance:
+        raise UsageError(
+            "the lines do not follow the light's code",
+            hint="light on, a scene at rest; acquire status and acquire trigger square look at the wires",
+        )
+    return reach - best
+
+
+def _parts(
+    view: NDArray[np.float64],
+    starts: NDArray[np.int64],
+    y: NDArray[np.float64],
+    whole: int,
+    geometry: Geometry,
+) -> Beyond:
+    """By regression on the bits, and a constant for what the light does not switch."""
+    unknown = view.shape[1] + 1
+    normal, right = np.zeros((unknown, unknown)), np.zeros(unknown)
+    for at in range(0, len(y), BLOCK):
+        A = np.hstack([view[starts[at : at + BLOCK]], np.ones((len(y[at : at + BLOCK]), 1))])
+        normal += A.T @ A
+        right += A.T @ y[at : at + BLOCK]
+    try:
+        factor = cho_factor(normal)
+    except LinAlgError as error:
+        raise UsageError(
+            "the light's code does not tell its sub-steps apart", possible="a pseudo-random code"
+        ) from error
+    found = cho_solve(factor, right)
+    variance = max(float(y @ y - right @ found), 0.0) / (len(y) - unknown)
+    errors = np.sqrt(variance * np.diag(cho_solve(factor, np.eye(unknown))))
+    return _edges(found[:-1], errors, whole, geometry)
+
+
+def _edges(parts: NDArray[np.float64], errors: NDArray[np.float64], whole: int, geometry: Geometry) -> Beyond:
+    """What lies beyond, with the line's own sub-steps where they leave least of it."""
+    width = geometry.size + geometry.substeps - 1
+    row = float(parts.sum() / (geometry.size * geometry.substeps))
+    outside = np.abs(parts).sum() - np.convolve(np.abs(parts), np.ones(width), "valid")
+    at = 1 + int(outside[1:-1].argmin())
+    first, last = parts[at : at + geometry.substeps], parts[at + width - geometry.substeps : at + width]
+    if min(first.sum(), last.sum()) < LIT * row * geometry.substeps * (geometry.substeps + 1) / 2:
+        raise UsageError(
+            "the scene is dark at the sensor's first or last rows, where delays show",
+            hint="a bright scene larger than the field, as for the flat",
+        )
+    before, begin, end, after = (float(parts[k]) / row for k in (at - 1, at, at + width - 1, at + width))
+    return Beyond(
+        whole + GUARD - at,
+        before,
+        begin,
+        end,
+        after,
+        float(np.hypot(errors[at - 1], errors[at + width]) / np.sqrt(2)) / row,
+    )

@@ -1,0 +1,281 @@
+"""A sweep of the trigger's delays: where to look, and where light and charge are together."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from acquire.calibrate.calibration import Finding, Measured
+from acquire.calibrate.delay import beyond
+from acquire.calibrate.exposure import unseen
+from acquire.errors import UsageError
+from acquire.lines import ARMS
+from acquire.trigger.base import Delays
+from acquire.trigger.settings import GATEWARE, pulse_width_ticks
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from numpy.typing import NDArray
+
+    from acquire.calibrate.delay import Beyond
+    from acquire.calibrate.exposure import Exposure, Progress
+
+SHARES = (0.3, -0.3, 0.2, -0.2, 0.15, -0.15)
+"""Of a sub-step, by which the light is made late in the recordings of a sweep: a half of it is one, too."""
+FIRST_LINES = 4096
+"""Of the recording that shows roughly where light and charge are."""
+MOST_LINES = 2**17
+LEAST_SHARE = 0.08
+"""Of a sub-step, below which a recording says little: that is the roundness of the light's edges."""
+WANTED_TICKS = 0.5
+"""Uncertainty that a sweep is made for, with as many lines as are sensible."""
+SWEEP_ERROR = 0.75
+"""Uncertainty of a sweep's delay beside that of one part of one recording."""
+MOST_LEAD = 255
+APART = 4.0
+"""Standard errors by which the two sides of a sweep are apart for certain."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What the delays of one trigger may be, in ticks."""
+
+    clock_hz: int
+    substep_ticks: int
+    pulse_distance_ticks: int
+
+    @property
+    def most_lead(self) -> int:
+        return min(MOST_LEAD, self.substep_ticks - GATEWARE.lead_margin_ticks)
+
+    @property
+    def most_delay(self) -> int:
+        return self.pulse_distance_ticks - pulse_width_ticks(None, self.pulse_distance_ticks) - 1
+
+    def delays(self, later: Sequence[float]) -> Delays:
+        """Those with which each arm's line starts ``later`` (ticks) than the light of its first sub-step, as
+        far as the trigger can.
+        """
+        a, b = (max(0, round(each)) for each in later)
+        lead = min(a, b, self.most_lead)
+        return Delays(lead, min(a - lead, self.most_delay), min(b - lead, self.most_delay))
+
+    def sweep(self, late: Sequence[float]) -> list[Delays]:
+        """Settings to look at, around where the light would be ``late`` (arm) without any.
+
+        Where that is out of reach, whole sub-steps away from it: light that is early, or late, by some shows
+        as well where its sub-steps begin.
+        """
+        around = [each - self._beyond_reach(each) * self.substep_ticks for each in late]
+        found = [self.delays([each - share * self.substep_ticks for each in around]) for share in SHARES]
+        return list(dict.fromkeys(found))
+
+    def _beyond_reach(self, late: float) -> int:
+        """Sub-steps by which ``late`` is too much, or too little (below 0), to be seen from both sides."""
+        substeps, side = late / self.substep_ticks, max(SHARES)
+        too_much = math.ceil(substeps + side - (self.most_lead + self.most_delay) / self.substep_ticks)
+        return too_much if too_much > 0 else min(0, math.floor(substeps - side))
+
+    def whole_substeps(self, late: NDArray[np.float64]) -> int:
+        """Sub-steps of lateness that are more than the trigger can take back."""
+        too_much = float(late.max()) - self.most_lead - self.most_delay
+        return max(0, math.ceil(too_much / self.substep_ticks))
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """One recording of a sweep: by how much each arm's line was made later (ticks), and what lay beyond."""
+
+    later: tuple[int, int]
+    seen: tuple[Beyond, Beyond]
+
+
+@dataclass(frozen=True, slots=True)
+class Crossing:
+    """Where light and charge of one arm are together: ``late_ticks`` is what the light lacks without delays.
+
+    ``edge_ticks`` is by how much the sides of the sweep are apart, as rounded edges of the light make them;
+    0 where only one side could be seen.
+    """
+
+    late_ticks: float
+    uncertainty: float
+    edge_ticks: float
+
+
+def setting_of(exposure: Exposure) -> Setting:
+    config = exposure.recording.attrs["config"]
+    trigger = config["trigger"]
+    each = 1 if trigger["line_start"] == "per-substep" else config["geometry"]["substeps"]
+    ticks = trigger["substep_ticks"]
+    return Setting(trigger["clock_hz"], ticks, ticks * each)
+
+
+def point_of(exposure: Exposure) -> Point:
+    """What a recording of a sweep says, and the delays that it was made with."""
+    trigger = exposure.recording.attrs["config"]["trigger"]
+    lead, a, b = (
+        trigger["light"]["lead_ticks"],
+        trigger["a"]["delay_ticks"],
+        trigger["b"]["delay_ticks"],
+    )
+    return Point((lead + a, lead + b), beyond(exposure))
+
+
+def first_sight(point: Point, substep_ticks: int) -> list[float]:
+    """By how many ticks the light of each arm is late without delays, from one recording."""
+    return [
+        later + each.late_substeps * substep_ticks
+        for later, each in zip(point.later, point.seen, strict=True)
+    ]
+
+
+def lines_for(point: Point, lines: int, substep_ticks: int) -> int:
+    """Lines of each recording with which a sweep finds delays to half a tick, as far as that is sensible."""
+    error_ticks = max(each.error for each in point.seen) * substep_ticks
+    wanted = lines * (SWEEP_ERROR * error_ticks / WANTED_TICKS) ** 2
+    return int(min(MOST_LINES, max(FIRST_LINES, -(-wanted // 1024) * 1024)))
+
+
+def delay(exposures: Sequence[Exposure], *, progress: Progress = unseen) -> Finding:
+    """How late the light is for either camera, from recordings with different delays of the trigger.
+
+    Needs a scene at rest that is bright at the edges of the field, and the rig's pseudo-random code. Raises
+    UsageError for fewer than two recordings that say something about an arm.
+    """
+    setting = setting_of(exposures[0])
+    if any(setting_of(each) != setting for each in exposures):
+        raise UsageError(
+            "recordings with sub-steps of different length are no sweep", possible="one trigger.substep_ticks"
+        )
+    points = []
+    for each in exposures:
+        points.append(point_of(each))
+        progress(len(points), len(exposures))
+    return found_by(points, exposures, setting)
+
+
+def found_by(points: Sequence[Point], exposures: Sequence[Exposure], setting: Setting) -> Finding:
+    """What the points of a sweep say."""
+    crossings = [_crossing(points, arm, setting.substep_ticks) for arm in range(len(ARMS))]
+    late = np.array([each.late_ticks for each in crossings])
+    error = np.array([each.uncertainty for each in crossings])
+    facts = {
+        "recordings": [exposure.facts() for exposure in exposures],
+        "lines": sum(exposure.lines for exposure in exposures),
+        "settings": len(points),
+        "clock_hz": setting.clock_hz,
+        "edge_ticks": {arm: round(each.edge_ticks, 2) for arm, each in zip(ARMS, crossings, strict=True)},
+        "whole_substeps": setting.whole_substeps(late),
+        "rig": settings_for(late, setting),
+    }
+    quantities = {"light_late_ticks": Measured(late, error)}
+    return Finding("delay", exposures[0].instrument, quantities, facts=facts, warnings=_doubts(error, facts))
+
+
+def settings_for(late: NDArray[np.float64], setting: Setting) -> dict[str, int]:
+    """Keys of ``[trigger]`` with which light and charge of both arms are together, as far as they can be."""
+    late = late - setting.whole_substeps(late) * setting.substep_ticks
+    earlier = max(0.0, -float(late.min()))
+    delays = setting.delays((late + earlier).tolist())
+    keys = {
+        "light.lead_ticks": delays.light_lead_ticks,
+        "a.delay_ticks": delays.a_ticks,
+        "b.delay_ticks": delays.b_ticks,
+    }
+    return keys | ({"light.open_ticks": round(earlier)} if round(earlier) > 0 else {})
+
+
+def _crossing(points: Sequence[Point], arm: int, substep_ticks: int) -> Crossing:
+    """Of one arm: the delay with which the table in `acquire.calibrate.delay` explains all recordings."""
+    sight = float(np.median([first_sight(point, substep_ticks)[arm] for point in points]))
+    later = np.array([point.later[arm] + point.seen[arm].whole * substep_ticks for point in points])
+    kept = np.abs(sight - later) > LEAST_SHARE * substep_ticks
+    later, seen = later[kept], [point.seen[arm] for point, good in zip(points, kept, strict=True) if good]
+    if len(set(later)) < 2:
+        raise UsageError(
+            f"arm {ARMS[arm]}: no two recordings with the light late, or early, by a part of a sub-step",
+            hint="acquire calibrate delay, with the daemon, sweeps by itself",
+        )
+    model = _Model(later, seen, sight, substep_ticks)
+    together = model.fit(rounded=False)
+    if (later < sight).all() or (later > sight).all():
+        return Crossing(*together[:2], 0.0)
+    apart = model.fit(rounded=True)
+    if abs(apart[2]) > APART * apart[3]:
+        return Crossing(*apart[:3])
+    return Crossing(*together[:2], 0.0)
+
+
+class _Model:
+    """The parts at both ends of a line, as the delay and four rows' light make them; see the table.
+
+    ``later`` is by how much each recording's lines were made later, whole sub-steps of lateness included.
+    """
+
+    def __init__(
+        self, later: NDArray[np.float64], seen: Sequence[Beyond], sight: float, substep_ticks: int
+    ) -> None:
+        self._later, self._sight, self._ticks = later, sight, substep_ticks
+        self._parts = np.array([[each.before, each.first, each.last, each.after] for each in seen])
+        self._errors = np.array([each.error for each in seen])
+        self._is_late = later < sight
+
+    def fit(self, *, rounded: bool) -> tuple[float, float, float, float]:
+        """The delay and its standard error, and, where ``rounded``, by how much both sides are apart (ticks).
+
+        Rounded edges of the light make it seem later where it is late, and earlier where it is early.
+        """
+        start = [self._sight / self._ticks, 1.0, 1.0, 1.0, 1.0, *([0.0] if rounded else [])]
+        found = least_squares(self._left, start, x_scale=0.1)
+        spare = found.fun.size - len(start)
+        scale = max(1.0, 2 * found.cost / spare) if spare > 0 else 1.0
+        slopes = np.asarray(found.jac, np.float64)
+        covariance = np.linalg.pinv(slopes.T @ slopes) * scale
+        errors = np.sqrt(np.diag(covariance)) * self._ticks
+        late = float(found.x[0]) * self._ticks, float(errors[0])
+        return (*late, float(found.x[5]) * self._ticks, float(errors[5])) if rounded else (*late, 0.0, 0.0)
+
+    def _left(self, unknown: NDArray[np.float64]) -> NDArray[np.float64]:
+        delay, X0, X1, Y0, Y1, *edge = unknown
+        shift = delay - self._later / self._ticks
+        if edge:
+            shift = shift + np.where(self._is_late, edge[0] / 2, -edge[0] / 2)
+        late, early = np.maximum(shift, 0), np.maximum(-shift, 0)
+        expected = np.stack(
+            [
+                late * X0,
+                np.where(self._is_late, X0 + late * X1, (1 - early) * X0),
+                np.where(self._is_late, (1 - late) * Y0, Y0 + early * Y1),
+                early * Y0,
+            ],
+            axis=1,
+        )
+        left: NDArray[np.float64] = ((self._parts - expected) / self._errors[:, None]).ravel()
+        return left
+
+
+def _doubts(error: NDArray[np.float64], facts: dict[str, Any]) -> tuple[str, ...]:
+    doubts = []
+    if error.max() > 1:
+        doubts.append(f"sure to {error.max():.1f} ticks only: more lines or brighter light, for one tick")
+    edge = {arm: ticks for arm, ticks in facts["edge_ticks"].items() if abs(ticks) > APART * error.max()}
+    if edge:
+        text = " and ".join(f"{abs(ticks):.0f} ticks in arm {arm}" for arm, ticks in edge.items())
+        doubts.append(f"light and charge do not change at once, but over {text}: see the light's edges")
+    if facts["whole_substeps"]:
+        doubts.append(
+            f"the light is late by {facts['whole_substeps']} sub-steps more than the trigger can take back; "
+            "the code stays shifted by them, as acquire status says: a faster light driver or isolator helps"
+        )
+    if "light.open_ticks" in facts["rig"]:
+        doubts.append(
+            "the light is early for the later camera, which no lead mends: light.open_ticks cuts off what "
+            "comes too soon, and with it as much of every sub-step's light; a later light would cost none"
+        )
+    return tuple(doubts)

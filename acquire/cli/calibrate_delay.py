@@ -1,0 +1,108 @@
+"""``acquire calibrate delay``: light against line start and sub-step, swept by the trigger."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from acquire.cli.calibrate_live import instrument, kept, record, wait_for_enter
+from acquire.cli.control import SocketOption
+from acquire.cli.output import JsonFlag, note, print_facts, print_json, print_warning
+
+if TYPE_CHECKING:
+    from acquire.calibrate.calibration import Finding
+    from acquire.calibrate.exposure import Exposure
+
+PREPARE = "Put a bright scene in, at rest, larger than the field, as for the flat; it need not be uniform."
+
+
+def delay(
+    out: Annotated[
+        str, typer.Option("--out", metavar="CAL", help="The calibration: new, or one that is added to.")
+    ],
+    recordings: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[RECORDING...]", help="Of a sweep, to be looked at again; else a new sweep."),
+    ] = None,
+    directory: Annotated[
+        Path, typer.Option(metavar="DIR", help="Where the recordings go, which stay; made if absent.")
+    ] = Path("calibration-recordings"),
+    lines: Annotated[
+        int | None,
+        typer.Option(min=1024, max=2**20, help="Of each recording; else as many as half a tick takes."),
+    ] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Ask nothing: everything is in place already.")] = False,
+    socket: SocketOption = None,
+    json: JsonFlag = False,
+) -> None:
+    """How late the light is for either camera, to a tick of the trigger, and what to put into the rig file.
+
+    Sweeps the trigger's delays on the running daemon: one recording that shows where light and charge are,
+    and six around it. At Ctrl-C it ends with what it has. The instrument is left as it was: armed or not.
+    Noise is what limits it: bright light, just below saturation, is best.
+
+    Example: [bold]acquire calibrate delay --out cal.zarr[/]
+    """
+    from acquire.calibrate.exposure import open_exposure
+
+    if recordings:
+        exposures = [open_exposure(each) for each in recordings]
+    else:
+        exposures = _swept(directory, lines, socket, ask=not yes)
+    found = _found(out, exposures)
+    if json:
+        print_json({"calibration": out, "facts": found.facts, "warnings": found.warnings, **_numbers(found)})
+        return
+    _tell(found, out)
+
+
+def _swept(directory: Path, lines: int | None, socket: Path | None, *, ask: bool) -> list[Exposure]:
+    """One recording to see where to look, and one for each setting around that, until Ctrl-C."""
+    from acquire.calibrate import delay_sweep as sweep
+    from acquire.cli.interrupts import first_interrupt_asks
+    from acquire.cli.progress import Progress
+    from acquire.daemon.messages import TriggerDelays
+
+    note(f"delay: {PREPARE}")
+    if ask:
+        wait_for_enter()
+    with instrument(socket, directory) as daemon, first_interrupt_asks("ending with what there is") as asked:
+        first = record(daemon, "delay", directory, sweep.FIRST_LINES)
+        setting, point = sweep.setting_of(first), sweep.point_of(first)
+        late = sweep.first_sight(point, setting.substep_ticks)
+        lines = lines or sweep.lines_for(point, first.lines, setting.substep_ticks)
+        settings = setting.sweep(late)
+        about = " and ".join(f"{each:.0f}" for each in late)
+        note(f"the light is about {about} ticks late; {len(settings)} recordings of {lines} lines follow")
+        exposures = [first]
+        with Progress("sweeping the delays") as progress:
+            for done, each in enumerate(settings):
+                progress.advance(done, len(settings))
+                if asked.is_set():
+                    break
+                delays = TriggerDelays(light_lead=each.light_lead_ticks, a=each.a_ticks, b=each.b_ticks)
+                exposures.append(record(daemon, "delay", directory, lines, delays=delays))
+    return exposures
+
+
+def _found(out: str, exposures: list[Exposure]) -> Finding:
+    from acquire.calibrate.delay_sweep import delay as look
+    from acquire.cli.progress import stage_progress
+
+    with stage_progress("looking beyond the lines' sub-steps") as advance:
+        return kept(out, exposures[0], lambda _: look(exposures, progress=advance))
+
+
+def _numbers(found: Finding) -> dict[str, object]:
+    late = found.quantities["light_late_ticks"]
+    return {"light_late_ticks": late.value.tolist(), "uncertainty_ticks": late.uncertainty.tolist()}
+
+
+def _tell(found: Finding, out: str) -> None:
+    from acquire.cli.calibrate_words import found_facts
+
+    print_facts(found_facts(found) | {"kept in": out})
+    for text in found.warnings:
+        print_warning(text)

@@ -1,0 +1,108 @@
+"""Recordings that a calibration asks for, made by the running daemon; the instrument is left as it was."""
+
+from __future__ import annotations
+
+import sys
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from acquire.cli.output import note
+from acquire.errors import StateError, UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+    from pathlib import Path
+
+    from acquire.calibrate.calibration import Calibration, Finding
+    from acquire.calibrate.exposure import Exposure
+    from acquire.client import Client
+    from acquire.daemon.messages import LightCode, TriggerDelays
+
+SEALED_S = 120.0
+"""Longest wait for a recording to be sealed, beside the time that its lines take."""
+
+
+@contextmanager
+def instrument(socket: Path | None, directory: Path) -> Iterator[Client]:
+    """The daemon, idle or armed; in the end it is as it was. ``directory`` is made."""
+    from acquire.cli.progress import teller
+    from acquire.client import Client
+
+    with Client(socket, teller()) as daemon:
+        status = daemon.status()
+        if status.state not in ("idle", "armed"):
+            raise StateError(
+                f"the daemon is {status.state}", possible="idle or armed", hint="acquire stop, or disarm"
+            )
+        directory.mkdir(parents=True, exist_ok=True)
+        try:
+            yield daemon
+        finally:
+            if daemon.status().run_id != status.run_id:
+                _leave(daemon, armed=status.state == "armed")
+
+
+def record(
+    daemon: Client,
+    name: str,
+    directory: Path,
+    lines: int,
+    *,
+    code: LightCode = "rig",
+    delays: TriggerDelays | None = None,
+) -> Exposure:
+    """Arm with the light and the delays that are wanted, record ``NAME-1.zarr`` or the next free, disarm."""
+    from acquire.calibrate.exposure import open_exposure
+    from acquire.client import SEALED
+
+    if daemon.status().state == "armed":
+        daemon.disarm()
+    daemon.arm(code=code, calibration="none", delays=delays)
+    path = free(directory, name)
+    status = daemon.start(path, lines=lines)
+    rates = [arm.rate_hz for arm in status.arms.values() if arm.rate_hz > 0]
+    daemon.wait(SEALED, timeout_s=SEALED_S + lines / min(rates, default=1000.0))
+    daemon.disarm()
+    return open_exposure(path)
+
+
+def free(directory: Path, name: str) -> Path:
+    """A name that nothing has yet: what was recorded before stays."""
+    number = 1
+    while (path := directory.absolute() / f"{name}-{number}.zarr").exists():
+        number += 1
+    return path
+
+
+def kept(out: str, exposure: Exposure, look: Callable[[Calibration], Finding]) -> Finding:
+    """Look, and add what was found to the calibration at a place. UsageError where nothing can be told."""
+    from acquire.calibrate import Calibration, open_calibration, save_calibration
+    from acquire.store.source import source_of
+
+    known = open_calibration(out) if source_of(out).exists() else Calibration(exposure.instrument)
+    found = look(known)
+    if found.step == "orientation" and found.orientation is None:
+        raise UsageError(f"orientation: {found.warnings[0]}")
+    save_calibration(out, known.with_step(found))
+    return found
+
+
+def wait_for_enter() -> None:
+    """StateError where nobody can press it."""
+    note("Enter goes on, Ctrl-C ends; what was found so far is kept")
+    if not sys.stdin.readline():
+        raise StateError("nobody is there to press Enter", hint="--yes, where everything is in place")
+
+
+def _leave(daemon: Client, *, armed: bool) -> None:
+    """The instrument as it was before."""
+    from acquire.client import SEALED
+
+    status = daemon.status()
+    if status.state == "recording":
+        daemon.stop()
+        status = daemon.wait(SEALED, timeout_s=SEALED_S)
+    if status.state == "armed":
+        daemon.disarm()
+    if armed:
+        daemon.arm()

@@ -1,0 +1,68 @@
+"""``acquire calibrate delay`` on a running daemon, ended half-way; and its recordings looked at once more."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+from live_daemon import COMMAND, Daemon
+from waiting import until
+
+from acquire.calibrate import open_calibration
+
+SCENE = """
+kind = "leds"
+[[leds]]
+name = "all"
+shape = "square"
+row = 0.5
+column = 0.5
+size = 1.0
+drive = { waveform = "constant", level = 0.5 }
+[[effects]]
+kind = "shot_noise"
+[[effects]]
+kind = "delays"
+light_s = 4.0e-6
+a_s = 1.0e-6
+"""
+LATE = (270, 360)
+"""Ticks, of arms a and b."""
+
+
+def test_a_sweep_that_is_interrupted_keeps_what_it_has(tmp_path: Path) -> None:
+    (tmp_path / "scene.toml").write_text(SCENE)
+    scene = f"simulation.scene='{tmp_path}/scene.toml'"
+    daemon = Daemon(tmp_path, "trigger.substep_ticks=900", scene)
+    try:
+        words = [*COMMAND, "calibrate", "delay", "--out", "cal.zarr", "--yes", "--lines", "4096"]
+        environment = os.environ | {"ACQUIRE_SOCKET": str(daemon.socket)}
+        with subprocess.Popen(
+            words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment
+        ) as sweeping:
+            assert sweeping.stderr is not None
+            for line in sweeping.stderr:
+                if "recordings of 4096 lines" in line:
+                    break
+            third = tmp_path / "calibration-recordings" / "delay-3.zarr"
+            until(lambda: third.exists() or sweeping.poll() is not None)
+            sweeping.send_signal(signal.SIGINT)
+            out, said = sweeping.communicate(timeout=300)
+        assert sweeping.returncode == 0, said
+        assert "trigger.light.lead_ticks = " in out
+        late = open_calibration(tmp_path / "cal.zarr").quantities["light_late_ticks"]
+        assert late.value == pytest.approx(LATE, abs=5 * late.uncertainty.max())
+        assert late.uncertainty.max() < 60
+        with daemon.client() as client:
+            assert client.status().state == "idle"
+        taken = sorted(path.name for path in (tmp_path / "calibration-recordings").iterdir())
+        assert 3 <= len(taken) < 7, said
+        places = [f"calibration-recordings/{name}" for name in taken]
+        again = json.loads(daemon("calibrate", "delay", *places, "--out", "again.zarr", "--json").out)
+        assert again["light_late_ticks"] == pytest.approx(late.value.tolist())
+    finally:
+        daemon.close()
