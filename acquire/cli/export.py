@@ -60,6 +60,9 @@ def export(
         int | None, typer.Option(help="Of a recording, the trigger's number; else its first.")
     ] = None,
     lines: Annotated[int | None, typer.Option(help="How many lines; else all that follow.")] = None,
+    average: Annotated[
+        int, typer.Option(min=1, metavar="LINES", help="An overview: so many lines become their mean.")
+    ] = 1,
     begin: Annotated[
         str | None,
         typer.Option("--from", metavar="TIME", help="Its begin: 52ms after the first, or UTC."),
@@ -90,15 +93,16 @@ def export(
     format_for(out)
     check_new_path(out)
     if (format_of(source) or "").startswith("acquire-video/"):
-        _refuse_numbers("video", "--first-frame and --frames", first_line, lines)
+        averaged = average if average > 1 else None
+        _refuse_numbers("video", "--first-frame and --frames", first_line, lines, averaged)
         part = _Part(first_frame, frames, begin, end)
         content = _of_video(open_video(source), source, part, whole=all_frames)
     else:
         opened = open_recording(source)
         _refuse_numbers("recording", "--first-line and --lines", first_frame, frames)
-        content = _of_recording(opened, _Part(first_line, lines, begin, end))
-    with stage_progress(f"writing {out.name}") as advance:
-        size = write(content, out, advance, fps=fps, peak=peak)
+        content = _of_recording(opened, _Part(first_line, lines, begin, end), average)
+    with stage_progress(f"writing {out.name}, MB") as advance:
+        size = write(content, out, lambda done, total: advance(done / 1e6, total / 1e6), fps=fps, peak=peak)
     if json:
         print_json({"path": str(out), "bytes": size, "shape": content.image.shape, **content.facts})
     else:
@@ -136,7 +140,7 @@ def _of_video(video: VideoFile, name: str, part: _Part, *, whole: bool) -> Conte
     return video_content(video, name, frames, whole=whole)
 
 
-def _of_recording(recording: Recording, part: _Part) -> Content:
+def _of_recording(recording: Recording, part: _Part, average: int) -> Content:
     from acquire.exchange import recording_content
 
     part.check()
@@ -145,7 +149,7 @@ def _of_recording(recording: Recording, part: _Part) -> Content:
     rows = range(chosen, end if part.count is None else chosen + part.count)
     if part.begin is not None or part.end is not None:
         rows = _numbers(part, first, end, recording.line_period_ns, _first_ns(recording), "lines")
-    return recording_content(recording, range(rows.start - first, rows.stop - first))
+    return recording_content(recording, range(rows.start - first, rows.stop - first, average))
 
 
 def _first_ns(recording: Recording) -> int:

@@ -32,8 +32,9 @@ FACTS = (
 def recording_content(recording: Recording, rows: range | None = None) -> Content:
     """Lines of both arms of a recording (rows; None: all) as (arm, line, pixel), with their tags and flags.
 
-    A line that is missing, or was dropped by retention, is 0 and flagged so. UsageError for lines that are
-    not there.
+    A line that is missing, or was dropped by retention, is 0 and flagged so. Rows with a step are an
+    overview: so many lines each become their mean (float32, of those that are not missing), with all their
+    flags and the first one's tags. UsageError for lines that are not there.
     """
     asked = range(recording.lines) if rows is None else rows
     if not 0 <= asked.start < asked.stop <= recording.lines:
@@ -43,25 +44,27 @@ def recording_content(recording: Recording, rows: range | None = None) -> Conten
             possible=f"lines {first} to {last}" if recording.lines else "none: it holds no lines yet",
         )
     stream, first_line = recording.arms[ARMS[0]], recording.first_line + asked.start
+    words = "lines as recorded" if asked.step == 1 else f"means of {asked.step} lines each"
     image = Array(
         "lines",
         ("arm", "line", "pixel"),
         (len(ARMS), len(asked), stream.pixels),
-        little(stream.dtype),
+        little(stream.dtype if asked.step == 1 else np.dtype(np.float32)),
         partial(_of_arms, recording, asked, "lines"),
-        {"long_name": "lines as recorded", "units": "DN"},
+        {"long_name": words, "units": "DN"},
     )
-    axes = (Axis("arm"), Axis("line", 1.0, first_line), Axis("pixel", 1.0))
-    facts = _facts(recording, first_line, len(asked))
+    axes = (Axis("arm"), Axis("line", float(asked.step), first_line), Axis("pixel", 1.0))
+    facts = _facts(recording, asked)
     return Content("lines", str(recording), axes, image, tuple(_columns(recording, asked)), facts)
 
 
-def _facts(recording: Recording, first_line: int, count: int) -> dict[str, Any]:
+def _facts(recording: Recording, rows: range) -> dict[str, Any]:
     return {
         "source": str(recording),
         **{key: recording.attrs[key] for key in FACTS if key in recording.attrs},
-        "first_line": first_line,
-        "lines": count,
+        "first_line": recording.first_line + rows.start,
+        "lines": rows.stop - rows.start,
+        "lines_averaged": rows.step,
         "arms": list(ARMS),
         "line_period_s": recording.line_period_ns * 1e-9,
         "flag_masks": {flag.name.lower(): int(flag) for flag in LineFlag if flag.name},
@@ -77,11 +80,12 @@ def _columns(recording: Recording, rows: range) -> Iterator[Array]:
     yield Array(
         "flags", ("arm", "line"), (len(ARMS), len(rows)), np.dtype("<u2"), flags, {"long_name": words}
     )
-    for name, column, words in (
+    tags = (
         ("time_ns", "time", "UTC at which the line's read-out begins, ns since 1970"),
         ("code_index", "code_index", "index of the code's bit in the line's first sub-step"),
         ("code", "code", "the line's code bits, first sub-step in bit 0"),
-    ):
+    )
+    for name, column, words in tags if rows.step == 1 else tags[:2]:
         blocks = partial(_of_either, recording, rows, column)
         dtype = little(stream.reader(column).shape.dtype)
         yield Array(name, ("line",), (len(rows),), dtype, blocks, {"long_name": words})
@@ -90,7 +94,7 @@ def _columns(recording: Recording, rows: range) -> Iterator[Array]:
 def _steps(recording: Recording, rows: range) -> Iterator[tuple[int, int]]:
     """Parts of the rows that are read at once."""
     stream = recording.arms[ARMS[0]]
-    size = max(1, BLOCK_BYTES // (stream.pixels * stream.dtype.itemsize))
+    size = max(1, BLOCK_BYTES // (stream.pixels * stream.dtype.itemsize * rows.step)) * rows.step
     for start in range(rows.start, rows.stop, size):
         yield start, min(rows.stop, start + size)
 
@@ -100,7 +104,9 @@ def _of_arms(recording: Recording, rows: range, name: str) -> Iterator[Block]:
         for start, stop in _steps(recording, rows):
             flags = flags_of(recording, arm, start, stop)
             values = flags if name == "flags" else present_values(recording, arm, name, start, flags)
-            yield block((number, slice(start - rows.start, stop - rows.start)), values)
+            if rows.step > 1:
+                values = _all_flags(flags, rows.step) if name == "flags" else _means(values, flags, rows.step)
+            yield block((number, _place(rows, start, stop)), values)
 
 
 def _of_either(recording: Recording, rows: range, name: str) -> Iterator[Block]:
@@ -108,7 +114,7 @@ def _of_either(recording: Recording, rows: range, name: str) -> Iterator[Block]:
     for start, stop in _steps(recording, rows):
         (missing, values), (_, others) = (_tags(recording, arm, name, start, stop) for arm in ARMS)
         both = np.where(missing, others, values)
-        yield block((slice(start - rows.start, stop - rows.start),), both)
+        yield block((_place(rows, start, stop),), both[:: rows.step])
 
 
 def _tags(
@@ -117,3 +123,23 @@ def _tags(
     """Which rows are missing, and the tags of the others."""
     flags = flags_of(recording, arm, start, stop)
     return (flags & MISSING) != 0, present_values(recording, arm, name, start, flags)
+
+
+def _place(rows: range, start: int, stop: int) -> slice:
+    """Where what becomes of these rows belongs."""
+    return slice((start - rows.start) // rows.step, -(-(stop - rows.start) // rows.step))
+
+
+def _all_flags(flags: NDArray[np.uint16], count: int) -> NDArray[np.uint16]:
+    """Every flag that one of ``count`` lines has; ``missing`` where all of them are."""
+    edges = np.arange(0, len(flags), count)
+    found: NDArray[np.uint16] = np.bitwise_or.reduceat(flags & ~MISSING, edges)
+    return found | np.bitwise_and.reduceat(flags & MISSING, edges)
+
+
+def _means(lines: NDArray[Any], flags: NDArray[np.uint16], count: int) -> NDArray[np.float32]:
+    """Of ``count`` lines each, without those that are missing, which are 0."""
+    edges = np.arange(0, len(lines), count)
+    total = np.add.reduceat(lines, edges, axis=0, dtype=np.float64)
+    there = np.add.reduceat((flags & MISSING) == 0, edges, dtype=np.int64)
+    return (total / np.maximum(there, 1)[:, None]).astype(np.float32)

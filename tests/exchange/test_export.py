@@ -20,7 +20,7 @@ from acquire.exchange import arrays, export, from_recording, recording_content, 
 from acquire.lines import LineFlag
 from acquire.store import open_recording, open_video
 
-FIRST, S, TRUSTED = 100, 2, range(3, 17)
+FIRST, M, S, TRUSTED = 100, 6, 2, range(3, 17)
 Cli = Callable[..., tuple[int, str, str]]
 
 
@@ -151,6 +151,34 @@ def test_lines_and_tags_of_a_recording(
         np.testing.assert_array_equal(file.asarray(), cut.lines)
 
 
+@pytest.mark.parametrize("block_bytes", [200, 2**23])
+def test_an_overview_is_the_mean_of_the_lines_that_are_there(
+    cli: Cli, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, block_bytes: int
+) -> None:
+    monkeypatch.setattr(from_recording, "BLOCK_BYTES", block_bytes)
+    assert cli("export", recording, tmp_path / "o.h5", "--average", 4, "--first-line", 128)[0] == 0
+    whole = open_recording(recording).cut(128, 62)
+    lines, mask = whole.lines.astype(float), np.ones((2, 62), bool)
+    mask[1, 2:7] = False
+    with h5py.File(tmp_path / "o.h5") as file:
+        data = file["entry/data"]
+        assert (data["lines"].shape, data["lines"].dtype) == ((2, 16, M), np.float32)
+        for arm in range(2):
+            for row in range(16):
+                part = slice(4 * row, min(62, 4 * row + 4))
+                there = lines[arm, part][mask[arm, part]]
+                np.testing.assert_allclose(data["lines"][arm, row], there.mean(axis=0), rtol=1e-6)
+        np.testing.assert_array_equal(data["line"], np.arange(128, 190, 4))
+        np.testing.assert_array_equal(data["time_ns"], whole.time_ns[::4])
+        assert not data["flags"][:].any()  # a line of each group is there
+        assert "code" not in data
+    code, _, err = cli("export", recording, tmp_path / "p.npz", "--average", 5, "--first-line", 130)
+    with np.load(tmp_path / "p.npz") as saved:
+        missing = (saved["flags"] & LineFlag.MISSING) != 0
+        assert (code, [np.flatnonzero(arm).tolist() for arm in missing]) == (0, [[], [0]]), err
+        assert not saved["lines"][1, 0].any()
+
+
 def test_times_choose_lines(cli: Cli, recording: Path, tmp_path: Path) -> None:
     assert cli("export", recording, tmp_path / "l.npz", "--from", "200us", "--to", "0.4ms")[0] == 0
     with np.load(tmp_path / "l.npz") as saved:
@@ -166,6 +194,7 @@ def test_times_choose_lines(cli: Cli, recording: Path, tmp_path: Path) -> None:
         (["run", "l.mp4"], "whose lines are no pictures"),
         (["run", "l.npy", "--frames", 3], "a recording has no frames"),
         (["video", "v.npy", "--lines", 3], "a video has no lines"),
+        (["video", "v.npy", "--average", 3], "a video has no lines"),
         (["run", "l.npy", "--lines", 300], "possible: lines 100 to 189"),
         (["run", "l.npy", "--lines", 0], "1 or more"),
         (["run", "l.npy", "--lines", 5, "--from", "1ms"], "numbers and times exclude each other"),
