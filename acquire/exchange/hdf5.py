@@ -39,8 +39,11 @@ def write_hdf5(path: Path, content: Content, advance: Callable[[int], object]) -
             if axis.step:
                 _write_axis(data, axis, content.image.shape[number])
                 data.attrs[f"{axis.name}_indices"] = number
-        for array in (content.image, *content.columns):
+        names = [axis.name for axis in content.axes]
+        _write(data, content.image, advance)
+        for array in content.columns:
             _write(data, array, advance)
+            data.attrs[f"{array.name}_indices"] = [names.index(dim) for dim in array.dims]
         process = _group(entry, "process", "NXprocess")
         process["program"], process["version"] = "acquire", __version__
         note = _group(process, "note", "NXnote")

@@ -23,6 +23,8 @@ PEAK_QUANTILE = 0.999
 SAMPLED = 65_536
 """Voxels of a block that are looked at to find out what is white."""
 MOST_SIDE = 8192
+USUAL_SIDE = 256
+"""Of a movie: a smaller video is enlarged by a whole factor, pixel by pixel, to about that."""
 
 
 def check_movie(content: Content) -> None:
@@ -44,24 +46,27 @@ def write_movie(
     """``fps`` frames a second, grey linear from 0 to ``peak`` (None: nearly the brightest)."""
     av = library("av", "video", "an MP4 file")
     white = peak or _white(content)
-    height, width = content.image.shape[1:]
+    times = max(1, USUAL_SIDE // max(content.image.shape[1:]))
+    height, width = (side * times for side in content.image.shape[1:])
+    facts = content.facts | {"white": white, "shown_fps": fps, "enlarged": times}
     with av.open(str(path), "w", format="mp4", options={"movflags": "use_metadata_tags"}) as container:
         container.metadata["title"] = content.title
-        container.metadata["comment"] = json.dumps(content.facts | {"white": white, "shown_fps": fps})
+        container.metadata["comment"] = json.dumps(facts)
         stream = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000))
         stream.pix_fmt, stream.options = "yuv420p", {"crf": "18"}
         stream.width, stream.height = width + width % 2, height + height % 2
         for _, block in content.image.blocks():
             for frame in block:
-                container.mux(stream.encode(_picture(av, frame, white)))
+                container.mux(stream.encode(_picture(av, frame, white, times)))
             advance(block.nbytes)
         container.mux(stream.encode())
 
 
-def _picture(av: Any, frame: NDArray[Any], white: float) -> Any:
+def _picture(av: Any, frame: NDArray[Any], white: float, times: int) -> Any:
     """The codec wants even sides: an odd one gets its last row or column twice."""
     grey = np.rint(np.clip(frame.astype(np.float32) * (255 / white), 0, 255)).astype(np.uint8)
-    even = np.pad(grey, [(0, side % 2) for side in grey.shape], mode="edge")
+    large = grey.repeat(times, axis=0).repeat(times, axis=1)
+    even = np.pad(large, [(0, side % 2) for side in large.shape], mode="edge")
     return av.VideoFrame.from_ndarray(even, format="gray")
 
 

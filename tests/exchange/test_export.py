@@ -16,7 +16,15 @@ import pytest
 import tifffile
 
 from acquire.cli import main
-from acquire.exchange import arrays, export, from_recording, recording_content, tiff, video_content
+from acquire.exchange import (
+    arrays,
+    export,
+    from_recording,
+    movie,
+    recording_content,
+    tiff,
+    video_content,
+)
 from acquire.lines import LineFlag
 from acquire.store import open_recording, open_video
 
@@ -75,6 +83,7 @@ def test_nexus_plots_the_video_by_default(cli: Cli, video: Path, tmp_path: Path)
         assert [data[name].attrs["units"] for name in axes] == ["s", "um", "um"]
         np.testing.assert_allclose(data["x"], np.arange(5) * 2.5)
         np.testing.assert_array_equal(data["time_ns"], open_video(video).time_ns)
+        assert [data.attrs[f"{name}_indices"].tolist() for name in ("time_ns", "trusted")] == [[0], [0]]
         np.testing.assert_array_equal(np.flatnonzero(data["trusted"]), TRUSTED)
         facts = json.loads(entry["process/note/data"][()])
     assert facts["trusted_frames"] == [3, 17]
@@ -104,16 +113,21 @@ def test_times_choose_frames(cli: Cli, video: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(saved["time_ns"], open_video(video).time_ns[5:12])
 
 
-def test_a_movie_shows_what_the_video_holds(cli: Cli, video: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("usual_side", "times"), [(256, 36), (7, 1)])
+def test_a_movie_shows_what_the_video_holds(
+    cli: Cli, video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, usual_side: int, times: int
+) -> None:
+    monkeypatch.setattr(movie, "USUAL_SIDE", usual_side)
     assert cli("export", video, tmp_path / "v.mp4", "--peak", 1, "--fps", 10)[0] == 0
     with av.open(str(tmp_path / "v.mp4")) as file:
         assert file.streams.video[0].average_rate == 10
         frames = np.stack([frame.to_ndarray(format="gray") for frame in file.decode(video=0)])
         facts = json.loads(file.metadata["comment"])
-    assert frames.shape == (14, 8, 6)  # even sides
-    error = frames[:, :7, :5] / 255 - open_video(video).video[3:17]
-    assert np.sqrt(np.mean(error**2)) < 0.1  # the codec loses some of what is all noise
-    assert (facts["white"], facts["frames"]) == (1.0, [3, 17])
+    assert frames.shape == (14, *(side * times + side * times % 2 for side in (7, 5)))
+    middle = frames[:, times // 2 :: times, times // 2 :: times][:, :7, :5]
+    error = middle / 255 - open_video(video).video[3:17]
+    assert np.sqrt(np.mean(error**2)) < (0.02 if times > 1 else 0.1)  # fine noise is lost in coding
+    assert (facts["white"], facts["frames"], facts["enlarged"]) == (1.0, [3, 17], times)
 
 
 @pytest.mark.parametrize("block_bytes", [200, 2**23])
