@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import typer
 
 from acquire.cli.output import JsonFlag, print_json, print_table
+from acquire.cli.usage import not_installed
 
+_MISSING = re.compile(r"No module named '([^.']+)")
 COLUMNS = ("kind", "name", "distribution", "version", "state")
 
 
@@ -31,12 +34,16 @@ def plugins(json: JsonFlag = False) -> None:
 
 
 def _rows() -> list[dict[str, Any]]:
-    from acquire.plugins import GROUPS, described
+    from acquire.plugins import GROUPS, OURS, described
 
     rows = []
     for group in GROUPS:
         for plugin in group.found():
             trouble = group.trouble(plugin)
+            if plugin.distribution == OURS and (missing := _MISSING.search(trouble)):
+                trouble = not_installed(
+                    ModuleNotFoundError(name=missing[1])
+                ).hint  # an extra that is not here
             rows.append(
                 {
                     "kind": group.what,

@@ -1,4 +1,4 @@
-"""A distribution of somebody else's adds an effect, a scene, a camera and a solver; another one is broken."""
+"""A distribution of somebody else's adds a variant of every kind; another one is broken."""
 
 from __future__ import annotations
 
@@ -92,7 +92,9 @@ def test_what_is_there_is_listed_with_whose_it_is_and_what_is_broken_with_its_er
         ("effect", "flicker"),
         ("scene", "stars"),
         ("camera driver", "ramp"),
+        ("trigger driver", "slow-link"),
         ("solver", "least-squares"),
+        ("denoiser", "local-wiener"),
     }
     assert all(row["works"] and row["version"] == "0.3" and row["about"] for row in theirs.values())
     broken = [row for row in rows if not row["works"]]

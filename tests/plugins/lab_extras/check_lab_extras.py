@@ -6,16 +6,24 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from lab_extras import Flicker
+from lab_extras import Flicker, LocalWiener
 
 from acquire.codes import ConstantCode
 from acquire.config import load_rig
+from acquire.rig import Rig
 from acquire.sim.instrument import SimulatedDevices
 from acquire.testing.cameras import CameraContract, CameraStand
 from acquire.testing.effects import EffectContract
-from acquire.testing.solvers import SolverContract
+from acquire.testing.solvers import DenoiserContract, SolverContract
+from acquire.testing.triggers import TriggerContract
 
 STAGES = 16
+RAMPS = {
+    "geometry.stages": STAGES,
+    "stream.block_lines": 32,
+    "cameras.a.driver": "ramp",
+    "cameras.b.driver": "ramp",
+}
 
 
 class TestFlicker(EffectContract):
@@ -29,19 +37,22 @@ class TestLeastSquares(SolverContract):
     most_error = 0.65
 
 
+class TestLocalWiener(DenoiserContract):
+    def make(self):
+        return LocalWiener()
+
+
+class TestSlowLink(TriggerContract):
+    @pytest.fixture
+    def trigger(self):
+        with Rig(load_rig("rig-demo", RAMPS | {"trigger.driver": "slow-link"})) as rig:
+            yield rig.trigger
+
+
 class TestRamp(CameraContract):
     @pytest.fixture
     def stand(self):
-        rig = load_rig(
-            "rig-demo",
-            {
-                "geometry.stages": STAGES,
-                "stream.block_lines": 32,
-                "cameras.a.driver": "ramp",
-                "cameras.b.driver": "ramp",
-                "cameras.a.options": {"step": 3},
-            },
-        )
+        rig = load_rig("rig-demo", RAMPS | {"cameras.a.options": {"step": 3}})
         bench = SimulatedDevices(rig)
         wire, opener = bench.pulses("a"), rig.cameras.a.options.opener(rig, "a", bench)
 

@@ -1,7 +1,8 @@
-"""What a laboratory adds: a lamp on the mains, stars, a camera that counts, and plain least squares."""
+"""What a laboratory adds: a lamp on the mains, stars, a camera that counts, a slow link, least squares."""
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
@@ -13,6 +14,7 @@ from acquire.camera.variant import CameraVariant
 from acquire.forward import DualArm
 from acquire.recon.solver import Solver
 from acquire.sim.devices import SimulatedCamera
+from acquire.sim.drivers import SimulatedTrigger
 from acquire.sim.effects.base import Effect, Place, Stage
 from acquire.sim.readout import Readout
 from acquire.sim.scene import MaskScene, SceneModel
@@ -112,6 +114,31 @@ class Ramp:
         return Readout(pixels.astype(self.dtype), np.zeros(count, bool))
 
 
+class SlowLinkTrigger(SimulatedTrigger):
+    """The simulated trigger behind a link that is slow: what it sends comes late."""
+
+    delay_s: float = Field(default=0.002, ge=0, le=0.05)
+
+    def transport(self, config, bench):
+        connect = super().transport(config, bench)
+        return lambda: SlowLink(connect(), self.delay_s)
+
+
+class SlowLink:
+    """Carries bytes as another way does, later."""
+
+    def __init__(self, way, delay_s):
+        self.name, self.bytes_per_s = f"{way.name}, slowed down", way.bytes_per_s
+        self.write, self.close = way.write, way.close
+        self._way, self._delay_s = way, delay_s
+
+    def read(self):
+        data = self._way.read()
+        if data:
+            time.sleep(self._delay_s)
+        return data
+
+
 class LeastSquares(Solver):
     """min ½‖Λx − y‖² + ½·ridge·‖x‖² over x ≥ 0, by Nesterov's accelerated projected gradient."""
 
@@ -150,3 +177,15 @@ class Answer:
 
     def facts(self):
         return {}
+
+
+class LocalWiener:
+    """Pixels towards the mean of the 3 × 3 around, as far as noise explains their spread (Lee 1980)."""
+
+    def prox(self, frames, weight):
+        noise = np.broadcast_to(np.asarray(weight, frames.dtype) ** 2, len(frames))[:, None, None]
+        padded = np.pad(frames, ((0, 0), (1, 1), (1, 1)), mode="edge")
+        around = np.lib.stride_tricks.sliding_window_view(padded, (3, 3), axis=(1, 2))
+        mean, variance = around.mean(axis=(3, 4)), around.var(axis=(3, 4))
+        kept = np.maximum(variance - noise, 0) / np.maximum(variance, np.finfo(frames.dtype).tiny)
+        return mean + kept * (frames - mean)
