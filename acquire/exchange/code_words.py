@@ -10,6 +10,7 @@ import numpy as np
 
 from acquire.codes import MOST_LISTED_BITS, ConstantCode, ListedCode, PrbsCode
 from acquire.errors import UsageError
+from acquire.exchange.foreign import check_file
 from acquire.reading import read_regular
 from acquire.store.refusals import refused
 from acquire.text import shortened
@@ -64,11 +65,14 @@ def _from_hex(text: str) -> NDArray[np.uint8]:
 
 
 def _from_array(path: Path) -> NDArray[np.uint8]:
+    check_file(path)
     with refused(path, "read"):
         try:
             found = np.load(path, mmap_mode="r", allow_pickle=False)
         except ValueError as error:
             raise UsageError(f"{path} is no array of NumPy's: {error}") from error
+    if not isinstance(found, np.ndarray):
+        raise UsageError(f"{path} is an archive of several arrays", possible="one array in a .npy file")
     if found.ndim != 1 or not 0 < len(found) <= MOST_LISTED_BITS or not np.isin(found, (0, 1)).all():
         raise UsageError(
             f"{path} holds no bits: {found.dtype} {found.shape}",

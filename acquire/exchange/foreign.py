@@ -17,8 +17,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.errors import DataError, UsageError
+from acquire.errors import DataError, PlaceError, UsageError
 from acquire.exchange.libraries import library
+from acquire.reading import kind_of
 from acquire.store.camera_stream import DAMAGE
 from acquire.store.refusals import refused
 
@@ -104,14 +105,20 @@ def open_lines(path: Path, layout: Layout) -> Iterator[LineFile]:
     kind = _kind(path, layout)
     openers = {"NumPy": _numpy, "HDF5": _hdf5, "TIFF": _tiff, "raw": _raw}
     with ExitStack() as held:
-        with refused(path, "read"):
-            path.stat()
+        check_file(path)
         try:
             file = openers[kind](path, layout, held)
         except DAMAGE as error:
             raise UsageError(f"{path} cannot be read as {kind}: {error}") from error
         _check(file)
         yield file if layout.columns is None else _cropped(file, layout.columns)
+
+
+def check_file(path: Path) -> None:
+    """PlaceError unless there is a regular file: a pipe would keep a reader waiting."""
+    with refused(path, "read"):
+        if (kind := kind_of(path.stat().st_mode)) is not None:
+            raise PlaceError(f"{path} cannot be read: it is {kind}", possible="a file")
 
 
 def _kind(path: Path, layout: Layout) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -223,6 +224,11 @@ def test_lines_from_the_middle_of_a_run_have_its_code(
         (["a.raw", *SIZES, "--dtype", "f4", "--pixels", 8], "possible: uint8"),
         (["a.xyz", *SIZES], "does not say what it is"),
         (["absent.npy", *SIZES], "No such file"),
+        (["pipe.npy", *SIZES], "it is a pipe"),
+        (["pipe.raw", *SIZES, "--dtype", "u16", "--pixels", 8], "it is a pipe"),
+        (["a.npy", *SIZES[:-1], "bits:pipe.npy"], "it is a pipe"),
+        (["a.npy", *SIZES[:-1], "bits:pipe.raw"], "it is a pipe"),
+        (["archive.npy", *SIZES], "an archive of several arrays"),
         (["a.npy", "b.npy", "a.npy", *SIZES], "3 files of lines"),
     ],
 )
@@ -239,6 +245,10 @@ def test_what_does_not_fit_is_refused_and_nothing_touched(
         (tmp_path / f"text.{suffix}").write_text("no lines\n")
     with h5py.File(tmp_path / "several.h5", "w") as file:
         file["a"], file["b"] = lines["a"], lines["b"]
+    for name in ("pipe.npy", "pipe.raw"):
+        os.mkfifo(tmp_path / name)
+    with (tmp_path / "archive.npy").open("wb") as archive:
+        np.savez(archive, a=lines["a"])
     for name in ("a.raw", "a.xyz"):
         (tmp_path / name).write_bytes(lines["a"].tobytes())
     monkeypatch.chdir(tmp_path)
