@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from acquire.cli.completion import rigs
+from acquire.cli.durations import seconds_between
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, quantity, say
 from acquire.cli.progress import stage_progress
-from acquire.errors import DeviceError, UsageError
+from acquire.errors import DeviceError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -25,7 +27,14 @@ def register(app: typer.Typer) -> None:
 
 def bench(
     config: Annotated[
-        str, typer.Option("--config", "-c", metavar="FILE", help="Rig file, or the name of a built-in one.")
+        str,
+        typer.Option(
+            "--config",
+            "-c",
+            metavar="FILE",
+            autocompletion=rigs,
+            help="Rig file, or the name of a built-in one.",
+        ),
     ] = "rig-demo",
     settings: Annotated[
         list[str] | None,
@@ -34,13 +43,15 @@ def bench(
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Where to record; else the configuration's directory.")
+        Path | None, typer.Option(help="Directory to record in; absent: the configuration's.")
     ] = None,
-    seconds: Annotated[float, typer.Option(help="Duration of each run.")] = 2.0,
-    runs: Annotated[int, typer.Option(min=1, max=100, help="Most runs.")] = 9,
+    seconds: Annotated[
+        float, typer.Option(parser=seconds_between(0.1, 600), metavar="TIME", help="Duration of each run.")
+    ] = 2.0,
+    runs: Annotated[int, typer.Option(min=1, max=100, help="Largest number of runs.")] = 9,
     json: JsonFlag = False,
 ) -> None:
-    """Search the highest line rate without a loss.
+    """Search for the highest line rate without a loss.
 
     Cameras show stored lines, everything else is as in a run. Every run has processes, rings and a
     recording of its own, which is removed again. Exit code 5 where no rate that is tried can be held.
@@ -53,8 +64,6 @@ def bench(
     from acquire.config import load_rig, parse_settings
     from acquire.daemon.storage import choose_for
 
-    if not 0.1 <= seconds <= 600:
-        raise UsageError(f"--seconds {seconds:g} is out of range", possible="0.1 to 600")
     rig = load_rig(config, parse_settings(settings or []))
     directory = (out or rig.recording.directory).absolute()
     chosen = choose_for(rig, directory=directory).codec if rig.recording.codec == "auto" else None

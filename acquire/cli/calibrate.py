@@ -9,8 +9,10 @@ import typer
 
 from acquire.cli.calibrate_all import calibrate_all
 from acquire.cli.calibrate_delay import delay
+from acquire.cli.completion import recordings
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, print_warning, say
 from acquire.cli.progress import stage_progress
+from acquire.cli.stretch import FirstLineOption, FromOption, LinesOption, ToOption, lines_between
 from acquire.errors import PlaceError, UsageError
 
 if TYPE_CHECKING:
@@ -18,14 +20,17 @@ if TYPE_CHECKING:
     from acquire.calibrate.exposure import Exposure
 
 RecordingArgument = Annotated[
-    str, typer.Argument(metavar="RECORDING", help="A directory NAME.zarr, or its URL: s3://bucket/NAME.zarr.")
+    str,
+    typer.Argument(
+        metavar="RECORDING",
+        autocompletion=recordings,
+        help="A directory NAME.zarr, or its URL: s3://bucket/NAME.zarr.",
+    ),
 ]
 OutOption = Annotated[
     str,
     typer.Option("--out", metavar="CAL", help="The calibration: a new NAME.zarr, or one that is added to."),
 ]
-FirstLineOption = Annotated[int | None, typer.Option(help="The trigger's number; else the first.")]
-LinesOption = Annotated[int | None, typer.Option(help="How many lines; else all.")]
 CoveredOption = Annotated[
     bool, typer.Option("--covered", help="The lens is covered: the code does not matter.")
 ]
@@ -52,6 +57,8 @@ def dark(
     covered: CoveredOption = False,
     first_line: FirstLineOption = None,
     lines: LinesOption = None,
+    begin: FromOption = None,
+    end: ToOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Offset and noise of every column, from lines without the light.
@@ -64,7 +71,7 @@ def dark(
     """
     from acquire.calibrate import columns
 
-    exposure = _exposure(recording, first_line, lines)
+    exposure = _exposure(recording, first_line, lines, begin, end)
     with stage_progress(f"reading {recording}") as advance:
         found = columns.dark(exposure, covered=covered, progress=advance)
     _keep(out, found, json=json, new=True)
@@ -75,6 +82,8 @@ def ambient(
     out: OutOption,
     first_line: FirstLineOption = None,
     lines: LinesOption = None,
+    begin: FromOption = None,
+    end: ToOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Light that no code switches, from lines with the lens open and the light's code 0.
@@ -85,7 +94,7 @@ def ambient(
     """
     from acquire.calibrate import columns
 
-    known, exposure = _known(out), _exposure(recording, first_line, lines)
+    known, exposure = _known(out), _exposure(recording, first_line, lines, begin, end)
     with stage_progress(f"reading {recording}") as advance:
         found = columns.ambient(exposure, known, progress=advance)
     _keep(out, found, json=json)
@@ -97,11 +106,14 @@ def flat(
     smooth: Annotated[
         bool,
         typer.Option(
-            "--smooth", help="The scene is not quite uniform: what is smooth along the columns is its own."
+            "--smooth",
+            help="The scene is not quite uniform: what varies smoothly along the columns is the scene's.",
         ),
     ] = False,
     first_line: FirstLineOption = None,
     lines: LinesOption = None,
+    begin: FromOption = None,
+    end: ToOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Gain of every column and the arms' balance, from a white scene under steady light.
@@ -113,7 +125,7 @@ def flat(
     """
     from acquire.calibrate import columns
 
-    known, exposure = _known(out), _exposure(recording, first_line, lines)
+    known, exposure = _known(out), _exposure(recording, first_line, lines, begin, end)
     with stage_progress(f"reading {recording}") as advance:
         found = columns.flat(exposure, known, smooth=smooth, progress=advance)
     _keep(out, found, json=json)
@@ -136,7 +148,7 @@ def transfer(
     from acquire.calibrate import transfer as method
 
     known = _known(out)
-    exposures = [_exposure(each, None, None) for each in recordings]
+    exposures = [_exposure(each, None, None, None, None) for each in recordings]
     with stage_progress("reading the flats") as advance:
         found = method.transfer(exposures, known, progress=advance)
     _keep(out, found, json=json)
@@ -147,6 +159,8 @@ def orientation(
     out: OutOption,
     first_line: FirstLineOption = None,
     lines: LinesOption = None,
+    begin: FromOption = None,
+    end: ToOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Which of eight views of the scene arm B has: turned how, mirrored or not, arms swapped or not.
@@ -158,7 +172,7 @@ def orientation(
     """
     from acquire.calibrate import target
 
-    known, exposure = _known_or_new(out, recording), _exposure(recording, first_line, lines)
+    known, exposure = _known_or_new(out, recording), _exposure(recording, first_line, lines, begin, end)
     with stage_progress("comparing the arms' images"):
         found = target.orientation(exposure, known)
     _keep(out, found, json=json, new=True)
@@ -169,6 +183,8 @@ def align(
     out: OutOption,
     first_line: FirstLineOption = None,
     lines: LinesOption = None,
+    begin: FromOption = None,
+    end: ToOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Where arm B's image lies on arm A's: shift, turn and magnification.
@@ -181,7 +197,7 @@ def align(
     """
     from acquire.calibrate import target
 
-    known, exposure = _known_or_new(out, recording), _exposure(recording, first_line, lines)
+    known, exposure = _known_or_new(out, recording), _exposure(recording, first_line, lines, begin, end)
     with stage_progress("laying the arms' images on each other"):
         found = target.alignment(exposure, known)
     _keep(out, found, json=json, new=True)
@@ -223,6 +239,8 @@ def check(
     covered: CoveredOption = False,
     first_line: FirstLineOption = None,
     lines: LinesOption = None,
+    begin: FromOption = None,
+    end: ToOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Is a calibration still true? A new recording of dark lines, a flat or a target is compared with it.
@@ -234,7 +252,7 @@ def check(
     from acquire.calibrate.check import check as compare
     from acquire.cli.calibrate_words import compared_rows
 
-    known, exposure = _known(calibration), _exposure(recording, first_line, lines)
+    known, exposure = _known(calibration), _exposure(recording, first_line, lines, begin, end)
     with stage_progress("comparing"):
         found = compare(exposure, known, covered=covered)
     rows = compared_rows(found)
@@ -253,9 +271,14 @@ def check(
         raise typer.Exit(CHANGED)
 
 
-def _exposure(recording: str, first_line: int | None, lines: int | None) -> Exposure:
+def _exposure(
+    recording: str, first_line: int | None, lines: int | None, begin: str | None, end: str | None
+) -> Exposure:
     from acquire.calibrate.exposure import open_exposure
+    from acquire.store import open_recording
 
+    if begin is not None or end is not None:
+        first_line, lines = lines_between(open_recording(recording), first_line, lines, begin, end)
     return open_exposure(recording, first_line, lines)
 
 

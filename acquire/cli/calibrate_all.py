@@ -59,11 +59,12 @@ def calibrate_all(
         str, typer.Option("--out", metavar="CAL", help="The calibration: new, or one that is added to.")
     ],
     directory: Annotated[
-        Path, typer.Option(metavar="DIR", help="Where the recordings go, which stay; made if absent.")
+        Path, typer.Option(metavar="DIR", help="Directory of the recordings, which stay; made if absent.")
     ] = Path("calibration-recordings"),
-    lines: Annotated[int, typer.Option(min=64, max=2**20, help="Of each recording.")] = LINES,
+    lines: Annotated[int, typer.Option(min=64, max=2**20, help="Number of lines of each recording.")] = LINES,
     only: Annotated[
-        list[str] | None, typer.Option(metavar="STEP", help="dark, flat or target; repeatable. Else all.")
+        list[str] | None,
+        typer.Option(metavar="STEP", help="Only this step, dark, flat or target; repeatable; absent: all."),
     ] = None,
     yes: Annotated[
         bool, typer.Option("--yes", help="Ask nothing: everything is in place already, or moves by itself.")

@@ -9,13 +9,18 @@ import typer
 
 from acquire.cli.camera_bench import OPEN_S, Bench
 from acquire.cli.camera_live import live
+from acquire.cli.completion import rigs
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table
 from acquire.errors import UsageError
 
 ConfigOption = Annotated[
     str | None,
     typer.Option(
-        "--config", "-c", metavar="FILE", help="Rig file; else all cameras of GENICAM_GENTL64_PATH."
+        "--config",
+        "-c",
+        metavar="FILE",
+        autocompletion=rigs,
+        help="Rig file; absent: every camera of GENICAM_GENTL64_PATH is searched.",
     ),
 ]
 SerialArgument = Annotated[str, typer.Argument(help="Serial number: acquire devices lists them.")]
@@ -50,9 +55,9 @@ def features(serial: SerialArgument, config: ConfigOption = None, json: JsonFlag
 def snapshot(
     serial: SerialArgument,
     config: ConfigOption = None,
-    lines: Annotated[int, typer.Option(min=1, max=1_000_000, help="Lines of the picture.")] = 1024,
+    lines: Annotated[int, typer.Option(min=1, max=1_000_000, help="Number of lines of the picture.")] = 1024,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="A picture (.png), or the values (.npy).")
+        Path | None, typer.Option(metavar="FILE", help="New file: a picture (.png), or the values (.npy).")
     ] = None,
     json: JsonFlag = False,
 ) -> None:

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
+from acquire.cli.completion import rigs
+from acquire.cli.durations import seconds_between
 from acquire.cli.output import JsonFlag, json_text, say
 from acquire.errors import UsageError
 
@@ -22,12 +24,17 @@ if TYPE_CHECKING:
 
 def live(
     serial: Annotated[
-        str | None, typer.Argument(metavar="[SERIAL]", help="Of one camera; else both of the rig.")
+        str | None,
+        typer.Argument(metavar="SERIAL", help="Serial number of the camera; absent: both of the rig."),
     ] = None,
     config: Annotated[
         str | None,
         typer.Option(
-            "--config", "-c", metavar="FILE", help="Open this rig's cameras; else look at the daemon's."
+            "--config",
+            "-c",
+            metavar="FILE",
+            autocompletion=rigs,
+            help="Open this rig's cameras; else look at the daemon's.",
         ),
     ] = None,
     code: Annotated[
@@ -35,7 +42,10 @@ def live(
         typer.Option(help="With --config, what the light follows: rig, its code; dark, off; steady, on."),
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option(min=0.1, max=86400, help="End after this time; else at Ctrl-C.")
+        float | None,
+        typer.Option(
+            parser=seconds_between(0.1, 86400), metavar="TIME", help="End after this time; absent: at Ctrl-C."
+        ),
     ] = None,
     socket: Annotated[
         Path | None, typer.Option("--socket", envvar="ACQUIRE_SOCKET", help="The daemon's control socket.")

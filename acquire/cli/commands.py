@@ -52,6 +52,7 @@ COMMANDS = (
     Listed("devices", "devices", RIG, "find triggers and cameras, and what each lacks"),
     Listed("doctor", "doctor", RIG, "is this host fit to capture, and what should be done?"),
     Listed("plugins", "plugins", RIG, "list the variants of effects, drivers, solvers and codecs"),
+    Listed("completion", "completion", RIG, "let Tab complete commands in bash, zsh or fish"),
     Listed("install-service", "install_service", RIG, "print or install the systemd unit"),
     Listed("trigger", "trigger", RIG, "talk to the trigger"),
     Listed("camera", "camera", RIG, "look at the cameras"),

@@ -1,11 +1,14 @@
-"""``acquire config check | show | schema``: rig files without devices."""
+"""``acquire config list | check | show | schema``: configurations without devices."""
 
 from __future__ import annotations
 
+import re
+from itertools import takewhile
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from acquire.cli.completion import configurations
 from acquire.cli.output import JsonFlag, json_text, print_facts, print_json, quantity, say
 
 if TYPE_CHECKING:
@@ -15,14 +18,77 @@ if TYPE_CHECKING:
 
     from acquire.config import RigConfig
 
-FileArgument = Annotated[str, typer.Argument(metavar="FILE", help="Rig file, or the name of a built-in one.")]
+FileArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="FILE", autocompletion=configurations, help="Rig file, or the name of a built-in one."
+    ),
+]
+
+
+USED_BY = {
+    "rig": "serve, arm and everything with --config",
+    "scene": "simulate, and a rig's simulated cameras",
+    "plan": "reconstruct --plan",
+}
+"""Kind of configuration → the commands that take it."""
 
 
 def register(app: typer.Typer) -> None:
     group = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
+    group.command("list")(list_configurations)
     for command in (check, show, schema):
         group.command()(command)
-    app.add_typer(group, name="config", help="Check and show rig files.", rich_help_panel="Rig")
+    app.add_typer(
+        group,
+        name="config",
+        help="List, check and show configurations: rigs, scenes and plans.",
+        rich_help_panel="Rig",
+    )
+
+
+def list_configurations(
+    kind: Annotated[
+        Literal["rig", "scene", "plan"] | None,
+        typer.Argument(metavar="KIND", help="Kind of configuration: rig, scene or plan; absent: all."),
+    ] = None,
+    json: JsonFlag = False,
+) -> None:
+    """List the configurations that come with the program, by kind: rigs, scenes and plans.
+
+    Example: [bold]acquire config list scene[/]
+    """
+    from acquire.place import builtin_names
+
+    kinds = USED_BY if kind is None else {kind: USED_BY[kind]}
+    found = [
+        {"kind": each, "name": name, "about": _about(name)}
+        for each in kinds
+        for name in builtin_names(f"{each}-")
+    ]
+    if json:
+        print_json(found)
+        return
+    for number, (each, command) in enumerate(kinds.items()):
+        if number:
+            say()
+        say(f"{each}s, for {command}:")
+        print_facts({f"  {one['name']}": one["about"] for one in found if one["kind"] == each})
+
+
+def _about(name: str) -> str:
+    """The first sentence of the comment that a file begins with; its title or name where it has none."""
+    import tomllib
+
+    from acquire.place import builtin_directory
+
+    text = (builtin_directory() / f"{name}.toml").read_text(encoding="utf-8")
+    comment = " ".join(
+        line.lstrip("# ") for line in takewhile(lambda line: line.startswith("#"), text.splitlines())
+    )
+    table = tomllib.loads(text)
+    sentence = re.split(r"(?<!Fig)[.;](?:\s|$)", comment, maxsplit=1)[0]
+    return sentence or str(table.get("title") or table.get("name", ""))
 
 
 def check(file: FileArgument, json: JsonFlag = False) -> None:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from acquire.daemon.messages import LastRecording
 
 SocketOption = Annotated[
-    Path | None, typer.Option("--socket", envvar="ACQUIRE_SOCKET", help="The daemon's control socket.")
+    Path | None, typer.Option("--socket", envvar="ACQUIRE_SOCKET", help="Control socket of the daemon.")
 ]
 SEALED_WORD = "sealed"
 """For ``status --wait``: any state in which no recording is under way."""
@@ -36,10 +36,13 @@ def register(app: typer.Typer) -> None:
 def arm(
     force: Annotated[
         bool,
-        typer.Option("--force", help="Even where this host is too slow, or the store of uploads refuses."),
+        typer.Option("--force", help="Arm even if this host is too slow or the store of uploads refuses."),
     ] = False,
     code: Annotated[
-        str, typer.Option(help="What the light follows: rig, its code; dark, it stays off; steady, on.")
+        str,
+        typer.Option(
+            help="What the light follows: rig (the rig's code), dark (it stays off) or steady (it stays on)."
+        ),
     ] = "rig",
     without_calibration: Annotated[
         bool,
@@ -69,20 +72,32 @@ def arm(
 
 def start(
     path: Annotated[
-        Path | None, typer.Argument(metavar="[RECORDING]", help="New recording; else named by rig and time.")
+        Path | None,
+        typer.Argument(metavar="RECORDING", help="New recording NAME.zarr; absent: named by rig and time."),
     ] = None,
-    lines: Annotated[int | None, typer.Option(help="Stop after so many lines.")] = None,
+    lines: Annotated[int | None, typer.Option(help="End after this number of lines.")] = None,
     duration: Annotated[
-        float | None, typer.Option(parser=seconds, metavar="TIME", help="Stop after 5s, 500ms, 2min.")
+        float | None,
+        typer.Option(parser=seconds, metavar="TIME", help="End after this time: 5, 5s, 500ms, 2min."),
     ] = None,
     pre: Annotated[
-        float | None, typer.Option(parser=seconds, metavar="TIME", help="Of that, from before: see the ring.")
+        float | None,
+        typer.Option(
+            parser=seconds,
+            metavar="TIME",
+            help="Begin this long before the command, with lines that the rings still hold.",
+        ),
     ] = None,
     post: Annotated[
-        float | None, typer.Option(parser=seconds, metavar="TIME", help="Stop so long after this command.")
+        float | None,
+        typer.Option(
+            parser=seconds,
+            metavar="TIME",
+            help="End this long after the command, whatever --pre adds before it.",
+        ),
     ] = None,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with a sealed RECORDING, in a segment beside it.")
+        bool, typer.Option("--resume", help="Continue a sealed RECORDING in a new segment beside it.")
     ] = False,
     socket: SocketOption = None,
     json: JsonFlag = False,
@@ -99,7 +114,7 @@ def start(
 
 
 def mark(
-    text: Annotated[str, typer.Argument(help="What happens, in your words.")] = "",
+    text: Annotated[str, typer.Argument(help="Text of the mark: what happens, in your words.")] = "",
     socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from acquire.cli.completion import rigs
 from acquire.cli.output import JsonFlag, print_json, print_table
 from acquire.errors import AcquireError
 
@@ -27,7 +28,13 @@ def register(app: typer.Typer) -> None:
 def devices(
     config: Annotated[
         str | None,
-        typer.Option("--config", "-c", metavar="FILE", help="Rig file; else all that this host shows."),
+        typer.Option(
+            "--config",
+            "-c",
+            metavar="FILE",
+            autocompletion=rigs,
+            help="Rig file whose devices are opened; absent: all that this host shows.",
+        ),
     ] = None,
     json: JsonFlag = False,
 ) -> None:

@@ -8,6 +8,7 @@ import typer
 
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, say
 from acquire.cli.recordings import PlaceArgument
+from acquire.cli.stretch import FromOption, ToOption, lines_between
 
 if TYPE_CHECKING:
     from acquire.recon.diagnosis import Diagnosis
@@ -22,11 +23,16 @@ def register(app: typer.Typer) -> None:
 
 def diagnose(
     recording: PlaceArgument,
-    first_line: Annotated[int | None, typer.Option(help="The trigger's number; else the middle.")] = None,
-    lines: Annotated[int | None, typer.Option(help="How many lines; else some hundreds.")] = None,
+    first_line: Annotated[
+        int | None,
+        typer.Option(help="Number of the first line, as the trigger counts; absent: in the middle."),
+    ] = None,
+    lines: Annotated[int | None, typer.Option(help="Number of lines; absent: some hundreds.")] = None,
+    begin: FromOption = None,
+    end: ToOption = None,
     calibration: Annotated[
         str | None,
-        typer.Option(metavar="CAL", help="Instead of the recording's own: NAME.zarr, or none."),
+        typer.Option(metavar="CAL", help="Calibration NAME.zarr, or none; absent: the recording's own."),
     ] = None,
     json: JsonFlag = False,
 ) -> None:
@@ -45,7 +51,7 @@ def diagnose(
 
     opened = open_recording(recording)
     chosen = choose(opened, calibration)
-    first, count = stretch(opened, first_line, lines)
+    first, count = stretch(opened, *lines_between(opened, first_line, lines, begin, end))
     found = diagnose_recording(opened, first, count, None if chosen is None else chosen.calibration)
     if json:
         print_json({"recording": str(opened), "first_line": first, "lines": count, **found.to_dict()})

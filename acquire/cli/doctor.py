@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from acquire.cli.completion import rigs
 from acquire.cli.output import JsonFlag, print_json, print_table, say
 from acquire.errors import AcquireError, DeviceError
 
@@ -27,7 +28,13 @@ def register(app: typer.Typer) -> None:
 def doctor(
     config: Annotated[
         str | None,
-        typer.Option("--config", "-c", metavar="FILE", help="Rig file: its devices and needs are looked at."),
+        typer.Option(
+            "--config",
+            "-c",
+            metavar="FILE",
+            autocompletion=rigs,
+            help="Rig file: its devices and needs are looked at.",
+        ),
     ] = None,
     socket: Annotated[
         Path | None, typer.Option("--socket", envvar="ACQUIRE_SOCKET", help="The daemon's control socket.")

@@ -1,23 +1,70 @@
-"""Durations on the command line: ``2s``, ``500ms``, ``1.5min``; a bare number is seconds."""
+"""The one grammar of times on the command line.
+
+::
+
+    duration   5   5s   500ms   300us   2min   1.5h      a bare number is seconds
+    moment     a duration after the first line or frame · UTC as 2026-01-31T12:00:00 · a line as L5000
+
+`seconds` is a parser of options; `acquire.cli.stretch` makes lines of moments.
+"""
 
 from __future__ import annotations
 
 import math
 import re
+from typing import TYPE_CHECKING
 
 import typer
 
-UNITS_S = {"us": 1e-6, "ms": 1e-3, "s": 1.0, "": 1.0, "min": 60.0, "h": 3600.0}
-_FORM = re.compile(r"\s*([0-9.eE+-]*[0-9.])\s*([a-z]*)\s*")
+from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+UNITS_NS = {"ns": 1, "us": 10**3, "µs": 10**3, "ms": 10**6, "s": 10**9, "": 10**9, "min": 60 * 10**9}
+UNITS_NS["h"] = 60 * UNITS_NS["min"]
+DURATIONS = "2s, 500ms, 300us, 1.5min, 1h, or seconds as a number"
+MOMENTS = f"{DURATIONS}, after the first; UTC as 2026-01-31T12:00:00; or a line as L5000"
+_FORM = re.compile(r"\s*([0-9.eE+-]*[0-9.])\s*([a-zµ]*)\s*")
+_NS_PER_S = 1e9
+
+
+def duration_ns(text: str) -> float | None:
+    """Nanoseconds of a duration; None for text that is none."""
+    found = _FORM.fullmatch(text)
+    if found is None or found[2] not in UNITS_NS:
+        return None
+    try:
+        value = float(found[1]) * UNITS_NS[found[2]]
+    except ValueError:
+        return None
+    return value if math.isfinite(value) and value >= 0 else None
+
+
+def parse_duration_ns(text: str) -> int:
+    """``52ms`` in whole nanoseconds. UsageError names what can be written."""
+    value = duration_ns(text)
+    if value is None:
+        raise UsageError(f"the time {text!r} cannot be read", possible=MOMENTS)
+    return round(value)
 
 
 def seconds(text: str | float) -> float:
     """Seconds of a duration in words. typer.BadParameter names what can be written."""
-    found = _FORM.fullmatch(str(text))
-    try:
-        value = float(found[1]) * UNITS_S[found[2]] if found else math.nan
-    except (KeyError, ValueError):
-        value = math.nan
-    if not math.isfinite(value) or value < 0:
-        raise typer.BadParameter(f"{text!r} is no duration: 2s, 500ms, 1.5min, 1h, or seconds as a number")
-    return value
+    value = duration_ns(str(text))
+    if value is None:
+        raise typer.BadParameter(f"{text!r} is no duration: {DURATIONS}")
+    return value / _NS_PER_S
+
+
+def seconds_between(least: float, most: float = math.inf) -> Callable[[str | float], float]:
+    """A parser like `seconds` of durations from ``least`` to ``most`` seconds."""
+
+    def parse(text: str | float) -> float:
+        value = seconds(text)
+        if not least <= value <= most:
+            possible = f"{least:g} s or more" if most == math.inf else f"{least:g} to {most:g} s"
+            raise typer.BadParameter(f"{text} is out of range: {possible}")
+        return value
+
+    return parse

@@ -12,6 +12,7 @@ import typer
 from acquire.cli.moments import after_ns
 from acquire.cli.output import JsonFlag, print_json, print_warning, quantity, say
 from acquire.cli.progress import stage_progress
+from acquire.cli.stretch import FirstLineOption, FromOption, LinesOption, ToOption, lines_between
 from acquire.errors import UsageError
 
 if TYPE_CHECKING:
@@ -52,28 +53,28 @@ def export(
     ],
     out: Annotated[
         Path,
-        typer.Argument(metavar="FILE", help="New .tif, .ome.tif, .h5, .nxs, .npy, .npz or .mp4."),
+        typer.Argument(metavar="FILE", help="New file: .tif, .ome.tif, .h5, .nxs, .npy, .npz or .mp4."),
     ],
-    first_frame: Annotated[int | None, typer.Option(help="Of a video; else its first.")] = None,
-    frames: Annotated[int | None, typer.Option(help="How many frames; else all that follow.")] = None,
-    first_line: Annotated[
-        int | None, typer.Option(help="Of a recording, the trigger's number; else its first.")
+    first_frame: Annotated[
+        int | None, typer.Option(help="Number of a video's first frame; absent: its first.")
     ] = None,
-    lines: Annotated[int | None, typer.Option(help="How many lines; else all that follow.")] = None,
+    frames: Annotated[int | None, typer.Option(help="Number of frames; absent: all that follow.")] = None,
+    first_line: FirstLineOption = None,
+    lines: LinesOption = None,
     average: Annotated[
-        int, typer.Option(min=1, metavar="LINES", help="An overview: so many lines become their mean.")
+        int,
+        typer.Option(
+            min=1, metavar="LINES", help="Number of lines that are averaged into one, for an overview."
+        ),
     ] = 1,
-    begin: Annotated[
-        str | None,
-        typer.Option("--from", metavar="TIME", help="Its begin: 52ms after the first, or UTC."),
-    ] = None,
-    end: Annotated[str | None, typer.Option("--to", metavar="TIME", help="Its end.")] = None,
+    begin: FromOption = None,
+    end: ToOption = None,
     all_frames: Annotated[
-        bool, typer.Option("--all-frames", help="Also frames that are sampled in part, and marked so.")
+        bool, typer.Option("--all-frames", help="Write frames that are sampled in part, too, marked as such.")
     ] = False,
     fps: Annotated[float, typer.Option(help="Frames that a movie shows per second.")] = 25.0,
     peak: Annotated[
-        float | None, typer.Option(help="What is white in a movie; else nearly the brightest.")
+        float | None, typer.Option(help="Value that is white in a movie; absent: nearly the brightest.")
     ] = None,
     json: JsonFlag = False,
 ) -> None:
@@ -143,21 +144,10 @@ def _of_video(video: VideoFile, name: str, part: _Part, *, whole: bool) -> Conte
 def _of_recording(recording: Recording, part: _Part, average: int) -> Content:
     from acquire.exchange import recording_content
 
-    part.check()
-    first, end = recording.first_line, recording.first_line + recording.lines
-    chosen = first if part.first is None else part.first
-    rows = range(chosen, end if part.count is None else chosen + part.count)
-    if part.begin is not None or part.end is not None:
-        rows = _numbers(part, first, end, recording.line_period_ns, _first_ns(recording), "lines")
-    return recording_content(recording, range(rows.start - first, rows.stop - first, average))
-
-
-def _first_ns(recording: Recording) -> int:
-    """When the first line was read out, also where it has been dropped since."""
-    row = recording.first_available_line - recording.first_line
-    if row >= recording.lines:
-        raise UsageError(f"{recording} holds no lines")
-    return int(recording.arms["a"].read("time", row, row + 1)[0]) - round(row * recording.line_period_ns)
+    first, count = lines_between(recording, part.first, part.count, part.begin, part.end)
+    begin = 0 if first is None else first - recording.first_line
+    end = recording.lines if count is None else begin + count
+    return recording_content(recording, range(begin, end, average))
 
 
 def _numbers(part: _Part, first: int, end: int, period_ns: float, first_ns: int, what: str) -> range:

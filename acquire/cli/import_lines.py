@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from acquire.cli.completion import rigs
 from acquire.cli.moments import utc_ns
 from acquire.cli.output import JsonFlag, print_json, print_warning, say
 from acquire.cli.progress import stage_progress
@@ -35,7 +36,9 @@ def import_lines(
     out: Annotated[str, typer.Option(metavar="RECORDING", help="New recording: NAME.zarr, or a URL.")],
     config: Annotated[
         str | None,
-        typer.Option(metavar="RIG", help="Rig file with geometry, code, trigger and cameras."),
+        typer.Option(
+            metavar="RIG", autocompletion=rigs, help="Rig file with geometry, code, trigger and cameras."
+        ),
     ] = None,
     stages: Annotated[int | None, typer.Option(help="M, stages of the sensor; pixels of a line.")] = None,
     substeps: Annotated[int | None, typer.Option(help="S, charge-transfer steps in a line.")] = None,
@@ -48,16 +51,18 @@ def import_lines(
         int, typer.Option(min=0, help="The code's bit in the first sub-step of line 0.")
     ] = 0,
     code_repeats: Annotated[
-        bool, typer.Option("--code-repeats", help="Listed bits begin anew after the last.")
+        bool, typer.Option("--code-repeats", help="Begin the listed bits anew after the last.")
     ] = False,
     first_line: Annotated[int, typer.Option(min=0, help="Number of the files' first line.")] = 0,
-    lines: Annotated[int | None, typer.Option(help="So many lines of each arm; else all.")] = None,
+    lines: Annotated[int | None, typer.Option(help="Number of lines of each arm; absent: all.")] = None,
     arm: Annotated[str, typer.Option(help="a or b: whose lines a single file has.")] = "a",
     dtype: Annotated[
-        str | None, typer.Option(help="Of bare numbers: uint8, uint16, or >u2 (larger byte first).")
+        str | None, typer.Option(help="Type of bare numbers: uint8, uint16, or >u2 (larger byte first).")
     ] = None,
-    pixels: Annotated[int | None, typer.Option(help="Of bare numbers: pixels of a line.")] = None,
-    skip_bytes: Annotated[int, typer.Option(help="Of bare numbers: before the first line.")] = 0,
+    pixels: Annotated[int | None, typer.Option(help="Pixels of a line, in a file of bare numbers.")] = None,
+    skip_bytes: Annotated[
+        int, typer.Option(help="Bytes before the first line of a file of bare numbers.")
+    ] = 0,
     dataset: Annotated[
         str | None, typer.Option(metavar="PATH", help="The array inside HDF5 files, as /entry/data/lines.")
     ] = None,
@@ -65,15 +70,18 @@ def import_lines(
         str | None, typer.Option(metavar="FIRST:END", help="Pixels of a line that are arm a's.")
     ] = None,
     columns_b: Annotated[
-        str | None, typer.Option(metavar="FIRST:END", help="Arm b's; also of the same file.")
+        str | None,
+        typer.Option(metavar="FIRST:END", help="Pixels of a line that are arm b's, also of the same file."),
     ] = None,
-    white: Annotated[float | None, typer.Option(metavar="DN", help="Where a pixel is saturated.")] = None,
-    black: Annotated[float | None, typer.Option(metavar="DN", help="Of a pixel without light.")] = None,
+    white: Annotated[
+        float | None, typer.Option(metavar="DN", help="Value at which a pixel is saturated.")
+    ] = None,
+    black: Annotated[float | None, typer.Option(metavar="DN", help="Value of a pixel without light.")] = None,
     responsivity: Annotated[
-        float | None, typer.Option(metavar="DN", help="Per unit of light and sub-step.")
+        float | None, typer.Option(metavar="DN", help="DN per unit of light and sub-step.")
     ] = None,
     start: Annotated[
-        str | None, typer.Option(metavar="UTC", help="When the first line was read out.")
+        str | None, typer.Option(metavar="UTC", help="UTC at which the first line was read out.")
     ] = None,
     json: JsonFlag = False,
 ) -> None:

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from acquire.cli.completion import rigs
 from acquire.cli.output import say
 from acquire.errors import UsageError
 
@@ -16,18 +17,25 @@ def register(app: typer.Typer) -> None:
 
 
 def install_service(
-    config: Annotated[str, typer.Option("--config", "-c", metavar="FILE", help="Rig file of the service.")],
+    config: Annotated[
+        str,
+        typer.Option("--config", "-c", metavar="FILE", autocompletion=rigs, help="Rig file of the service."),
+    ],
     user: Annotated[
-        bool, typer.Option("--user", help="For this user, who needs no root; else for the host.")
+        bool,
+        typer.Option("--user", help="Make a service of this user, who needs no root; absent: of the host."),
     ] = False,
     account: Annotated[
-        str | None, typer.Option(help="Who runs the host's service; else who calls this.")
+        str | None, typer.Option(help="User that the host's service runs as; absent: whoever calls this.")
     ] = None,
     install: Annotated[
-        bool, typer.Option("--install", help="Write the files; else they are printed.")
+        bool, typer.Option("--install", help="Write the files; absent: they are printed.")
     ] = False,
     directory: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Write them there instead, as for a package.")
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="Directory that the files are written to instead, as for a package."
+        ),
     ] = None,
 ) -> None:
     """Print or write a unit for systemd (ready, watchdog, hardened, restarted) and a udev rule.

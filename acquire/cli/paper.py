@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
+from acquire.cli.durations import seconds
 from acquire.cli.output import JsonFlag, print_json, print_table, say
 from acquire.cli.places import new_directory
 from acquire.cli.progress import told
@@ -24,13 +25,16 @@ def register(app: typer.Typer) -> None:
 
 def paper(
     figures: Annotated[
-        list[str] | None, typer.Argument(metavar="[FIGURE...]", help=f"{', '.join(NAMES)}; else all.")
+        list[str] | None, typer.Argument(metavar="FIGURE...", help=f"{', '.join(NAMES)}; else all.")
     ] = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="New directory.")] = Path("acquire-paper"),
-    preset: Annotated[str, typer.Option(help="fast, balanced or best.")] = "balanced",
-    solver: Annotated[str, typer.Option(help="admm, or twist: the paper's.")] = "admm",
-    budget: Annotated[float | None, typer.Option(metavar="SECONDS", help="For each reconstruction.")] = None,
-    seed: Annotated[int, typer.Option(help="Of the exposure code.")] = 1,
+    preset: Annotated[str, typer.Option(help="Effort: fast, balanced or best.")] = "balanced",
+    solver: Annotated[str, typer.Option(help="Solver: admm, or twist, which is the paper's.")] = "admm",
+    budget: Annotated[
+        float | None,
+        typer.Option(parser=seconds, metavar="TIME", help="Wall time that each reconstruction may take."),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of the exposure code.")] = 1,
     json: JsonFlag = False,
 ) -> None:
     """Record, reconstruct and draw figures of the paper, beside what it says of them.

@@ -11,10 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from acquire.cli.completion import plans
+from acquire.cli.durations import seconds
 from acquire.cli.interrupts import first_interrupt_asks
 from acquire.cli.output import JsonFlag, note, print_facts, print_json, print_table, print_warning, say
 from acquire.cli.progress import stage_progress
 from acquire.cli.recordings import PlaceArgument
+from acquire.cli.stretch import FirstLineOption, FromOption, LinesOption, ToOption
 from acquire.errors import EXIT_INTERRUPTED, UsageError
 
 if TYPE_CHECKING:
@@ -41,15 +44,10 @@ def reconstruct(
     out: Annotated[
         str | None, typer.Option(metavar="VIDEO", help="New video: a directory NAME.zarr, or a URL.")
     ] = None,
-    first_line: Annotated[
-        int | None, typer.Option(help="The trigger's number; else the recording's first.")
-    ] = None,
-    lines: Annotated[int | None, typer.Option(help="How many lines, L_R; else all that follow.")] = None,
-    begin: Annotated[
-        str | None,
-        typer.Option("--from", metavar="TIME", help="Its begin: 52ms after the first line, or UTC."),
-    ] = None,
-    end: Annotated[str | None, typer.Option("--to", metavar="TIME", help="Its end.")] = None,
+    first_line: FirstLineOption = None,
+    lines: LinesOption = None,
+    begin: FromOption = None,
+    end: ToOption = None,
     spatial_merge: Annotated[
         int, typer.Option("--spatial-merge", "--nm", help="N_m, voxel side in fine pixels.")
     ] = 3,
@@ -58,26 +56,39 @@ def reconstruct(
     ] = 1,
     voxels: Annotated[
         list[str] | None,
-        typer.Option(metavar="NMxTM", help="Instead, repeatable: each a video of the same lines."),
+        typer.Option(
+            metavar="NMxTM",
+            help="Voxels N_m x T_m, as 1x820; repeatable: a video of each, of the same lines.",
+        ),
     ] = None,
     plan: Annotated[
-        str | None, typer.Option(metavar="FILE", help="Sub-segments with voxels of their own (TOML).")
+        str | None,
+        typer.Option(
+            metavar="FILE",
+            autocompletion=plans,
+            help="Plan (TOML) of sub-segments with voxels of their own, or the name of a built-in one.",
+        ),
     ] = None,
     segment: Annotated[
         list[str] | None,
-        typer.Option(metavar="LENGTH:NMxTM", help="The same here, repeatable: 712:3x4, 1.1ms:1x230, :3x4."),
+        typer.Option(
+            metavar="LENGTH:NMxTM",
+            help="One sub-segment of a plan, by lines or time: 712:3x4, 1.1ms:1x230, or :3x4 for the rest.",
+        ),
     ] = None,
-    auto: Annotated[
-        bool, typer.Option("--auto", help="Propose the plan from the lines, and say why.")
-    ] = False,
+    auto: Annotated[bool, typer.Option("--auto", help="Propose a plan from the lines, and say why.")] = False,
     save_plan: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write the plan that was proposed.")
+        Path | None, typer.Option(metavar="FILE", help="File that the plan is written to.")
     ] = None,
     ends: Annotated[
-        str | None, typer.Option(help="trusted, or whole: also what is sampled in part at the ends.")
+        str | None,
+        typer.Option(help="Frames at the ends: trusted, or whole (sampled in part, too)."),
     ] = None,
     preset: Annotated[
-        str | None, typer.Option(help="fast, balanced or best; else balanced, or what --budget learned.")
+        str | None,
+        typer.Option(
+            help="Effort: fast, balanced or best; absent: balanced, or what `acquire tradeoff` found best."
+        ),
     ] = None,
     solver: Annotated[
         str,
@@ -85,31 +96,46 @@ def reconstruct(
     ] = "admm",
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="An option of the solver's own, repeatable."),
+        typer.Option("--set", metavar="KEY=VALUE", help="Option of the solver's own; repeatable."),
     ] = None,
     denoiser: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help="In place of total variation: haar, or another that is installed."),
+        typer.Option(
+            metavar="NAME",
+            help="Denoiser in the place of total variation: haar, or another that is installed.",
+        ),
     ] = None,
-    budget: Annotated[float | None, typer.Option(metavar="SECONDS", help="For the whole command.")] = None,
-    iterations: Annotated[int | None, typer.Option(help="Instead of the preset's.")] = None,
-    dtype: Annotated[str, typer.Option(help="float32 or float64: how exactly it is computed.")] = "float32",
-    device: Annotated[str, typer.Option(help="cpu, or gpu: CUDA by way of CuPy.")] = "cpu",
+    budget: Annotated[
+        float | None,
+        typer.Option(parser=seconds, metavar="TIME", help="Wall time that the whole command may take."),
+    ] = None,
+    iterations: Annotated[
+        int | None, typer.Option(help="Number of iterations; absent: the preset's.")
+    ] = None,
+    dtype: Annotated[
+        str, typer.Option(help="Numbers that are computed with: float32 or float64.")
+    ] = "float32",
+    device: Annotated[str, typer.Option(help="Processor: cpu, or gpu (CUDA by way of CuPy).")] = "cpu",
     calibration: Annotated[
         str | None,
-        typer.Option(metavar="CAL", help="Instead of the recording's own: NAME.zarr, or none."),
+        typer.Option(metavar="CAL", help="Calibration NAME.zarr, or none; absent: the recording's own."),
     ] = None,
     explain: Annotated[
-        bool, typer.Option("--explain", help="Say what each part of the calibration gives, and costs.")
+        bool, typer.Option("--explain", help="Only say what each part of the calibration gives and costs.")
     ] = False,
     try_orientations: Annotated[
         bool,
-        typer.Option("--try-orientations", help="Arms swapped or mirrored, if the lines say so clearly."),
+        typer.Option(
+            "--try-orientations", help="Swap or mirror the arms if the lines say clearly that they are."
+        ),
     ] = False,
-    preview: Annotated[bool, typer.Option("--preview", help="Coarse, in a second or two.")] = False,
-    workers: Annotated[int | None, typer.Option(help="Processes at once; else one per core.")] = None,
+    preview: Annotated[
+        bool, typer.Option("--preview", help="Make a coarse video in a second or two.")
+    ] = False,
+    workers: Annotated[int | None, typer.Option(help="Number of processes; absent: one per core.")] = None,
     dask: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="On a Dask cluster: tcp://HOST:8786.")
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Scheduler of a Dask cluster that computes: tcp://HOST:8786."),
     ] = None,
     json: JsonFlag = False,
 ) -> None:

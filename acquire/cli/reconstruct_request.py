@@ -7,8 +7,10 @@ import re
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-from acquire.cli.moments import after_ns, parse_duration_ns
+from acquire.cli.durations import parse_duration_ns
+from acquire.cli.moments import after_ns
 from acquire.cli.progress import stage_progress
+from acquire.cli.stretch import first_ns, lines_between
 from acquire.config import check_plan, load_plan
 from acquire.cores import idle_cores, limit_blas
 from acquire.errors import UsageError
@@ -136,15 +138,19 @@ def _select(recording: Recording, asked: Asked) -> Selection:
     if not timed:
         return by_lines(recording, asked.first_line, asked.lines)
     if asked.first_line is not None or asked.lines is not None:
-        raise UsageError(
-            "lines and times exclude each other", possible="--first-line and --lines, or --from and --to"
+        return by_lines(
+            recording, *lines_between(recording, asked.first_line, asked.lines, asked.begin, asked.end)
         )
     return by_time(recording, _after_ns(recording, asked.begin), _after_ns(recording, asked.end))
 
 
 def _after_ns(recording: Recording, text: str | None) -> int | None:
     """A time as nanoseconds after the read-out of the recording's first line begins."""
-    return after_ns(text, lambda: int(recording.arms["a"].read("time", 0, 1)[0]))
+    return after_ns(
+        text,
+        lambda: first_ns(recording),
+        lambda line: round((line - recording.first_line) * recording.line_period_ns),
+    )
 
 
 def _preview(selection: Selection, *, whole: bool | None) -> Request:

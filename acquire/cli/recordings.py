@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from acquire.cli.completion import recordings
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, quantity, say
 from acquire.cli.places import local_path
 from acquire.cli.progress import stage_progress
-from acquire.errors import AcquireError, DataError
+from acquire.cli.stretch import FirstLineOption, FromOption, LinesOption, ToOption, lines_between
+from acquire.errors import AcquireError, DataError, UsageError
 from acquire.text import shortened
 
 if TYPE_CHECKING:
@@ -21,11 +23,19 @@ if TYPE_CHECKING:
     from acquire.store import Mirrored, Recording, Verification
 
 PlaceArgument = Annotated[
-    str, typer.Argument(metavar="RECORDING", help="A directory NAME.zarr, or its URL: s3://bucket/NAME.zarr.")
+    str,
+    typer.Argument(
+        metavar="RECORDING",
+        autocompletion=recordings,
+        help="A directory NAME.zarr, or its URL: s3://bucket/NAME.zarr.",
+    ),
 ]
 
 RecordingArgument = Annotated[
-    Path, typer.Argument(metavar="RECORDING", help="A directory NAME.zarr.", parser=local_path)
+    Path,
+    typer.Argument(
+        metavar="RECORDING", autocompletion=recordings, help="A directory NAME.zarr.", parser=local_path
+    ),
 ]
 
 LISTED = 20
@@ -45,7 +55,7 @@ def register(app: typer.Typer) -> None:
 
 
 def list_recordings(
-    directory: Annotated[Path, typer.Argument(metavar="[DIR]", help="Where to look.")] = Path(),
+    directory: Annotated[Path, typer.Argument(metavar="DIR", help="Directory that is searched.")] = Path(),
     json: JsonFlag = False,
 ) -> None:
     """List the recordings of a directory; damaged ones are listed as such, videos are not.
@@ -137,9 +147,13 @@ def recover(recording: RecordingArgument, json: JsonFlag = False) -> None:
 
 def hold(
     recording: RecordingArgument,
-    first_line: Annotated[int, typer.Option(help="The trigger's number of the first line.")],
-    lines: Annotated[int, typer.Option(help="How many lines; they may be still to come.")],
-    why: Annotated[str, typer.Option(help="A word for those who wonder.")] = "",
+    first_line: FirstLineOption = None,
+    lines: Annotated[
+        int | None, typer.Option(help="Number of lines, also of lines that are still to come.")
+    ] = None,
+    begin: FromOption = None,
+    end: ToOption = None,
+    why: Annotated[str, typer.Option(metavar="TEXT", help="Reason, which `acquire info` shows.")] = "",
     json: JsonFlag = False,
 ) -> None:
     """Keep lines of an endless recording, with what reconstruction needs around them, from being dropped.
@@ -149,18 +163,29 @@ def hold(
     Example: [bold]acquire hold run.zarr --first-line 2000 --lines 5000 --why flash[/]
     """
     from acquire.store import hold as hold_lines
+    from acquire.store import open_recording
 
-    held = hold_lines(recording, first_line, lines, why)
+    first, count = lines_between(open_recording(recording), first_line, lines, begin, end, to_come=True)
+    if first is None or count is None:
+        raise UsageError(
+            "hold: begin and end of the stretch are missing",
+            possible="--first-line and --lines, --from and --to, or --from and --lines",
+        )
+    held = hold_lines(recording, first, count, why)
     if json:
         print_json({"path": str(recording), "first_line": held.first_line, "lines": held.count, "why": why})
     else:
-        say(f"{recording}: lines {first_line} to {first_line + lines - 1} are held")
+        say(f"{recording}: lines {first} to {first + count - 1} are held")
 
 
 def upload(
     recording: RecordingArgument,
-    url: Annotated[str, typer.Argument(help="s3://bucket/NAME.zarr, or whatever fsspec reaches.")],
-    follow: Annotated[bool, typer.Option("--follow", help="Go on until the recording is sealed.")] = False,
+    url: Annotated[
+        str, typer.Argument(help="Copy's address: s3://bucket/NAME.zarr, or whatever fsspec reaches.")
+    ],
+    follow: Annotated[
+        bool, typer.Option("--follow", help="Keep copying until the recording is sealed.")
+    ] = False,
     json: JsonFlag = False,
 ) -> None:
     """Copy a recording to a remote store, also while it grows; one that was interrupted goes on where it was.
@@ -189,11 +214,14 @@ def upload(
 
 def cut(
     recording: PlaceArgument,
-    first_line: Annotated[int, typer.Option(help="The trigger's number of the first line.")],
-    lines: Annotated[int, typer.Option(help="How many lines.")],
     out: Annotated[Path, typer.Option(metavar="FILE.npz", help="New file.")],
+    first_line: FirstLineOption = None,
+    lines: LinesOption = None,
+    begin: FromOption = None,
+    end: ToOption = None,
     merge: Annotated[
-        int, typer.Option(min=1, help="Add up so many raw lines and columns, of a sensor of whole steps.")
+        int,
+        typer.Option(min=1, help="Lines and columns of a sensor without intra-line steps that are added up."),
     ] = 1,
     json: JsonFlag = False,
 ) -> None:
@@ -201,21 +229,26 @@ def cut(
 
     --merge 3 makes of 192 stages that are triggered at every sub-step 64 stages with 3 intra-line steps.
 
-    Example: [bold]acquire cut run.zarr --first-line 2000 --lines 256 --out segment.npz[/]
+    Example: [bold]acquire cut run.zarr --first-line 2000 --lines 256 --out segment.npz[/], or
+    [bold]acquire cut run.zarr --from 52ms --to 60ms --out segment.npz[/]
     """
     from acquire.lines import merged
     from acquire.store import open_recording
     from acquire.store.files import check_new_path
 
     check_new_path(out)
-    with stage_progress(f"cutting {lines} lines"):
-        segment = open_recording(recording).cut(first_line, lines)
+    opened = open_recording(recording)
+    first, count = lines_between(opened, first_line, lines, begin, end)
+    first = opened.first_available_line if first is None else first
+    count = opened.first_line + opened.lines - first if count is None else count
+    with stage_progress(f"cutting {count} lines"):
+        segment = opened.cut(first, count)
         size = _save(segment if merge == 1 else merged(segment, merge), out)
-    facts = {"path": str(out), "first_line": first_line, "lines": lines, "bytes": size}
+    facts = {"path": str(out), "first_line": first, "lines": count, "bytes": size}
     if json:
         print_json(facts)
     else:
-        say(f"{out}: lines {first_line} to {first_line + lines - 1}, {quantity(size, 'B')}")
+        say(f"{out}: lines {first} to {first + count - 1}, {quantity(size, 'B')}")
 
 
 def _print_verification(found: Verification) -> None:

@@ -22,15 +22,21 @@ def register(app: typer.Typer) -> None:
 
 def render(
     video: Annotated[
-        list[str], typer.Argument(metavar="VIDEO...", help="Paths or URLs; several stand side by side.")
+        list[str],
+        typer.Argument(metavar="VIDEO...", help="Videos, by path or URL; several are shown side by side."),
     ],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="New .mp4, .gif, .webp, or .png (a sheet).")],
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="New file: .mp4, .gif, .webp, or .png (a sheet of frames).")
+    ],
     frames: Annotated[
-        int | None, typer.Option(help=f"At most so many; else {MOVIE_FRAMES}, {SHEET_FRAMES} on a sheet.")
+        int | None,
+        typer.Option(help=f"Largest number of frames; absent: {MOVIE_FRAMES}, on a sheet {SHEET_FRAMES}."),
     ] = None,
-    fps: Annotated[float, typer.Option(help="Frames shown per second.")] = 25.0,
-    height: Annotated[int | None, typer.Option(metavar="PIXELS", help="Of a panel.")] = None,
-    peak: Annotated[float | None, typer.Option(help="What is white; else nearly the brightest.")] = None,
+    fps: Annotated[float, typer.Option(help="Frames that are shown per second.")] = 25.0,
+    height: Annotated[int | None, typer.Option(metavar="PIXELS", help="Height of a panel.")] = None,
+    peak: Annotated[
+        float | None, typer.Option(help="Value that is shown white; absent: nearly the brightest.")
+    ] = None,
     json: JsonFlag = False,
 ) -> None:
     """Make a movie, an animation or a sheet of stills of reconstructed videos.

@@ -36,12 +36,15 @@ def register(app: typer.Typer) -> None:
 def replay(
     recording: PlaceArgument,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Record it again; else a daemon waits for commands.")
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="New recording of the replay; absent: a daemon waits for commands."
+        ),
     ] = None,
     speed: Annotated[
         float, typer.Option(help="Simulated seconds per second; 0: as fast as no line is lost.")
     ] = 1.0,
-    loop: Annotated[bool, typer.Option(help="Over and over, for a daemon under load.")] = False,
+    loop: Annotated[bool, typer.Option(help="Replay over and over, for a daemon under load.")] = False,
     socket: Annotated[
         Path | None,
         typer.Option(envvar="ACQUIRE_SOCKET", help="Control socket, without --out; else the user's."),

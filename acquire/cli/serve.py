@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from acquire.cli.completion import rigs
+
 
 def register(app: typer.Typer) -> None:
     app.command(rich_help_panel="Capture")(serve)
@@ -14,15 +16,26 @@ def register(app: typer.Typer) -> None:
 
 def serve(
     config: Annotated[
-        str, typer.Option("--config", "-c", metavar="FILE", help="Rig file, or the name of a built-in one.")
+        str,
+        typer.Option(
+            "--config",
+            "-c",
+            metavar="FILE",
+            autocompletion=rigs,
+            help="Rig file, or the name of a built-in one.",
+        ),
     ],
     socket: Annotated[
         Path | None,
-        typer.Option(envvar="ACQUIRE_SOCKET", help="Control socket; else the configuration's."),
+        typer.Option(envvar="ACQUIRE_SOCKET", help="Control socket; absent: the one in the configuration."),
     ] = None,
     settings: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Change one value of the file, e.g. code.seed=7."),
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Change one value of the rig file, e.g. code.seed=7; repeatable.",
+        ),
     ] = None,
     owned: Annotated[
         bool, typer.Option("--owned", hidden=True, help="End as on SIGTERM when standard input is closed.")

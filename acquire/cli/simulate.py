@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from acquire.cli.completion import rigs, scenes
+from acquire.cli.durations import seconds
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, say
 from acquire.cli.progress import stage_progress
 from acquire.errors import UsageError
@@ -24,20 +26,32 @@ def register(app: typer.Typer) -> None:
 def simulate(
     scene: Annotated[
         str,
-        typer.Argument(metavar="SCENE", help="Scene file; picture, video or .npy."),
+        typer.Argument(metavar="SCENE", autocompletion=scenes, help="Scene file; picture, video or .npy."),
     ],
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="New recording, NAME.zarr.")] = None,
     config: Annotated[
-        str | None, typer.Option("--config", "-c", metavar="RIG", help="Rig file; else the scene's.")
+        str | None,
+        typer.Option(
+            "--config",
+            "-c",
+            metavar="RIG",
+            autocompletion=rigs,
+            help="Rig file, or the name of a built-in one; absent: the scene's.",
+        ),
     ] = None,
-    lines: Annotated[int | None, typer.Option(help="How many lines; else the scene's.")] = None,
-    duration: Annotated[float | None, typer.Option(metavar="SECONDS", help="Instead of --lines.")] = None,
+    lines: Annotated[int | None, typer.Option(help="Number of lines; absent: the scene's.")] = None,
+    duration: Annotated[
+        float | None,
+        typer.Option(
+            parser=seconds, metavar="TIME", help="Length of the recording, in the place of --lines."
+        ),
+    ] = None,
     settings: Annotated[
         list[str] | None,
         typer.Option("--set", metavar="KEY=VALUE", help="Change one value of the rig, e.g. code.seed=7."),
     ] = None,
     explain: Annotated[bool, typer.Option(help="Only show the pipeline and the cost of each stage.")] = False,
-    advice: Annotated[bool, typer.Option(help="Say which effects matter.")] = True,
+    advice: Annotated[bool, typer.Option(help="Say which of the scene's effects matter.")] = True,
     json: JsonFlag = False,
 ) -> None:
     """Write a recording of a simulated scene as fast as it goes; no daemon needed.

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from acquire.cli.durations import seconds
 from acquire.cli.output import JsonFlag, print_json, print_table, say
 from acquire.cli.places import new_directory
 from acquire.cli.progress import stage_progress, told
@@ -41,25 +42,44 @@ def tradeoff(
     sources: Annotated[
         list[str],
         typer.Argument(
-            metavar="SCENE|RECORDING", help="Repeatable: scene files, NAME.zarr, or splash, bullet, flame …"
+            metavar="SCENE|RECORDING",
+            help="Scene files, recordings (NAME.zarr), or procedural scenes: splash, bullet, flame …",
         ),
     ],
     out: Annotated[Path, typer.Option(metavar="DIR", help="New directory.")] = Path("acquire-tradeoff"),
     full_well: Annotated[
         list[str] | None,
-        typer.Option(metavar="ELECTRONS", help="Of splash …: repeatable, or clean; else 1e4."),
+        typer.Option(
+            metavar="ELECTRONS",
+            help="Electrons at the brightest of procedural scenes, or clean; repeatable; absent: 1e4.",
+        ),
     ] = None,
-    voxels: Annotated[list[str] | None, typer.Option(metavar="NMxTM", help="Repeatable; else 3x1.")] = None,
-    solver: Annotated[list[str] | None, typer.Option(help="Repeatable; else every solver.")] = None,
-    preset: Annotated[list[str] | None, typer.Option(help="Repeatable; else fast and balanced.")] = None,
-    dtype: Annotated[list[str] | None, typer.Option(help="Repeatable; else float32.")] = None,
-    repeats: Annotated[int, typer.Option(min=1, max=20, help="Runs of each kind, for the band.")] = 3,
-    first_line: Annotated[int | None, typer.Option(help="Of the segment.")] = None,
-    lines: Annotated[int, typer.Option(help="How many lines, L_R.")] = LINES,
+    voxels: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NMxTM", help="Voxels to reconstruct, N_m x T_m; repeatable; absent: 3x1."),
+    ] = None,
+    solver: Annotated[
+        list[str] | None, typer.Option(help="Solver to try; repeatable; absent: every one.")
+    ] = None,
+    preset: Annotated[
+        list[str] | None, typer.Option(help="Preset to try; repeatable; absent: fast and balanced.")
+    ] = None,
+    dtype: Annotated[
+        list[str] | None, typer.Option(help="float32 or float64; repeatable; absent: float32.")
+    ] = None,
+    repeats: Annotated[
+        int, typer.Option(min=1, max=20, help="Runs of each kind, which give the band of the curves.")
+    ] = 3,
+    first_line: Annotated[
+        int | None, typer.Option(help="Number of the segment's first line; absent: chosen.")
+    ] = None,
+    lines: Annotated[int, typer.Option(help="Number of lines of the segment, L_R.")] = LINES,
     budget: Annotated[
-        float, typer.Option(metavar="SECONDS", help="No run longer than this; what it cuts is marked.")
+        float, typer.Option(parser=seconds, metavar="TIME", help="Longest run; what it cuts short is marked.")
     ] = LONGEST_S,
-    learn: Annotated[bool, typer.Option(help="Keep it for --budget of acquire reconstruct.")] = True,
+    learn: Annotated[
+        bool, typer.Option(help="Let `acquire reconstruct --budget` prefer the best preset.")
+    ] = True,
     json: JsonFlag = False,
 ) -> None:
     """Draw accuracy against wall and processor time for every solver, preset and kind of voxels, on one page.

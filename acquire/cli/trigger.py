@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from acquire.cli.durations import seconds_between
 from acquire.cli.output import JsonFlag, print_facts, print_json, say
 from acquire.cli.trigger_device import ConfigOption, SetOption, UrlOption, device_of
 from acquire.cli.trigger_patterns import blink, square
@@ -87,9 +88,12 @@ def arm(
     config: ConfigOption = "rig-demo",
     url: UrlOption = None,
     settings: SetOption = None,
-    run_id: Annotated[str | None, typer.Option(help="Name of the run; absent: a new one.")] = None,
-    start: Annotated[bool, typer.Option("--start", help="Start it as well.")] = False,
-    memory: Annotated[bool, typer.Option("--memory", help="Use the code that was loaded.")] = False,
+    run_id: Annotated[str | None, typer.Option(help="Name of the run; absent: a new name.")] = None,
+    start: Annotated[bool, typer.Option("--start", help="Start the run as well.")] = False,
+    memory: Annotated[
+        bool,
+        typer.Option("--memory", help="Light the scene with the code that `acquire trigger load` loaded."),
+    ] = False,
     json: JsonFlag = False,
 ) -> None:
     """Configure the device as the rig file says and arm it; it stays so when the command ends.
@@ -172,7 +176,9 @@ def monitor(
     url: UrlOption = None,
     settings: SetOption = None,
     tags: Annotated[int | None, typer.Option(min=1, help="End after so many tags.")] = None,
-    seconds: Annotated[float | None, typer.Option(min=0.0, help="End after this time.")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(parser=seconds_between(0), metavar="TIME", help="End after this time.")
+    ] = None,
     json: JsonFlag = False,
 ) -> None:
     """Print tags as they come, until the run ends or Ctrl-C. With --json, one object per line.

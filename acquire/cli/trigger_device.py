@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from acquire.cli.completion import rigs
 from acquire.errors import UsageError
 
 if TYPE_CHECKING:
@@ -16,7 +17,10 @@ if TYPE_CHECKING:
     from acquire.trigger.driver import TriggerDriver
 
 ConfigOption = Annotated[
-    str, typer.Option("--config", "-c", metavar="FILE", help="Rig file, or the name of a built-in one.")
+    str,
+    typer.Option(
+        "--config", "-c", metavar="FILE", autocompletion=rigs, help="Rig file, or the name of a built-in one."
+    ),
 ]
 UrlOption = Annotated[
     str | None,

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from acquire.cli.durations import seconds_between
 from acquire.cli.output import JsonFlag, note, print_facts, print_json, quantity
 from acquire.cli.trigger_device import ConfigOption, SetOption, UrlOption, device_of
 
@@ -24,7 +25,10 @@ if TYPE_CHECKING:
 _LOOK_S = 0.2
 
 SecondsOption = Annotated[
-    float | None, typer.Option(min=0.1, max=86400, help="End after this time; else at Ctrl-C.")
+    float | None,
+    typer.Option(
+        parser=seconds_between(0.1, 86400), metavar="TIME", help="End after this time; absent: at Ctrl-C."
+    ),
 ]
 
 
@@ -32,7 +36,7 @@ def blink(
     config: ConfigOption = "rig-demo",
     url: UrlOption = None,
     settings: SetOption = None,
-    hz: Annotated[float, typer.Option(min=1e-3, max=1e9, help="Times a second.")] = 2.0,
+    hz: Annotated[float, typer.Option(min=1e-3, max=1e9, help="Flashes per second.")] = 2.0,
     seconds: SecondsOption = None,
     json: JsonFlag = False,
 ) -> None:

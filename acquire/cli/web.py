@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from acquire.cli.completion import rigs
 from acquire.cli.output import say
 
 if TYPE_CHECKING:
@@ -22,7 +23,13 @@ def register(app: typer.Typer) -> None:
 def web(
     config: Annotated[
         str | None,
-        typer.Option("--config", "-c", metavar="FILE", help="Rig file with [web]; else its defaults."),
+        typer.Option(
+            "--config",
+            "-c",
+            metavar="FILE",
+            autocompletion=rigs,
+            help="Rig file with [web]; else its defaults.",
+        ),
     ] = None,
     socket: Annotated[
         Path | None, typer.Option("--socket", envvar="ACQUIRE_SOCKET", help="The daemon's control socket.")
@@ -35,7 +42,10 @@ def web(
     viewer: Annotated[
         bool, typer.Option("--viewer", help="With --link: the token of those who only look.")
     ] = False,
-    given: Annotated[str | None, typer.Option("--given", hidden=True, help="Set by the daemon.")] = None,
+    given: Annotated[
+        str | None,
+        typer.Option("--given", hidden=True, help="For the daemon, which starts the page with it."),
+    ] = None,
     owned: Annotated[
         bool, typer.Option("--owned", hidden=True, help="End as on SIGTERM when standard input is closed.")
     ] = False,

@@ -211,7 +211,7 @@ def test_times_choose_lines(cli: Cli, recording: Path, tmp_path: Path) -> None:
         (["video", "v.npy", "--average", 3], "a video has no lines"),
         (["run", "l.npy", "--lines", 300], "possible: lines 100 to 189"),
         (["run", "l.npy", "--lines", 0], "1 or more"),
-        (["run", "l.npy", "--lines", 5, "--from", "1ms"], "numbers and times exclude each other"),
+        (["run", "l.npy", "--lines", 5, "--to", "1ms"], "said twice"),
         (["video", "v.npy", "--first-frame", 19, "--frames", 2], "possible: 0 to 19"),
         (["video", "v.mp4", "--fps", 0], "0.1 to 240"),
         (["video", "v.mp4", "--peak", -1], "above 0"),

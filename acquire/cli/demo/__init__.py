@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from acquire.cli.completion import rigs
 from acquire.cli.demo.plan import (
     LINES,
     RIG,
@@ -18,6 +19,7 @@ from acquire.cli.demo.plan import (
     rig_of,
     trigger_settings,
 )
+from acquire.cli.durations import seconds
 from acquire.cli.journal import Journal
 from acquire.cli.output import JsonFlag, print_facts, print_json
 
@@ -31,13 +33,24 @@ def demo(
         Path | None,
         typer.Option(metavar="DIR", help="New directory for everything; else acquire-demo, -2, …"),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Another exposure code.")] = SEED,
-    lines: Annotated[int, typer.Option(help="Lines to record.")] = LINES,
-    budget: Annotated[float | None, typer.Option(metavar="SECONDS", help="For the default solver.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the exposure code.")] = SEED,
+    lines: Annotated[int, typer.Option(help="Number of lines that are recorded.")] = LINES,
+    budget: Annotated[
+        float | None, typer.Option(parser=seconds, metavar="TIME", help="Wall time of the default solver.")
+    ] = None,
     twist_budget: Annotated[
-        float, typer.Option(metavar="SECONDS", help="For the paper's solver.")
+        float, typer.Option(parser=seconds, metavar="TIME", help="Wall time of the paper's solver.")
     ] = TWIST_BUDGET_S,
-    config: Annotated[str, typer.Option("--config", "-c", metavar="FILE", help="Rig file.")] = RIG,
+    config: Annotated[
+        str,
+        typer.Option(
+            "--config",
+            "-c",
+            metavar="FILE",
+            autocompletion=rigs,
+            help="Rig file, or the name of a built-in one.",
+        ),
+    ] = RIG,
     trigger: Annotated[
         Literal["simulated", "rtl"],
         typer.Option(help="A model of the sync trigger, or its gateware itself, clock by clock."),

@@ -1,0 +1,103 @@
+"""Tab: what bash, zsh and fish are offered, as their scripts ask for it; in bash itself, too."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from acquire.cli.completion import STATES
+from acquire.cli.words import VARIABLE
+from acquire.daemon.states import State
+
+Cli = Callable[..., Any]
+SHELLS = ("bash", "zsh", "fish")
+
+
+@pytest.fixture
+def offered(cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., list[str]]:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "take.zarr").mkdir()
+    (tmp_path / "old").mkdir()
+    (tmp_path / "$(touch bad).zarr").mkdir()
+    (tmp_path / "own.toml").touch()
+
+    def ask(typed: str, shell: str = "bash") -> list[str]:
+        words = typed.split(" ")
+        for name in ("COMP_WORDS", "COMP_CWORD", "_TYPER_COMPLETE_ARGS"):
+            monkeypatch.delenv(name, raising=False)
+        monkeypatch.setenv(VARIABLE, f"complete_{shell}")
+        if shell == "bash":
+            monkeypatch.setenv("COMP_WORDS", typed)
+            monkeypatch.setenv("COMP_CWORD", str(len(words) - 1))
+        else:
+            monkeypatch.setenv("_TYPER_COMPLETE_ARGS", typed)
+            monkeypatch.setenv("_TYPER_COMPLETE_FISH_ACTION", "get-args")
+        said: str = cli().out
+        return said.split("\n")[:-1] if shell != "zsh" else said.split('"')[1::2]
+
+    return ask
+
+
+@pytest.mark.parametrize("shell", SHELLS)
+def test_commands_options_and_values(offered: Callable[..., list[str]], shell: str) -> None:
+    assert offered("acquire st", shell) == ["start", "stop", "status"]
+    assert offered("acquire calibrate d", shell) == ["dark"]
+    assert offered("acquire reconstruct take.zarr --pl", shell) == ["--plan"]
+    assert offered("acquire status --wait ", shell) == list(STATES)
+    assert offered("acquire serve --config rig-f", shell) == ["rig-fast"]
+    assert "scene-leds" in offered("acquire simulate scene-", shell)
+    assert offered("acquire reconstruct take.zarr --plan plan", shell) == ["plan-window"]
+    assert offered("acquire config check own", shell) == ["own.toml"]
+
+
+@pytest.mark.parametrize("shell", SHELLS)
+def test_recordings_and_directories_but_no_name_that_a_shell_would_take_apart(
+    offered: Callable[..., list[str]], shell: str, tmp_path: Path
+) -> None:
+    assert offered("acquire info ", shell) == ["old/", "take.zarr"]
+    (tmp_path / "old" / "run.zarr").mkdir()
+    assert offered("acquire verify old/", shell) == ["old/run.zarr"]
+
+
+def test_the_states_are_the_daemon_s() -> None:
+    assert set(STATES) == {*map(str, State), "sealed"}
+
+
+def test_bash_itself_completes(tmp_path: Path) -> None:
+    """The script that is printed, in the shell that it is for."""
+    bash = shutil.which("bash")
+    if bash is None:
+        pytest.skip("no bash")
+    program = tmp_path / "acquire"
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m acquire "$@"\n')
+    program.chmod(0o755)
+    script = (
+        'eval "$(acquire completion bash)"\n'
+        "COMP_WORDS=(acquire status --wait dr); COMP_CWORD=3\n"
+        '_acquire_completion acquire; echo "${COMPREPLY[*]}"; complete -p acquire\n'
+    )
+    environment = {k: v for k, v in os.environ.items() if k != VARIABLE}
+    environment["PATH"] = f"{tmp_path}:{environment['PATH']}"
+    ended = subprocess.run(
+        [bash, "--norc", "-c", script],
+        cwd=tmp_path,
+        env=environment,
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert ended.stdout.splitlines() == ["draining", "complete -o default -F _acquire_completion acquire"]
+
+
+@pytest.mark.parametrize("shell", SHELLS)
+def test_each_shell_has_its_script(cli: Cli, shell: str) -> None:
+    said = cli("completion", shell).out
+    assert f"{VARIABLE}=complete_{shell}" in said
