@@ -24,14 +24,20 @@ def delay(
     ],
     recordings: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[RECORDING...]", help="Of a sweep, to be looked at again; else a new sweep."),
+        typer.Argument(
+            metavar="RECORDING...", help="Recordings of a sweep, to be looked at again; absent: a new sweep."
+        ),
     ] = None,
     directory: Annotated[
-        Path, typer.Option(metavar="DIR", help="Where the recordings go, which stay; made if absent.")
+        Path, typer.Option(metavar="DIR", help="Directory of the recordings, which stay; made if absent.")
     ] = Path("calibration-recordings"),
     lines: Annotated[
         int | None,
-        typer.Option(min=1024, max=2**20, help="Of each recording; else as many as half a tick takes."),
+        typer.Option(
+            min=1024,
+            max=2**20,
+            help="Number of lines of each recording; absent: as many as half a tick takes.",
+        ),
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Ask nothing: everything is in place already.")] = False,
     socket: SocketOption = None,
