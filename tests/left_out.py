@@ -51,6 +51,11 @@ def _have_gpu() -> bool:
     return True
 
 
+def _is_checkout() -> bool:
+    """Not an unpacked source distribution."""
+    return (Path(__file__).parents[1] / ".git").exists()
+
+
 def _can_mount() -> bool:
     """A file system of a few MB that is really full is one that is mounted here."""
     with tempfile.TemporaryDirectory() as place:
@@ -67,6 +72,7 @@ NEEDS = {
     "needs_chromium": "drives the operator's page in a browser",
     "needs_compiler": "builds the simulated GenTL producer",
     "needs_dask": "spreads work over a Dask cluster",
+    "needs_git": "compares with what git keeps",
     "needs_gpu": "computes on CUDA",
     "needs_freeze": "freezes a file system of its own",
     "needs_mount": "fills a small file system of its own",
@@ -91,6 +97,7 @@ def find_missing() -> dict[str, str]:
         "needs_compiler": not (compiler() and _HAVE_GENICAM) and "a C compiler and the genicam package",
         "needs_dask": importlib.util.find_spec("distributed") is None and "dask.distributed",
         "needs_gpu": not _have_gpu() and "CuPy and a GPU",
+        "needs_git": not (which("git") and _is_checkout()) and "a checkout, and git",
         "needs_freeze": not can_freeze() and "the right to mount a file system and to freeze it",
         "needs_mount": not _can_mount() and "the right to mount a small file system",
         "needs_throttle": not can_throttle(Path(tempfile.gettempdir())) and "the right to slow a disk down",

@@ -7,7 +7,6 @@ import resource
 import socket
 import subprocess
 import sys
-from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -29,11 +28,19 @@ def test_every_lack_says_what_to_do(tmp_path: Path) -> None:
         assert one.level == "good" or one.todo or one.name == "clock"
 
 
-def test_a_foreign_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    owners = {"acquire": ["tdi-acquire", "acquire-imaging"]}
-    monkeypatch.setattr(metadata, "packages_distributions", lambda: owners)
+def test_a_foreign_package_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As pip leaves it: what is installed says which files are its own."""
+    assert found(None, "package").level == "good"
+    about = tmp_path / "acquire_imaging-0.3.0.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: acquire-imaging\nVersion: 0.3.0\n")
+    (about / "RECORD").write_text("acquire/__init__.py,,\n")
+    (tmp_path / "acquire").mkdir()
+    (tmp_path / "acquire/__init__.py").touch()
+    monkeypatch.syspath_prepend(tmp_path)
     one = found(None, "package")
     assert (one.level, "pip uninstall acquire-imaging" in one.todo) == ("bad", True)
+    assert one.text.startswith("acquire-imaging installs a package `acquire`, too")
 
 
 def test_limits_are_judged_by_what_the_rig_asks_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
