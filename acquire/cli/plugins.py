@@ -7,7 +7,7 @@ from typing import Any
 
 import typer
 
-from acquire.cli.output import JsonFlag, print_json, print_table
+from acquire.cli.output import JsonFlag, print_json, print_table, say
 from acquire.cli.usage import not_installed
 
 _MISSING = re.compile(r"No module named '([^.']+)")
@@ -30,20 +30,20 @@ def plugins(json: JsonFlag = False) -> None:
     if json:
         print_json(rows)
         return
-    print_table(COLUMNS, [[row[column] for column in COLUMNS] for row in rows])
+    shown = [row | {"state": "broken" if row["error"] else "ok"} for row in rows]
+    print_table(COLUMNS, [[row[column] for column in COLUMNS] for row in shown])
+    for row in rows:
+        if row["error"]:
+            say(f"{row['kind']} {row['name']} of {row['distribution']} {row['version']}: {row['error']}")
 
 
 def _rows() -> list[dict[str, Any]]:
-    from acquire.plugins import GROUPS, OURS, described
+    from acquire.plugins import GROUPS, described
 
     rows = []
     for group in GROUPS:
         for plugin in group.found():
-            trouble = group.trouble(plugin)
-            if plugin.distribution == OURS and (missing := _MISSING.search(trouble)):
-                trouble = not_installed(
-                    ModuleNotFoundError(name=missing[1])
-                ).hint  # an extra that is not here
+            error = group.trouble(plugin)
             rows.append(
                 {
                     "kind": group.what,
@@ -51,9 +51,20 @@ def _rows() -> list[dict[str, Any]]:
                     "name": plugin.name,
                     "distribution": plugin.distribution,
                     "version": plugin.version,
-                    "works": not trouble,
-                    "state": trouble or "ok",
-                    "about": "" if trouble else described(group.load(plugin.name)),
+                    "works": not error,
+                    "error": _with_extra(error, plugin.distribution),
+                    "about": "" if error else described(group.load(plugin.name)),
                 }
             )
     return rows
+
+
+def _with_extra(error: str, distribution: str) -> str:
+    """Ours lack nothing but packages of an extra: which one is said."""
+    from acquire.plugins import OURS
+
+    missing = _MISSING.search(error) if distribution == OURS else None
+    if missing is None:
+        return error
+    lacking = not_installed(ModuleNotFoundError(name=missing[1]))
+    return f"{missing[1]} is not installed; try: {lacking.hint}"

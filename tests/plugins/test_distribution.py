@@ -99,7 +99,7 @@ def test_what_is_there_is_listed_with_whose_it_is_and_what_is_broken_with_its_er
     assert all(row["works"] and row["version"] == "0.3" and row["about"] for row in theirs.values())
     broken = [row for row in rows if not row["works"]]
     assert {row["name"] for row in broken} == {"haze", "haze-free"}
-    assert all("No module named 'library_that_nobody_installed'" in row["state"] for row in broken)
+    assert all("No module named 'library_that_nobody_installed'" in row["error"] for row in broken)
     assert sum(row["distribution"] == "tdi-acquire" for row in rows) >= 45
 
 
