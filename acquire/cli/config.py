@@ -155,7 +155,7 @@ def schema(
     from acquire.config import RigConfig
     from acquire.config.plan import ReconstructionPlan
     from acquire.config.scene import SceneFile
-    from acquire.config.variants import whole_schema
+    from acquire.config.schema import whole_schema
 
     models: dict[str, type[BaseModel]] = {"rig": RigConfig, "scene": SceneFile, "plan": ReconstructionPlan}
     print_json(whole_schema(models[of]))

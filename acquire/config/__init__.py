@@ -8,7 +8,8 @@ table of a rig file, a file for all that a scene file may hold::
     device event recording service web      its tables
     scene plan                              what simulated cameras see · what a reconstruction combines
     effect                                  what all effects have in common
-    findings variants                       what is to be mended, in words · tables of an installed class
+    findings schema                         what is to be mended, in words · JSON schemas for editors
+    variants                                tables of an installed class
     base                                    what all models refuse
 """
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from acquire.config.base import MOST_DN, FrozenModel
-from acquire.config.variants import NameOf, Options, options_of
+from acquire.config.variants import NameOf, OptionsOf
 from acquire.plugins import CAMERAS, TRIGGERS
 
 PIXEL_BITS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono16": 16}
@@ -53,7 +53,7 @@ class TriggerConfig(FrozenModel):
         description="'simulated'; 'rtl', the compiled gateware; 'serial', 'usb'; or one that "
         "`acquire plugins` lists",
     )
-    options: Annotated[Options, options_of(TRIGGERS)] = Field(
+    options: Annotated[FrozenModel | None, OptionsOf(TRIGGERS)] = Field(
         default=None, validate_default=True, description="of the driver's own"
     )
     url: str = Field(default="", description="driver 'serial': /dev/tty…, socket://host:port")
@@ -126,7 +126,7 @@ class CameraConfig(FrozenModel):
         "'pattern': stored lines in place of the scene, at any rate, for loads; or one that "
         "`acquire plugins` lists",
     )
-    options: Annotated[Options, options_of(CAMERAS)] = Field(
+    options: Annotated[FrozenModel | None, OptionsOf(CAMERAS)] = Field(
         default=None, validate_default=True, description="of the driver's own"
     )
     serial: str = "simulated"

@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 
 from acquire import plugins
-from acquire.config import load_scene
+from acquire.config import RigConfig, load_scene
 from acquire.config.scene import SceneFile
-from acquire.config.variants import whole_schema
+from acquire.config.schema import whole_schema
 from acquire.errors import ConfigError
-from acquire.plugins import EFFECTS
+from acquire.plugins import CAMERAS, EFFECTS
 
 GLOW = """
 from typing import ClassVar, Literal
@@ -140,6 +140,14 @@ def test_the_schema_has_what_is_installed_told_apart_by_kind(install: Install) -
     glow = schema[mapping["glow"].removeprefix("#/$defs/")]
     assert set(glow["properties"]) == {"kind", "level"}
     assert glow["properties"]["kind"]["const"] == "glow"
+
+
+def test_the_schema_of_a_rig_has_every_drivers_options() -> None:
+    camera = whole_schema(RigConfig)["$defs"]["CameraConfig"]
+    options = {rule["if"]["properties"]["driver"]["const"]: rule["then"] for rule in camera["allOf"]}
+    assert set(options) == set(camera["properties"]["driver"]["enum"]) == set(CAMERAS.names())
+    ref = options["aravis"]["properties"]["options"]["$ref"]
+    assert whole_schema(RigConfig)["$defs"][ref.removeprefix("#/$defs/")]["additionalProperties"] is False
 
 
 def test_a_checkout_that_is_newer_than_its_installation_says_so(
