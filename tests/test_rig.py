@@ -235,5 +235,5 @@ def test_on_the_gateware_each_camera_follows_its_own_trigger_pin(config):
     with Rig(rtl) as rig:
         wires = [opener.wire for opener in rig.openers().values()]
         assert [wire.arm for wire in wires] == ["a", "b"]
-        assert all(wire.look().train is None for wire in wires)
+        assert all(wire.read().train is None for wire in wires)
     assert open_descriptors() == before

@@ -23,7 +23,7 @@ from acquire.errors import EXIT_INTERRUPTED, UsageError
 if TYPE_CHECKING:
     from acquire.cli.reconstruct_request import Asked, Prepared
     from acquire.config.plan import ReconstructionPlan
-    from acquire.reconstruct import Options, Outcome, Request
+    from acquire.reconstruct import Options, Outcome, VideoRequest
     from acquire.store import Recording
 
 
@@ -266,7 +266,7 @@ def _share(options: Options, elapsed_s: float, videos: int) -> Options:
 
 def _run(
     recording: Recording,
-    request: Request,
+    request: VideoRequest,
     out: str,
     options: Options,
     where: tuple[int | None, str | None],

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from acquire.config.plan import ReconstructionPlan
-    from acquire.reconstruct import Options, Request
+    from acquire.reconstruct import Options, VideoRequest
     from acquire.store import Recording
 
 PREVIEW_ITERATIONS = 8
@@ -62,7 +62,7 @@ class Prepared:
     why the preset was preferred.
     """
 
-    requests: dict[str, Request]
+    requests: dict[str, VideoRequest]
     options: Options
     plan: ReconstructionPlan | None = None
     learned: str = ""
@@ -153,7 +153,7 @@ def _after_ns(recording: Recording, text: str | None) -> int | None:
     )
 
 
-def _preview(selection: Selection, *, whole: bool | None) -> Request:
+def _preview(selection: Selection, *, whole: bool | None) -> VideoRequest:
     """The whole of a selection in a second or two, however long it is: coarse, or glimpses of it."""
     stream = selection.stream
     side = min(2 * stream.substeps, stream.geometry(1).size)

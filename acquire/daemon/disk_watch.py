@@ -37,7 +37,7 @@ def disk_watch(config: RigConfig) -> DiskWatch:
 
 
 class DiskWatch:
-    """The directory's disk, looked at now and then; `look` never waits.
+    """The directory's disk, looked at now and then; `check` never waits.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ class DiskWatch:
         self._asked_s = -LOOK_EVERY_S
         self._thread: threading.Thread | None = None
 
-    def look(self, *, recording: bool) -> None:
+    def check(self, *, recording: bool) -> None:
         """Ask again, if it is time and the last question was answered."""
         if not recording:
             while len(self._looks) > 1:  # what others write says nothing of the next recording

@@ -58,7 +58,7 @@ class NewsLog:
             self._kept.append(News(id=made, time=now, kind=known, text=text, state=self._state, **facts))
         self.wake()
 
-    def look(self, status: Status) -> None:
+    def update(self, status: Status) -> None:
         """Tell what has changed since the last status."""
         for facts in self._changes.of(status):
             self.tell(**facts)

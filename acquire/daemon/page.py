@@ -28,7 +28,7 @@ log = logging.getLogger("acquire.daemon")
 
 
 class Page:
-    """For one thread; `look` never waits."""
+    """For one thread; `poll` never waits."""
 
     def __init__(self, config: RigConfig, socket: Path) -> None:
         """Nothing is started yet, and nothing ever where the rig has no ``[web]``."""
@@ -45,7 +45,7 @@ class Page:
         self._begun_s = self._not_before_s = 0.0
         self._wait_s = FIRST_WAIT_S
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Start it, or anew where it has ended."""
         now_s = time.monotonic()
         if self._words is None or now_s < self._not_before_s:

@@ -31,7 +31,7 @@ class Rates:
         self._looked_s = -LOOK_EVERY_S
         self._changes: dict[str, deque[tuple[float, int, int]]] = {}
 
-    def look(self, seen: CaptureStatus) -> None:
+    def update(self, seen: CaptureStatus) -> None:
         now_s = self._now_s()
         if now_s - self._looked_s < LOOK_EVERY_S:
             return

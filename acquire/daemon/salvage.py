@@ -72,7 +72,7 @@ class Salvage:
         return list(self._found.values())
 
     def search(self) -> None:
-        """Look for recordings that a killed daemon has left; `look` will find them."""
+        """Look for recordings that a killed daemon has left; `poll` will find them."""
         self._not_sealed = dict.fromkeys(self._journal.read())
         thread = ThreadPoolExecutor(1, "salvage")
         self._searching = thread.submit(search, self._directory, list(self._not_sealed))
@@ -98,7 +98,7 @@ class Salvage:
                 log.warning("%s was not sealed: %s", orphan.path, orphan.why)
                 self._queue(Task(orphan.path, orphan.why, True, orphan.committed_lines))
 
-    def look(self, *, capturing: bool = False) -> list[RecoveryStatus]:
+    def poll(self, *, capturing: bool = False) -> list[RecoveryStatus]:
         """Hear what is done, begin what is next; what came to an end since the last look.
 
         While ``capturing``, only what the run itself has left is recovered.
@@ -118,7 +118,7 @@ class Salvage:
         deadline = time.monotonic() + timeout_s
         ended: list[RecoveryStatus] = []
         while any(task.ours and not task.tries for task in self._tasks.values()):
-            ended += self.look(capturing=True)
+            ended += self.poll(capturing=True)
             if time.monotonic() > deadline:
                 log.error("not recovered in time: %s", ", ".join(map(str, self._tasks)))
                 break

@@ -139,7 +139,7 @@ class Daemon:
         while not (self._ending.is_set() or serving.done()):
             try:
                 if self._page is not None:
-                    self._page.look()
+                    self._page.poll()
                 nursery()  # another one, where it has died: the next run must find it warm
                 await self._in_device_thread(self._service.supervise)
             except Exception as error:  # noqa: BLE001 - a defect in one look must not end the service

@@ -123,7 +123,7 @@ class Service:
         them, or where recordings are to be copied is refused, and that is not forced; the state is idle then.
         """
         with self._doing(Event.ARM):
-            self._recovered(self._salvage.look(capturing=True))  # what is under way would be measured, too
+            self._recovered(self._salvage.poll(capturing=True))  # what is under way would be measured, too
             self._uploads.prove(force=request.force)
             if self._prove is not None:
                 self._capacity = self._prove(force=request.force, tell=self._tell)
@@ -200,8 +200,8 @@ class Service:
                 look()
             except Exception as error:  # noqa: BLE001 - told in the status; the capture comes first
                 self.troubles.note(name, error)
-        self._disk.look(recording=self._state is State.RECORDING)
-        self.news.look(self.status())
+        self._disk.check(recording=self._state is State.RECORDING)
+        self.news.update(self.status())
         if self._run is None:
             return
         try:
@@ -214,10 +214,10 @@ class Service:
         self._publish()
 
     def _look_at_salvage(self) -> None:
-        self._recovered(self._salvage.look(capturing=self._run is not None))
+        self._recovered(self._salvage.poll(capturing=self._run is not None))
 
     def _look_at_uploads(self) -> None:
-        self._uploads.look()
+        self._uploads.poll()
         told = self._status.uploads, self._status.upload_warning
         if (self._uploads.statuses, self._uploads.warning) != told:
             self._publish()
@@ -286,7 +286,7 @@ class Service:
             if self._take is not None:
                 self._salvage.began(Path(self._seen.path))
             self._uploads.add(Path(self._seen.path))
-        self._rates.look(self._seen)
+        self._rates.update(self._seen)
         return self._seen
 
     def _tell_waiting(self, before: CaptureStatus) -> None:
@@ -481,7 +481,7 @@ class Service:
             uploads_left=self._uploads.left,
             upload_warning=self._uploads.warning,
         )
-        self.news.look(self.status())
+        self.news.update(self.status())
         told, self._told = self._told, (self._state, self._busy)
         if told != self._told:
             self.news.wake()

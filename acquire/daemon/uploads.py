@@ -140,7 +140,7 @@ class Uploads:
         if path in self._found or _wants_copy(path):
             self.renew(path)
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Hear how far it is; replace a process that has died."""
         worker = self._worker
         if worker is None:
@@ -273,7 +273,7 @@ class Uploads:
                 asked, deadline = True, min(deadline, time.monotonic() + ANSWER_S)
             if time.monotonic() > deadline:
                 return None
-            self.look()
+            self.poll()
             time.sleep(_POLL_S)
         return self._answer
 

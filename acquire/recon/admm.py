@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class AdmmParameters:
-    """Weights are relative to samples and operator as `problem.pose` scales them.
+    """Weights are relative to samples and operator as `problem.build_problem` scales them.
 
     ``tv_weight`` is λ; ``tv_penalty`` and ``sign_penalty`` are the splits' ρ. ``preconditioned`` makes the
     data step nearly exact in a few gradient steps; without it the iterates come to weak details last, which

@@ -15,10 +15,10 @@ from acquire.recon.clock import IterationClock
 from acquire.recon.denoisers import open_denoiser
 from acquire.recon.judge import frame_error, judge
 from acquire.recon.least import check_budget, least_seconds
-from acquire.recon.problem import pose
-from acquire.recon.request import Request, Stop
+from acquire.recon.options import SolveOptions, Stop
+from acquire.recon.problem import build_problem
 from acquire.recon.result import Look, Progress, Quality, Reconstruction
-from acquire.recon.solve import Lit
+from acquire.recon.solve import KnownImage
 from acquire.recon.solver import Preset, Solver, open_solver, preset_iterations
 from acquire.recon.told import Told, tell
 
@@ -96,7 +96,7 @@ def reconstruct(
     count = preset_iterations(solver, preset)
     if iterations is not None:
         count = iterations
-    request = Request(
+    options = SolveOptions(
         spatial_merge,
         temporal_merge,
         solver,
@@ -109,7 +109,7 @@ def reconstruct(
         open_denoiser(denoiser) if isinstance(denoiser, str) else denoiser,
     )
     arrays = open_arrays(device, dtype)
-    request.check_shapes(segment.geometry.size, segment.geometry.video_shape(spatial_merge, temporal_merge))
+    options.check_shapes(segment.geometry.size, segment.geometry.video_shape(spatial_merge, temporal_merge))
     clock = IterationClock(count, budget_s, progress, stop, began)
     held_out = HOLD_OUT if chosen.holds_out and static_image is None else 0.0
     # threads that wait for a core that others use make times that nobody can foresee
@@ -117,19 +117,19 @@ def reconstruct(
         if budget_s is not None and refuse and arrays.compiled:
             least_s = least_seconds(segment.geometry, spatial_merge, temporal_merge, solver)
             check_budget(clock, budget_s, least_s)
-        problem = pose(segment, spatial_merge, temporal_merge, hold_out=held_out, arrays=arrays)
+        problem = build_problem(segment, spatial_merge, temporal_merge, hold_out=held_out, arrays=arrays)
         if look is not None:
             clock.looks = _looking(look, problem, chosen)
-        estimate = _solve(segment, problem, request, chosen, clock)
-        return _finish(segment, problem, request, chosen, estimate, clock, check=check)
+        estimate = _solve(segment, problem, options, chosen, clock)
+        return _finish(segment, problem, options, chosen, estimate, clock, check=check)
 
 
 def _solve(
-    segment: Segment, problem: Problem, request: Request, solver: Solver, clock: IterationClock
+    segment: Segment, problem: Problem, options: SolveOptions, solver: Solver, clock: IterationClock
 ) -> Estimate:
-    if request.static_image is not None:
-        return Lit(segment, problem, request, np.asarray(request.static_image), clock)
-    return solver.solve(segment, problem, request, clock)
+    if options.static_image is not None:
+        return KnownImage(segment, problem, options, np.asarray(options.static_image), clock)
+    return solver.solve(segment, problem, options, clock)
 
 
 def _looking(look: Callable[[Look], object], problem: Problem, solver: Solver) -> Callable[[Look], object]:
@@ -146,14 +146,14 @@ def _scaled(video: NDArray[Any], problem: Problem, solver: Solver) -> NDArray[An
 def _finish(
     segment: Segment,
     problem: Problem,
-    request: Request,
+    options: SolveOptions,
     solver: Solver,
     estimate: Estimate,
     clock: IterationClock,
     *,
     check: bool,
 ) -> Reconstruction:
-    T_m = request.temporal_merge
+    T_m = options.temporal_merge
     predicted = estimate.predict()
     video = _scaled(estimate.video(), problem, solver)
     held_out = estimate.held_out_error
@@ -161,7 +161,7 @@ def _finish(
     noise = problem.noise(segment)
     quality = Quality(problem.misfit(predicted), prediction, problem.coverage, noise)
     trusted = segment.geometry.trusted_frames(T_m)
-    asked = check and request.static_image is None and clock.ended != "stopped"
+    asked = check and options.static_image is None and clock.ended != "stopped"
     told = tell(segment, quality, clock) if asked else Told()
     return Reconstruction(
         video=video,
@@ -172,7 +172,7 @@ def _finish(
         processor_s=clock.processor_s,
         iterations=clock.made,
         iterations_asked=clock.iterations,
-        solver=request.solver,
+        solver=options.solver,
         quality=quality,
         frame_error=frame_error(problem, predicted, segment.geometry, T_m),
         ended=clock.ended,
@@ -180,7 +180,7 @@ def _finish(
         masked=problem.masked_by,
         warnings=(*judge(segment, problem, quality, trusted), *told.warnings, *clock.shortcuts),
         parameters={
-            "spatial_merge": request.spatial_merge,
+            "spatial_merge": options.spatial_merge,
             "temporal_merge": T_m,
             "dtype": problem.arrays.dtype,
             **solver.model_dump(mode="json"),

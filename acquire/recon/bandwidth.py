@@ -18,7 +18,7 @@ from acquire.arrays import HOST, host
 from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import band_operator
 from acquire.recon.basis import TemporalBasis
-from acquire.recon.problem import pose
+from acquire.recon.problem import build_problem
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -91,7 +91,7 @@ def _tentative(
     merge, temporal_merge = merges
     frames, side, _ = segment.geometry.video_shape(merge, temporal_merge)
     basis = TemporalBasis(frames, count, arrays)
-    problem = pose(segment, merge, temporal_merge, hold_out=0.0, arrays=arrays)
+    problem = build_problem(segment, merge, temporal_merge, hold_out=0.0, arrays=arrays)
     operator = problem.masked(
         band_operator(segment.geometry, segment.code, basis, merge, temporal_merge, segment.alignment)
     )

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from acquire.lines import Segment
     from acquire.recon.clock import IterationClock
     from acquire.recon.estimates import Estimate
+    from acquire.recon.options import SolveOptions
     from acquire.recon.problem import Problem
-    from acquire.recon.request import Request
 
 FIRST_LOOK, LONGER_LOOK = 60, 90
 """Iterations in the cosines before patterns are looked for; longer where these are in doubt."""
@@ -61,52 +61,58 @@ PATIENCE = 6
 """Rounds in vain that end a refinement."""
 
 
-def solve_blinking(segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> Estimate:
+def solve_blinking(
+    segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock
+) -> Estimate:
     """Cosines first, then patterns and curves where the scene is of a few."""
-    return go_on(segment, problem, request, clock, look_in_cosines(segment, problem, request, clock))
+    return go_on(segment, problem, options, clock, look_in_cosines(segment, problem, options, clock))
 
 
-def look_in_cosines(segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> InBand:
+def look_in_cosines(
+    segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock
+) -> InBand:
     """A first look in the band that was asked for or found."""
-    count = find_band(segment, problem, request, clock)
-    return _look(segment, problem, request, clock, count)
+    count = find_band(segment, problem, options, clock)
+    return _look(segment, problem, options, clock, count)
 
 
 def go_on(
-    segment: Segment, problem: Problem, request: Request, clock: IterationClock, first: InBand
+    segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock, first: InBand
 ) -> Estimate:
     """Patterns, or more of the same; once more in a wider band where the lines show light beyond this one."""
-    found = _go_on(segment, problem, request, clock, first)
+    found = _go_on(segment, problem, options, clock, first)
     if not clock.affords(BEYOND_S * segment.geometry.lines * first.basis.frames):
         return found
     predicted = found.predict()
-    beyond = light_beyond(segment, problem, predicted, request.temporal_merge, first.basis.count)
+    beyond = light_beyond(segment, problem, predicted, options.temporal_merge, first.basis.count)
     if beyond is None:
         return found
-    if request.bandwidth is not None or clock.spent(WIDER_SHARE):
-        rate_hz = 1e9 / (segment.substep_ns * request.temporal_merge)
+    if options.bandwidth is not None or clock.spent(WIDER_SHARE):
+        rate_hz = 1e9 / (segment.substep_ns * options.temporal_merge)
         clock.shortcuts.append(
             f"the lines hold light of about {beyond * rate_hz / (2 * first.basis.frames):.3g} Hz, which is "
             "faster than what the video may hold: a longer budget or another bandwidth shows it"
         )
         return found
     clock.begin_anew()
-    first = _look(segment, problem, request, clock, round(MARGIN * (beyond + 1)))
-    wider = _go_on(segment, problem, request, clock, first)
+    first = _look(segment, problem, options, clock, round(MARGIN * (beyond + 1)))
+    wider = _go_on(segment, problem, options, clock, first)
     better = problem.prediction_error(wider.predict()) < problem.prediction_error(predicted)
     return wider if better else found
 
 
-def _look(segment: Segment, problem: Problem, request: Request, clock: IterationClock, count: int) -> InBand:
-    frames = segment.geometry.video_shape(request.spatial_merge, request.temporal_merge)[0]
+def _look(
+    segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock, count: int
+) -> InBand:
+    frames = segment.geometry.video_shape(options.spatial_merge, options.temporal_merge)[0]
     basis = TemporalBasis(frames, min(frames, count), problem.arrays)
-    return _first_look(segment, problem, request, basis, clock)
+    return _first_look(segment, problem, options, basis, clock)
 
 
 def _go_on(
-    segment: Segment, problem: Problem, request: Request, clock: IterationClock, first: InBand
+    segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock, first: InBand
 ) -> Estimate:
-    refined = None if request.denoiser else _refine(segment, problem, request, first, clock)
+    refined = None if options.denoiser else _refine(segment, problem, options, first, clock)
     if refined is not None:
         return refined
     for _ in clock.run(PLAIN_ITERATIONS - clock.done, "solve", video=first.video):
@@ -115,15 +121,15 @@ def _go_on(
 
 
 def _first_look(
-    segment: Segment, problem: Problem, request: Request, basis: TemporalBasis, clock: IterationClock
+    segment: Segment, problem: Problem, options: SolveOptions, basis: TemporalBasis, clock: IterationClock
 ) -> InBand:
     """In the cosines; few frames with lower penalties from where they turn out to explain the lines."""
-    N_m, T_m = request.spatial_merge, request.temporal_merge
+    N_m, T_m = options.spatial_merge, options.temporal_merge
     frames, side, _ = segment.geometry.video_shape(N_m, T_m)
     operator = band_operator(segment.geometry, segment.code, basis, N_m, T_m, segment.alignment)
 
     def begin(start: Array | None, *, explained: bool = False) -> InBand:
-        parameters = _weighted(_defaults(frames, explained=explained), request.tv_weight)
+        parameters = _weighted(_defaults(frames, explained=explained), options.tv_weight)
         solver = Admm(
             problem.masked(operator),
             problem.used_samples,
@@ -131,13 +137,13 @@ def _first_look(
             basis,
             parameters,
             start=start,
-            denoiser=request.denoiser,
+            denoiser=options.denoiser,
         )
         return InBand(solver, operator, basis, problem, parameters)
 
     start = None
-    if request.initial is not None:
-        start = basis.analyze(problem.arrays.asarray(request.initial / problem.scale))
+    if options.initial is not None:
+        start = basis.analyze(problem.arrays.asarray(options.initial / problem.scale))
     estimate = begin(start)
     if 1 < frames <= FEW_FRAMES:
         for _ in clock.run(TRIAL, "first look", FIRST_LOOK_SHARE, estimate.video):
@@ -145,7 +151,7 @@ def _first_look(
         if problem.prediction_error(estimate.predict()) < EXPLAINED:
             estimate = begin(estimate.solver.theta, explained=True)
     for look in (FIRST_LOOK, LONGER_LOOK):
-        most = min(look, -(-4 * request.iterations // 5))
+        most = min(look, -(-4 * options.iterations // 5))
         for _ in clock.run(most - clock.done, "first look", FIRST_LOOK_SHARE, estimate.video):
             estimate.solver.step()
         if find_patterns(host(estimate.solver.theta), beyond_doubt=True):
@@ -156,7 +162,7 @@ def _first_look(
 def _refine(
     segment: Segment,
     problem: Problem,
-    request: Request,
+    options: SolveOptions,
     first: InBand,
     clock: IterationClock,
 ) -> Estimate | None:
@@ -166,7 +172,7 @@ def _refine(
     if found is None:
         return None
     basis = TemporalBasis(first.basis.frames, first.basis.count, problem.arrays)
-    merges = (request.spatial_merge, request.temporal_merge)
+    merges = (options.spatial_merge, options.temporal_merge)
     refinement = Refinement(segment, problem, basis, found, merges)
     best, kept, idle = np.inf, refinement.found, 0
     for _ in clock.run(clock.iterations - clock.done, "refine", video=refinement.video):
@@ -186,9 +192,9 @@ def _refine(
     return Refined(refinement, basis.count)
 
 
-def find_band(segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> int:
-    N_m, T_m = request.spatial_merge, request.temporal_merge
-    if request.bandwidth is None and clock.spent(UNSEARCHED_SHARE):
+def find_band(segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock) -> int:
+    N_m, T_m = options.spatial_merge, options.temporal_merge
+    if options.bandwidth is None and clock.spent(UNSEARCHED_SHARE):
         frames = segment.geometry.video_shape(N_m, T_m)[0]
         few = min(frames, FEWEST_COEFFICIENTS)
         limit_hz = few / (2e-9 * segment.substep_ns * T_m * frames)
@@ -197,10 +203,10 @@ def find_band(segment: Segment, problem: Problem, request: Request, clock: Itera
             f"{limit_hz:.3g} Hz is in the video"
         )
         return few
-    if request.bandwidth is None:
+    if options.bandwidth is None:
         return estimate_coefficients(segment, N_m, T_m, lambda: clock.spent(TENTATIVE_SHARE), problem.arrays)
     frames = segment.geometry.video_shape(N_m, T_m)[0]
-    return min(frames, max(1, round(request.bandwidth * frames)))
+    return min(frames, max(1, round(options.bandwidth * frames)))
 
 
 def _defaults(frames: int, *, explained: bool = False) -> AdmmParameters:

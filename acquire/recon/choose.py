@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from acquire.lines import Segment
     from acquire.recon.clock import IterationClock
     from acquire.recon.estimates import Estimate, InBand
+    from acquire.recon.options import SolveOptions
     from acquire.recon.problem import Problem
-    from acquire.recon.request import Request
     from acquire.recon.workbench import Trial
 
 ITERATIONS_PER_TRIAL = 10
@@ -51,25 +51,27 @@ class AdmmSolver(Solver):
     iterations: ClassVar[Mapping[Preset, int]] = {"fast": 40, "balanced": 150, "best": 300}
     takes: ClassVar[frozenset[str]] = frozenset({"initial", "denoiser"})
 
-    def solve(self, segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> Estimate:
-        return solve_admm(segment, problem, request, clock)
+    def solve(
+        self, segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock
+    ) -> Estimate:
+        return solve_admm(segment, problem, options, clock)
 
 
-def solve_admm(segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> Estimate:
-    """The chosen prior's video; as asked where the request fixes bandwidth, weight, denoiser or start."""
+def solve_admm(segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock) -> Estimate:
+    """The chosen prior's video; as asked where the options fixes bandwidth, weight, denoiser or start."""
     held_out = HeldOut(problem, segment.geometry)
-    asked = (request.denoiser, request.tv_weight, request.bandwidth, request.initial)
+    asked = (options.denoiser, options.tv_weight, options.bandwidth, options.initial)
     if not held_out or any(each is not None for each in asked):
-        return solve_blinking(segment, problem, request, clock)
-    bench = Workbench(segment, problem, request, clock, held_out)
-    trials = max(4, request.iterations // ITERATIONS_PER_TRIAL)
+        return solve_blinking(segment, problem, options, clock)
+    bench = Workbench(segment, problem, options, clock, held_out)
+    trials = max(4, options.iterations // ITERATIONS_PER_TRIAL)
     if bench.frames == 1:
         return bench.finish(bench.climb(bench.attempt(STILL, FIRST_ITERATIONS), trials))
     volume = bench.attempt(bench.fitting(VOLUME), FIRST_ITERATIONS)
     if clock.spent(SEARCH_SHARE):
         clock.shortcuts.append("the budget left no time to try more than one kind of motion")
         return bench.finish(volume)
-    first = look_in_cosines(segment, problem, request, clock)
+    first = look_in_cosines(segment, problem, options, clock)
     bench.note({"prior": "cosines"} | first.facts(), first.predict())
     still = bench.attempt(STILL, FIRST_ITERATIONS)
     best = _better(volume, still)
@@ -77,7 +79,7 @@ def solve_admm(segment: Segment, problem: Problem, request: Request, clock: Iter
         best = _search(bench, still, volume, first, trials)
     if not _worth_going_on(bench, first, best):
         return bench.finish(best)
-    blinking = go_on(segment, problem, request, clock, first)
+    blinking = go_on(segment, problem, options, clock, first)
     errors = bench.note({"prior": "patterns"} | blinking.facts(), blinking.predict())
     if held_out.clearly_less(errors, best.errors):
         return Preferred(blinking, bench.record)

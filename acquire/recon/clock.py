@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from acquire.recon.request import Stop
+    from acquire.recon.options import Stop
 
 FINISH_SHARE = 0.02
 """Of a budget, kept for what comes after the last iteration (the video and its quality), and"""

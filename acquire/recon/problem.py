@@ -130,7 +130,7 @@ class MaskedOperator:
         return lambda lines: mask * inverse(lines) / largest**2
 
 
-def pose(
+def build_problem(
     segment: Segment,
     spatial_merge: int,
     temporal_merge: int,

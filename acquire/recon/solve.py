@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from acquire.lines import Segment
     from acquire.recon.clock import IterationClock
     from acquire.recon.estimates import Estimate
+    from acquire.recon.options import SolveOptions
     from acquire.recon.problem import Problem
-    from acquire.recon.request import Request
 
 
 class TwistSolver(Solver):
@@ -39,30 +39,34 @@ class TwistSolver(Solver):
     signed: ClassVar[bool] = True
     holds_out: ClassVar[bool] = False
 
-    def solve(self, segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> Estimate:
-        return solve_twist(segment, problem, request, clock, banded=False)
+    def solve(
+        self, segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock
+    ) -> Estimate:
+        return solve_twist(segment, problem, options, clock, banded=False)
 
 
 class BandedTwistSolver(Solver):
     """The paper's algorithm with the band and the sign of the default."""
 
-    def solve(self, segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> Estimate:
-        return solve_twist(segment, problem, request, clock, banded=True)
+    def solve(
+        self, segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock
+    ) -> Estimate:
+        return solve_twist(segment, problem, options, clock, banded=True)
 
 
 def solve_twist(
-    segment: Segment, problem: Problem, request: Request, clock: IterationClock, *, banded: bool
+    segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock, *, banded: bool
 ) -> Estimate:
     """The paper's algorithm; ``banded`` in the band that the lines show."""
-    N_m, T_m = request.spatial_merge, request.temporal_merge
+    N_m, T_m = options.spatial_merge, options.temporal_merge
     shape = segment.geometry.video_shape(N_m, T_m)
-    count = find_band(segment, problem, request, clock) if banded else shape[0]
+    count = find_band(segment, problem, options, clock) if banded else shape[0]
     basis = TemporalBasis(shape[0], count, problem.arrays)
     make = band_operator if banded else InBasis
     operator = make(segment.geometry, segment.code, basis, N_m, T_m, segment.alignment)
     parameters = TwistParameters()
-    if request.tv_weight is not None:
-        parameters = replace(parameters, tv_weight=request.tv_weight)
+    if options.tv_weight is not None:
+        parameters = replace(parameters, tv_weight=options.tv_weight)
     solver = Twist(
         problem.masked(operator),
         problem.used_samples,
@@ -71,12 +75,12 @@ def solve_twist(
         basis if banded else None,
     )
     estimate = InBand(solver, operator, basis, problem, parameters)
-    for _ in clock.run(request.iterations, "solve", video=estimate.video):
+    for _ in clock.run(options.iterations, "solve", video=estimate.video):
         solver.step()
     return estimate
 
 
-class Lit:
+class KnownImage:
     """A known image with a curve: X = s(t)·image.
 
     Frames that the code leaves dark are not observed: their light is interpolated from those beside them.
@@ -85,20 +89,25 @@ class Lit:
     held_out_error: float | None = None
 
     def __init__(
-        self, segment: Segment, problem: Problem, request: Request, image: NDArray[Any], clock: IterationClock
+        self,
+        segment: Segment,
+        problem: Problem,
+        options: SolveOptions,
+        image: NDArray[Any],
+        clock: IterationClock,
     ) -> None:
-        frames = segment.geometry.video_shape(request.spatial_merge, request.temporal_merge)[0]
+        frames = segment.geometry.video_shape(options.spatial_merge, options.temporal_merge)[0]
         self._problem = problem = problem.on_host()
         arrays = problem.arrays
-        self._image, self._merge = image.astype(arrays.dtype), request.spatial_merge
+        self._image, self._merge = image.astype(arrays.dtype), options.spatial_merge
         basis = TemporalBasis(frames, frames, arrays)
         patterns = self._image[None] / np.linalg.norm(self._image)
-        self._operator = CurveOperator(segment, patterns, basis, request.temporal_merge)
+        self._operator = CurveOperator(segment, patterns, basis, options.temporal_merge)
         coefficients = np.zeros((frames, 1))
         for _ in clock.run(1, "light"):
-            coefficients = CurveFit(segment, problem, basis, request.temporal_merge)(patterns, coefficients)
+            coefficients = CurveFit(segment, problem, basis, options.temporal_merge)(patterns, coefficients)
         self._coefficients = arrays.asarray(coefficients)
-        seen = np.add.reduceat(segment.code, np.arange(0, len(segment.code), request.temporal_merge)) > 0
+        seen = np.add.reduceat(segment.code, np.arange(0, len(segment.code), options.temporal_merge)) > 0
         light = basis.synthesize(self._coefficients)[:, 0] / np.linalg.norm(self._image)
         self._light = np.interp(np.arange(frames), np.flatnonzero(seen), light[seen]).astype(arrays.dtype)
 

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from acquire.lines import Segment
     from acquire.recon.clock import IterationClock
     from acquire.recon.estimates import Estimate
+    from acquire.recon.options import SolveOptions
     from acquire.recon.problem import Problem
-    from acquire.recon.request import Request
 
 Preset = Literal["fast", "balanced", "best"]
 
@@ -44,7 +44,9 @@ class Solver(FrozenModel, ABC):
     takes: ClassVar[frozenset[str]] = frozenset()
 
     @abstractmethod
-    def solve(self, segment: Segment, problem: Problem, request: Request, clock: IterationClock) -> Estimate:
+    def solve(
+        self, segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock
+    ) -> Estimate:
         """A video that explains ``problem.samples`` where ``problem.weight`` is 1: what is masked or held out
         is not looked at. Every iteration is one of ``clock.run``, which ends them for a budget or a stop.
         """

@@ -43,7 +43,7 @@ MEMORY = 0.95
 
 @dataclass(frozen=True, slots=True)
 class TwistParameters:
-    """``tv_weight`` is λ, relative to samples and operator as `problem.pose` scales them.
+    """``tv_weight`` is λ, relative to samples and operator as `problem.build_problem` scales them.
 
     ``smallest_eigenvalue`` is ξ₁ of the reference, its value for severely ill-conditioned operators: the
     norm of a non-negative Λ′ is that of a flat scene, and all detail lies a hundred times below. Both

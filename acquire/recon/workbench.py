@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from acquire.recon.clock import IterationClock
     from acquire.recon.denoisers import Denoiser
     from acquire.recon.holdout import HeldOut
+    from acquire.recon.options import SolveOptions
     from acquire.recon.problem import Operator, Problem
-    from acquire.recon.request import Request
 
 FIRST_ITERATIONS, NEXT_ITERATIONS = 30, 25
 """Of a trial from nothing, and of one that begins where another ended."""
@@ -91,10 +91,15 @@ class Workbench:
     """Tries candidates on one problem and keeps a record of them."""
 
     def __init__(
-        self, segment: Segment, problem: Problem, request: Request, clock: IterationClock, held_out: HeldOut
+        self,
+        segment: Segment,
+        problem: Problem,
+        options: SolveOptions,
+        clock: IterationClock,
+        held_out: HeldOut,
     ) -> None:
         self._segment, self._problem, self._clock, self.held_out = segment, problem, clock, held_out
-        self._merges = (request.spatial_merge, request.temporal_merge)
+        self._merges = (options.spatial_merge, options.temporal_merge)
         self.frames, self._side, _ = segment.geometry.video_shape(*self._merges)
         self._brightness: NDArray[Any] | None = None
         self._operators: dict[tuple[int, bool], Operator] = {}  # neighbours mostly share one

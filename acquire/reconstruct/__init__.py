@@ -2,8 +2,8 @@
 
 ::
 
-    select    lines, times or a plan ──▶ Request: stretches on one grid
-    combine   Request ──▶ sub-segments ──▶ pool ──▶ stitched in order ──▶ video
+    select    lines, times or a plan ──▶ VideoRequest: stretches on one grid
+    combine   VideoRequest ──▶ sub-segments ──▶ pool ──▶ stitched in order ──▶ video
     pools     where sub-segments are solved: here, in processes, on a cluster
     work      one sub-segment: cut, solve, bring to the grid
     single    a reconstruction that is already in memory, as `reconstruct` (of `acquire.recon`) makes one
@@ -14,7 +14,7 @@ Memory is bounded by what the pool works on; the recording is read and the video
 from acquire.recon import reconstruct
 from acquire.reconstruct.combine import Outcome, Watcher, combine
 from acquire.reconstruct.pools import Pool, open_pool
-from acquire.reconstruct.select import Request, along_plan, by_lines, by_time, in_glimpses, in_voxels
+from acquire.reconstruct.select import VideoRequest, along_plan, by_lines, by_time, in_glimpses, in_voxels
 from acquire.reconstruct.single import describe, save_reconstruction
 from acquire.reconstruct.work import Options
 
@@ -22,7 +22,7 @@ __all__ = [
     "Options",
     "Outcome",
     "Pool",
-    "Request",
+    "VideoRequest",
     "Watcher",
     "along_plan",
     "by_lines",

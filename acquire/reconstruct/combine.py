@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from acquire.recon.segments import Grid, SubSegment
     from acquire.reconstruct.pools import Pool
-    from acquire.reconstruct.select import Request
+    from acquire.reconstruct.select import VideoRequest
     from acquire.reconstruct.work import Options, Part
     from acquire.store import Recording
 
@@ -76,7 +76,7 @@ class Watcher:
 
 def combine(
     recording: Recording,
-    request: Request,
+    request: VideoRequest,
     out: Path | str,
     options: Options,
     pool: Pool,
@@ -172,7 +172,7 @@ def _result(waiting: deque[Future[Part]], pool: Pool, watcher: Watcher) -> Part 
         ) from error
 
 
-def _anchor(recording: Recording, request: Request) -> tuple[int, int]:
+def _anchor(recording: Recording, request: VideoRequest) -> tuple[int, int]:
     """The sub-step at which the read-out of the stream's first line begins, and its UTC in ns."""
     stream = request.stream
     row = stream.first_line - recording.first_line
@@ -181,7 +181,7 @@ def _anchor(recording: Recording, request: Request) -> tuple[int, int]:
 
 
 def describe_parts(
-    recording: Recording, request: Request, parts: Sequence[dict[str, Any]], options: Options
+    recording: Recording, request: VideoRequest, parts: Sequence[dict[str, Any]], options: Options
 ) -> dict[str, Any]:
     """Where the video comes from and how good it is, as JSON: as a whole, and each sub-segment."""
     names, reasons = request.names or ("",) * len(parts), request.reasons or ("",) * len(parts)
@@ -236,7 +236,7 @@ def _whole_stretch(segments: Sequence[tuple[SubSegment, bool]]) -> tuple[int, in
     return max(found, key=lambda edges: edges[1] - edges[0], default=(first.begin, first.begin))
 
 
-def _trusted_frames(request: Request, frames: int, whole: tuple[int, int]) -> list[int]:
+def _trusted_frames(request: VideoRequest, frames: int, whole: tuple[int, int]) -> list[int]:
     """First frame that is sampled in full, of a trusted sub-segment, and the one after the last."""
     T_m, begin = request.grid.voxels.temporal_merge, request.grid.begin
     low, high = (

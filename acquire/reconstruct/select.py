@@ -51,7 +51,7 @@ class Selection:
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class VideoRequest:
     """Stretches of a stream that follow one another, and the grid of their common video.
 
     ``trusted`` are the sub-steps that are sampled in full; ``names`` and ``reasons`` are the stretches'.
@@ -99,7 +99,7 @@ def by_time(recording: Recording, begin_ns: int | None, end_ns: int | None) -> S
 
 def in_voxels(
     selection: Selection, voxels: Voxels, *, whole_ends: bool | None = None, longest: int | None = None
-) -> Request:
+) -> VideoRequest:
     """All of a selection in one kind of voxels, in sub-segments of at most ``longest`` sub-steps.
 
     Voxels as long as two passes of the scene are sampled by every row wherever they lie: they are kept at
@@ -112,10 +112,10 @@ def in_voxels(
     begin, end = selection.extent(voxels, voxels, whole=whole)
     default = max(SPANS_PER_SEGMENT * size, VOXELS_PER_SEGMENT * voxels.temporal_merge)
     stretches = tuple(split(begin, end, voxels, longest or default))
-    return Request(stream, stretches, Grid.finest(stretches, size), _trusted(stream, begin, end))
+    return VideoRequest(stream, stretches, Grid.finest(stretches, size), _trusted(stream, begin, end))
 
 
-def in_glimpses(selection: Selection, voxels: Voxels, count: int) -> Request:
+def in_glimpses(selection: Selection, voxels: Voxels, count: int) -> VideoRequest:
     """One frame for each of ``count`` equal stretches, from the fewest lines about its middle that show one.
 
     How long that takes does not depend on how long the selection is. UsageError where the stretches are
@@ -133,7 +133,7 @@ def in_glimpses(selection: Selection, voxels: Voxels, count: int) -> Request:
     stretches = tuple(Stretch(begin + i * length, begin + (i + 1) * length, whole) for i in range(count))
     glimpses = tuple(_glimpse(stream, stretch, voxels) for stretch in stretches)
     grid = Grid.finest(stretches, stream.geometry(1).size)
-    return Request(stream, stretches, grid, (begin, stretches[-1].end), glimpses=glimpses)
+    return VideoRequest(stream, stretches, grid, (begin, stretches[-1].end), glimpses=glimpses)
 
 
 def _glimpse(stream: Stream, stretch: Stretch, voxels: Voxels) -> SubSegment:
@@ -144,7 +144,7 @@ def _glimpse(stream: Stream, stretch: Stretch, voxels: Voxels) -> SubSegment:
     )
 
 
-def along_plan(selection: Selection, plan: ReconstructionPlan, grid: Voxels | None = None) -> Request:
+def along_plan(selection: Selection, plan: ReconstructionPlan, grid: Voxels | None = None) -> VideoRequest:
     """The sub-segments of a plan, one after the other from the selection's beginning.
 
     UsageError for a plan that is longer than what there is.
@@ -168,7 +168,7 @@ def along_plan(selection: Selection, plan: ReconstructionPlan, grid: Voxels | No
         stop = end if length is None else edge + length
         stretches.append(Stretch(edge, stop, stream.evened(each, stop - edge)))
         edge = stop
-    return Request(
+    return VideoRequest(
         stream,
         tuple(stretches),
         Grid.finest(stretches, geometry.size, grid),

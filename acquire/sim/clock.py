@@ -210,7 +210,7 @@ class Wire:
             )
             return allowed.budget or 0
 
-    def look(self) -> Reading:
+    def read(self) -> Reading:
         """The latest train and the pulses it has issued at this moment."""
         return self._observe()[1]
 
@@ -225,7 +225,7 @@ class Wire:
         """
         deadline_ns = self.clock.monotonic_ns() + int(timeout_s * 1e9)
         while True:
-            reading = self.look()
+            reading = self.read()
             if reading.run > run or (reading.run == run and (reading.stopped or reading.issued >= pulses)):
                 return reading
             now_ns = self.clock.monotonic_ns()

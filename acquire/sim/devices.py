@@ -120,7 +120,7 @@ class SimulatedCamera:
         }
 
     def arm(self) -> None:
-        reading = self._wire.look()
+        reading = self._wire.read()
         self._train = reading.run if reading.running else reading.run + 1
         self._first_pulse = reading.issued if reading.running else 0
         self._delivered = self._lost = 0
@@ -140,7 +140,7 @@ class SimulatedCamera:
             raise CameraError("a block was asked of a camera that is not armed", hint="arm it")
         if self._ready:
             return self._ready.popleft()
-        if self._finished(self._wire.look()):
+        if self._finished(self._wire.read()):
             self._wire.clock.sleep(timeout_s)
             return None
         pulses = self._first_pulse + self._delivered + self._block_lines
@@ -152,7 +152,7 @@ class SimulatedCamera:
 
     def times_ns(self, first_line: int, count: int) -> NDArray[np.int64]:
         """CLOCK_MONOTONIC at which lines, counted since arm, were triggered (count,)."""
-        train = self._wire.look().train
+        train = self._wire.read().train
         if train is None or train.run != self._train:
             raise CameraError("times were asked of a camera without its pulses")
         spacing = train.line_period_ns / train.speed
@@ -169,7 +169,7 @@ class SimulatedCamera:
         self._train = None
 
     def statistics(self) -> dict[str, int]:
-        behind = 0 if self._train is None else self._behind(self._wire.look())
+        behind = 0 if self._train is None else self._behind(self._wire.read())
         return {"lines": self._delivered - self._lost, "lost": self._lost, "behind_lines": behind}
 
     def close(self) -> None:

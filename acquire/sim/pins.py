@@ -142,7 +142,7 @@ class PinWire:
     arm: str
     clock: HostClock = field(default_factory=HostClock)
 
-    def look(self) -> Reading:
+    def read(self) -> Reading:
         """The run that the pins show, as a pulse train, and this arm's pulses so far."""
         fields = [int(value) for value in self.page.read()]
         issued = fields[_PULSES + ARMS.index(self.arm)]
@@ -157,7 +157,7 @@ class PinWire:
         """As `Wire.wait`."""
         deadline_s = time.monotonic() + timeout_s
         while True:
-            reading = self.look()
+            reading = self.read()
             come = reading.run == run and (reading.stopped or reading.issued >= pulses)
             if come or reading.run > run or time.monotonic() >= deadline_s:
                 return reading

@@ -113,7 +113,7 @@ class ReplayCamera:
 
     def arm(self) -> None:
         """Follow the next train of pulses from its beginning."""
-        reading = self._wire.look()
+        reading = self._wire.read()
         if reading.running:
             raise CameraError("a replay was armed while the trigger runs", hint="arm it before the start")
         self._run = reading.run + 1
@@ -157,14 +157,14 @@ class ReplayCamera:
         if now_ns < self._not_before_ns or (count < self._opener.block_lines and not self._ended()):
             return 0
         count = min(count, self._opener.block_lines)
-        train = self._wire.look().train
+        train = self._wire.read().train
         if train is not None:
             self._not_before_ns = now_ns + int(count * train.line_period_ns / train.speed / _CATCH_UP)
         return count
 
     def _due(self) -> int:
         """Lines whose pulses have come, and which are not delivered; none while the gate is closed."""
-        reading = self._wire.look()
+        reading = self._wire.read()
         if reading.train is None or reading.run != self._run or not self._is_open():
             return 0
         issued = reading.train.issued(self._wire.clock.monotonic_ns())
@@ -182,7 +182,7 @@ class ReplayCamera:
         return self._depth_lines + self._rows + self._tail_lines
 
     def _ended(self) -> bool:
-        reading = self._wire.look()
+        reading = self._wire.read()
         finished = not self._opener.loop and self._delivered + self._due() >= self._last
         return finished or reading.stopped
 

@@ -273,7 +273,7 @@ class TriggerModel:
         if run.state != State.RUNNING or not period:
             return
         run.bark_tick = tick + math.ceil(period * self._speed) + BARK_CLOCKS
-        if self._wire.look().running:
+        if self._wire.read().running:
             self._wire.allow(self._lines_allowed() or 0)
 
     def _lines_allowed(self) -> int | None:
@@ -294,7 +294,7 @@ class TriggerModel:
         if run.state not in (State.RUNNING, State.STOPPING):
             return
         tick = self._tick()  # before the look: what is over by then has issued all its lines
-        lines = self._wire.look().issued
+        lines = self._wire.read().issued
         self._tell_lines(run.lines, lines)
         run.lines = lines
         self._expire(tick)

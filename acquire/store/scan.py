@@ -51,7 +51,7 @@ class ArmScan:
         """Chunks of an array that hold any of ``rows``."""
         return chunks_of(self.stream.reader(array).shape.chunk_rows, rows)
 
-    def look(self, array: str, chunk: int) -> None:
+    def check(self, array: str, chunk: int) -> None:
         """Note what is wrong with a chunk, if anything is."""
         trouble = self.stream.reader(array).trouble(chunk)
         if trouble is not None:
@@ -96,7 +96,7 @@ def scan(
     done = 0
     for arm, name in arrays:
         for chunk in found[arm].chunks(name, rows):
-            found[arm].look(name, chunk)
+            found[arm].check(name, chunk)
             done += 1
             if progress is not None:
                 progress(done, total)

@@ -12,8 +12,9 @@ Grabbers, recorder and watcher are processes, the supervisor is a thread; `Captu
 shared memory: nothing between a camera's buffer and the recorder's is sent, and no camera waits for a reader.
 
 `losses` causes · `ring` · `observer` of a ring · `messages` · `grabber` · `tagger` · `window` of lines around
-an event · `session` one recording · `recorder` · `lightcheck`, `threshold`, `watcher` · `witness` what others
-counted · `ledger` of every pulse · `plan` · `succession` of what was killed · `supervisor` · `capture`
+an event · `session` one recording · `recorder` · `lightcheck`, `threshold`, `watcher` · `external_counts` of
+trigger, cameras and watcher · `ledger` of every pulse · `plan` · `succession` of what was killed ·
+`supervisor` · `capture`
 """
 
 from acquire.stream.capture import Capture

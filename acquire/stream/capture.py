@@ -22,6 +22,7 @@ from acquire.processes.messages import Quit, Ready
 from acquire.processes.shared import Counters
 from acquire.processes.worker import Worker
 from acquire.stream import grabber, recorder, recorder_plan, watcher
+from acquire.stream.external_counts import TRIGGER, TRIGGER_COUNTERS, WATCHER
 from acquire.stream.kept import Kept
 from acquire.stream.ledger import Counted, account
 from acquire.stream.losses import Cause
@@ -31,7 +32,6 @@ from acquire.stream.ring import Ring, RingShape
 from acquire.stream.succession import Succession
 from acquire.stream.supervisor import RECORDER, Supervisor
 from acquire.stream.window import NOW
-from acquire.stream.witness import TRIGGER, TRIGGER_COUNTERS, WATCHER
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -475,7 +475,7 @@ class Capture:
 
     def _end_memory(self) -> None:
         if self._supervisor is not None:
-            self._supervisor.bury()
+            self._supervisor.mark_unsealed()
         with self._memory:
             self._final = self._look(self._supervisor) if self._supervisor else CaptureStatus()
             for counters in self._counters.values():

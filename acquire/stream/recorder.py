@@ -30,6 +30,7 @@ from acquire.lines import ARMS
 from acquire.processes.messages import Ready
 from acquire.processes.worker import OwnerGone, become_important
 from acquire.store import RecordingWriter, RunCondition
+from acquire.stream.external_counts import ExternalCounts
 from acquire.stream.kept import Kept
 from acquire.stream.losses import Cause
 from acquire.stream.messages import Began, Begin, Cancel, End, Extend, Interrupt, Note, Refused, RunStarted
@@ -38,7 +39,6 @@ from acquire.stream.session import OPEN_END, Session
 from acquire.stream.stalls import HELD_UP_S, Arm, Backlog, DiskWaits, HoldUps, Lent, find_stall
 from acquire.stream.tagger import Tagger
 from acquire.stream.window import Span, hold, span
-from acquire.stream.witness import Witness
 
 if TYPE_CHECKING:
     from acquire.processes.shared import Counters
@@ -73,7 +73,7 @@ def record(
     if plan.realtime:
         become_important()  # not in real time: it computes, and must not keep the grabbers waiting
     with ThreadPoolExecutor(1, thread_name_prefix="store") as disk:
-        recorder = Recorder(mailbox, plan, rings, tags, counters, disk, Witness(others))
+        recorder = Recorder(mailbox, plan, rings, tags, counters, disk, ExternalCounts(others))
         mailbox.post(Ready())
         while recorder.turn():
             recorder.wait()
@@ -90,7 +90,7 @@ class Recorder:
         tags: Ring,
         counters: Counters,
         disk: ThreadPoolExecutor,
-        witness: Witness,
+        external: ExternalCounts,
     ) -> None:
         self._mailbox = mailbox
         self._plan = plan
@@ -98,7 +98,7 @@ class Recorder:
         self._tags = tags
         self._counters = counters
         self._disk = disk
-        self._witness = witness
+        self._external = external
         self._tagger: Tagger | None = None
         self._opening: Opening | None = None
         self._session: Session | None = None
@@ -309,8 +309,8 @@ class Recorder:
     def _new_session(self, writer: RecordingWriter, opening: Opening, first_line: int) -> Session:
         assert self._tagger is not None
         session = Session(writer, self._tagger, self._blank, first_line, opening.lines_from(first_line))
-        self._witness.begin()
-        session.doubted = self._witness.doubted()
+        self._external.begin()
+        session.doubted = self._external.doubted()
         window = opening.begin.window
         if window.padded:
             session.before = Cause.RECORDER_LOST
@@ -318,7 +318,7 @@ class Recorder:
         if window.kind:
             at = first_line if opening.span is None else opening.span.at
             self._notes.add(Note(at, window.kind, window.text))
-        if doubt := self._witness.doubt():
+        if doubt := self._external.doubt():
             self._notes.add(Note(first_line, "code_check", doubt))
         for note in self._notes.before_and_since(first_line):
             session.note(note.kind, note.line, note.text)
@@ -361,7 +361,7 @@ class Recorder:
         """Let go of the arm's last block and take the next, if there is one that may go."""
         self._release(name, arm)
         self._listen_to(name, arm)
-        self._hold_ups.look()
+        self._hold_ups.update()
         if self._opening is not None and self._opening.span is not None:
             return False  # it waits for the recording
         block = arm.ring.acquire()
@@ -449,9 +449,9 @@ class Recorder:
     # ---- the recording under way
 
     def _look_after(self, session: Session) -> None:
-        session.doubted = self._witness.doubted()
-        session.trigger, session.cameras = self._witness.trigger(), self._witness.cameras()
-        session.verified = self._witness.verified()
+        session.doubted = self._external.doubted()
+        session.trigger, session.cameras = self._external.trigger(), self._external.cameras()
+        session.verified = self._external.verified()
         for name, arm in self._arms.items():
             self._listen_to(name, arm)  # what came while this was held up by the disk is no silence
             if name in session.lost and not arm.ring.fill:

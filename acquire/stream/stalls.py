@@ -107,7 +107,7 @@ class HoldUps:
         self.longest_s = 0.0
         """Of those that may have to do with the lines which are taken now."""
 
-    def look(self) -> None:
+    def update(self) -> None:
         """To be called between any two things that may take time."""
         now_s = time.monotonic()
         held_s, self._seen_s = now_s - self._seen_s, now_s
@@ -165,7 +165,7 @@ class Heartbeat:
         self._looked_s = time.monotonic()
         self.still_s = 0.0
 
-    def look(self, now_s: float) -> float:
+    def update(self, now_s: float) -> float:
         """Seconds without a beat; of a time between two looks, only so much as a look can take counts."""
         self.still_s += min(now_s - self._looked_s, _LONGEST_LOOK_S)
         self._looked_s = now_s
@@ -192,7 +192,7 @@ class Excess:
         self._limit_s = limit_s
         self._since_s: float | None = None
 
-    def look(self, newest_pulse: int, now_s: float) -> int:
+    def update(self, newest_pulse: int, now_s: float) -> int:
         """The arm's next line when it cannot be, else 0; ``newest_pulse`` is the latest tag's."""
         line = self._counters["next_line"]
         if line <= newest_pulse + self._margin_lines:

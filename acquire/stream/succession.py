@@ -88,7 +88,7 @@ class Resumption:
 
 
 @dataclass(slots=True)
-class Line:
+class WorkerSlot:
     """The processes that had one place, one after the other."""
 
     spawn: Callable[[], Worker | None]
@@ -105,32 +105,32 @@ class Succession:
     """
 
     def __init__(self, spawn: Mapping[str, Callable[[], Worker | None]]) -> None:
-        self._lines = {name: Line(start) for name, start in spawn.items()}
+        self._slots = {name: WorkerSlot(start) for name, start in spawn.items()}
 
     def successor(self, name: str) -> Worker | None:
         """A new process in the place of one that was killed, or None."""
-        line = self._lines.get(name)
-        if line is None or line.successors >= MOST:
+        slot = self._slots.get(name)
+        if slot is None or slot.successors >= MOST:
             return None
-        worker = line.spawn()
+        worker = slot.spawn()
         if worker is not None:
-            line.successors += 1
-            line.ready_by_s = time.monotonic() + READY_S
+            slot.successors += 1
+            slot.ready_by_s = time.monotonic() + READY_S
         return worker
 
     def is_starting(self, name: str) -> bool:
         """A successor is not ready yet: its silence means nothing."""
-        return self._lines[name].ready_by_s is not None if name in self._lines else False
+        return self._slots[name].ready_by_s is not None if name in self._slots else False
 
     def is_late(self, name: str) -> bool:
         """A successor has not become ready in time."""
-        ready_by_s = self._lines[name].ready_by_s if name in self._lines else None
+        ready_by_s = self._slots[name].ready_by_s if name in self._slots else None
         return ready_by_s is not None and time.monotonic() > ready_by_s
 
     def ready(self, name: str) -> None:
         """The process has said that it is ready."""
-        if name in self._lines:
-            self._lines[name].ready_by_s = None
+        if name in self._slots:
+            self._slots[name].ready_by_s = None
 
 
 def continuation(begin: Begin, began: Began, committed_lines: int, why: str) -> Begin:
@@ -177,6 +177,6 @@ def free_name(path: Path) -> Path:
     return found
 
 
-def obituary(worker: str, why: str, line: int) -> Note:
+def replacement_note(worker: str, why: str, line: int) -> Note:
     """The event of a succession."""
     return Note(line, "fault", f"{worker}: {why}; another took its place")

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from acquire.errors import AcquireError, DeviceError, TriggerError
 from acquire.lines import ARMS
 from acquire.processes.messages import Failed, Ready
+from acquire.stream.external_counts import TRIGGER, TRIGGER_COUNTERS, WATCHER
 from acquire.stream.messages import Began, Cancel, Checked, End, Extend, Interrupt, Note, Refused, Sealed
 from acquire.stream.stalls import Excess, Heartbeat
 from acquire.stream.succession import (
@@ -21,12 +22,11 @@ from acquire.stream.succession import (
     Resumption,
     Succession,
     continuation,
-    obituary,
     once_more,
+    replacement_note,
     resumed,
 )
 from acquire.stream.tagger import tag_rows
-from acquire.stream.witness import TRIGGER, TRIGGER_COUNTERS, WATCHER
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -166,7 +166,7 @@ class Supervisor:
                 f"the trigger has not returned from a wait of {_TAG_WAIT_S} s for {_JOIN_S:g} s"
             )
 
-    def bury(self) -> None:
+    def mark_unsealed(self) -> None:
         """Every process has ended: a recording that is not sealed now will not be."""
         self._going_on = False
         if self.began is not None and self.sealed is None and self.path is not None:
@@ -303,7 +303,7 @@ class Supervisor:
         if self.recording:
             for camera in self._cameras.values():
                 camera.revive()
-        silent_s = {arm: camera.look(now_s) for arm, camera in self._cameras.items()}
+        silent_s = {arm: camera.update(now_s) for arm, camera in self._cameras.items()}
         if max(silent_s.values()) > limit_s:
             # Arms that fall silent together do so to within a block: half the limit tells both from one.
             arms = " and ".join(arm for arm in ARMS if silent_s[arm] > limit_s / 2)
@@ -311,7 +311,7 @@ class Supervisor:
 
     def _watch_recorder(self, now_s: float) -> None:
         """One that hangs is replaced. A disk is waited for: the rings keep what comes meanwhile."""
-        silent_s, patience_s = self._loop.look(now_s), self._plan.patience_s
+        silent_s, patience_s = self._loop.update(now_s), self._plan.patience_s
         if self._hung is not None:
             if silent_s > 2 * self._plan.hung_after_s:
                 self._fail(f"{self._hung}; it was killed, and has not ended")
@@ -344,7 +344,7 @@ class Supervisor:
     def _watch_counts(self, now_s: float) -> None:
         pulse = self._newest_pulse
         for arm, excess in self._excess.items() if pulse is not None else ():
-            if line := excess.look(pulse or 0, now_s):
+            if line := excess.update(pulse or 0, now_s):
                 self._fail(
                     f"arm {arm}: line {line} came with the trigger at line {pulse}: "
                     "the camera does not wait for it"
@@ -390,7 +390,7 @@ class Supervisor:
             self._orphans.append(Orphan(self._asked.path, f"its recorder was {death}"))
             self._note(name, Refused(DeviceError(f"start: the recorder was {death}", hint="start again")))
         newest = max(self._counters[arm]["next_line"] for arm in ARMS)
-        self.happened(obituary(worker.name, death, max(newest, 0)))
+        self.happened(replacement_note(worker.name, death, max(newest, 0)))
         return True
 
     def _go_on(self, begin: Begin, began: Began, death: str) -> Begin:

@@ -45,7 +45,7 @@ def test_two_arms_of_one_trigger_have_one_rate(phase: int) -> None:
     for look in range(200):
         clock.now_s = look * 0.2
         lines = clock.now_s * RATE_HZ
-        rates.look(seen({"a": blocks(lines), "b": blocks(lines + phase)}))
+        rates.update(seen({"a": blocks(lines), "b": blocks(lines + phase)}))
         if clock.now_s > RATE_WINDOW_S + 1:
             worst = max(worst, abs(rates.of("a") - rates.of("b")), abs(rates.of("a") - RATE_HZ))
     assert worst < 0.05 * RATE_HZ
@@ -57,7 +57,7 @@ def test_an_arm_that_falls_silent_comes_down_to_nothing() -> None:
     found = []
     for look in range(100):
         clock.now_s = look * 0.2
-        rates.look(seen({"a": blocks(min(clock.now_s, 8.0) * RATE_HZ)}))
+        rates.update(seen({"a": blocks(min(clock.now_s, 8.0) * RATE_HZ)}))
         found.append(rates.of("a"))
     assert found[40] == pytest.approx(RATE_HZ, rel=0.1)
     assert 0 < found[50] < 0.9 * RATE_HZ
@@ -69,7 +69,7 @@ def test_saturation_is_of_the_last_seconds() -> None:
     rates = Rates(clock)
     for look, (lines, saturated) in enumerate([(0, 0), (BLOCK, 500), (2 * BLOCK, 750), (3 * BLOCK, 1000)]):
         clock.now_s = look * 4.0
-        rates.look(seen({"a": lines}, saturated))
+        rates.update(seen({"a": lines}, saturated))
     status = arm_statuses(seen({"a": 3 * BLOCK}, 1000), rates)["a"]
     assert status.saturated == 1000
     assert status.saturated_part == pytest.approx(0.25)
@@ -114,28 +114,28 @@ class Disk:
             raise OSError(5, "Input/output error")
         return self.free
 
-    def look(self, *, recording: bool = True) -> None:
+    def check(self, *, recording: bool = True) -> None:
         self.clock.now_s += LOOK_EVERY_S
-        self.watch.look(recording=recording)
+        self.watch.check(recording=recording)
         self.watch.close()
 
 
 def test_time_to_full_is_that_of_the_recording() -> None:
     disk = Disk()
     assert disk.watch.status is None
-    disk.look(recording=False)
+    disk.check(recording=False)
     found = disk.watch.status
     assert found is not None
     assert (found.free_bytes, found.bytes_per_s, found.seconds_to_full) == (10_000, 100.0, 90.0)
     for _ in range(5):
         disk.free -= 500
-        disk.look()
+        disk.check()
     found = disk.watch.status
     assert found is not None
     assert (found.free_bytes, found.bytes_per_s, found.seconds_to_full) == (7500, 250.0, 26.0)
     assert 5 * LOOK_EVERY_S > LEAST_S
     disk.free = 500
-    disk.look(recording=False)
+    disk.check(recording=False)
     found = disk.watch.status
     assert found is not None
     assert found.seconds_to_full == 0
@@ -143,11 +143,11 @@ def test_time_to_full_is_that_of_the_recording() -> None:
 
 def test_a_disk_that_does_not_answer_keeps_nobody_waiting() -> None:
     disk = Disk()
-    disk.look()
+    disk.check()
     disk.answers.clear()
     for _ in range(3):
         disk.clock.now_s += LOOK_EVERY_S
-        disk.watch.look(recording=True)
+        disk.watch.check(recording=True)
     assert disk.watch.status is not None
     assert sum(thread.name == "disk-watch" for thread in threading.enumerate()) == 1
     disk.gone = True

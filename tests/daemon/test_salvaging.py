@@ -56,7 +56,7 @@ def states(salvage: Salvage) -> dict[str, str]:
 def look_until(salvage: Salvage, condition: Callable[[], bool], **how: bool) -> list[RecoveryStatus]:
     deadline, ended = time.monotonic() + WAIT_S, []
     while not condition():
-        ended += salvage.look(**how)
+        ended += salvage.poll(**how)
         assert time.monotonic() < deadline
         time.sleep(0.01)
     return ended
@@ -227,7 +227,7 @@ def test_a_journal_that_is_damaged_costs_a_line_in_the_log(
 def test_a_recovery_that_is_killed_is_told(salvage: Salvage, tmp_path: Path) -> None:
     path = leave_open(tmp_path / "r.zarr")
     salvage.add([Orphan(path, "killed")])
-    salvage.look()
+    salvage.poll()
     worker = salvage._worker
     assert worker is not None
     until(lambda: worker.pid is not None, "the process")
@@ -255,7 +255,7 @@ def test_an_arming_daemon_puts_a_recovery_off(salvage: Salvage, tmp_path: Path) 
     path = leave_open(tmp_path / "r.zarr")
     salvage.search()
     look_until(salvage, lambda: salvage._worker is not None)
-    salvage.look(capturing=True)
+    salvage.poll(capturing=True)
     assert salvage._worker is None
     assert states(salvage) == {"r.zarr": "waiting"}
     look_until(salvage, lambda: states(salvage) == {"r.zarr": "recovered"})

@@ -409,8 +409,8 @@ def test_a_defect_beside_the_capture_does_not_keep_it_from_being_watched(
     def broken(*_: object, **__: object) -> None:
         raise RecursionError("a nested journal")
 
-    monkeypatch.setattr(bed.service._salvage, "look", broken)
-    monkeypatch.setattr(bed.service._uploads, "look", broken)
+    monkeypatch.setattr(bed.service._salvage, "poll", broken)
+    monkeypatch.setattr(bed.service._uploads, "poll", broken)
     bed.run.see(fault="camera a is gone")
     bed.service.supervise()
     status = bed.service.status()

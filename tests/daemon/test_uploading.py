@@ -112,7 +112,7 @@ def said(uploads: Uploads, name: str) -> UploadStatus:
 def look_until(uploads: Uploads, condition: Callable[[], bool]) -> None:
     deadline = time.monotonic() + WAIT_S
     while not condition():
-        uploads.look()
+        uploads.poll()
         assert time.monotonic() < deadline, uploads.statuses
         time.sleep(0.01)
 
@@ -129,7 +129,7 @@ def test_what_one_daemon_did_not_finish_the_next_does(place: Place) -> None:
     look_until(first, lambda: all(one.error for one in first.statuses))
     assert sorted(place.left()) == ["open.zarr", "whole.zarr"]
     nothing_set = place.daemon(None)
-    nothing_set.look()
+    nothing_set.poll()
     nothing_set.add(whole)
     assert sorted(place.left()) == ["open.zarr", "whole.zarr"]
     second = place.daemon()

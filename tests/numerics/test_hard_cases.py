@@ -13,7 +13,7 @@ from acquire.forward import DualArm, merge_video
 from acquire.geometry import Geometry
 from acquire.lines import Segment
 from acquire.recon import Reconstruction, reconstruct
-from acquire.recon.problem import MaskedOperator, pose
+from acquire.recon.problem import MaskedOperator, build_problem
 from acquire.recon.twist import Twist, TwistParameters
 
 GEOMETRY = Geometry(16, 3, 80)
@@ -163,7 +163,7 @@ def test_a_wrong_orientation_is_said() -> None:
 
 def test_twist_survives_an_underestimated_norm() -> None:
     """Where the step is too long nothing is taken, so the objective never rises above its start."""
-    problem = pose(segment(), 3, 1, hold_out=0.0)
+    problem = build_problem(segment(), 3, 1, hold_out=0.0)
     whole = DualArm(GEOMETRY, CODE, 3, 1)
     loud = MaskedOperator(whole, problem.weight / np.float32(0.7 * problem.norm))
     solver = Twist(loud, problem.used_samples, whole.video_shape, TwistParameters())

@@ -26,7 +26,7 @@ from acquire.recon import HaarShrink, Reconstruction, reconstruct
 from acquire.recon.band import BandOperator
 from acquire.recon.basis import TemporalBasis
 from acquire.recon.patterns import ROUND, Refinement, find_patterns
-from acquire.recon.problem import pose
+from acquire.recon.problem import build_problem
 from acquire.recon.tv import FrameTv
 
 GEOMETRY = Geometry(16, 3, 80)
@@ -152,7 +152,7 @@ def test_patterns_and_curves(segment: Segment) -> None:
     found, videos = find_patterns(theta), []
     assert found is not None
     for where in (DOUBLE, STRICT):
-        problem = pose(segment, 3, 1, hold_out=0.02, arrays=where)
+        problem = build_problem(segment, 3, 1, hold_out=0.02, arrays=where)
         cosines = TemporalBasis(GEOMETRY.span, 32, where)
         refinement = Refinement(segment, problem, cosines, found, (3, 1))
         for _ in range(2 * ROUND):

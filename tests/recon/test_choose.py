@@ -20,7 +20,7 @@ from acquire.recon.bandwidth import light_beyond
 from acquire.recon.basis import TemporalBasis
 from acquire.recon.brightness import fit_brightness
 from acquire.recon.holdout import HeldOut
-from acquire.recon.problem import pose
+from acquire.recon.problem import build_problem
 
 GEOMETRY = Geometry(16, 3, 120)
 CODE = prbs(31, mix_seed(5, 31), 0, GEOMETRY.span)
@@ -94,7 +94,7 @@ def test_less_light_ends_in_a_smoother_picture_and_not_in_noise() -> None:
 
 
 def test_brightness_is_found_with_the_picture_known() -> None:
-    problem = pose(segment("flicker"), 3, 1, hold_out=0.08)
+    problem = build_problem(segment("flicker"), 3, 1, hold_out=0.08)
     picture = merge_video(light("still"), 3, 1).astype(np.float32) / problem.scale
     found = fit_brightness(segment("flicker"), problem, picture, (3, 1), 40)
     frames = GEOMETRY.trusted_frames(1)
@@ -103,7 +103,7 @@ def test_brightness_is_found_with_the_picture_known() -> None:
 
 
 def test_light_beyond_the_band_stands_out_of_what_the_rest_leaves() -> None:
-    problem = pose(segment("still"), 3, 1, hold_out=0.0)
+    problem = build_problem(segment("still"), 3, 1, hold_out=0.0)
     swing = np.cos(np.pi * 50 * (np.arange(GEOMETRY.span) + 0.5) / GEOMETRY.span)
     lamp = np.zeros((GEOMETRY.size, GEOMETRY.size), np.float32)
     lamp[10:20, 12:25] = 0.3
@@ -134,7 +134,7 @@ def test_the_near_inverse_is_that_of_either_arm_where_pixels_share_no_voxel(
 
 
 def test_blocks_that_see_what_nobody_is_shown_do_not_count() -> None:
-    problem = pose(segment("still"), 3, 1, hold_out=0.3)
+    problem = build_problem(segment("still"), 3, 1, hold_out=0.3)
     held_out = HeldOut(problem, GEOMETRY)
     wrong = problem.samples.copy()
     wrong[:, 0] += 1  # this line ends where the trusted interval begins

@@ -19,7 +19,7 @@ from acquire.recon.bandwidth import estimate_coefficients
 from acquire.recon.basis import TemporalBasis
 from acquire.recon.curves import CurveFit, CurveOperator
 from acquire.recon.patterns import find_patterns
-from acquire.recon.problem import pose
+from acquire.recon.problem import build_problem
 
 GEOMETRY = Geometry(12, 3, 72)
 CODE = prbs(64, mix_seed(3, 64), 0, GEOMETRY.span)
@@ -67,7 +67,7 @@ def test_curves_of_known_patterns_are_exact_even_where_samples_are_lost() -> Non
     holed = segment()
     holed.mask[0, 20:24] = False
     cosines = TemporalBasis(GEOMETRY.span, 40)
-    problem = pose(holed, 1, 1, hold_out=0.0)
+    problem = build_problem(holed, 1, 1, hold_out=0.0)
     wanted = cosines.analyze((LIGHT.T / problem.scale).astype(np.float32))
     held = segment(np.tensordot(cosines.synthesize(wanted) * problem.scale, IMAGES, 1))
     problem = replace(problem, samples=np.where(holed.mask, held.lines / (problem.scale * problem.norm), 0))

@@ -159,7 +159,7 @@ def watching_child(wire: Wire, link: Connection) -> None:
     link.send("watching")
     while not link.poll(0):
         for _ in range(50):
-            reading = wire.look()
+            reading = wire.read()
             most[reading.run] = max(most.get(reading.run, 0), reading.issued)
             looks += 1
     link.send((most, looks))

@@ -40,15 +40,15 @@ def test_pulses_keep_pace_with_the_clock_times_the_speed(wire, clock, speed):
     for elapsed_ns in (0, 599, 600, 29_999, 30_000, 59_999, 60_000, 1_000_003, 86_400 * 10**9 + 1):
         clock.now_ns = train.start_ns + elapsed_ns
         simulated_lines = Fraction(elapsed_ns) * Fraction(speed) / 30_000
-        assert wire.look().issued == int(simulated_lines) + 1
+        assert wire.read().issued == int(simulated_lines) + 1
 
 
 def test_a_line_period_of_no_whole_nanosecond_does_not_drift(wire, clock):
     train = wire.start(Fraction(10**9, 600_000), Fraction(1), CODE_ATTRS)  # 600 kHz: 1666.66… ns
     clock.now_ns = train.start_ns + 3600 * 10**9
-    assert wire.look().issued == 3600 * 600_000 + 1
+    assert wire.read().issued == 3600 * 600_000 + 1
     clock.now_ns -= 1
-    assert wire.look().issued == 3600 * 600_000
+    assert wire.read().issued == 3600 * 600_000
 
 
 @given(
@@ -69,14 +69,14 @@ def test_a_pulse_is_due_at_the_first_nanosecond_that_counts_it(pulse, period, sp
 def test_nothing_is_issued_before_a_start_in_the_future(wire, clock):
     start_ns = clock.now_ns + 5_000_000
     wire.start(LINE_PERIOD_NS, Fraction(1), CODE_ATTRS, start_ns=start_ns)
-    assert (wire.look().issued, wire.look().running) == (0, True)
+    assert (wire.read().issued, wire.read().running) == (0, True)
     assert wire.wait(1, 1, timeout_s=1.0).issued == 1
     assert clock.now_ns == start_ns
 
 
 def test_a_start_in_the_past_has_issued_pulses_already(wire, clock):
     wire.start(LINE_PERIOD_NS, Fraction(1), CODE_ATTRS, start_ns=clock.now_ns - 300_000)
-    assert wire.look().issued == 11
+    assert wire.read().issued == 11
 
 
 def test_stop_keeps_the_count_and_is_idempotent(wire, clock):
@@ -86,7 +86,7 @@ def test_stop_keeps_the_count_and_is_idempotent(wire, clock):
     assert wire.stop() == 4
     clock.now_ns += 10**9
     assert wire.stop() == 4
-    assert (wire.look().issued, wire.look().stopped) == (4, True)
+    assert (wire.read().issued, wire.read().stopped) == (4, True)
 
 
 def test_a_train_cannot_start_while_another_runs_but_after_it(wire, clock):
@@ -96,7 +96,7 @@ def test_a_train_cannot_start_while_another_runs_but_after_it(wire, clock):
     wire.stop()
     second = wire.start(LINE_PERIOD_NS, Fraction(2), {"kind": "constant", "value": 1})
     assert (first.run, second.run) == (1, 2)
-    assert wire.look().train == second
+    assert wire.read().train == second
 
 
 def test_wait_ends_when_the_pulse_is_due_and_not_before(wire, clock):
@@ -116,7 +116,7 @@ def test_wait_is_bounded_with_and_without_a_train(wire, clock):
 
 
 def test_wait_sees_a_start_and_a_stop_that_come_meanwhile(wire, clock):
-    clock.on_sleep = lambda: wire.look().train or wire.start(LINE_PERIOD_NS, Fraction(1), CODE_ATTRS)
+    clock.on_sleep = lambda: wire.read().train or wire.start(LINE_PERIOD_NS, Fraction(1), CODE_ATTRS)
     assert wire.wait(1, 5, timeout_s=1.0).issued == 5
     clock.on_sleep = wire.stop
     begin_ns = clock.now_ns
@@ -127,7 +127,7 @@ def test_wait_sees_a_start_and_a_stop_that_come_meanwhile(wire, clock):
 def test_a_code_that_does_not_fit_is_refused_and_leaves_the_wire_whole(wire):
     with pytest.raises(UsageError, match="on the wire"):
         wire.start(LINE_PERIOD_NS, Fraction(1), {"kind": "x" * 5000})
-    assert wire.look().train is None
+    assert wire.read().train is None
 
 
 @pytest.mark.parametrize("place", [0, clock_module._PAYLOAD_AT + 3])
@@ -138,7 +138,7 @@ def test_a_torn_record_is_never_believed(wire, monkeypatch, place):
     wire._known = (0, None)
     wire._page[place] ^= 1
     with pytest.raises(DeviceError, match="died"):
-        wire.look()
+        wire.read()
 
 
 def test_a_stop_between_two_steps_of_a_look_is_noticed(wire, clock):
@@ -147,15 +147,15 @@ def test_a_stop_between_two_steps_of_a_look_is_noticed(wire, clock):
     reader = Wire.__new__(Wire)
     reader._attach(os.dup(wire._descriptor), late)
     train = wire.start(LINE_PERIOD_NS, Fraction(1), CODE_ATTRS)
-    assert reader.look().running
+    assert reader.read().running
 
     def stop_then_look_at_the_clock():
-        if not wire.look().stopped:
+        if not wire.read().stopped:
             wire.stop()
         return train.start_ns + 10**9
 
     late.monotonic_ns = stop_then_look_at_the_clock
-    assert (reader.look().issued, reader.look().stopped) == (1, True)
+    assert (reader.read().issued, reader.read().stopped) == (1, True)
     reader.close()
 
 

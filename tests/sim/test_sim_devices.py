@@ -112,9 +112,9 @@ def test_a_stop_leaves_exactly_the_issued_lines_however_they_are_blocked(block_l
     trigger.start()
     blocks = []
     for lines in looks:
-        clock.now_ns = min(clock.now_ns + lines * LINE_NS, wire.look().train.due_ns(pulses - 1))
+        clock.now_ns = min(clock.now_ns + lines * LINE_NS, wire.read().train.due_ns(pulses - 1))
         blocks += [block.pixels for block in [eye.next_block(0)] if block is not None]
-    clock.now_ns = max(clock.now_ns, wire.look().train.due_ns(pulses - 1))
+    clock.now_ns = max(clock.now_ns, wire.read().train.due_ns(pulses - 1))
     assert trigger.stop() == pulses
     while (block := eye.next_block(0.001)) is not None:
         blocks.append(block.pixels)

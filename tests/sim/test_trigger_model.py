@@ -82,12 +82,12 @@ def test_lines_follow_the_clock_at_the_configured_speed(speed) -> None:
     assert [tag.line for tag in bench.tags] == list(range(0, int(35 * speed) + 1, 7))
     start = bench.read(r.START_TIME)
     assert all(tag.timestamp == start + 2700 * tag.line for tag in bench.tags)
-    lines = bench.wire.look().issued
+    lines = bench.wire.read().issued
     bench.command(Command.STOP)
     assert bench.status()["state"] == State.STOPPING  # the line that runs is finished
     bench.clock.now_ns += int(LINE_NS / speed) + 1
     assert bench.status()["state"] == State.ENDED
-    assert (bench.wire.look().stopped, bench.wire.look().issued) == (True, lines)
+    assert (bench.wire.read().stopped, bench.wire.read().issued) == (True, lines)
     bench.wire.close()
 
 
@@ -95,7 +95,7 @@ def test_nothing_is_lit_or_pulsed_before_a_start(bench) -> None:
     bench.write(r.CODE_SOURCE, r.Source.CONSTANT)
     bench.command(Command.ARM)
     bench.clock.now_ns += 10**9
-    assert bench.wire.look().issued == 0
+    assert bench.wire.read().issued == 0
     assert (bench.read(r.LINES), bench.read(r.START_TIME), bench.status()["state"]) == (0, 0, State.ARMED)
     bench.command(Command.STOP)
     (tag,) = bench.tags
@@ -113,7 +113,7 @@ def test_a_budget_ends_the_run_whoever_looks_and_when(bench) -> None:
         (99, TagFlag.LAST | TagFlag.BUDGET),
     ]
     assert bench.tags[-1].timestamp == bench.tags[0].timestamp + 100 * 2700
-    assert bench.wire.look().issued == 100
+    assert bench.wire.read().issued == 100
 
 
 def test_a_second_is_latched_and_told_in_a_run(bench) -> None:

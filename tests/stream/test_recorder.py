@@ -18,13 +18,13 @@ from acquire.lines import ARMS
 from acquire.processes.shared import Counters
 from acquire.store import RunCondition, Suspect, open_recording, suspect_lines
 from acquire.store.suspect import DOUBTFUL, VERIFIED
+from acquire.stream.external_counts import ExternalCounts
 from acquire.stream.losses import Cause, Loss, LossLog
 from acquire.stream.messages import Began, Begin, End, Note, Refused, RunStarted, Sealed
 from acquire.stream.recorder import Recorder
 from acquire.stream.recorder_plan import COUNTERS, RecorderPlan
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.window import NOW, Window
-from acquire.stream.witness import Witness
 from acquire.trigger.base import TriggerRun
 
 ROWS, SLOTS = 16, 4
@@ -83,7 +83,7 @@ class Bed:
         self.disk = SlowDisk()
         plan = RecorderPlan(RUN, STAGES, stall_timeout_s=60.0, tag_wait_s=0.0, max_skew_lines=10_000)
         self.recorder = Recorder(
-            self.post, plan, self.rings, self.tags, self.counters, self.disk, Witness({})
+            self.post, plan, self.rings, self.tags, self.counters, self.disk, ExternalCounts({})
         )
         self.post.waiting.append(RunStarted(ClockFit(90_000_000, 0, 0)))
         self.line = 0

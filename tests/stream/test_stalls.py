@@ -105,18 +105,18 @@ def test_a_counter_that_stands_still_shows_no_life(counters: Counters) -> None:
     now_s = time.monotonic()
     heart = Heartbeat(counters, "beats")
     for k in range(1, 6):
-        still_s = heart.look(now_s + 0.3 * k)
+        still_s = heart.update(now_s + 0.3 * k)
     assert still_s == pytest.approx(1.5, abs=0.01)
     counters.add("beats", 1)
-    assert heart.look(now_s + 1.6) == 0
-    assert heart.look(now_s + 1.8) == pytest.approx(0.2)
+    assert heart.update(now_s + 1.6) == 0
+    assert heart.update(now_s + 1.8) == pytest.approx(0.2)
     heart.revive()
-    assert heart.look(now_s + 1.9) == pytest.approx(0.1)
+    assert heart.update(now_s + 1.9) == pytest.approx(0.1)
 
 
 def test_the_watchers_own_absence_is_not_held_against_the_watched(counters: Counters) -> None:
     heart = Heartbeat(counters, "beats")
-    assert heart.look(time.monotonic() + 1000) < 1
+    assert heart.update(time.monotonic() + 1000) < 1
 
 
 def test_a_hold_up_counts_until_lines_that_came_after_it_are_taken(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -125,7 +125,7 @@ def test_a_hold_up_counts_until_lines_that_came_after_it_are_taken(monkeypatch: 
     found = HoldUps()
     for step_s, longest_s in ((HELD_UP_S / 2, 0.0), (3.0, 3.0), (0.1, 3.0), (1.0, 3.0)):
         clock[0] += step_s
-        found.look()
+        found.update()
         assert found.longest_s == pytest.approx(longest_s)
     assert found.over_s == clock[0]
     found.took(clock[0] - 2.0)

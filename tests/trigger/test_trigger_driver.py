@@ -165,7 +165,7 @@ def test_simulated_time_runs_fast_and_the_fit_holds_at_the_start() -> None:
     before_ns = time.time_ns()
     fit = driver.start()
     assert fit.utc_ns_at_tick_0 == pytest.approx(
-        wire.look().train.start_ns + time.time_ns() - time.monotonic_ns(), abs=2e6
+        wire.read().train.start_ns + time.time_ns() - time.monotonic_ns(), abs=2e6
     )
     assert fit.utc_ns_at_tick_0 - before_ns < 5e9
     assert fit.uncertainty_ns < 10**7
@@ -179,13 +179,13 @@ def test_the_wire_carries_what_the_registers_say() -> None:
     driver = driver_of(TriggerModel(wire, CLOCK_HZ))
     driver.prepare(run())
     driver.start()
-    train = wire.look().train
+    train = wire.read().train
     assert float(train.line_period_ns) == 30_000.0
     assert (
         code_from_attrs(train.code) == CODE
     )  # whatever number its user gave is nothing that a register holds
     lines = driver.stop()
-    assert (wire.look().issued, wire.look().stopped) == (lines, True)
+    assert (wire.read().issued, wire.read().stopped) == (lines, True)
     driver.close()
     wire.close()
 

@@ -150,12 +150,12 @@ def compare_pins(pair: Pair, config: dict[r.Register, int]) -> None:
     """Pulses and light that simulated cameras would see, where the model's cameras can see them."""
     lines = pair.device.read(r.LINES)
     seen, light = pair.device.twin.latest_run, pair.device.twin.take_light()
-    train = pair.wire.look().train
+    train = pair.wire.read().train
     assert train is not None
     assert train.line_period_ns == seen.line_clocks == line_clocks(config)
     a = r.TRIGGER_A.unpack(config[r.TRIGGER_A])
     if a["enable"] and not a["invert"] and r.LINE.mode.of(config[r.LINE]) == LineMode.PER_LINE:
-        assert seen.pulses_a == pair.wire.look().issued == lines
+        assert seen.pulses_a == pair.wire.read().issued == lines
     led = r.LED.unpack(config[r.LED])
     shown = 2 * (config[r.WINDOW_CLOSE] - config[r.WINDOW_OPEN]) > config[r.SUBSTEP_CLOCKS]
     memory = r.CODE_SOURCE.kind.of(config[r.CODE_SOURCE]) == Source.MEMORY

@@ -61,7 +61,7 @@ def test_cameras_see_the_pulses_and_the_light_that_the_pins_gave(
     driver: TriggerDriver, page: PinPage
 ) -> None:
     wires = [PinWire(page, arm) for arm in "ab"]
-    assert wires[0].look().train is None
+    assert wires[0].read().train is None
     for number in (1, 2):
         driver.prepare(TriggerRun(f"run {number}", CODE, 3, TICKS, 64))
         driver.start()

@@ -100,8 +100,8 @@ def compare_ends(both: Pair, reason: TagFlag | None) -> int:
     assert last.flags == TagFlag.LAST | (reason or 0)
     seen = device.twin.latest_run
     assert not seen.running
-    assert seen.pulses_a == both.wire.look().issued == last.line + 1
-    assert both.wire.look().stopped
+    assert seen.pulses_a == both.wire.read().issued == last.line + 1
+    assert both.wire.read().stopped
     return last.line + 1
 
 

@@ -27,7 +27,7 @@ class Stop(Protocol):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Request:
+class SolveOptions:
     """What is asked of a reconstruction, refused here if it cannot be."""
 
     spatial_merge: int

@@ -29,7 +29,7 @@ received, dropped, lost in the device; strobes by which cameras answer pulses, m
 CAMERA_COUNTS = ("delivered", "preroll", "next_line", "reopened", *CAMERA_CAUSES)
 
 
-class Witness:
+class ExternalCounts:
     """See the module; ``others`` maps `TRIGGER`, `WATCHER` and the arms to what they count."""
 
     def __init__(self, others: Mapping[str, Counters]) -> None:
