@@ -340,7 +340,7 @@ def _beside_noise(quality: dict[str, Any]) -> str:
 
 def _iterations(facts: dict[str, Any]) -> str:
     done, asked = facts["iterations"], facts["iterations_asked"]
-    return f"{done} iterations" if done == asked else f"{done} of {asked} iterations"
+    return f"{done} iterations" if done >= asked else f"{done} of {asked} iterations"
 
 
 def _print_segments(segments: list[dict[str, Any]]) -> None:

@@ -77,6 +77,10 @@ class Part:
     facts: dict[str, Any] = field(default_factory=dict)
 
 
+MOST_SHARE = 0.95
+"""Of a task, that its iterations can be; it is done when its result is there."""
+
+
 class Watch(Protocol):
     """Who looks on while a task is solved."""
 
@@ -96,8 +100,14 @@ def solve(task: Task, watch: Watch) -> Part:
         lines = calibrated(lines, options.calibration)
     lines = put_right(lines, options.turn)
 
+    done = 0.0
+
     def advanced(progress: Progress) -> None:
-        watch.advance(1 / progress.iterations)
+        """Trials come beside the iterations that were asked for, and nobody knows how many."""
+        nonlocal done
+        share = min(progress.iteration / progress.iterations, MOST_SHARE)
+        watch.advance(max(0.0, share - done))
+        done = max(done, share)
 
     result = reconstruct(
         lines,
@@ -117,7 +127,7 @@ def solve(task: Task, watch: Watch) -> Part:
         refuse=False,  # what is begun is ended in order
         check=options.check,
     )
-    watch.advance(1 - result.iterations / result.iterations_asked)
+    watch.advance(1 - done)
     substeps = lines.geometry.substeps
     why = _why_not_trusted(result, segment)
     return Part(

@@ -220,6 +220,20 @@ def test_what_had_too_little_time_to_explain_its_lines_is_not_trusted(
     assert facts["trusted"][1] - facts["trusted"][0] < request_of_three.grid.frames
 
 
+def test_progress_never_goes_beyond_the_whole_whatever_trials_are_made(recording_path, tmp_path):
+    """Iterations of trials come beside those that were asked for."""
+    request = in_voxels(by_lines(open_recording(recording_path), 20, 60), Voxels(3, 20))
+    seen = []
+    watcher = Watcher(len(request.stretches), lambda done, tasks: seen.append(done / tasks))
+    with open_pool(len(request.stretches), 1, watch=watcher) as pool:
+        recording, options = open_recording(recording_path), Options(iterations=8)
+        outcome = combine(recording, request, tmp_path / "v.zarr", options, pool, watcher)
+    assert outcome.provenance["iterations"] > outcome.provenance["iterations_asked"]
+    assert seen == sorted(seen)
+    assert seen[0] < 0.5
+    assert seen[-1] == pytest.approx(1.0)
+
+
 def test_a_failing_sub_segment_leaves_nothing(recording_path, request_of_three, tmp_path):
     with pytest.raises(UsageError, match="solver"):
         run(recording_path, request_of_three, tmp_path / "v.zarr", Options(solver="magic"), workers=2)
