@@ -13,6 +13,7 @@ from typing import Any
 import typer
 
 PLAIN = (str, Path, int, float, bool)
+_NOT = {int: "{} is not a whole number", float: "{} is not a number", Path: "{} is not a path"}
 
 
 class Quick:
@@ -21,9 +22,10 @@ class Quick:
     def __init__(self, parameter: Any) -> None:
         self._slow = parameter.get_runtime_param
         about = parameter.type_descriptor
-        checked = about.is_ranged or about.is_file or about.is_choice or _checked(about.parameter_info)
+        checked = about.is_file or about.is_choice or _checked(about.parameter_info)
         kind = about.parameter_info.parser or (about.annotation if about.annotation in PLAIN else None)
         self._type: Any = None if checked else kind
+        self._least, self._most = about.parameter_info.min, about.parameter_info.max
 
     def coerce(self, value: Any, param: Any, ctx: Any) -> Any:
         several = param.multiple or param.nargs == -1
@@ -33,10 +35,30 @@ class Quick:
             return value
         try:
             if self._type not in (None, bool) and not several:
-                return self._type(value)
-        except (ValueError, typer.BadParameter):
-            pass  # typer says why
+                return self._within(self._type(value), ctx, param)
+        except OutOfRange:
+            raise
+        except typer.BadParameter:
+            pass  # it is raised again, with the option's name
+        except ValueError:
+            raise typer.BadParameter(_NOT[self._type].format(repr(value)), ctx=ctx, param=param) from None
         return self._slow().coerce(value, param=param, ctx=ctx)
+
+    def _within(self, value: Any, ctx: Any, param: Any) -> Any:
+        """The value. typer.BadParameter where it is out of the option's range."""
+        least, most = self._least, self._most
+        if not (least is None or value >= least) or not (most is None or value <= most):  # nan is neither
+            possible = f"{least:g} to {most:g}" if None not in (least, most) else _limit(least, most)
+            raise OutOfRange(f"{value} is out of range: {possible}", ctx=ctx, param=param)
+        return value
+
+
+class OutOfRange(typer.BadParameter):
+    """A number that is one, and not in the range of its option."""
+
+
+def _limit(least: float | None, most: float | None) -> str:
+    return f"{least:g} or more" if least is not None else f"{most:g} or less"
 
 
 def ease(command: Any) -> None:

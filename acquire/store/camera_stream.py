@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import zarr
 
 from acquire.showing import in_words
 from acquire.store.chunks import ChunkReader
@@ -15,6 +14,7 @@ from acquire.store.stretch import Stretch
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    import zarr
     from numpy.typing import NDArray
 
     from acquire.store.layout import Document
@@ -121,6 +121,8 @@ class CameraStream:
 
 def child_array(group: zarr.Group, name: str) -> zarr.Array[Any]:
     """The array ``name`` inside ``group``; TypeError when it is something else."""
+    import zarr
+
     node = group[name]
     if not isinstance(node, zarr.Array):
         raise TypeError(f"{name} is not an array")

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import zarr
 
 from acquire.clock import NS_PER_S, ClockFit
 from acquire.codes import code_from_attrs
@@ -30,6 +29,7 @@ from acquire.store.table_reader import read_events, read_gaps
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    import zarr
     from numpy.typing import NDArray
 
     from acquire.store.layout import Document
@@ -95,7 +95,9 @@ class Recording:
 
     @cached_property
     def group(self) -> zarr.Group:
-        """The recording in zarr-python."""
+        """The recording in zarr-python, which is imported when somebody asks for it."""
+        import zarr
+
         return zarr.open_group(self.source.zarr_store(), mode="r", zarr_format=3)
 
     def _open(self) -> zarr.Group:

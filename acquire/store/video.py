@@ -23,8 +23,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import zarr
-from zarr.errors import GroupNotFoundError
 
 from acquire.errors import DataError, PlaceError, UsageError
 from acquire.showing import as_picture, as_table, in_words
@@ -39,6 +37,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
+    import zarr
     from numpy.typing import NDArray
 
 _VIDEO = "the path of a video (a directory NAME.zarr), as `acquire reconstruct --out` writes one"
@@ -152,6 +151,9 @@ def open_video(place: Path | str) -> VideoFile:
     Raises PlaceError where there is none, DataError for a damaged one, and StoreError where that cannot be
     found out.
     """
+    import zarr
+    from zarr.errors import GroupNotFoundError
+
     source = source_of(place)
     try:
         with refused(source, "read"):

@@ -7,8 +7,6 @@ from pathlib import PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import zarr
-from zarr.codecs import BloscCodec, Crc32cCodec
 
 from acquire.errors import UsageError
 from acquire.store import video_layout as layout
@@ -21,6 +19,7 @@ if TYPE_CHECKING:
     from pathlib import Path
     from types import TracebackType
 
+    import zarr
     from numpy.typing import NDArray
 
 CHUNK_BYTES = 4 * 2**20
@@ -44,6 +43,8 @@ class VideoWriter:
         *,
         quality: bool = False,
     ) -> None:
+        import zarr
+
         self._place, self._delivery, self._grid = place, delivery_to(place), grid
         self._name = PurePosixPath(str(place)).stem
         self._window, self._begin_ns = layout.Window(), 0
@@ -146,6 +147,18 @@ def check_provenance(provenance: Mapping[str, Any]) -> None:
         ) from error
 
 
+def _checked() -> list[Any]:
+    from zarr.codecs import Crc32cCodec
+
+    return [Crc32cCodec()]
+
+
+def _packed() -> list[Any]:
+    from zarr.codecs import BloscCodec
+
+    return [BloscCodec(cname="zstd", clevel=3, shuffle="bitshuffle"), *_checked()]
+
+
 def _append(array: zarr.Array[Any], values: NDArray[Any]) -> None:
     first = array.shape[0]
     array.resize((first + len(values), *array.shape[1:]))
@@ -161,7 +174,7 @@ def _image(
         shape=(0, *chunk[1:]),
         dtype=dtype,
         chunks=chunk,
-        compressors=[BloscCodec(cname="zstd", clevel=3, shuffle="bitshuffle"), Crc32cCodec()],
+        compressors=_packed(),
         dimension_names=("t", "y", "x"),
     )
 
@@ -172,7 +185,7 @@ def _column(group: zarr.Group, name: str, dtype: str, attributes: dict[str, Any]
         shape=(0,),
         dtype=dtype,
         chunks=(COLUMN_CHUNK,),
-        compressors=[Crc32cCodec()],
+        compressors=_checked(),
         dimension_names=("t",),
         attributes=attributes,
     )
@@ -185,7 +198,7 @@ def _whole(group: zarr.Group, name: str, values: NDArray[Any], axis: str, grid: 
         shape=values.shape,
         dtype=values.dtype,
         chunks=values.shape,
-        compressors=[Crc32cCodec()],
+        compressors=_checked(),
         dimension_names=(axis,),
         attributes=layout.coordinate_attributes(axis, grid),
     )

@@ -7,6 +7,7 @@ import resource
 import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,6 +15,8 @@ import typer
 
 from acquire.cli.commands import BY_NAME, COMMANDS, MODULES
 from acquire.cli.usage import build
+from acquire.config import load_rig, load_scene
+from acquire.simulate import simulate
 
 Cli = Callable[..., Any]
 LATE = {"rich", "pydantic", "numpy", "zarr", "acquire.config", "acquire.store"}
@@ -84,3 +87,21 @@ def test_what_is_like_nothing_is_told_without_a_guess(cli: Cli) -> None:
 
 def test_help_names_the_environment_s_variables(cli: Cli) -> None:
     assert "[env var: ACQUIRE_SOCKET]" in cli("arm", "--help").out
+
+
+@pytest.mark.parametrize("words", [["ls", "."], ["info", "run.zarr"]], ids=" ".join)
+def test_recordings_are_listed_without_zarr_python(tmp_path: Path, words: list[str]) -> None:
+    """The metadata is read by our own reader: the library takes half a second to import."""
+    simulate(
+        load_rig("rig-demo", {"geometry.stages": 8}), load_scene("scene-leds"), tmp_path / "run.zarr", 100
+    )
+    code = (
+        "import sys\nfrom acquire.cli import main\n"
+        f"sys.argv = ['acquire', *{words!r}]\n"
+        f"assert main() == 0\nprint('loaded:', sorted({{'zarr', 'rich', 'scipy'}} & set(sys.modules)))"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, check=True, capture_output=True, text=True, timeout=300
+    )
+    assert "run.zarr" in ended.stdout
+    assert ended.stdout.splitlines()[-1] == "loaded: []"
