@@ -21,6 +21,7 @@ import numpy as np
 from acquire.capacity.load import Load
 from acquire.capacity.run import LoadReport, run_load
 from acquire.capacity.search import best, search_rate
+from tools.results import Run, add_option, recorded
 
 LOADS = {
     "4640 px x 100 kHz": Load(4640, "uint8", 100_000.0),
@@ -59,7 +60,7 @@ def bare_copy() -> float:
     return 10 * len(source) / (time.perf_counter() - begun) / 1e9
 
 
-def show(name: str, report: LoadReport) -> None:
+def show(name: str, report: LoadReport, run: Run) -> None:
     cores, late = report.cores, report.latency_ms
     mb_s = report.load.bytes_per_s / 1e6
     print(
@@ -71,9 +72,22 @@ def show(name: str, report: LoadReport) -> None:
         f"  grabber latency ms: p50 {late['p50']:.2f}, p99 {late['p99']:.2f}, p99.9 {late['p99.9']:.2f},"
         f" max {late['max']:.2f}"
     )
+    run.add(
+        f"2 x {name}",
+        mb_s=mb_s,
+        seconds=report.seconds,
+        condition=str(report.condition),
+        lines=report.lines,
+        lost=report.lost,
+        unaccounted=report.unaccounted,
+        ring_peak_percent=100 * report.ring_peak,
+        **{f"cores_{owner}": cores[owner] for owner in ("recorder", "a", "b", "owner")},
+        cpu_s_per_gb=report.cpu_s_per_gb,
+        **{f"latency_{name}_ms": late[name] for name in ("p50", "p99", "p99.9", "max")},
+    )
 
 
-def search(name: str, load: Load, directory: Path) -> None:
+def search(name: str, load: Load, directory: Path, run: Run) -> None:
     disk_mb_s, _ = bare_write(directory)
     found = best(search_rate(load, directory, load.line_rate_hz))
     if found is None:
@@ -84,6 +98,7 @@ def search(name: str, load: Load, directory: Path) -> None:
         f"2 x {name}: highest rate without loss {found.line_rate_hz / 1e3:.0f} klines/s = {mb_s:.0f} MB/s,"
         f" {mb_s / disk_mb_s:.2f} of the bare write ({disk_mb_s:.0f} MB/s)"
     )
+    run.add(f"2 x {name}, highest rate without loss", mb_s=mb_s, line_rate_hz=found.line_rate_hz)
 
 
 def main() -> None:
@@ -92,15 +107,17 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(tempfile.gettempdir()))
     parser.add_argument("--search", action="store_true")
     parser.add_argument("--case", help="only those whose name has this", default="")
+    add_option(parser)
     options = parser.parse_args()
-    for name, load in LOADS.items():
-        if options.case not in name:
-            continue
-        mb_s, cpu = bare_write(options.out)
-        print(f"bare O_DIRECT write {mb_s:.0f} MB/s, {cpu:.3f} s per GB; memcpy {bare_copy():.1f} GB/s")
-        show(name, run_load(load, options.out, options.seconds))
-        if options.search:
-            search(name, load, options.out)
+    with recorded("bench_capture", keep=options.record) as run:
+        for name in (name for name in LOADS if options.case in name):
+            mb_s, cpu = bare_write(options.out)
+            copy_gb_s = bare_copy()
+            print(f"bare O_DIRECT write {mb_s:.0f} MB/s, {cpu:.3f} s per GB; memcpy {copy_gb_s:.1f} GB/s")
+            run.add(f"bare write before {name}", mb_s=mb_s, cpu_s_per_gb=cpu, memcpy_gb_s=copy_gb_s)
+            show(name, run_load(LOADS[name], options.out, options.seconds), run)
+            if options.search:
+                search(name, LOADS[name], options.out, run)
 
 
 if __name__ == "__main__":

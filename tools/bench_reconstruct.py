@@ -34,6 +34,7 @@ from acquire.sim.lines import StreamingArm
 from acquire.sim.scene import Scene, SeparableScene
 from acquire.sim.scenes import build_scene
 from acquire.sim.voxels import truth
+from tools.results import Run, add_option, recorded
 
 FULL_SCALE_DN = 4095
 GAIN_DN = 6.0
@@ -105,7 +106,7 @@ def curves(case: Case, scene: LedScene, result: Reconstruction) -> str:
     return f"{max(errors):8.1f} Hz  5 kHz × {found[0].amplitude_ratio:.2f}"
 
 
-def compare(name: str, case: Case, seed: int, solvers: list[str]) -> None:
+def compare(name: str, case: Case, seed: int, solvers: list[str], run: Run) -> None:
     scene, segment = record(case, seed)
     voxels = truth(scene, case.geometry.substeps * case.first_line, case.geometry.span, *case.merges)
     for budget_s, goal in case.goals:
@@ -119,6 +120,16 @@ def compare(name: str, case: Case, seed: int, solvers: list[str]) -> None:
                 f"{db:8.2f}{goal:6.0f}{result.quality.prediction:9.4f}{more}",
                 flush=True,
             )
+            run.add(
+                f"{name}, code {seed}, {solver}",
+                budget_s=budget_s,
+                took_s=result.seconds,
+                iterations=result.iterations,
+                psnr_db=db,
+                goal_db=goal,
+                prediction=result.quality.prediction,
+                curves=more.strip(),
+            )
 
 
 @dataclass(frozen=True)
@@ -130,7 +141,7 @@ class Trial:
     processor_s: float
 
 
-def against_twist(name: str, case: Case, seed: int) -> None:
+def against_twist(name: str, case: Case, seed: int, run: Run) -> None:
     scene, segment = record(case, seed)
     voxels = truth(scene, case.geometry.substeps * case.first_line, case.geometry.span, *case.merges)
 
@@ -156,9 +167,18 @@ def against_twist(name: str, case: Case, seed: int) -> None:
         f"in equal time {then.db:.1f} dB, {then.db - best.db:+.1f}",
         flush=True,
     )
+    run.add(
+        f"{name}, code {seed}",
+        twist_db=best.db,
+        twist_s=best.seconds,
+        twist_processor_s=best.processor_s,
+        as_good_after_s=equal and equal.seconds,
+        as_good_after_processor_s=equal and equal.processor_s,
+        in_equal_time_db=then.db,
+    )
 
 
-def pulses(seed: int, noise: float = 0.01) -> None:
+def pulses(seed: int, run: Run, noise: float = 0.01) -> None:
     for scene_name in PULSES:
         case = replace(CASES["static"], scene=scene_name)
         scene, segment = record(case, seed)
@@ -172,6 +192,7 @@ def pulses(seed: int, noise: float = 0.01) -> None:
         light = scene.intensity(case.geometry.substeps * case.first_line, case.geometry.span)[0]
         correlation = np.corrcoef(result.video.mean((1, 2))[seen], light[seen])[0, 1]
         print(f"{scene_name}{seed:5}  correlation {correlation:.4f}  {result.seconds:.1f} s", flush=True)
+        run.add(f"{scene_name}, code {seed}", correlation=correlation, took_s=result.seconds)
 
 
 def main() -> None:
@@ -182,23 +203,23 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--against-twist", action="store_true")
     parser.add_argument("--solvers", nargs="+", default=["admm", "twist", "twist-band"])
+    add_option(parser)
     asked = parser.parse_args()
     warm = CASES["fig9"]
     for solver in asked.solvers:  # compiles
         reconstruct(record(warm, 0)[1], *warm.merges, solver=solver, iterations=2)
-    if asked.against_twist:
+    with recorded("bench_reconstruct", keep=asked.record) as run:
+        if not asked.against_twist:
+            print(f"{'case':8}{'code':>5} {'solver':12}{'budget':>6}{'s':>7}{'steps':>6}", end="")
+            print(f"{'PSNR dB':>8}{'goal':>6}{'predicts':>9}")
         for name in asked.cases:
             for seed in asked.seeds:
-                against_twist(name, CASES[name], seed)
-        return
-    print(f"{'case':8}{'code':>5} {'solver':12}{'budget':>6}{'s':>7}{'steps':>6}", end="")
-    print(f"{'PSNR dB':>8}{'goal':>6}{'predicts':>9}")
-    for name in asked.cases:
-        for seed in asked.seeds:
-            if name == "pulses":
-                pulses(seed)
-            else:
-                compare(name, CASES[name], seed, asked.solvers)
+                if asked.against_twist:
+                    against_twist(name, CASES[name], seed, run)
+                elif name == "pulses":
+                    pulses(seed, run)
+                else:
+                    compare(name, CASES[name], seed, asked.solvers, run)
 
 
 if __name__ == "__main__":

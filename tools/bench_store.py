@@ -30,6 +30,7 @@ from acquire.store.files import DISK
 from acquire.store.pages import PAGE, aligned_bytes, open_direct, page_up
 from acquire.store.retention import shard_files
 from acquire.store.shard import shard_key
+from tools.results import Run, add_option, recorded
 
 PIXELS, SHARD_CHUNKS, SUBSTEPS = 4640, 240, 3
 LINE_RATE_HZ = 100_000
@@ -151,7 +152,7 @@ def written(directory: Path, memory: list[np.ndarray], count: int, codec: str, f
     return pace
 
 
-def write_cases(directory: Path, gigabytes: float) -> None:
+def write_cases(directory: Path, gigabytes: float, run: Run) -> None:
     memory = block_memory()
     count = max(2, int(gigabytes * 1e9 / memory[0].nbytes) // 2 * 2)
     cases = [("none", "seal"), ("none", "commit"), ("lz4", "seal"), ("zstd", "seal")]
@@ -163,13 +164,22 @@ def write_cases(directory: Path, gigabytes: float) -> None:
             f"per GB; {ours.mb_s / disk.mb_s:.2f} of the bare write ({disk.mb_s:.0f} MB/s, "
             f"{disk.cpu_s_per_gb:.3f} s per GB)"
         )
+        run.add(
+            f"write, codec {codec}, fsync at {fsync}",
+            mb_s=ours.mb_s,
+            cpu_s_per_gb=ours.cpu_s_per_gb,
+            of_the_bare_write=ours.mb_s / disk.mb_s,
+            bare_write_mb_s=disk.mb_s,
+            bare_write_cpu_s_per_gb=disk.cpu_s_per_gb,
+        )
 
 
-def codec_cases() -> None:
+def codec_cases(run: Run) -> None:
     chunk = block_memory(1)[0][:CHUNK_LINES]
     for codec in CODECS:
         speed = measure_codec(chunk, codec, seconds=0.5)
         print(f"codec {codec} with crc32c, one thread: {speed.megabytes_per_s:.0f} MB/s, x {speed.ratio:.2f}")
+        run.add(f"codec {codec} with crc32c, one thread", mb_s=speed.megabytes_per_s, ratio=speed.ratio)
 
 
 def hour(directory: Path) -> Path:
@@ -206,7 +216,7 @@ def _stretch(path: Path, first_line: int) -> None:
     root.write_text(json.dumps(document))
 
 
-def cut_case(directory: Path) -> None:
+def cut_case(directory: Path, run: Run) -> None:
     path = hour(directory)
     try:
         times = [_cut_cold(path, line) for line in _places()]
@@ -216,6 +226,7 @@ def cut_case(directory: Path) -> None:
     for name, values in zip(names, zip(*times, strict=True), strict=True):
         found = f"median {np.median(values):.1f} ms, worst {max(values):.1f} ms"
         print(f"{CUT_LINES} lines of an hour, a fresh process, {name}: {found}")
+        run.add(f"{CUT_LINES} lines of an hour, {name}", median_ms=np.median(values), worst_ms=max(values))
 
 
 def _places() -> list[int]:
@@ -280,13 +291,15 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path(tempfile.gettempdir()))
     parser.add_argument("--gigabytes", type=float, default=2.0, help="written per case")
     parser.add_argument("--cut", nargs=2, metavar=("RECORDING", "LINE"), help=argparse.SUPPRESS)
+    add_option(parser)
     options = parser.parse_args()
     if options.cut:
         cut_here(Path(options.cut[0]), int(options.cut[1]))
         return
-    write_cases(options.out, options.gigabytes)
-    codec_cases()
-    cut_case(options.out)
+    with recorded("bench_store", keep=options.record) as run:
+        write_cases(options.out, options.gigabytes, run)
+        codec_cases(run)
+        cut_case(options.out, run)
 
 
 if __name__ == "__main__":

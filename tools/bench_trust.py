@@ -26,6 +26,7 @@ from acquire.cores import limit_threads
 from acquire.evaluate.metrics import psnr, ssim
 from acquire.recon import reconstruct
 from acquire.sim.procedural import CLEAN, SCENES, Camera, Recorded, record
+from tools.results import add_option, recorded
 
 VOXEL = 3
 COSINES = 32
@@ -75,6 +76,13 @@ def _twist(recorded: Recorded, truth: np.ndarray) -> float:
     return psnr(result.video[result.trusted], truth)
 
 
+def figures(row: Row) -> dict[str, float | str]:
+    """To be kept."""
+    ways = {f"{name}_db": getattr(row, name) for name in ("mean", "still", "cosines", "twist", "default")}
+    error = {"ssim": row.ssim, "held_out_error_percent": 100 * row.error}
+    return ways | error | {"processor_s": row.processor_s, "prior": row.prior}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -83,15 +91,17 @@ def main() -> None:
     parser.add_argument("--seeds", nargs="+", type=int, default=[21])
     parser.add_argument("--full-well", type=float, default=1e4, help="electrons at the brightest; inf: clean")
     parser.add_argument("--twist", action="store_true", help="the paper's solver, too (minutes)")
+    add_option(parser)
     options = parser.parse_args()
     camera = Camera(options.full_well) if np.isfinite(options.full_well) else CLEAN
     print("scene      mean  still  cosines  TwIST  default  SSIM  error   s   prior")
     rows = []
-    with limit_threads(1):
+    with limit_threads(1), recorded("bench_trust", keep=options.record) as run:
         for scene in options.scenes:
             for seed in options.seeds:
                 row = measure(scene, seed, camera, twist=options.twist)
                 rows.append(row)
+                run.add(f"{scene}, seed {seed}", **figures(row))
                 yardsticks = f"{row.mean:5.1f}  {row.still:5.1f}  {row.cosines:7.1f}  {row.twist:5.1f}"
                 told = f"{row.ssim:4.2f}  {row.error:5.1%}  {row.processor_s:3.0f}   {row.prior}"
                 print(f"{row.scene:9} {yardsticks}  {row.default:7.1f}  {told}", flush=True)

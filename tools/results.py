@@ -1,0 +1,253 @@
+"""What benchmarks measured: one line of JSON per run, in a file that is kept, and tables made from it.
+
+``--record`` of a benchmark appends its run to tools/results.jsonl: the command, when, at which commit, on
+which machine and how busy that was before, and a row of figures per case. ``python tools/results.py`` lists
+the runs, ``--table NAME`` prints the newest whole one of a benchmark as Markdown, ``--run NUMBER`` another.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import acquire
+from acquire.cores import usable_cores
+
+ROOT = Path(__file__).parents[1]
+FILE = ROOT / "tools/results.jsonl"
+Figure = float | int | str | None
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What figures depend on; no name of it."""
+
+    cpu: str
+    cores: int
+    memory_gb: float
+    load_before: float
+    kernel: str
+    python: str
+    numpy: str
+
+    @classmethod
+    def here(cls) -> Machine:
+        """With the load of the last minute, before the benchmark adds its own."""
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        return cls(
+            cpu=cpu_model(),
+            cores=usable_cores(),
+            memory_gb=round(memory / 1e9, 1),
+            load_before=round(os.getloadavg()[0], 2),
+            kernel=platform.release(),
+            python=platform.python_version(),
+            numpy=np.__version__,
+        )
+
+
+@dataclass
+class Run:
+    """One run of a benchmark: a row per case, named figures with their units in the names.
+
+    ``commit`` ends with + where the tree differed from it. ``whole``: it came to its end.
+    """
+
+    benchmark: str
+    command: str
+    date: str
+    commit: str
+    version: str
+    machine: Machine
+    rows: list[dict[str, Figure]] = field(default_factory=list)
+    whole: bool = False
+
+    def add(self, case: str, **figures: Any) -> None:
+        """A case; what is not finite is noted as absent."""
+        self.rows.append({"case": case, **{name: _plain(value) for name, value in figures.items()}})
+
+
+def add_option(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--record", action="store_true", help=f"append what is measured to tools/{FILE.name}")
+
+
+@contextmanager
+def recorded(benchmark: str, *, keep: bool, file: Path = FILE) -> Iterator[Run]:
+    """A run to add figures to, appended to the file when it ends; if that is early, as far as it came."""
+    run = Run(
+        benchmark,
+        _command(sys.argv),
+        datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+        commit(),
+        acquire.__version__,
+        Machine.here(),
+    )
+    try:
+        yield run
+        run.whole = True
+    finally:
+        if keep and run.rows:
+            with file.open("a", encoding="utf-8") as out:
+                out.write(json.dumps(asdict(run), ensure_ascii=False) + "\n")
+
+
+def cpu_model(path: Path = Path("/proc/cpuinfo")) -> str:
+    """As the kernel names it; the architecture where it does not."""
+    lines = (line.partition(":") for line in path.read_text(encoding="utf-8").splitlines())
+    return next(
+        (value.strip() for name, _, value in lines if name.strip() == "model name"), platform.machine()
+    )
+
+
+def commit(root: Path = ROOT) -> str:
+    """Of the tree that is measured; the results themselves do not change it. "unknown" outside a checkout."""
+
+    def git(*words: str) -> str:
+        return subprocess.run(
+            ["git", *words], cwd=root, check=True, capture_output=True, text=True, timeout=60
+        ).stdout.strip()
+
+    try:
+        changed = git("status", "--porcelain", "--untracked-files=no", "--", ".", f":!tools/{FILE.name}")
+        return git("rev-parse", "--short=12", "HEAD") + ("+" if changed else "")
+    except (OSError, subprocess.CalledProcessError):
+        return "unknown"
+
+
+def _command(words: list[str]) -> str:
+    """As it was given, but for places on this machine."""
+    program = Path(words[0]).absolute()
+    name = program.relative_to(ROOT) if program.is_relative_to(ROOT) else Path(program.name)
+    return shlex.join(["python", str(name), *("DIR" if word.startswith("/") else word for word in words[1:])])
+
+
+def _plain(value: Any) -> Figure:
+    """Numbers of any library, as JSON has them."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if isinstance(value, float):
+        return float(f"{value:.6g}") if np.isfinite(value) else None
+    if value is None or isinstance(value, (int, str)):
+        return value
+    raise TypeError(f"{value!r} is no figure; possible: a number, a text, None")
+
+
+# ---- what is there
+
+
+def read(file: Path = FILE) -> list[Run]:
+    """All runs, the oldest first. Raises ValueError for a line that is none."""
+    runs = []
+    for number, line in enumerate(file.read_text(encoding="utf-8").splitlines() if file.exists() else (), 1):
+        try:
+            facts = json.loads(line)
+            runs.append(Run(**{**facts, "machine": Machine(**facts["machine"])}))
+        except (ValueError, TypeError, KeyError) as error:
+            raise ValueError(f"{file.name}, line {number}: not a run of a benchmark: {error}") from None
+    return runs
+
+
+def table(run: Run) -> str:
+    """In Markdown: where the figures come from, then a row per case, and a column per figure that one has."""
+    columns = list(dict.fromkeys(name for row in run.rows for name in row))
+    rows = [[_shown(row.get(name)) for name in columns] for row in run.rows]
+    lines = [[_heading(name) for name in columns], ["---"] * len(columns), *rows]
+    return "\n".join([_origin(run), "", *(f"| {' | '.join(line)} |" for line in lines)])
+
+
+def _origin(run: Run) -> str:
+    on = run.machine
+    cut = "" if run.whole else "; cut short"
+    return (
+        f"(`{run.command}`, {run.date[:10]}, commit {run.commit}; {on.cpu}, {on.cores} cores, "
+        f"load {on.load_before:g} before; Python {on.python}, NumPy {on.numpy}{cut})"
+    )
+
+
+UNITS = {
+    "mb_s": "MB/s",
+    "gb_s": "GB/s",
+    "s_per_gb": "s per GB",
+    "ms": "ms",
+    "s": "s",
+    "db": "dB",
+    "hz": "Hz",
+    "percent": "%",
+}
+
+
+"""Ending of a figure's name → its unit. Longer endings first: gb_s is none of seconds."""
+
+
+def _heading(name: str) -> str:
+    """The name's words, and its unit in brackets: write_mb_s → write (MB/s)."""
+    for ending, unit in UNITS.items():
+        if name == ending:
+            return unit
+        if name.endswith(f"_{ending}"):
+            return f"{name.removesuffix(f'_{ending}').replace('_', ' ')} ({unit})"
+    return name.replace("_", " ")
+
+
+def _shown(value: Figure) -> str:
+    """Three digits, without exponents as long as that can be read."""
+    if value is None:
+        return ""
+    if not isinstance(value, float):
+        return str(value).replace("|", "\\|")
+    size = abs(value)
+    if size >= 100:
+        return f"{value:.0f}"
+    return f"{value:.1f}" if size >= 10 else f"{value:.2f}" if size >= 1 else f"{value:.3g}"
+
+
+def choose(runs: list[Run], benchmark: str | None, number: int | None) -> Run:
+    """The run of a number, or the newest whole one of a benchmark. Raises ValueError, with what there is."""
+    if number is not None:
+        if not 1 <= number <= len(runs):
+            raise ValueError(f"run {number}: there are {len(runs)}")
+        return runs[number - 1]
+    found = [run for run in runs if run.benchmark == benchmark and run.whole]
+    if not found:
+        there = ", ".join(sorted({run.benchmark for run in runs})) or "none yet"
+        raise ValueError(
+            f"no whole run of {benchmark}; there are: {there}; python tools/{benchmark}.py --record"
+        )
+    return found[-1]
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--table", metavar="NAME", help="of a benchmark: bench_store, …")
+    parser.add_argument("--run", type=int, metavar="NUMBER", help="of the list, instead of the newest")
+    parser.add_argument("--file", type=Path, default=FILE, help=f"instead of tools/{FILE.name}")
+    asked = parser.parse_args()
+    try:
+        runs = read(asked.file)
+        if asked.table or asked.run is not None:
+            print(table(choose(runs, asked.table, asked.run)))
+            return 0
+    except ValueError as error:
+        print(f"results: {error}", file=sys.stderr)
+        return 2
+    for number, run in enumerate(runs, 1):
+        print(f"{number:3}  {run.benchmark:18}{len(run.rows):4} rows  {_origin(run)}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
