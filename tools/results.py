@@ -18,6 +18,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -160,11 +161,17 @@ def read(file: Path = FILE) -> list[Run]:
 
 
 def table(run: Run) -> str:
-    """In Markdown: where the figures come from, then a row per case, and a column per figure that one has."""
-    columns = list(dict.fromkeys(name for row in run.rows for name in row))
-    rows = [[_shown(row.get(name)) for name in columns] for row in run.rows]
-    lines = [[_heading(name) for name in columns], ["---"] * len(columns), *rows]
-    return "\n".join([_origin(run), "", *(f"| {' | '.join(line)} |" for line in lines)])
+    """In Markdown: where the figures come from, then a table of each group of cases with the same figures."""
+    parts = [list(rows) for _, rows in groupby(run.rows, key=tuple)]
+    return "\n\n".join([_origin(run), *map(_part, parts)])
+
+
+def _part(rows: list[dict[str, Figure]]) -> str:
+    """A row per case, and a column per figure that one of them has."""
+    columns = [name for name in rows[0] if any(row[name] is not None for row in rows)]
+    shown = [[_shown(row[name]) for name in columns] for row in rows]
+    lines = [[_heading(name) for name in columns], ["---"] * len(columns), *shown]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def _origin(run: Run) -> str:
