@@ -38,6 +38,7 @@ class Progress:
         self._what, self._advice = what, advice
         self._done, self._total = 0.0, 0.0
         self._began_s = time.monotonic()
+        self._first: tuple[float, float] | None = None
         self._lock = threading.Lock()
         self._over = threading.Event()
         self._printer: threading.Thread | None = None
@@ -47,6 +48,8 @@ class Progress:
         """So much is done, of so much in all."""
         with self._lock:
             self._done, self._total = done, total
+            if self._first is None and done > 0:
+                self._first = (time.monotonic(), done)
         self._advise()
         if self._bar is not None:
             self._bar.update(0, completed=done, total=total or None, amount=self.amount)
@@ -54,7 +57,7 @@ class Progress:
     def doing(self, what: str) -> None:
         """The work is now this; how much of it there is, is not known."""
         with self._lock:
-            self._what, self._done, self._total = what, 0.0, 0.0
+            self._what, self._done, self._total, self._first = what, 0.0, 0.0, None
         if self._bar is not None:
             self._bar.update(0, description=what, completed=0, total=None, amount="")
 
@@ -64,10 +67,13 @@ class Progress:
 
     @property
     def left_s(self) -> float | None:
-        """At the rate so far; None while that is not known."""
-        if not 0 < self._done <= self._total:
+        """At the rate so far; None while that is not known. The first piece, which compiling or a cold disk
+        may delay, is left out as soon as there are others.
+        """
+        if self._first is None or not 0 < self._done <= self._total:
             return None
-        return self.elapsed_s * (self._total - self._done) / self._done
+        begun_s, before = self._first if self._done >= 2 * self._first[1] else (self._began_s, 0.0)
+        return (time.monotonic() - begun_s) * (self._total - self._done) / (self._done - before)
 
     @property
     def amount(self) -> str:
@@ -141,7 +147,8 @@ class Progress:
 
     def _advise(self) -> None:
         left = self.left_s
-        if self._advice and left is not None and left > ADVISE_S and self.elapsed_s > KNOWN_S:
+        known = self._first is not None and time.monotonic() - self._first[0] > KNOWN_S
+        if self._advice and known and left is not None and left > ADVISE_S:
             advice, self._advice = self._advice, ""
             if not json_asked():
                 note(f"{self._what} will take about {span(left)}; in less time: {advice}")

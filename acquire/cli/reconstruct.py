@@ -279,7 +279,9 @@ def _run(
     at_once = workers or (None if options.device == "cpu" else 1)  # one process fills a GPU
     with (
         first_interrupt_asks("finishing the sub-segments under way, as far as they came") as interrupted,
-        stage_progress(f"reconstructing {PurePosixPath(out).name}", QUICKER) as advance,
+        stage_progress(
+            f"reconstructing {PurePosixPath(out).name}", QUICKER if options.budget_s is None else ""
+        ) as advance,
     ):
         watcher = Watcher(tasks, advance, interrupted.is_set)
         with open_pool(tasks, at_once, cluster, watcher) as pool:
@@ -321,7 +323,7 @@ def _readable(outcome: Outcome) -> dict[str, Any]:
         "trusted": f"frames {first} to {end - 1}" if end > first else f"none: {nothing}",
         "solver": f"{facts['solver']}, {_iterations(facts)}, {facts['seconds']:.1f} s",
         "corrected": ", ".join(facts["calibration"]["corrected"]) if facts["calibration"] else None,
-        "compiled": f"for {facts['compiled_s']:.1f} s more, once after an installation"
+        "compiled": f"for {facts['compiled_s']:.1f} s of these, once after an installation"
         if facts["compiled_s"] >= SAID_S
         else None,
         "misfit": f"{quality['misfit']:.2%} of the samples' RMS",
