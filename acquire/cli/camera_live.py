@@ -67,7 +67,7 @@ def live(
     from acquire.daemon.messages import LightCode
 
     if code is not None and code not in get_args(LightCode):
-        raise UsageError(f"--code {code!r}", possible=", ".join(get_args(LightCode)))
+        raise UsageError(f"the light cannot follow --code {code!r}", possible=", ".join(get_args(LightCode)))
     with (
         first_interrupt_asks("letting go of the cameras") as asked,
         eyes_of(config, serial, code, Client(socket)) as eyes,  # type: ignore[arg-type]  # checked above

@@ -44,7 +44,7 @@ class _Part:
                 possible="--first-line and --lines, --first-frame and --frames, or --from and --to",
             )
         if self.count is not None and self.count < 1:
-            raise UsageError(f"a count of {self.count}", possible="1 or more")
+            raise UsageError(f"a count of {self.count} cannot be written", possible="1 or more")
 
 
 def export(
@@ -158,6 +158,6 @@ def _numbers(part: _Part, first: int, end: int, period_ns: float, first_ns: int,
     if not first <= start < stop <= end:
         have = f"0ms to {(end - first) * period_ns / 1e6:.6g}ms after the first"
         raise UsageError(
-            f"no {what} from {part.begin or 'the first'} to {part.end or 'the last'}", possible=have
+            f"there are no {what} from {part.begin or 'the first'} to {part.end or 'the last'}", possible=have
         )
     return range(start, stop)

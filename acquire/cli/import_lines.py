@@ -95,7 +95,9 @@ def import_lines(
     from acquire.store.delivery import check_new_place
 
     if len(files) > 2:
-        raise UsageError(f"{len(files)} files of lines", possible="one for each arm, or one with both")
+        raise UsageError(
+            f"{len(files)} files of lines were given", possible="one for each arm, or one with both"
+        )
     check_new_place(out)
     said = {"white_dn": white, "black_level_dn": black, "responsivity_dn": responsivity}
     instrument = _instrument(config, stages, substeps, line_rate, code, repeats=code_repeats)
@@ -160,7 +162,7 @@ def _arms(
     from acquire.exchange import Arm, open_lines
 
     if arm not in columns:
-        raise UsageError(f"arm {arm!r}", possible="a, b")
+        raise UsageError(f"there is no arm {arm!r}", possible="a, b")
     if len(files) == 2 or all(columns.values()):
         paths = {"a": files[0], "b": files[-1]}
         opened = {
@@ -213,8 +215,9 @@ def _of_options(
 
     if stages is None or substeps is None or line_rate is None or light is None:
         given = {"--stages": stages, "--substeps": substeps, "--line-rate": line_rate, "--code": light}
+        absent = ", ".join(name for name, value in given.items() if value is None)
         raise UsageError(
-            f"lines without {', '.join(name for name, value in given.items() if value is None)}",
+            f"the lines cannot be read without {absent}",
             possible="all of --stages, --substeps, --line-rate and --code, or --config RIG",
         )
     _check_sizes(stages, substeps, line_rate)

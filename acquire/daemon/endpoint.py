@@ -67,7 +67,9 @@ def lock_path(path: Path) -> Path:
 def _check(path: Path) -> None:
     if len(os.fsencode(path)) > LONGEST_PATH:
         raise UsageError(
-            f"control socket {path}", possible=f"a path of at most {LONGEST_PATH} bytes", hint=ELSEWHERE
+            f"control socket {path} has too long a path",
+            possible=f"a path of at most {LONGEST_PATH} bytes",
+            hint=ELSEWHERE,
         )
     if path == default_socket():
         _own(path.parent)

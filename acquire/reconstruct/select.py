@@ -37,7 +37,8 @@ class Selection:
         begin, end = low if self.begin is None else self.begin, high if self.end is None else self.end
         if not low <= begin < end <= high:
             raise UsageError(
-                f"{self.in_words(begin, end)} after the first line", possible=self.in_words(low, high)
+                f"the lines do not show {self.in_words(begin, end)} after the first line",
+                possible=self.in_words(low, high),
             )
         return begin, end
 

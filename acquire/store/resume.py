@@ -41,7 +41,10 @@ def next_segment(path: Path, spec: RecordingSpec, cause: str = "interrupted") ->
     """
     first = open_recording(path)
     if "segment" in first.attrs:
-        raise UsageError(f"resuming {path}, a segment itself", possible=first.attrs["segment"]["of"])
+        raise UsageError(
+            f"resuming is not possible with {path}, which is a segment itself",
+            possible=first.attrs["segment"]["of"],
+        )
     _check_alike(first, spec)
     segments = [first, *first.segments]
     last = segments[-1]
@@ -111,6 +114,11 @@ def _check_alike(first: Recording, spec: RecordingSpec) -> None:
     }
     for key, value in asked.items():
         if first.attrs[key] != value:
-            raise UsageError(f"resuming {first} with {key} {value}", possible=str(first.attrs[key]))
+            raise UsageError(
+                f"resuming {first} needs the same {key}, and not {value}", possible=str(first.attrs[key])
+            )
     if first.arms[ARMS[0]].dtype != spec.line_dtype:
-        raise UsageError(f"resuming {first} with {spec.dtype} samples", possible=str(first.arms["a"].dtype))
+        raise UsageError(
+            f"resuming {first} needs the same samples, and not {spec.dtype}",
+            possible=str(first.arms["a"].dtype),
+        )

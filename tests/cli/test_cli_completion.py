@@ -48,7 +48,7 @@ def offered(cli: Cli, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callab
 @pytest.mark.parametrize("shell", SHELLS)
 def test_commands_options_and_values(offered: Callable[..., list[str]], shell: str) -> None:
     assert offered("acquire st", shell) == ["start", "stop", "status"]
-    assert offered("acquire calibrate d", shell) == ["dark"]
+    assert offered("acquire calibrate da", shell) == ["dark"]
     assert offered("acquire reconstruct take.zarr --pl", shell) == ["--plan"]
     assert offered("acquire status --wait ", shell) == list(STATES)
     assert offered("acquire serve --config rig-f", shell) == ["rig-fast"]
@@ -72,32 +72,59 @@ def test_the_states_are_the_daemon_s() -> None:
 
 def test_bash_itself_completes(tmp_path: Path) -> None:
     """The script that is printed, in the shell that it is for."""
-    bash = shutil.which("bash")
-    if bash is None:
-        pytest.skip("no bash")
-    program = tmp_path / "acquire"
-    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m acquire "$@"\n')
-    program.chmod(0o755)
     script = (
         'eval "$(acquire completion bash)"\n'
         "COMP_WORDS=(acquire status --wait dr); COMP_CWORD=3\n"
         '_acquire_completion acquire; echo "${COMPREPLY[*]}"; complete -p acquire\n'
     )
-    environment = {k: v for k, v in os.environ.items() if k != VARIABLE}
-    environment["PATH"] = f"{tmp_path}:{environment['PATH']}"
-    ended = subprocess.run(
-        [bash, "--norc", "-c", script],
-        cwd=tmp_path,
-        env=environment,
-        check=True,
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert ended.stdout.splitlines() == ["draining", "complete -o default -F _acquire_completion acquire"]
+    said = shell(tmp_path, "bash", script, "--norc")
+    assert said == ["draining", "complete -o default -F _acquire_completion acquire"]
 
 
 @pytest.mark.parametrize("shell", SHELLS)
 def test_each_shell_has_its_script(cli: Cli, shell: str) -> None:
     said = cli("completion", shell).out
     assert f"{VARIABLE}=complete_{shell}" in said
+
+
+@pytest.mark.needs_fish
+def test_fish_itself_completes(tmp_path: Path) -> None:
+    said = shell(tmp_path, "fish", "acquire completion fish | source; complete -C 'acquire status --wait dr'")
+    assert said == ["draining"]
+
+
+@pytest.mark.needs_zsh
+def test_zsh_itself_completes(tmp_path: Path) -> None:
+    """What the function hands to zsh's own _arguments, which works inside the line editor only."""
+    script = (
+        "autoload -U compinit; compinit -u -D\n"
+        'eval "$(acquire completion zsh)"; print -r -- ${_comps[acquire]}\n'
+        '_arguments() { print -r -- "$@" }\n'
+        "words=(acquire status --wait dr); CURRENT=4; ${_comps[acquire]}\n"
+    )
+    assert shell(tmp_path, "zsh", script, "-f") == ["_acquire_completion", '*: :(("draining"))']
+
+
+def shell(place: Path, name: str, script: str, *options: str) -> list[str]:
+    """Lines that a script prints in a shell, where `acquire` is this program."""
+    found = shutil.which(name)
+    assert found is not None
+    program = place / "acquire"
+    program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m acquire "$@"\n')
+    program.chmod(0o755)
+    environment = {k: v for k, v in os.environ.items() if k != VARIABLE}
+    environment |= {
+        "PATH": f"{place}:{environment['PATH']}",
+        "HOME": str(place),
+        "XDG_CONFIG_HOME": str(place),
+    }
+    ended = subprocess.run(
+        [found, *options, "-c", script],
+        cwd=place,
+        env=environment,
+        check=True,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    return ended.stdout.splitlines()

@@ -203,7 +203,7 @@ def test_lines_from_the_middle_of_a_run_have_its_code(
         (["a.npy", "b.npy", *SIZES[:-1], "bits:0xff00"], "the code has 16 bits, and 150 lines touch 315"),
         (["a.npy", "b.npy", *SIZES[:-1], "prbs:64"], "possible: prbs:DEGREE:SEED"),
         (["a.npy", "b.npy", *SIZES[:-1], "bits:a.npy"], "holds no bits"),
-        (["a.npy", "b.npy", *SIZES[:4]], "lines without --line-rate, --code"),
+        (["a.npy", "b.npy", *SIZES[:4]], "cannot be read without --line-rate, --code"),
         (["a.npy", *SIZES, "--line-rate", 0], "--line-rate 0 is out of range"),
         (["a.npy", *SIZES, "--substeps", 9], "--substeps 9 is out of range"),
         (["a.npy", *SIZES, "--lines", 999], "possible: 1 to 150"),

@@ -88,7 +88,8 @@ def rig_of(config: str, cameras: str) -> str:
         return config
     if config != RIG:
         raise UsageError(
-            f"demo of {config} with --cameras {cameras}", hint="cameras.a.driver in that file, or no --config"
+            f"the demo cannot give {config} the cameras {cameras!r}: they are those of its file",
+            hint="cameras.a.driver in that file, or no --config",
         )
     return CAMERA_RIGS[cameras]
 
@@ -109,7 +110,8 @@ def check(plan: DemoPlan, rig: RigConfig) -> None:
     least = segment_row(rig) + SEGMENT_LINES
     if plan.lines < least:
         raise UsageError(
-            f"demo of {plan.lines} lines", possible=f"{least} or more: it cuts {SEGMENT_LINES} at 52 ms"
+            f"the demo cannot be made of {plan.lines} lines",
+            possible=f"{least} or more: it cuts {SEGMENT_LINES} at 52 ms",
         )
 
 
@@ -155,7 +157,7 @@ def _check_rig(plan: DemoPlan, rig: RigConfig) -> None:
     geometry = rig.geometry.segment(SEGMENT_LINES)
     if geometry.size % N_M or geometry.size < N_M * LEAST_SIDE:
         raise UsageError(
-            f"demo of {plan.config} with n = M·S = {geometry.size}",
+            f"the demo cannot use {plan.config}, whose n = M·S is {geometry.size}",
             possible=f"a multiple of {N_M}, {N_M * LEAST_SIDE} or more",
         )
     if (frames := geometry.trusted.stop - geometry.trusted.start) < LEAST_FRAMES:
