@@ -29,6 +29,7 @@ def heard(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
     monkeypatch.setattr(module, "EVERY_S", 0.01)
 
     def lines(count: int) -> list[str]:
+        capsys.readouterr()  # what was said before is not asked for
         said, deadline = "", time.monotonic() + LIMIT_S
         while said.count("\n") < count:
             assert time.monotonic() < deadline, said
