@@ -143,7 +143,7 @@ def test_over_a_bad_link_every_line_is_eq1_flagged_or_lost_also_after_the_camera
         until(lambda: run.poll().lines["a"]["reopened"] or _reopen(gige, rig), "the camera")
 
     def _reopen(gige: Any, rig: Rig) -> bool:
-        gige.opener("a", rig.simulated._sensor)
+        gige.opener("a", rig.simulated.sensor)
         return False
 
     recording, status = record(config, tmp_path / "r.zarr", 15_000, happen, prepare=prepare)
