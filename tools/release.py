@@ -108,8 +108,10 @@ def constraints_suit(root: Path) -> str:
             wrong.append(f"{wanted.name} has no version in {CONSTRAINTS.name}")
         elif not wanted.specifier.contains(pin, prereleases=True):
             wrong.append(f"{wanted.name}=={pin} is not {wanted.specifier}")
+        elif here is None:
+            wrong.append(f"{wanted.name} {pin} is not installed here")
         elif here != pin:
-            wrong.append(f"{wanted.name} is {here or 'not'} installed here, and not {pin}")
+            wrong.append(f"{wanted.name} {here} is installed here, and not {pin}")
     if wrong:
         raise Undone(
             "; ".join(wrong), "pip install -c tools/constraints.txt -e '.[dev]', or mend the versions"
