@@ -25,6 +25,7 @@ from acquire.daemon.messages import (
     TroubleStatus,
 )
 from acquire.daemon.states import State, commands
+from acquire.errors import EXIT_INTERRUPTED, NoDaemonError
 
 Cli = Callable[..., Any]
 
@@ -211,3 +212,31 @@ def test_status_fits_the_terminal(
     assert "SILENT for 8 s, 123456 lines, clock 90 MHz, UTC known to 1.2 us" in words
     assert "uploads: ValueError: \\x1b[31m (3 times)" in words
     assert ["rate", "33.3", "kHz", "33.3", "kHz"] in [line.split() for line in lines]
+
+
+class PassingClient:
+    """Answers, is away, answers; then Ctrl-C is pressed."""
+
+    def __init__(self, _: object) -> None:
+        self.answers = [status(State.ARMED), status(State.ARMED), None, status(State.RECORDING)]
+
+    def status(self) -> Status:
+        if not self.answers:
+            raise KeyboardInterrupt
+        answer = self.answers.pop(0)
+        if answer is None:
+            raise NoDaemonError("no daemon listens")
+        return answer
+
+
+def test_status_is_watched_until_ctrl_c_and_a_daemon_that_goes_is_missed(
+    cli: Cli, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("acquire.cli.watch.Client", PassingClient)
+    answer = cli("status", "--watch", "--every", "0.1")
+    assert answer.code == EXIT_INTERRUPTED
+    told = [line.partition(" ")[2] for line in answer.out.splitlines()]
+    assert [line.partition(",")[0] for line in told] == ["armed", "armed", "no daemon listens", "recording"]
+    lines = cli("status", "--watch", "--every", "100ms", "--json").out.splitlines()
+    assert [json.loads(line).get("state") for line in lines] == ["armed", "armed", None, "recording"]
+    assert json.loads(lines[2])["error"]["error"] == "NoDaemonError"

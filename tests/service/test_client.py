@@ -9,6 +9,10 @@ from pathlib import Path
 import pytest
 from live_daemon import Daemon
 
+from acquire.cli.status_page import status_lines
+from acquire.client import Client
+from acquire.daemon.glance import status_document
+
 DOCUMENT = Path(__file__).parents[2] / "acquire/client/SCRIPTING.md"
 
 
@@ -28,3 +32,16 @@ def test_the_example_arms_records_marks_cuts_and_reconstructs(
     assert re.search(r"armed|arm:", said)
     assert "the valve opens" in said
     assert "sealed: " in said
+
+
+def test_the_quick_status_is_the_client_s(tmp_path: Path) -> None:
+    """What `acquire status` shows without the models is what they show."""
+    with contextlib.closing(Daemon(tmp_path, "stream.ring_slots=64")) as daemon:
+        quick = status_document(daemon.socket)
+        full = Client(daemon.socket).status().model_dump(mode="json")
+    changing = ("uptime_s", "disk")
+    assert quick.keys() == full.keys()
+    assert {key: quick[key] for key in quick if key not in changing} == {
+        key: full[key] for key in full if key not in changing
+    }
+    assert status_lines(quick)[0] == status_lines(full)[0]
