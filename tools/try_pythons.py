@@ -91,11 +91,11 @@ def try_python(python: Python, made: Packages, tally: Tally) -> None:
             place = Path(home) / "env"
             try:
                 _make_environment(python, place)
-                _install(f"{name}, {stage}: install the wheel", place, f"{made.wheel}{extra}", tally)
+                install(f"{name}, {stage}: install the wheel", place, f"{made.wheel}{extra}", tally)
                 _smoke(f"{name}, {stage}", place, steps, tally)
                 if extra:
                     words = ("--no-deps", "--force-reinstall")
-                    _install(f"{name}, source: install", place, str(made.sdist), tally, *words)
+                    install(f"{name}, source: install", place, str(made.sdist), tally, *words)
                     _smoke(f"{name}, source", place, CORE, tally)
             except TrialError as broken:
                 tally.say(f"{name}, {stage}", str(broken), good=False)
@@ -105,7 +105,7 @@ def _make_environment(python: Python, place: Path) -> None:
     _call([python.program, "-m", "venv", str(place)], "no environment can be made")
 
 
-def _install(name: str, place: Path, what: str, tally: Tally, *options: str) -> None:
+def install(name: str, place: Path, what: str, tally: Tally, *options: str) -> None:
     """With the versions that are known to go together; if they do not here, with those that pip finds."""
     words = [str(place / "bin/python"), "-m", "pip", "install", "-q", "--disable-pip-version-check", *options]
     begun = time.monotonic()

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+from packed import install
 
 import acquire
 from tools import release, try_pythons
@@ -121,3 +122,24 @@ def test_what_fails_on_one_python_does_not_keep_another_from_being_tried(
     assert tally.failed == ["packages", "no-such-python"]
     assert tried == [sys.executable]
     assert "✗ packages: the wheel lacks a wing" in capsys.readouterr().out
+
+
+def test_constraints_that_do_not_suit_a_python_are_said_and_done_without(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By the pip of here, which installs aside and asks no index."""
+    install(ROOT / "tests/plugins/lab_extras", tmp_path / "first", tmp_path / "wheels")
+    (wheel,) = (tmp_path / "wheels").glob("*.whl")
+    (tmp_path / "env/bin").mkdir(parents=True)
+    python = tmp_path / "env/bin/python"
+    python.write_text(f'#!/bin/sh\nexec {sys.executable} "$@"\n')
+    python.chmod(0o755)
+    constraints = tmp_path / "constraints.txt"
+    constraints.write_text("lab-extras==99\n")
+    monkeypatch.setattr(try_pythons, "CONSTRAINTS", constraints)
+    tally, options = Tally(), ("--no-index", "--no-deps", "--no-compile", "--target", str(tmp_path / "site"))
+    try_pythons.install("lab", tmp_path / "env", str(wheel), tally, *options)
+    assert "✓ lab: without the constraints, which do not suit it: ERROR: " in capsys.readouterr().out
+    assert (tmp_path / "site/lab_extras.py").exists()
+    with pytest.raises(TrialError, match=r"with the constraints and without: ended with 1\n.*"):
+        try_pythons.install("lab", tmp_path / "env", str(tmp_path / "none.whl"), tally, *options)
