@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw, ImageFont, ImageSequence
 
 from acquire.errors import UsageError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -56,6 +58,15 @@ def write_webp(path: Path, pictures: list[Image.Image], duration_ms: int = FRAME
         method=2,
         minimize_size=False,
     )
+
+
+def stills(path: Path) -> Iterator[bytes]:
+    """The frames of an animation, each a WebP picture of its own: a player can stop at any."""
+    with Image.open(path) as pictures:
+        for picture in ImageSequence.Iterator(pictures):
+            file = BytesIO()
+            picture.convert("RGB").save(file, "WEBP", quality=75, method=2)
+            yield file.getvalue()
 
 
 def draw_frame(result: DemoResult, frame: int) -> Image.Image:

@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 from typing import TYPE_CHECKING, Any
 
 import jinja2
 
+from acquire.cores import usable_cores
 from acquire.errors import UsageError
 from acquire.evaluate import animation
 from acquire.evaluate.result import (
@@ -67,6 +69,7 @@ def write_report(result: DemoResult, directory: Path) -> Path:
     step = animation.save_animation(result, pictures["animation"])
     summary = summarise(result)
     summary["animation"] = _animation_facts(result, step)
+    summary["host"] = {"cores": usable_cores(), "load": round(os.getloadavg()[0], 1)}
     (directory / SUMMARY).write_text(json.dumps(summary, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     page = directory / PAGE
     page.write_text(render_page(summary, pictures), encoding="utf-8")
@@ -75,7 +78,12 @@ def write_report(result: DemoResult, directory: Path) -> Path:
 
 def render_page(summary: dict[str, Any], pictures: dict[str, Path]) -> str:
     """The page as text: ``summary`` and the pictures (name -> PNG or WebP file), which it takes in."""
-    return fill_template("report.html.j2", summary, pictures)
+    stills = {name: path for name, path in pictures.items() if name != "animation"}
+    frames = {
+        "animation_frames": [picture_uri(each) for each in animation.stills(pictures["animation"])],
+        "frame_shown_ms": animation.FRAME_DURATION_MS,
+    }
+    return fill_template("report.html.j2", summary | frames, stills)
 
 
 def fill_template(template: str, facts: dict[str, Any], pictures: dict[str, Path]) -> str:
@@ -96,6 +104,11 @@ def data_uri(path: Path) -> str:
     """The file as a ``data:`` URI; its suffix tells the media type."""
     content = base64.b64encode(path.read_bytes()).decode("ascii")
     return f"data:{MEDIA_TYPES[path.suffix]};base64,{content}"
+
+
+def picture_uri(webp: bytes) -> str:
+    """A WebP picture as a ``data:`` URI."""
+    return f"data:{MEDIA_TYPES['.webp']};base64,{base64.b64encode(webp).decode('ascii')}"
 
 
 def number(value: float | None, digits: int | None = None, *, signed: bool = False) -> str:
