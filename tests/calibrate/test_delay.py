@@ -13,8 +13,8 @@ from acquire.calibrate.calibration import Calibration, Finding
 from acquire.calibrate.delay import beyond
 from acquire.calibrate.delay_sweep import FIRST_LINES, delay, first_sight, lines_for, point_of, setting_of
 from acquire.calibrate.exposure import Exposure, open_exposure
-from acquire.config.scene import LedSceneConfig
 from acquire.errors import UsageError
+from acquire.sim.leds import LedSceneConfig
 
 HZ = 90_000_000
 TICKS = 120
