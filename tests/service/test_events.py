@@ -34,7 +34,7 @@ def serving(home: Path, **settings: object) -> Iterator[Service]:
     )
     config = load_rig(path, {**SETTINGS, **settings})
     with Rig(config) as rig:
-        service = Service(config, lambda: Run(config, rig))
+        service = Service(config, lambda _: Run(config, rig))
         try:
             yield service
         finally:

@@ -37,7 +37,7 @@ class Instrument:
 
     def __init__(self, home: Path, server: PageServer) -> None:
         self.run, self.server = FakeRun(), server
-        self.service = Service(rig_config(home), lambda: self.run)
+        self.service = Service(rig_config(home), lambda _: self.run)
         self._stack = contextlib.ExitStack()
         self.disk(seconds_to_full=1e6)
         socket = home / "c.sock"
@@ -62,7 +62,7 @@ class Instrument:
         class Disk:
             status = left
 
-            def look(self, *, recording: bool) -> None: ...
+            def check(self, *, recording: bool) -> None: ...
             def close(self) -> None: ...
 
         self.service._disk = Disk()  # type: ignore[assignment]
