@@ -1,8 +1,8 @@
 """The figures of the report, after Fig. 9 of the paper: line streams, frames, curves, error over time.
 
 Each function makes one matplotlib ``Figure`` from a :class:`~acquire.evaluate.result.DemoResult`, without
-pyplot and its global state; :func:`save_figures` writes all of them as PNG. This is the only module that
-imports matplotlib, so that no command pays for it which draws nothing.
+pyplot and its global state; :func:`save_figures` writes all of them as PNG, and curves as SVG, too. This and
+`themed` are imported late, so that no command pays for matplotlib which draws nothing.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
 from acquire.evaluate.curves import region_mean
+from acquire.evaluate.themed import save_drawing
 from acquire.lines import ARMS
 
 if TYPE_CHECKING:
@@ -35,7 +36,8 @@ DETAIL_SHARE = 0.1
 ERROR_SHARE = 0.5
 """The error's scale ends at this share of the peak."""
 
-INK = "#1f2933"
+DRAWINGS = ("curves", "psnr")
+INK, EDGE, GRID = "#1f2933", "#7b8794", "#e4e7eb"
 THEORY = "#9aa5b1"
 HIGHLIGHT = "#f0b429"
 MASKED = "#d55e00"
@@ -48,12 +50,12 @@ STYLE: Any = {
     "axes.titlelocation": "left",
     "axes.titleweight": "bold",
     "axes.labelcolor": INK,
-    "axes.edgecolor": "#7b8794",
+    "axes.edgecolor": EDGE,
     "axes.linewidth": 0.7,
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
-    "grid.color": "#e4e7eb",
+    "grid.color": GRID,
     "grid.linewidth": 0.6,
     "axes.axisbelow": True,
     "text.color": INK,
@@ -68,10 +70,21 @@ STYLE: Any = {
 }
 
 
+DARK = {
+    INK: "#e4e9ef",
+    EDGE: "#8592a0",
+    GRID: "#303a46",
+    THEORY: "#6b7785",
+    SOLVER_COLOURS[0]: "#4aa8e0",
+    SOLVER_COLOURS[1]: "#f0894a",
+}
+"""Colours of curves → those of a dark page."""
+
+
 def save_figures(result: DemoResult, directory: Path) -> dict[str, Path]:
     """Write ``lines.png``, ``frames.png``, ``curves.png`` and ``psnr.png``; returns name -> path.
 
-    Without regions there are no curves.
+    Curves are written as SVG, too, and these are returned. Without regions there are no curves.
     """
     makers = {"lines": line_streams, "frames": frames, "curves": intensity_curves, "psnr": psnr_over_time}
     if not result.regions:
@@ -79,7 +92,11 @@ def save_figures(result: DemoResult, directory: Path) -> dict[str, Path]:
     paths = {name: directory / f"{name}.png" for name in makers}
     with mpl.rc_context(STYLE):
         for name, make in makers.items():
-            make(result).savefig(paths[name], dpi=DPI)
+            figure = make(result)
+            figure.savefig(paths[name], dpi=DPI)
+            if name in DRAWINGS:
+                paths[name] = directory / f"{name}.svg"
+                save_drawing(figure, paths[name], DARK)
     return paths
 
 

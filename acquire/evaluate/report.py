@@ -48,7 +48,7 @@ __all__ = [
 PAGE = "index.html"
 SUMMARY = "summary.json"
 ANIMATION = "animation.webp"
-MEDIA_TYPES = {".png": "image/png", ".webp": "image/webp"}
+MEDIA_TYPES = {".png": "image/png", ".svg": "image/svg+xml", ".webp": "image/webp"}
 NARROW_SPACE = "\N{NARROW NO-BREAK SPACE}"
 MINUS = "\N{MINUS SIGN}"
 

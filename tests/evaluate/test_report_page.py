@@ -130,7 +130,8 @@ def test_pictures_have_a_text_and_are_those_beside_the_page(directory, page: Pag
     assert all(text and len(text) > 20 for text in texts)
     names = {path.name for path in directory.iterdir()}
     assert names == {
-        "index.html", "summary.json", "lines.png", "frames.png", "curves.png", "psnr.png", "animation.webp"
+        "index.html", "summary.json", "animation.webp",
+        "lines.png", "frames.png", "curves.png", "psnr.png", "curves.svg", "psnr.svg",
     }  # fmt: skip
 
 
