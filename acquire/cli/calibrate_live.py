@@ -6,8 +6,8 @@ import sys
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from acquire.cli.output import note
-from acquire.errors import StateError, UsageError
+from acquire.cli.output import note, print_warning
+from acquire.errors import DataError, StateError, UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 SEALED_S = 120.0
 """Longest wait for a recording to be sealed, beside the time that its lines take."""
+TRIES = 3
+MOST_LOST = 0.1
+"""Of a recording's lines: a calibration does without some."""
 
 
 @contextmanager
@@ -51,19 +54,34 @@ def record(
     code: LightCode = "rig",
     delays: TriggerDelays | None = None,
 ) -> Exposure:
-    """Arm with the light and the delays that are wanted, record ``NAME-1.zarr`` or the next free, disarm."""
+    """Arm with the light and the delays that are wanted, record ``NAME-1.zarr`` or the next free, disarm.
+
+    Again where lines were lost, which a busy host may do; DataError where they are each time.
+    """
     from acquire.calibrate.exposure import open_exposure
+    from acquire.store import open_recording
+
+    for _ in range(TRIES):
+        path = _recorded(daemon, free(directory, name), lines, code, delays)
+        made = open_recording(path)
+        missing = max(0, lines - made.lines) + sum(gap.count for gap in made.gaps)
+        if missing <= MOST_LOST * lines:
+            return open_exposure(path)
+        print_warning(f"{path} lacks {missing} of {lines} lines: once more")
+    raise DataError(f"{TRIES} recordings lacked lines", hint="acquire status, acquire bench")
+
+
+def _recorded(daemon: Client, path: Path, lines: int, code: LightCode, delays: TriggerDelays | None) -> Path:
     from acquire.client import SEALED
 
     if daemon.status().state == "armed":
         daemon.disarm()
     daemon.arm(code=code, calibration="none", delays=delays)
-    path = free(directory, name)
     status = daemon.start(path, lines=lines)
     rates = [arm.rate_hz for arm in status.arms.values() if arm.rate_hz > 0]
     daemon.wait(SEALED, timeout_s=SEALED_S + lines / min(rates, default=1000.0))
     daemon.disarm()
-    return open_exposure(path)
+    return path
 
 
 def free(directory: Path, name: str) -> Path:

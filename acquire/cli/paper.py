@@ -6,7 +6,7 @@ import shlex
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -15,6 +15,9 @@ from acquire.cli.output import JsonFlag, print_json, print_table, say
 from acquire.cli.places import new_directory
 from acquire.cli.progress import told
 from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from acquire.evaluate.paper import PaperFigure, Studio
 
 NAMES = ("fig6", "fig7", "fig8", "fig9", "fig10", "fig11")
 
@@ -35,15 +38,31 @@ def paper(
         typer.Option(parser=seconds, metavar="TIME", help="Wall time that each reconstruction may take."),
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of the exposure code.")] = 1,
+    recording: Annotated[
+        str | None,
+        typer.Option(
+            metavar="RECORDING",
+            help="A recording of Scene #1 by any instrument, for fig9; none is simulated.",
+        ),
+    ] = None,
+    first_line: Annotated[
+        int | None,
+        typer.Option(help="The trigger's number of that recording's line to begin with; else the first."),
+    ] = None,
     json: JsonFlag = False,
 ) -> None:
     """Record, reconstruct and draw figures of the paper, beside what it says of them.
+
+    With --recording, Fig. 9 from a recording of your own: four lamps in the quarters of the field, 5, 2.5 and
+    1 kHz and constant, recognised by their light; corrected by the calibration that the recording carries.
 
     Example: [bold]acquire paper fig9[/]
     """
     chosen = list(dict.fromkeys(figures or NAMES))
     if wrong := [name for name in chosen if name not in NAMES]:
         raise UsageError(f"figure {wrong[0]!r} is not known", possible=", ".join(NAMES))
+    if recording is not None:
+        chosen = _one_of_a_recording(figures)
     from acquire.cores import idle_cores, limit_blas
     from acquire.evaluate.paper import Studio, make
     from acquire.evaluate.paper.page import draw, summarise, write_page
@@ -55,11 +74,11 @@ def paper(
     with new_directory(out), told() as tell, limit_blas(idle_cores()):
         for name in chosen:
             studio = Studio(out, options, seed, lambda text, name=name: tell(f"{name}: {text}"))  # type: ignore[misc]
-            figure = make(name, studio)
+            figure = make(name, studio) if recording is None else _recorded(recording, studio, first_line)
             pictures |= draw(figure, out)
             made.append(summarise(figure))
             page = write_page(
-                made, pictures, studio, f"acquire {shlex.join(sys.argv[1:])}", datetime.now(UTC)
+                made, pictures, studio, f"acquire {shlex.join(sys.argv[1:])}", datetime.now(UTC), recording
             )
     if json:
         print_json({"page": str(page), "figures": made})
@@ -69,3 +88,20 @@ def paper(
         print_table(("", "the paper", "here"), [tuple(row.values()) for row in each["rows"]])
         say()
     say(f"page  {page}")
+
+
+def _one_of_a_recording(figures: list[str] | None) -> list[str]:
+    if figures not in (None, [], ["fig9"]):
+        raise UsageError(f"{', '.join(figures)} from a recording", possible="fig9")
+    return ["fig9"]
+
+
+def _recorded(place: str, studio: Studio, first_line: int | None) -> PaperFigure:
+    import matplotlib as mpl
+
+    from acquire.evaluate.figures import STYLE
+    from acquire.evaluate.paper.fig9_recorded import figure_of
+    from acquire.store import open_recording
+
+    with mpl.rc_context(STYLE):
+        return figure_of(open_recording(place), studio, first_line)

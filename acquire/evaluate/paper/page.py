@@ -61,12 +61,14 @@ def write_page(
     studio: Studio,
     command: str,
     when: datetime,
+    recording: str | None = None,
 ) -> Path:
     """Write ``index.html`` and ``summary.json`` of summarised figures into the studio's directory."""
     facts = {
         "when": when.isoformat(timespec="seconds"),
         "command": command,
-        "seed": studio.seed,
+        "seed": None if recording is not None else studio.seed,
+        "recording": recording,
         "solver": studio.options.solver,
         "preset": studio.options.preset,
         "budget_s": studio.options.budget_s,
