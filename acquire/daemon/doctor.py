@@ -21,6 +21,7 @@ import numpy as np
 from acquire import __version__
 from acquire.cores import usable_cores
 from acquire.lines import ARMS
+from acquire.plugins import GROUPS, OURS
 from acquire.processes.shared import available_bytes
 
 if TYPE_CHECKING:
@@ -59,6 +60,7 @@ def examine(rig: RigConfig | None, running: str | None) -> Iterator[Finding]:
     """
     yield _python()
     yield _foreign_package()
+    yield _plugins()
     yield _descriptors()
     yield _processors()
     yield _governor()
@@ -90,6 +92,17 @@ def _foreign_package() -> Finding:
         f"{', '.join(others)} installs a package `acquire`, too: the one hides the other",
         f"pip uninstall {' '.join(others)}, and install tdi-acquire anew; or an environment for each",
     )
+
+
+def _plugins() -> Finding:
+    """Those of other distributions; ours are as whole as the installation."""
+    others = [(group, each) for group in GROUPS for each in group.found() if each.distribution != OURS]
+    broken = [f"{group.what} {each.name} of {each.origin}" for group, each in others if group.trouble(each)]
+    if broken:
+        text = f"cannot be used: {', '.join(broken)}"
+        return Finding("plug-ins", "warning", text, "acquire plugins, which says why")
+    text = f"{len(others)} of other distributions, all work" if others else "no other distribution brings any"
+    return Finding("plug-ins", "good", text)
 
 
 def _descriptors() -> Finding:

@@ -103,6 +103,12 @@ def test_what_is_there_is_listed_with_whose_it_is_and_what_is_broken_with_its_er
     assert sum(row["distribution"] == "tdi-acquire" for row in rows) >= 45
 
 
+def test_the_doctor_names_those_that_are_broken(acquire: Run) -> None:
+    told = next(each for each in json.loads(acquire("doctor", "--json").stdout) if each["name"] == "plug-ins")
+    assert (told["level"], "effect haze of lab-broken 0.1" in told["text"]) == ("warning", True)
+    assert "lab-extras" not in told["text"]
+
+
 def test_its_scene_with_its_effect_is_simulated_and_solved_by_its_solver(
     acquire: Run, tmp_path: Path
 ) -> None:
