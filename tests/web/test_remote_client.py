@@ -51,7 +51,7 @@ def certificate(directory: Path) -> tuple[Path, Path]:
 @pytest.fixture
 def page(tmp_path: Path) -> Iterator[PageServer]:
     crt, key = certificate(tmp_path)
-    service, socket = Service(rig_config(tmp_path), FakeRun), tmp_path / "c.sock"
+    service, socket = Service(rig_config(tmp_path), lambda _: FakeRun()), tmp_path / "c.sock"
     with (
         contextlib.closing(Endpoint(socket)) as endpoint,
         api(service, endpoint),
