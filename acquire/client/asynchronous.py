@@ -26,6 +26,7 @@ PATIENCE_S = 30.0
 RETRY_S = 0.1
 COMMAND_S = 600.0
 """For the answer to a command: whoever waits for less cancels the call."""
+_LEAVE_S = 1.0
 _READ_BYTES = 65536
 
 T = TypeVar("T", bound=BaseModel)
@@ -217,7 +218,7 @@ class AsyncClient:
         except (OSError, h11.RemoteProtocolError) as error:
             raise NoDaemonError(f"the daemon on {self._target} went away") from error
         finally:
-            writer.close()
+            await _close(writer)
 
     async def _connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
         target = self._target
@@ -231,3 +232,13 @@ class AsyncClient:
                 return await asyncio.open_connection(target.host, target.port, ssl=context)
         except OSError as error:
             raise NoDaemonError(f"nobody answers on {target} ({error})", hint="acquire web") from error
+
+
+async def _close(writer: asyncio.StreamWriter) -> None:
+    """Close a connection; TLS takes leave first, and who does not answer that is not waited for."""
+    writer.close()
+    try:
+        async with asyncio.timeout(_LEAVE_S):
+            await writer.wait_closed()
+    except (OSError, TimeoutError):
+        writer.transport.abort()

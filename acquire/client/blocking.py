@@ -285,8 +285,10 @@ class Client:
             try:
                 return connect(path, core.CONNECT_TIMEOUT_S)
             except NoDaemonError:
-                if time.monotonic() > deadline or not is_one_starting(path):
+                if time.monotonic() > deadline:
                     raise
+                if not is_one_starting(path):  # or it listens by now, and does not start any more
+                    return connect(path, core.CONNECT_TIMEOUT_S)
             self._tell(f"waiting for a daemon on {path}: one is starting")
             time.sleep(POLL_S)
 
