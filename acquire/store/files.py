@@ -207,12 +207,20 @@ class Disk:
         _sync(path, os.O_DIRECTORY)
 
     def sync_tree(self, path: Path) -> None:
-        """Force every file and directory below ``path``, and ``path`` itself, to the medium."""
+        """Force every file and directory below ``path``, and ``path`` itself, to the medium.
+
+        What somebody else removes meanwhile, as a copier its hold, is not there to be forced.
+        """
         for directory, files in _walk(path):
             for file in files:
-                if kind_of(file.lstat().st_mode) is None:
-                    _sync(file)
-            self.sync_directory(directory)
+                with suppress(FileNotFoundError):
+                    if kind_of(file.lstat().st_mode) is None:
+                        _sync(file)
+            try:
+                self.sync_directory(directory)
+            except FileNotFoundError:
+                if directory == path:
+                    raise
 
     def free_bytes(self, path: Path) -> int:
         """What the file system of ``path`` can still take from us."""

@@ -22,6 +22,7 @@ from acquire.store import (
     RecordingWriter,
     RunCondition,
     choose_codec,
+    files,
     measure_disk,
     open_recording,
     recover,
@@ -311,3 +312,23 @@ def test_a_kill_while_the_disk_is_measured_leaves_nothing(tmp_path, monkeypatch,
 def test_a_disk_that_is_gone_while_measured_is_told(tmp_path):
     with pytest.raises(OSError, match=os.strerror(errno.ENOENT)):
         measure_disk(tmp_path / "gone")
+
+
+def test_what_somebody_else_removes_meanwhile_need_not_be_forced(tmp_path, monkeypatch):
+    """As a copier its hold, which it replaces, while the recording is sealed."""
+    (tmp_path / "holds").mkdir()
+    names = [tmp_path / "chunk", tmp_path / "holds" / "a", tmp_path / "holds" / "b"]
+    for name in names:
+        name.write_bytes(b"x")
+    forced, really = [], files._sync
+
+    def sync(path, flags=0):
+        forced.append(path)
+        if path.name in "ab":
+            for other in (names[1], names[2]):
+                other.unlink(missing_ok=True)
+        really(path, flags)
+
+    monkeypatch.setattr(files, "_sync", sync)
+    files.DISK.sync_tree(tmp_path)
+    assert {tmp_path / "chunk", tmp_path / "holds", tmp_path} <= set(forced)
