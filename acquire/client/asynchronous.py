@@ -139,6 +139,7 @@ class AsyncClient:
 
         Raises NoDaemonError when it breaks, or gives no sign of life for `core.SILENT_S`.
         """
+        reader.begin()
         path = core.events_path(self._target, history=history, status_s=status_s)
         async with contextlib.aclosing(
             self._exchange(

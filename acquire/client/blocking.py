@@ -222,6 +222,7 @@ class Client:
 
     def _follow(self, reader: EventReader, *, history: bool, end_s: float | None) -> Iterator[News | Status]:
         """One connection's worth of news. Raises NoDaemonError when it breaks."""
+        reader.begin()
         with self._connection(core.SILENT_S) as connection:
             path = core.events_path(self._target, history=history, status_s=None)
             headers = core.events_headers(self._target, reader.last_id)

@@ -186,12 +186,18 @@ def events_headers(target: Target, last_id: str | None) -> dict[str, str]:
 
 
 class EventReader:
-    """Lines of the stream in, `News` and `Status` out; keeps the id to go on with."""
+    """Lines of the stream in, `News` and `Status` out; keeps the id to go on with.
+
+    It outlives the connection: `begin` each one, so that what the last broke off in is not read on with.
+    """
 
     def __init__(self, last_id: str | None = None) -> None:
         self.last_id = last_id
-        self._event = ""
-        self._data = ""
+        self.begin()
+
+    def begin(self) -> None:
+        """A connection begins: half an event that an earlier one ended with is told again, whole."""
+        self._event = self._data = ""
 
     def take(self, line: str) -> Iterator[News | Status]:
         """The next line, without its end; what is complete with it."""
@@ -202,8 +208,9 @@ class EventReader:
         elif name == "data":
             self._data += value
         elif not line and self._data:
-            yield from self._told(self._event, self._data)
-            self._event = self._data = ""
+            event, data = self._event, self._data
+            self.begin()
+            yield from self._told(event, data)
 
     def _told(self, event: str, data: str) -> Iterable[News | Status]:
         try:

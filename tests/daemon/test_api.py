@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import inspect
+import socket
 import threading
 import time
+from datetime import UTC, datetime
 from pathlib import Path
 
 import httpx
@@ -20,7 +22,7 @@ from acquire.daemon import stream
 from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.facts import API_VERSION
 from acquire.daemon.service import Service
-from acquire.errors import NoDaemonError, StateError, UsageError
+from acquire.errors import AcquireError, NoDaemonError, StateError, UsageError
 
 
 def raw_client(path: Path) -> httpx.Client:
@@ -161,6 +163,51 @@ def test_a_status_comes_with_the_news_and_by_itself(path: Path, daemon: Client) 
         while "News" not in kinds:
             kinds += [type(one).__name__ for one in reader.take(next(lines))]
     assert kinds[:3] == ["Status"] * 3
+
+
+def _breaking_off(path: Path, ends: list[bytes]) -> threading.Thread:
+    """A daemon that answers each connection with one of ``ends`` of a stream of events, and hangs up."""
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(str(path))
+    listener.listen()
+    listener.settimeout(60)
+
+    def serve() -> None:
+        with listener:
+            for end in ends:
+                with listener.accept()[0] as connection:
+                    connection.recv(1 << 16)
+                    head = b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\nConnection: close\r\n\r\n"
+                    connection.sendall(head + end)
+
+    server = threading.Thread(target=serve)
+    server.start()
+    return server
+
+
+@pytest.mark.parametrize("kind", ["blocking", "asynchronous"])
+@pytest.mark.parametrize("cut", [20, -30, -1])
+def test_half_an_event_is_forgotten_with_its_connection(tmp_path: Path, kind: str, cut: int) -> None:
+    """It comes again, whole; read on with the rest of the old one, it would never be understood."""
+    news = News(id="a-1", time=datetime.now(UTC), kind="mark", text="drop", state=State.ARMED)
+    whole = f"event: news\nid: a-1\ndata: {news.model_dump_json()}\n\n".encode()
+    path = tmp_path / "sock"
+    server = _breaking_off(path, [whole[:cut], whole])
+
+    async def first() -> News:
+        async with AsyncClient(path) as client:
+            return await anext(aiter(client.events()))
+
+    assert (asyncio.run(first()) if kind == "asynchronous" else next(Client(path).events())) == news
+    server.join(60)
+
+
+def test_an_event_of_another_version_is_told_once() -> None:
+    reader = core.EventReader()
+    lines = ["event: news", "data: {}", ""]
+    with pytest.raises(AcquireError, match="another version"):
+        [one for line in lines for one in reader.take(line)]
+    assert not [one for line in ["event: later", "data: {}", ""] for one in reader.take(line)]
 
 
 def test_streams_are_bounded_and_end_with_their_clients(
