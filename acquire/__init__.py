@@ -9,7 +9,7 @@ The way of the data is one direction::
 The layers, top to bottom; imports point downwards only (checked by the tests)::
 
     cli           testing            commands: one file per group · suites for everybody's variants
-    web                              the operator's page, a process of its own
+    web           bluesky            the operator's page, a process of its own · the recorder in plans
     client                           the service from a script, blocking or awaited
     daemon        evaluate           the capture service · metrics, report
     rig           reconstruct        config -> devices · recording -> video
@@ -20,7 +20,8 @@ The layers, top to bottom; imports point downwards only (checked by the tests)::
     store  camera  trigger           recording format · device protocols
     pattern                          lines that follow from their numbers alone
     config  lines  processes         what a rig is · what travels from camera to disk · children
-    codes  geometry  clock           the code, the shear, the time: plain arithmetic
+    fibre                            where the bands of a larger scene lie on the sensors
+    codes  geometry  clock  flags    the code, the shear, the time: plain arithmetic · words for lines
     arrays  cores                    whose arrays are computed with, and on how many cores
     plugins                          classes that entry points name, ours and others'
     logs  reading  showing           one line per entry · files that anybody may have put there · reprs
@@ -34,8 +35,9 @@ spatio-temporal imaging capable of flexible voxels post-interpretation".
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from acquire.lazy import lazily
 
 if TYPE_CHECKING:
     from acquire.client import Client
@@ -54,12 +56,4 @@ _HOMES = {
 }
 """What is asked for first, and its package: imported when asked for, since each brings its libraries."""
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+__getattr__, __dir__ = lazily(__name__, _HOMES, __all__)

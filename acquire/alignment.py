@@ -34,7 +34,7 @@ class Alignment:
     def __post_init__(self) -> None:
         values = (self.rows, self.columns, self.turn_deg, self.magnification)
         if not all(map(math.isfinite, values)):
-            raise UsageError(f"alignment {self}", possible="finite numbers")
+            raise UsageError(f"the alignment is impossible: {self}", possible="finite numbers")
         near = max(abs(self.rows), abs(self.columns)) <= LARGEST_SHIFT_PIXELS
         low = 1 / LARGEST_MAGNIFICATION
         if not (
@@ -43,7 +43,7 @@ class Alignment:
             and low <= self.magnification <= LARGEST_MAGNIFICATION
         ):
             raise UsageError(
-                f"alignment {self}",
+                f"the alignment is impossible: {self}",
                 possible=f"shifts up to {LARGEST_SHIFT_PIXELS:g} fine pixels, turns up to "
                 f"{LARGEST_TURN_DEG:g} degrees, magnification {low:g} to {LARGEST_MAGNIFICATION:g}",
             )

@@ -88,13 +88,15 @@ def _cupy() -> tuple[Any, Any]:
         from array_api_compat import cupy as xp
     except ImportError as error:
         raise UsageError(
-            f"device 'gpu' without CuPy ({error})", possible="cpu", hint="pip install 'tdi-acquire[gpu]'"
+            f"device 'gpu' needs CuPy, which cannot be imported ({error})",
+            possible="cpu",
+            hint="pip install 'tdi-acquire[gpu]'",
         ) from error
     try:
         return xp, cupy.cuda.Device()  # the one in use; asks the driver
     except cupy.cuda.runtime.CUDARuntimeError as error:
         raise UsageError(
-            f"device 'gpu': {error}", possible="cpu", hint="nvidia-smi shows what CUDA sees"
+            f"device 'gpu' does not work: {error}", possible="cpu", hint="nvidia-smi shows what CUDA sees"
         ) from error
 
 

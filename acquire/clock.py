@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    import numpy as np
     from numpy.typing import NDArray
 
 NS_PER_S = 1_000_000_000
@@ -28,9 +27,16 @@ class ClockFit:
 
     def time_ns(self, tick: NDArray[np.uint64]) -> NDArray[np.int64]:
         """UTC in ns since 1970 (int64) of ticks (any shape), rounded down; exact integer arithmetic."""
-        seconds, rest = np.divmod(tick.astype(np.int64), self.clock_hz)
-        time_ns: NDArray[np.int64] = seconds * NS_PER_S + rest * NS_PER_S // self.clock_hz
-        return time_ns + self.utc_ns_at_tick_0
+        time_ns: NDArray[np.int64] = self._utc_ns(tick.astype("int64"))
+        return time_ns
+
+    def instant_ns(self, tick: int) -> int:
+        """The same of one tick, however large."""
+        return int(self._utc_ns(tick))
+
+    def _utc_ns(self, tick: Any) -> Any:
+        seconds, rest = divmod(tick, self.clock_hz)
+        return seconds * NS_PER_S + rest * NS_PER_S // self.clock_hz + self.utc_ns_at_tick_0
 
     def to_attrs(self) -> dict[str, Any]:
         return asdict(self)

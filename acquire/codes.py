@@ -7,6 +7,8 @@ The pseudo-random code is a maximal-length Galois register that shifts right, as
 Its output obeys  o_k = ⊕_{tap} o_{k - tap}, hence also  o_k = ⊕ o_{k - 2^m·tap}  (squaring is linear in
 GF(2)). The first gives the jump to any index by one power of x modulo the characteristic polynomial,
 the second lets numpy generate blocks that double in length.
+
+numpy is imported by what computes bits: what a recording says of its code is read without.
 """
 
 from __future__ import annotations
@@ -14,13 +16,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal, Protocol
 
-import numpy as np
-
 from acquire.errors import UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+    import numpy as np
     from numpy.typing import NDArray
 
 TAPS: dict[int, tuple[int, ...]] = {
@@ -97,6 +98,8 @@ class PrbsCode:
         return cls(degree, mix_seed(seed, degree), seed)
 
     def bits(self, start: int, length: int) -> NDArray[np.uint8]:
+        import numpy as np
+
         dark = min(max(-start, 0), length)
         lit = prbs(self.degree, self.state, max(start, 0), length - dark)
         return np.concatenate([np.zeros(dark, np.uint8), lit])
@@ -122,9 +125,11 @@ class ConstantCode:
 
     def __post_init__(self) -> None:
         if self.value not in (0, 1):
-            raise UsageError(f"constant code {self.value!r}", possible="0 or 1")
+            raise UsageError(f"a constant code cannot be {self.value!r}", possible="0 or 1")
 
     def bits(self, start: int, length: int) -> NDArray[np.uint8]:
+        import numpy as np
+
         index = np.arange(start, start + length)
         return np.where(index < 0, 0, self.value).astype(np.uint8)
 
@@ -147,16 +152,22 @@ class ListedCode:
     def __post_init__(self) -> None:
         possible = f"1 to {MOST_LISTED_BITS} bits, four in each hexadecimal digit"
         if not 1 <= self.length <= MOST_LISTED_BITS or len(self.digits) != -(-self.length // 8) * 2:
-            raise UsageError(f"code of {self.length} bits in {len(self.digits)} digits", possible=possible)
+            raise UsageError(
+                f"a code of {self.length} bits cannot have {len(self.digits)} digits", possible=possible
+            )
         if set(self.digits) - set("0123456789abcdef"):
-            raise UsageError("code with digits that are not hexadecimal", possible=possible)
+            raise UsageError("the code has digits that are not hexadecimal", possible=possible)
 
     @classmethod
     def of(cls, bits: NDArray[np.uint8], *, repeats: bool = False) -> ListedCode:
         """The code whose bits, 0 or 1, are given one by one."""
+        import numpy as np
+
         return cls(np.packbits(bits).tobytes().hex(), len(bits), repeats)
 
     def bits(self, start: int, length: int) -> NDArray[np.uint8]:
+        import numpy as np
+
         listed = np.unpackbits(np.frombuffer(bytes.fromhex(self.digits), np.uint8), count=self.length)
         index = np.arange(start, start + length)
         inside = (index >= 0) & (self.repeats | (index < self.length))
@@ -179,7 +190,8 @@ def code_from_attrs(attrs: Mapping[str, Any]) -> Code:
         degree = int(attrs["degree"])
         if tuple(attrs["taps"]) != TAPS.get(degree):
             raise UsageError(
-                f"prbs code of degree {degree} with taps {attrs['taps']}", possible=f"taps {TAPS.get(degree)}"
+                f"a prbs code of degree {degree} cannot have the taps {attrs['taps']}",
+                possible=f"taps {TAPS.get(degree)}",
             )
         seed = attrs.get("seed") if "state" in attrs else None
         return PrbsCode(degree, register_state(attrs), None if seed is None else int(seed))
@@ -187,7 +199,7 @@ def code_from_attrs(attrs: Mapping[str, Any]) -> Code:
         return ConstantCode(int(attrs["value"]))
     if kind == "bits":
         return ListedCode(str(attrs["bits"]), int(attrs["length"]), bool(attrs["repeats"]))
-    raise UsageError(f"code of kind {kind!r}", possible="'prbs', 'constant', 'bits'")
+    raise UsageError(f"there is no code of kind {kind!r}", possible="'prbs', 'constant', 'bits'")
 
 
 def register_state(attrs: Mapping[str, Any]) -> int:
@@ -202,7 +214,9 @@ def prbs(degree: int, state: int, start: int, length: int) -> NDArray[np.uint8]:
     """
     _check_register(degree, state)
     if start < 0 or length < 0:
-        raise UsageError(f"prbs start = {start}, length = {length}", possible="0 or more")
+        raise UsageError(
+            f"bits of a prbs code cannot have start = {start} and length = {length}", possible="0 or more"
+        )
     window = _window(degree, state, start)
     if length <= degree:
         return window[:length]
@@ -240,13 +254,18 @@ def mix_seed(number: int, degree: int) -> int:
 
 def _check_register(degree: int, state: int) -> None:
     if degree not in TAPS:
-        raise UsageError(f"prbs degree {degree}", possible=", ".join(map(str, TAPS)))
+        raise UsageError(f"there is no prbs code of degree {degree}", possible=", ".join(map(str, TAPS)))
     if not 0 < state < 1 << degree:
-        raise UsageError(f"prbs state {state:#x} of degree {degree}", possible=f"1 to {(1 << degree) - 1:#x}")
+        raise UsageError(
+            f"a prbs code of degree {degree} cannot have the state {state:#x}",
+            possible=f"1 to {(1 << degree) - 1:#x}",
+        )
 
 
 def _window(degree: int, state: int, start: int) -> NDArray[np.uint8]:
     """The ``degree`` output bits from index ``start``: o_{N+i} = Σ_j a_j·o_{j+i} with x^N ≡ Σ_j a_j·x^j."""
+    import numpy as np
+
     head = 0  # o_0 .. o_{2·degree - 1}, bit k = o_k
     mask = sum(1 << (tap - 1) for tap in TAPS[degree])
     for k in range(2 * degree):
@@ -275,6 +294,8 @@ def _reduce(value: int, poly: int, degree: int) -> int:
 
 def _extend(window: NDArray[np.uint8], taps: tuple[int, ...], length: int) -> NDArray[np.uint8]:
     """Continue ``window`` to ``length`` bits by blocks whose lag doubles whenever enough bits are known."""
+    import numpy as np
+
     out = np.empty(length, np.uint8)
     out[: len(window)] = window
     known, scale = len(window), 1

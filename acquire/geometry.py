@@ -35,7 +35,7 @@ class Geometry:
         for name in ("stages", "substeps", "lines"):
             value = getattr(self, name)
             if not is_integer(value) or value < 1:
-                raise UsageError(f"geometry: {name} = {value!r}", possible="an integer of at least 1")
+                raise UsageError(f"geometry: {name} cannot be {value!r}", possible="an integer of at least 1")
 
     @property
     def size(self) -> int:
@@ -110,12 +110,13 @@ class Geometry:
         """Raise UsageError unless they are integers with 1 ≤ N_m ≤ n and 1 ≤ T_m ≤ 2³¹ − 1."""
         if not is_integer(spatial_merge) or not 1 <= spatial_merge <= self.size:
             raise UsageError(
-                f"spatial merge N_m = {spatial_merge!r}",
+                f"the spatial merge N_m = {spatial_merge!r} is out of range",
                 possible=f"an integer, 1 to {self.size} (n = M·S of this segment)",
             )
         if not is_integer(temporal_merge) or not 1 <= temporal_merge <= MAX_TEMPORAL_MERGE:
             raise UsageError(
-                f"temporal merge T_m = {temporal_merge!r}", possible=f"an integer, 1 to {MAX_TEMPORAL_MERGE}"
+                f"the temporal merge T_m = {temporal_merge!r} is out of range",
+                possible=f"an integer, 1 to {MAX_TEMPORAL_MERGE}",
             )
 
 

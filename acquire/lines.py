@@ -3,40 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from enum import IntFlag
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from acquire.errors import UsageError
+from acquire.flags import ARMS, LineFlag
 from acquire.geometry import Geometry
 from acquire.showing import in_words
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from numpy.typing import NDArray
 
     from acquire.alignment import Alignment
+    from acquire.converter import ConverterCurve
     from acquire.noise import Noise
 
-ARMS = ("a", "b")
-"""Names of the two arms, in the order of the ``arm`` axis."""
-
-
-class LineFlag(IntFlag):
-    """What is known about one line beyond its pixels (CF ``flag_masks`` of the recording)."""
-
-    MISSING = 1
-    """Never arrived; the row is filled with 0."""
-    INCOMPLETE = 2
-    """The camera reported that part of the line is not valid."""
-    SATURATED = 4
-    """At least one pixel stands at the top of the range."""
-    TIME_ESTIMATED = 8
-    """No tag of the trigger confirmed tick and time; they are extrapolated."""
-    CODE_UNVERIFIED = 16
-    """No tag of the trigger confirmed the code index; it is extrapolated."""
-    CODE_CONTRADICTED = 32
-    """The arm's lines did not follow the code that they are tagged with (`acquire.stream.lightcheck`)."""
+__all__ = ["ARMS", "LineBlock", "LineFlag", "Segment", "TaggedBlock", "merged"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,9 +39,15 @@ class LineBlock:
 
     def __post_init__(self) -> None:
         if self.arm not in ARMS or self.first_line < 0:
-            raise UsageError(f"line block of arm {self.arm!r} from line {self.first_line}")
+            raise UsageError(
+                f"a line block cannot have arm {self.arm!r} and first line {self.first_line}",
+                possible=f"arm {' or '.join(ARMS)}, and line 0 or later",
+            )
         if self.pixels.ndim != 2 or self.flags.shape != self.pixels.shape[:1]:
-            raise UsageError(f"line block with pixels {self.pixels.shape} and flags {self.flags.shape}")
+            raise UsageError(
+                f"a line block cannot have pixels {self.pixels.shape} and flags {self.flags.shape}",
+                possible="pixels (lines, M) and flags (lines,)",
+            )
 
     def __len__(self) -> int:
         return len(self.flags)
@@ -103,8 +94,12 @@ class Segment:
     substep_ns : duration of a sub-step
     black_level_dn, responsivity_dn : DN = black level + responsivity · Y, with Y of Eq. (1);
         one number for both arms, one per arm, or one per arm and pixel (2, M)
+    curve : what makes the recorded DN those of a linear camera, of which black level, responsivity and noise
+        are then told; None: they are
     alignment : where arm B's image lies beside arm A's; None: on it
     noise : of the samples in DN; None: it is not known
+    balanced : the arms' shares of the light are in ``responsivity_dn``, as far as anybody knows them
+    first_column : of arms A and B, where on the sensor's columns these pixels begin; behind a fibre not at 0
     """
 
     lines: NDArray[Any]
@@ -116,28 +111,33 @@ class Segment:
     substep_ns: float = 1.0
     black_level_dn: float | tuple[float, float] | NDArray[np.float64] = 0.0
     responsivity_dn: float | tuple[float, float] | NDArray[np.float64] = 1.0
+    curve: ConverterCurve | None = None
     alignment: Alignment | None = None
     noise: Noise | None = None
+    balanced: bool = False
+    first_column: tuple[int, int] = (0, 0)
 
     def __post_init__(self) -> None:
         shape = self.geometry.lines_shape
         if self.lines.shape != shape or self.mask.shape != shape:
             raise UsageError(
-                f"segment with lines {self.lines.shape}, mask {self.mask.shape}", possible=f"{shape}"
+                f"a segment cannot have lines {self.lines.shape} and mask {self.mask.shape}",
+                possible=f"{shape}",
             )
         if self.code.shape != (self.geometry.span,):
             raise UsageError(
-                f"segment with {self.code.shape} code bits", possible=f"T = {self.geometry.span}"
+                f"a segment cannot have {self.code.shape} code bits", possible=f"T = {self.geometry.span}"
             )
         gains = np.asarray(self.responsivity_dn, np.float64)
         if not (np.isfinite(gains).all() and (gains > 0).all() and np.isfinite(self.black_level_dn).all()):
             raise UsageError(
-                f"segment with responsivity {self.responsivity_dn}, black level {self.black_level_dn} DN",
+                f"a segment cannot have responsivity {self.responsivity_dn} and black level "
+                f"{self.black_level_dn} DN",
                 possible="a responsivity above 0 and a black level, as the camera has them",
             )
         if self.time_ns.shape != (self.geometry.lines,):
             raise UsageError(
-                f"segment with {self.time_ns.shape} time stamps", possible=f"{self.geometry.lines}"
+                f"a segment cannot have {self.time_ns.shape} time stamps", possible=f"{self.geometry.lines}"
             )
 
     def __repr__(self) -> str:
@@ -154,7 +154,7 @@ class Segment:
     def samples(self, dtype: type[np.floating[Any]] = np.float32) -> NDArray[Any]:
         """Y of Eq. (1) (2, L_R, M): black level removed, in units of the scene; 0 where masked."""
         black, gain = (_beside_lines(value, dtype) for value in (self.black_level_dn, self.responsivity_dn))
-        scaled = (self.lines.astype(dtype) - black) / gain
+        scaled = (self._linear(dtype) - black) / gain
         return np.where(self.mask, scaled, dtype(0))
 
     def variance(self) -> NDArray[np.float64] | None:
@@ -163,8 +163,35 @@ class Segment:
             return None
         known = self.black_level_dn, self.responsivity_dn
         black, gain = (_beside_lines(value, np.float64) for value in known)
-        in_dn2 = self.noise.variance_dn2(self.lines.astype(np.float64) - black)
+        in_dn2 = self.noise.variance_dn2(self._linear(np.float64) - black)
         return np.asarray(in_dn2 / gain**2)
+
+    def _linear(self, dtype: type[np.floating[Any]]) -> NDArray[Any]:
+        """The lines in DN of a linear camera."""
+        dn = self.lines.astype(dtype)
+        return dn if self.curve is None else self.curve.straight(dn)
+
+    def mirrored(self, arm: int) -> Segment:
+        """With the pixels of one arm (0 or 1) in the other order, and all that is known of single columns."""
+        return self._of_arms(
+            lambda values: np.stack([each[..., ::-1] if i == arm else each for i, each in enumerate(values)])
+        )
+
+    def swapped(self) -> Segment:
+        """With the arms in each other's places, and all that is known of either."""
+        segment = self._of_arms(lambda values: values[::-1].copy(), per_arm=True)
+        noise, curve = self.noise and self.noise.swapped(), self.curve and self.curve.swapped()
+        return replace(segment, noise=noise, curve=curve)
+
+    def _of_arms(self, change: Callable[[NDArray[Any]], NDArray[Any]], *, per_arm: bool = False) -> Segment:
+        """With all that there is of each arm and pixel changed alike; ``per_arm``: of each arm, too."""
+        known: dict[str, Any] = {name: getattr(self, name) for name in ("black_level_dn", "responsivity_dn")}
+        for name, value in known.items():
+            if np.ndim(value) == 2:
+                known[name] = change(np.asarray(value))
+            elif np.ndim(value) == 1 and per_arm:
+                known[name] = tuple(change(np.asarray(value)).tolist())
+        return replace(self, lines=change(self.lines), mask=change(self.mask), **known)
 
     def frame_time_ns(self, temporal_merge: int = 1) -> NDArray[np.int64]:
         """UTC at which each frame of T_m sub-steps begins.
@@ -204,7 +231,8 @@ def merged(segment: Segment, count: int) -> Segment:
             f"{segment.first_line} on cannot be merged {count} x {count}",
             possible=f"S = 1; stages, lines and first line multiples of {count}",
         )
-    columns = np.ndim(segment.black_level_dn) == 2 or np.ndim(segment.responsivity_dn) == 2
+    columns = segment.curve is not None
+    columns |= np.ndim(segment.black_level_dn) == 2 or np.ndim(segment.responsivity_dn) == 2
     black = np.zeros(()) if columns else np.asarray(segment.black_level_dn, np.float64) * count**2
     raw = segment.samples(np.float64) if columns else segment.lines
     blocks = (len(raw), geometry.lines // count, count, geometry.stages // count, count)
@@ -219,5 +247,6 @@ def merged(segment: Segment, count: int) -> Segment:
         first_line=segment.first_line // count,
         black_level_dn=tuple(black.tolist()) if black.ndim else float(black),
         responsivity_dn=1.0 if columns else segment.responsivity_dn,
+        curve=None,
         noise=None if columns or segment.noise is None else segment.noise.merged(count),
     )

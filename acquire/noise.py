@@ -32,7 +32,7 @@ class Noise:
     def __post_init__(self) -> None:
         numbers = np.array([*self.dn_per_electron, *self.dark_noise_dn])
         if not (np.isfinite(numbers).all() and (numbers >= 0).all()):
-            raise UsageError(f"noise {self}", possible="numbers from 0 on")
+            raise UsageError(f"the noise is impossible: {self}", possible="numbers from 0 on")
 
     def variance_dn2(self, light_dn: NDArray[Any]) -> NDArray[np.float64]:
         """Of samples (arm, line, pixel) that are so far above their black level."""

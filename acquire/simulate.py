@@ -103,7 +103,20 @@ def bench_of(config: RigConfig, scene: SceneConfig) -> Bench:
     cameras = {arm: config.cameras.arm(arm) for arm in ARMS}
     trigger = config.trigger
     substep_s = trigger.substep_ticks / trigger.clock_hz
-    return Bench(scene, config.geometry, cameras, substep_s, settled_s=trigger.settled_s)
+    return Bench(
+        scene,
+        config.geometry,
+        cameras,
+        substep_s,
+        settled_s=trigger.settled_s,
+        lit_part=trigger.lit_part,
+        fibre=config.laid_out,
+    )
+
+
+def layout_of(config: RigConfig, scene: SceneConfig) -> str:
+    """How the simulated instrument is laid out: a fibre is the rig's, others may be the scene's optics'."""
+    return scene.optics.layout if config.fibre is None else config.cameras.layout
 
 
 def simulate(
@@ -223,7 +236,7 @@ def _spec(config: RigConfig, scene: SceneConfig) -> RecordingSpec:
         run_id=f"{config.name}-simulated",
         stages=config.geometry.stages,
         substeps=config.geometry.substeps,
-        pixels=config.geometry.stages,
+        pixels=config.pixels,
         dtype=config.cameras.a.dtype,
         first_line=0,
         clock=ClockFit(config.trigger.clock_hz, time.time_ns(), 1),
@@ -232,13 +245,14 @@ def _spec(config: RigConfig, scene: SceneConfig) -> RecordingSpec:
         trigger={**trigger, "settings": config.trigger.model_dump(mode="json")},
         cameras=cameras,
         config=config.model_dump(mode="json"),
-        extra=describe(scene) | handed_on(config, scene.optics.layout).attrs,
+        extra=describe(scene) | handed_on(config, layout_of(config, scene)).attrs,
         chunk_lines=config.chunk_lines,
         shard_chunks=recording.shard_chunks,
         tag_chunks=config.tag_chunks,
         codec="lz4" if recording.codec == "auto" else recording.codec,  # nothing has to be kept up with
         fsync=recording.fsync,
-        layout=scene.optics.layout,
+        layout=layout_of(config, scene),
+        fibre=config.laid_out,
     )
 
 

@@ -73,6 +73,7 @@ class Deframer(wiring.Component):
                     broken.eq(0),
                 ]
             with m.Elif(left == 0):
+                # COBS leaves a zero out after each block, but for those that are full: 254 bytes.
                 m.d.comb += [emit.eq(begun & follow_zero), write.data.eq(0)]
                 m.d.sync += [left.eq(byte - 1), begun.eq(1), follow_zero.eq(byte != 0xFF)]
             with m.Else():
@@ -81,5 +82,5 @@ class Deframer(wiring.Component):
             with m.If(emit):
                 m.d.sync += count.eq(count + 1)
                 with m.If(count == self._longest):
-                    m.d.sync += [broken.eq(1), count.eq(count)]
+                    m.d.sync += [broken.eq(1), count.eq(count)]  # of two assignments, the later one counts
         return m

@@ -131,6 +131,7 @@ class Host(wiring.Component):
 
     def _idle(self, m: Module) -> None:
         m.d.sync += [self._step.eq(0), self._fetch.eq(0)]
+        # A tag and a request in turns: neither is kept waiting by many of the other.
         with m.If(self.tags.valid & (self.tag_turn | ~self.frame)):
             m.d.comb += self.tags.ready.eq(1)
             m.d.sync += self.tag_turn.eq(0)
@@ -162,6 +163,7 @@ class Host(wiring.Component):
         with m.Elif(kind == FrameType.READ):
             self._accept(m, asked, (payload == 3) & (asked != 0) & (asked <= MAX_WORDS), "READ CHECK")
         with m.Elif(kind == FrameType.WRITE):
+            # Two bytes of address, and whole words of four.
             self._accept(m, words, (payload >= 6) & (payload[:2] == 2), "FETCH")
         with m.Else():
             self._refuse(m, ErrorCode.BAD_TYPE, 0)
@@ -205,6 +207,7 @@ class Host(wiring.Component):
             first = self._step == deframer.READ_LATENCY
             m.d.sync += self._set.eq((self._set & ~first) | self.frame_data.any())
         with m.If(self._step == deframer.READ_LATENCY + 3):
+            # Back to the byte after the word: the address runs ahead of the data.
             m.d.sync += self._fetch.eq(self._fetch - (deframer.READ_LATENCY - 1))
             m.next = "WRITE"
 
@@ -258,6 +261,7 @@ class Host(wiring.Component):
                     m.next = "SENT"
 
     def _sent(self, m: Module) -> None:
+        # High where the frame's answer was sent; a tag leaves the frame for the next turn.
         m.d.comb += self.release.eq(self.tag_turn)
         m.d.sync += self._address.eq(0)
         m.next = "IDLE"

@@ -22,6 +22,7 @@ CLOCK_BITS = 24
 LEAD_BITS = 8
 START_CLOCKS = 2
 SUBSTEP_CLOCKS_MIN = 5
+"""The bit of a loaded code comes four clocks after its index: see `firmware.codememory`."""
 
 
 class Timing(wiring.Component):
@@ -69,6 +70,7 @@ class Timing(wiring.Component):
         m.d.sync += [
             self.substep.eq(0),
             self.line.eq(0),
+            # A clock behind the number, which holds still for a line: five clocks at least.
             last_is_next.eq(self.line_number + 2 == self.lines),
         ]
         with m.If(self.stop & self.running):
@@ -91,7 +93,8 @@ class Timing(wiring.Component):
             m.d.sync += [leading.eq(0), self.line_number.eq(0), self.code_index.eq(0), self.place.eq(0)]
             m.d.sync += self.last_line.eq(self.lines == 1)
             self._begin(m, left, line=1)
-        with m.Elif(last_place & self._leave(leaving)):
+        # As the last advance decided, which may be this very clock (lead = 0).
+        with m.Elif(last_place & (leaving | (self.advance & self.ending))):
             m.d.sync += self.running.eq(0)
         with m.Else():
             m.d.sync += [
@@ -106,7 +109,3 @@ class Timing(wiring.Component):
 
     def _begin(self, m: Module, left: Signal, line: object) -> None:
         m.d.sync += [left.eq(self.substep_clocks - 1), self.substep.eq(1), self.line.eq(line)]
-
-    def _leave(self, leaving: Signal) -> object:
-        """The decision of the last advance, which may be this very clock (lead = 0)."""
-        return leaving | (self.advance & self.ending)

@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 from frozen_disk import can_freeze
+from memory_group import can_limit_memory
 from throttle import can_throttle
 from umockdev_here import missing as missing_for_umockdev
 
@@ -77,6 +78,7 @@ NEEDS = {
     "needs_fish": "completes words in fish",
     "needs_zsh": "completes words in zsh",
     "needs_freeze": "freezes a file system of its own",
+    "needs_memory_group": "has the kernel kill for want of memory",
     "needs_mount": "fills a small file system of its own",
     "needs_throttle": "has the kernel slow a disk down for a process",
     "needs_umockdev": "runs libusb on a made-up bus",
@@ -103,6 +105,7 @@ def find_missing() -> dict[str, str]:
         "needs_fish": which("fish") is None and "fish, the shell",
         "needs_zsh": which("zsh") is None and "zsh, the shell",
         "needs_freeze": not can_freeze() and "the right to mount a file system and to freeze it",
+        "needs_memory_group": not can_limit_memory() and "the right to limit the memory of processes",
         "needs_mount": not _can_mount() and "the right to mount a small file system",
         "needs_throttle": not can_throttle(Path(tempfile.gettempdir())) and "the right to slow a disk down",
         "needs_umockdev": missing_for_umockdev(),

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from acquire.config import RigConfig, builtin_directory, load_plan, load_rig, load_scene
-from acquire.config.files import MOST_FILE_BYTES
+from acquire.config.files import MOST_FILE_BYTES, parse_settings
 from acquire.daemon import host
 from acquire.daemon.host import check_host
 from acquire.errors import ConfigError
@@ -143,6 +143,55 @@ def test_memory_is_compared_with_the_host_s(tmp_path: Path, monkeypatch: pytest.
 def test_a_camera_without_intra_line_steps_gets_none() -> None:
     with pytest.raises(ConfigError, match="moves its charge once a line"):
         load_rig("rig-vt-4k5c-h100", {"geometry.substeps": 3})
-    with pytest.raises(ConfigError, match=r"TDIStages 'TDI192' with geometry\.stages = 64"):
+    with pytest.raises(ConfigError, match=r"TDIStages is 'TDI192', and geometry\.stages is 64"):
         load_rig("rig-vt-4k5c-h100", {"geometry.stages": 64})
     assert load_rig("rig-vt-4k5c-h100").line_rate_hz == 100_000
+
+
+FIBRE = {"geometry.stages": 64, "geometry.substeps": 1, "cameras.layout": "fibre"}
+FIBRE |= {"fibre.rows": 128, "fibre.columns": 192, "fibre.sensor_pixels": 400}
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        (
+            {"cameras.layout": "dual"},
+            "[fibre] goes with another cameras.layout than 'dual'; possible: 'fibre'",
+        ),
+        (
+            {"cameras.layout": "compact", "cameras.b.serial": "SIM-A"},
+            "[fibre] goes with another cameras.layout than 'compact'",
+        ),
+        ({"fibre.rows": 100}, "100 rows is no whole number of bands of n = 64; possible: a multiple of 64"),
+        ({"fibre.sensor_pixels": 383}, "sensor A with 383 columns is too narrow for 2 bands of 192"),
+        ({"fibre.bands_b": [0, 100, 256]}, "bands of 128 columns from 0, 100, 256 on do not lie beside each"),
+        ({"stream.ring_seconds": 1000.0}, "lines of 400 pixels are"),
+    ],
+)
+def test_a_fibre_that_does_not_fit_is_refused(changes: dict[str, object], words: str) -> None:
+    assert load_rig("rig-demo", FIBRE).pixels == 400
+    with pytest.raises(ConfigError) as caught:
+        load_rig("rig-demo", FIBRE | changes)
+    assert words in str(caught.value)
+
+
+def test_a_fibre_needs_its_table() -> None:
+    with pytest.raises(ConfigError, match=r"cameras\.layout = 'fibre' needs \[fibre\] with rows, columns"):
+        load_rig("rig-demo", {"cameras.layout": "fibre"})
+
+
+@pytest.mark.parametrize(
+    ("setting", "said", "hint"),
+    [
+        ("recording.directory=/data", "holds no TOML value", "\"recording.directory='/data'\""),
+        ("code.seed=", "holds no TOML value", ""),
+        ("name='lab", "holds no TOML value", ""),
+        ("code.seed", "has no '='", ""),
+    ],
+)
+def test_a_setting_that_is_no_toml_is_shown_as_it_would_be(setting: str, said: str, hint: str) -> None:
+    with pytest.raises(ConfigError, match=said) as caught:
+        parse_settings([setting])
+    assert caught.value.hint.endswith(hint)
+    assert bool(caught.value.hint) == bool(hint)

@@ -9,6 +9,7 @@ from acquire.errors import UsageError
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
 from acquire.lines import Segment, merged
+from acquire.noise import Noise
 
 GEOMETRY = Geometry(3, 2, 4)
 LIGHT = np.random.default_rng(0).random(GEOMETRY.lines_shape)
@@ -98,3 +99,19 @@ INTRA_LINE = {
 def test_what_cannot_be_merged_is_refused(changes: dict[str, object]) -> None:
     with pytest.raises(UsageError, match="cannot be merged"):
         merged(raw(**changes), S)
+
+
+OF_COLUMNS = np.arange(2 * RAW.stages, dtype=float).reshape(2, -1) + 1
+
+
+def test_arms_that_are_turned_take_what_is_known_of_their_columns_along() -> None:
+    segment = raw(responsivity_dn=OF_COLUMNS, black_level_dn=(3.0, 5.0), noise=Noise((0.1, 0.2), (1.0, 2.0)))
+    for arm in (0, 1):
+        turned = segment.mirrored(arm)
+        np.testing.assert_array_equal(turned.samples()[arm], segment.samples()[arm, :, ::-1])
+        np.testing.assert_array_equal(turned.samples()[1 - arm], segment.samples()[1 - arm])
+        np.testing.assert_array_equal(turned.mirrored(arm).responsivity_dn, OF_COLUMNS)
+    swapped = segment.swapped()
+    np.testing.assert_array_equal(swapped.samples(), segment.samples()[::-1])
+    np.testing.assert_array_equal(swapped.variance(), segment.variance()[::-1])
+    assert swapped.black_level_dn == (5.0, 3.0)

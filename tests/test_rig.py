@@ -157,7 +157,9 @@ def test_stored_lines_are_shown_without_a_scene(tmp_path):
 
 def test_real_time_has_one_speed():
     config = load_rig("rig-vt-4k5c-h100", HARDWARE | {"simulation.speed": 2.0})
-    with pytest.raises(ConfigError, match=r"simulation\.speed = 2 with trigger\.driver = 'serial'"):
+    with pytest.raises(
+        ConfigError, match=r"simulation\.speed = 2 does not go with trigger\.driver = 'serial'"
+    ):
         Rig(config)
 
 

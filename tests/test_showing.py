@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import sys
 from pathlib import Path
 
@@ -26,7 +27,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return open_recording(path)
 
 
-def test_a_recording_and_its_parts_say_what_they_hold(recording: Recording) -> None:
+def test_a_recording_and_its_parts_say_what_they_hold(recording: Recording, tmp_path: Path) -> None:
     assert repr(recording) == (
         f"<Recording: {recording}, GOOD, lines 0 to 59 of each arm, duration 0.0012 s at 50000 lines/s, "
         "geometry M = 8, S = 2, samples 8 pixels uint16, code prbs>"
@@ -40,6 +41,10 @@ def test_a_recording_and_its_parts_say_what_they_hold(recording: Recording) -> N
         repr(recording.cut(10, 40)),
     )
     assert "<td style='text-align:left'>M = 8, S = 2</td>" in recording._repr_html_()
+    assert "data:image/png;base64," in recording._repr_html_()
+    damaged = shutil.copytree(recording.path, tmp_path / "damaged.zarr")
+    (damaged / "overview" / "a" / "c" / "0" / "0").unlink()
+    assert "data:image" not in open_recording(damaged)._repr_html_()
 
 
 def test_results_say_what_can_be_trusted(recording: Recording, tmp_path: Path) -> None:
@@ -72,7 +77,7 @@ def test_a_calibration_says_what_is_known() -> None:
 def test_what_is_foreign_is_escaped(recording: Recording) -> None:
     document = json.loads(json.dumps(recording.document))
     document["attributes"]["run_id"] = "<script>\x1b[31m"
-    shown = Recording(recording.source, document, open_recording)._repr_html_()  # type: ignore[arg-type]
+    shown = Recording(recording.source, document)._repr_html_()
     assert "&lt;script&gt;\\x1b[31m" in shown
     assert "<b>&lt;i&gt;</b>" in as_table("<i>", {})
 

@@ -34,10 +34,10 @@ import numpy as np
 
 from acquire.config import load_rig
 from acquire.config.scene import SceneFile
-from acquire.evaluate.figures import DPI, STYLE
 from acquire.evaluate.metrics import psnr, ssim
 from acquire.evaluate.paper.drawing import strips
 from acquire.evaluate.paper.studio import true_voxels
+from acquire.evaluate.themed import DPI, STYLE
 from acquire.geometry import Geometry
 from acquire.lines import ARMS
 from acquire.recon import reconstruct

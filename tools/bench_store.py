@@ -25,11 +25,11 @@ from acquire.codes import ConstantCode
 from acquire.config.recording import usual_chunk_lines, usual_tag_chunks
 from acquire.lines import ARMS, TaggedBlock
 from acquire.store import RecordingSpec, RecordingWriter, RunCondition, open_recording
-from acquire.store.codecs import CODECS, measure_codec
+from acquire.store.codecs import measure_codec
 from acquire.store.files import DISK
 from acquire.store.pages import PAGE, aligned_bytes, open_direct, page_up
 from acquire.store.retention import shard_files
-from acquire.store.shard import shard_key
+from acquire.store.shape import CODECS, shard_key
 from tools.results import Run, add_option, recorded
 
 PIXELS, SHARD_CHUNKS, SUBSTEPS = 4640, 240, 3

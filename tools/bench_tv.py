@@ -1,6 +1,6 @@
 """How fast is our TV prox beside a library's, on the coefficient frames of the demo?
 
-Usage: python tools/bench_tv.py [--frames 128] [--side 64] [--iterations 10]
+Usage: python tools/bench_tv.py [--frames 128] [--side 64] [--iterations 10] [--record]
 
 Both make the same number of iterations of gradient projection on the same frames with two threads (ours)
 and one (scikit-image has no more). Prints milliseconds and the ratio, the best of five each.
@@ -16,6 +16,7 @@ import numpy as np
 from skimage.restoration import denoise_tv_chambolle
 
 from acquire.recon.tv import FrameTv
+from tools.results import Run, add_option, recorded
 
 
 def best_ms(work: Callable[[], object]) -> float:
@@ -33,7 +34,13 @@ def main() -> None:
     )
     for name, default in (("frames", 128), ("side", 64), ("iterations", 10)):
         parser.add_argument(f"--{name}", type=int, default=default)
+    add_option(parser)
     asked = parser.parse_args()
+    with recorded("bench_tv", keep=asked.record) as run:
+        measure(run, asked)
+
+
+def measure(run: Run, asked: argparse.Namespace) -> None:
     shape = (asked.frames, asked.side, asked.side)
     frames = np.random.default_rng(0).random(shape, np.float32)
     tv = FrameTv(asked.iterations)
@@ -45,7 +52,9 @@ def main() -> None:
             denoise_tv_chambolle(frame, weight=0.1, eps=0.0, max_num_iter=asked.iterations)
 
     theirs = best_ms(library)
-    print(f"{asked.frames} frames of {asked.side}², {asked.iterations} iterations")
+    case = f"{asked.frames} frames of {asked.side}², {asked.iterations} iterations"
+    run.add(case, acquire_ms=ours, scikit_image_ms=theirs, ratio=theirs / ours)
+    print(case)
     print(f"acquire       {ours:8.1f} ms")
     print(f"scikit-image  {theirs:8.1f} ms   {theirs / ours:.1f} × ours")
 

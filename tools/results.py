@@ -3,6 +3,9 @@
 ``--record`` of a benchmark appends its run to tools/results.jsonl: the command, when, at which commit, on
 which machine and how busy that was before, and a row of figures per case. ``python tools/results.py`` lists
 the runs, ``--table NAME`` prints the newest whole one of a benchmark as Markdown, ``--run NUMBER`` another.
+
+Between ``<!-- results of COMMAND -->`` and ``<!-- end of results -->`` in a document, ``--write`` puts the
+newest whole run of that command, given without its ``--record``. A test tells where a document differs.
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ import argparse
 import json
 import os
 import platform
+import re
 import shlex
 import subprocess
 import sys
@@ -29,6 +33,8 @@ from acquire.cores import usable_cores
 
 ROOT = Path(__file__).parents[1]
 FILE = ROOT / "tools/results.jsonl"
+DOCUMENTS = (ROOT / "README.md", ROOT / "tools/MEASURED.md")
+_PLACE = re.compile(r"(<!-- results of (.+?) -->\n).*?(<!-- end of results -->)", re.DOTALL)
 Figure = float | int | str | None
 
 
@@ -235,18 +241,37 @@ def choose(runs: list[Run], benchmark: str | None, number: int | None) -> Run:
     return found[-1]
 
 
+def with_tables(text: str, runs: list[Run]) -> str:
+    """A document with its tables made anew. Raises ValueError for a command that has no whole run."""
+
+    def filled(place: re.Match[str]) -> str:
+        before, command, after = place.groups()
+        found = [run for run in runs if run.whole and run.command.replace(" --record", "") == command]
+        if not found:
+            raise ValueError(f"no whole run of {command!r} is kept; run it with --record")
+        return f"{before}{table(found[-1])}\n{after}"
+
+    return _PLACE.sub(filled, text)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--table", metavar="NAME", help="of a benchmark: bench_store, …")
     parser.add_argument("--run", type=int, metavar="NUMBER", help="of the list, instead of the newest")
+    parser.add_argument("--write", action="store_true", help="make the tables of the documents anew")
     parser.add_argument("--file", type=Path, default=FILE, help=f"instead of tools/{FILE.name}")
     asked = parser.parse_args()
     try:
         runs = read(asked.file)
         if asked.table or asked.run is not None:
             print(table(choose(runs, asked.table, asked.run)))
+            return 0
+        if asked.write:
+            texts = [with_tables(path.read_text(encoding="utf-8"), runs) for path in DOCUMENTS]
+            for path, text in zip(DOCUMENTS, texts, strict=True):
+                path.write_text(text, encoding="utf-8")
             return 0
     except ValueError as error:
         print(f"results: {error}", file=sys.stderr)

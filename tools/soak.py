@@ -45,7 +45,7 @@ from acquire.sim.clock import Wire
 from acquire.sim.trigger_model import TriggerModel
 from acquire.sim.twin_links import TwinTransport
 from acquire.store import open_recording
-from acquire.stream import Capture
+from acquire.stream import Begin, Capture
 from acquire.trigger.driver import TriggerDriver
 from tools.kill_storm import check_recording
 
@@ -196,7 +196,7 @@ def _cycle(path: Path, load: Load, chance: random.Random, found: Soak, cycle_s: 
     capture = Capture(plan, trigger)
     try:
         capture.arm()
-        capture.start(path, recording_spec(load, capture.clock))
+        capture.start(Begin(path, recording_spec(load, capture.clock)))
         _throw(capture, faults, chance, found, time.monotonic() + cycle_s, plan.ring_s)
         found.note_memory(capture.pids)
         capture.stop("end of the cycle")

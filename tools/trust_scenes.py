@@ -25,8 +25,8 @@ def main() -> None:
     import matplotlib as mpl
 
     mpl.use("agg")
-    from acquire.evaluate.figures import DPI, STYLE
     from acquire.evaluate.paper.drawing import strips
+    from acquire.evaluate.themed import DPI, STYLE
 
     options.pictures.mkdir(parents=True, exist_ok=True)
     for name in SCENES:

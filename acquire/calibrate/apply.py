@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.calibrate.calibration import Calibration, differing
+from acquire.calibrate.calibration import COLUMN, QUANTITIES, Calibration, Measured, differing
+from acquire.calibrate.curve import curve_of
 from acquire.calibrate.exposure import instrument_of
 from acquire.calibrate.orientation import oriented, view_named
 from acquire.errors import UsageError
@@ -58,15 +59,22 @@ def calibrated(segment: Segment, calibration: Calibration) -> Segment:
     """
     if segment.geometry.stages != calibration.instrument.stages:
         raise UsageError(
-            f"a calibration of {calibration.instrument.stages} columns for lines of "
+            f"a calibration of {calibration.instrument.stages} columns does not fit lines of "
             f"{segment.geometry.stages} pixels",
             possible="the same",
         )
+    calibration = _of_columns(calibration, segment)
     changes: dict[str, Any] = {}
-    if (black := black_level(segment, calibration)) is not None:
+    black = black_level(segment, calibration)
+    if (curve := curve_of(calibration)) is not None:
+        changes["curve"] = curve
+        black = curve.straight(_columns(segment.black_level_dn, segment) if black is None else black)
+    if black is not None:
         changes["black_level_dn"] = black
     if (responsivity := _responsivity(segment, calibration)) is not None:
         changes["responsivity_dn"] = responsivity
+    if calibration.value("balance") is not None:
+        changes["balanced"] = True
     if calibration.usable is not None and not calibration.usable.all():
         changes["mask"] = segment.mask & calibration.usable[:, None, :]
     if (noise := _noise(calibration)) is not None:
@@ -77,6 +85,36 @@ def calibrated(segment: Segment, calibration: Calibration) -> Segment:
     if calibration.alignment is not None:
         corrected = replace(corrected, alignment=calibration.alignment.alignment)
     return corrected
+
+
+def _of_columns(calibration: Calibration, segment: Segment) -> Calibration:
+    """Behind a fibre: what is known of the columns that see the segment's tile. UsageError beside them."""
+    if max(segment.first_column) + segment.geometry.stages > calibration.instrument.columns:
+        raise UsageError(
+            f"a calibration of {calibration.instrument.columns} columns does not reach those of the lines, "
+            f"from column {max(segment.first_column)} on",
+            possible="a calibration of this instrument",
+        )
+    if calibration.instrument.columns == segment.geometry.stages:
+        return calibration
+    stages = segment.geometry.stages
+
+    def seen(values: NDArray[Any]) -> NDArray[Any]:
+        return np.stack(
+            [row[first : first + stages] for row, first in zip(values, segment.first_column, strict=True)]
+        )
+
+    return replace(
+        calibration,
+        instrument=calibration.instrument.model_copy(update={"pixels": None}),
+        quantities={
+            name: Measured(seen(each.value), seen(each.uncertainty))
+            if QUANTITIES[name].dimensions == COLUMN
+            else each
+            for name, each in calibration.quantities.items()
+        },
+        usable=None if calibration.usable is None else seen(calibration.usable),
+    )
 
 
 def black_level(segment: Segment, calibration: Calibration) -> NDArray[np.float64] | None:

@@ -11,6 +11,8 @@
     read_noise_e     (arm)           σ_d of EMVA 1288
     full_well_e      (arm)           μ_e.sat of EMVA 1288
     light_late_ticks (arm)           by which light comes after the charge's moves, without lead and delays
+    linearity_error  (arm)           LE of EMVA 1288
+    excess_dn        (arm, knot)     by which samples are too high that read so much, evenly from 0 to white
 
 and ``usable`` (arm, column), the orientation of arm B, and its alignment on arm A.
 """
@@ -48,7 +50,9 @@ class Quantity:
     meaning: str
 
 
-ARM, COLUMN = ("arm",), ("arm", "column")
+ARM, COLUMN, CURVE = ("arm",), ("arm", "column"), ("arm", "knot")
+KNOTS = 65
+"""Of a camera's curve: between them a bend of a percent is straight to a part in 10⁶."""
 QUANTITIES = {
     "offset_dn": Quantity(COLUMN, "DN", "of a pixel under a dark code"),
     "noise_dn": Quantity(COLUMN, "DN", "temporal standard deviation of a dark pixel"),
@@ -63,6 +67,8 @@ QUANTITIES = {
         "1",
         "by which light comes after the charge's moves without lead and delays, in the trigger's ticks",
     ),
+    "linearity_error": Quantity(ARM, "1", "linearity error of EMVA 1288"),
+    "excess_dn": Quantity(CURVE, "DN", "by which samples are too high that read 0 … white, evenly"),
 }
 
 
@@ -80,7 +86,7 @@ class Measured:
     def __post_init__(self) -> None:
         if self.value.shape != self.uncertainty.shape:
             raise UsageError(
-                f"values {self.value.shape} with uncertainties {self.uncertainty.shape}",
+                f"values {self.value.shape} cannot have uncertainties {self.uncertainty.shape}",
                 possible="the same shape",
             )
 
@@ -95,6 +101,14 @@ class Instrument(BaseModel):
     substep_s: float = Field(gt=0, allow_inf_nan=False)
     layout: str
     cameras: dict[str, dict[str, Any]] = Field(description="arm → serial, and settings that lines depend on")
+    pixels: int | None = Field(
+        default=None, ge=1, le=2**16, description="of a line, where a fibre ends on more than M"
+    )
+
+    @property
+    def columns(self) -> int:
+        """Of either sensor."""
+        return self.stages if self.pixels is None else self.pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,19 +167,20 @@ class Calibration:
         )
 
     def __post_init__(self) -> None:
-        sizes = {"arm": len(ARMS), "column": self.instrument.stages}
-        if self.usable is not None and self.usable.shape != tuple(sizes.values()):
+        sizes = {"arm": len(ARMS), "column": self.instrument.columns, "knot": KNOTS}
+        columns = tuple(sizes[dimension] for dimension in COLUMN)
+        if self.usable is not None and self.usable.shape != columns:
             raise UsageError(
-                f"calibration with usable columns of shape {self.usable.shape}",
-                possible=f"{tuple(sizes.values())}",
+                f"a calibration cannot have usable columns of shape {self.usable.shape}",
+                possible=f"{columns}",
             )
         for name, measured in self.quantities.items():
             if name not in QUANTITIES:
-                raise UsageError(f"calibration with {name!r}", possible=", ".join(QUANTITIES))
+                raise UsageError(f"a calibration has no quantity {name!r}", possible=", ".join(QUANTITIES))
             shape = tuple(sizes[dimension] for dimension in QUANTITIES[name].dimensions)
             if measured.value.shape != shape or not np.isfinite(measured.value).all():
                 raise UsageError(
-                    f"calibration with {name} of shape {measured.value.shape}",
+                    f"{name} of shape {measured.value.shape} does not fit the calibration, or is not finite",
                     possible=f"finite numbers {shape}",
                 )
 
@@ -193,7 +208,7 @@ class Calibration:
         return replace(
             self,
             quantities={**self.quantities, **found.quantities},
-            usable=_usable(steps, self.instrument.stages),
+            usable=_usable(steps, self.instrument.columns),
             orientation=found.orientation or self.orientation,
             alignment=found.alignment or self.alignment,
             steps=steps,
@@ -278,7 +293,12 @@ def _rounded(values: NDArray[np.float64]) -> Any:
 def differing(known: Instrument, other: Instrument) -> list[str]:
     """What makes two instruments differ, so that the calibration of one is none of the other; in words."""
     found = []
-    for name, meaning in (("stages", "stages M"), ("substeps", "sub-steps S"), ("layout", "layout")):
+    for name, meaning in (
+        ("stages", "stages M"),
+        ("substeps", "sub-steps S"),
+        ("layout", "layout"),
+        ("columns", "number of columns"),
+    ):
         mine, theirs = getattr(known, name), getattr(other, name)
         if mine != theirs:
             found.append(f"{meaning} {mine} is {theirs} there")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from acquire.calibrate.apply import calibration_of, check_fits
 from acquire.calibrate.calibration import Calibration, Instrument, differing
+from acquire.calibrate.curve import curve_of
 from acquire.calibrate.file import open_calibration
 from acquire.calibrate.orientation import MODEL, view_named
 from acquire.errors import AcquireError, ConfigError, PlaceError
@@ -47,7 +48,7 @@ def choose(recording: Recording, asked: Path | str | None = None) -> Chosen | No
 
 def corrected(known: Calibration) -> list[str]:
     """What a reconstruction corrects with a calibration, in words."""
-    found = []
+    found = [] if curve_of(known) is None else ["the cameras' curves"]
     for name, words in (
         ("offset_dn", "offsets per column"),
         ("ambient_dn", "ambient light"),
@@ -128,4 +129,5 @@ def configured(config: RigConfig, layout: str) -> Instrument:
             }
             for arm, camera in cameras.items()
         },
+        pixels=None if config.fibre is None else config.pixels,
     )

@@ -22,6 +22,7 @@ from acquire.calibrate.checks import (
     refuse_coded,
     refuse_level,
 )
+from acquire.calibrate.curve import straightened
 from acquire.calibrate.exposure import moments, unseen
 from acquire.errors import UsageError
 from acquire.lines import ARMS
@@ -101,7 +102,7 @@ def flat(
     refuse_coded(exposure, "flat")
     offset = offset_of(known, "flat")
     found = moments(exposure, progress)
-    light = found.mean - offset
+    light, _ = straightened(known, found.mean, offset)
     refuse_level(exposure, found, light)
     response = light / exposure.camera("responsivity_dn")[:, None]
     alive, middle = response > 0, np.median(response, axis=1, keepdims=True)
@@ -117,7 +118,8 @@ def flat(
         np.sqrt(found.variance / found.lines[:, None]), known.quantities["offset_dn"].uncertainty
     )
     own_error = np.sqrt(np.maximum(found.own_variance, QUANTISATION) / found.lines[:, None])
-    relative = np.hypot(own_error, known.quantities["offset_dn"].uncertainty) / light
+    relative = np.hypot(own_error, known.quantities["offset_dn"].uncertainty)
+    relative = relative / np.where(alive, light, np.inf)  # a column that sees nothing has no gain
     gain = np.where(trusted, shape / level, 1.0)
     arm_error = np.sqrt((error**2).sum(axis=1)) / light.sum(axis=1)
     balance = arms / arms.mean()
@@ -133,7 +135,7 @@ def flat(
         "optics_hide_columns": listed(trusted | ~usable),
         "edge_response": _responses(shape / level, edges),
     }
-    warnings = (*dim(exposure, light), *drift(found), *left_out(usable, "response"))
+    warnings = (*dim(exposure, light), *drift(found), *left_out(usable | ~exposure.lit, "response"))
     return Finding("flat", exposure.instrument, quantities, usable, facts=facts, warnings=warnings)
 
 

@@ -29,6 +29,7 @@ import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from acquire.codes import ConstantCode, code_from_attrs
+from acquire.cores import limit_blas
 from acquire.errors import UsageError
 from acquire.lines import ARMS
 
@@ -97,7 +98,8 @@ def beyond(exposure: Exposure) -> tuple[Beyond, Beyond]:
     found = []
     for arm, sums in zip(ARMS, np.concatenate(parts, axis=1), strict=True):
         try:
-            found.append(beyond_of(sums, code, exposure.first_line, geometry))
+            with limit_blas(1):  # products of some hundred columns: threads spin longer than they work
+                found.append(beyond_of(sums, code, exposure.first_line, geometry))
         except UsageError as error:
             raise UsageError(
                 f"arm {arm} of {exposure.recording}: {error.message}",

@@ -199,7 +199,7 @@ def _crossing(points: Sequence[Point], arm: int, substep_ticks: int) -> Crossing
     later, seen = later[kept], [point.seen[arm] for point, good in zip(points, kept, strict=True) if good]
     if len(set(later)) < 2:
         raise UsageError(
-            f"arm {ARMS[arm]}: no two recordings with the light late, or early, by a part of a sub-step",
+            f"arm {ARMS[arm]}: no two recordings have their light late, or early, by a part of a sub-step",
             hint="acquire calibrate delay, with the daemon, sweeps by itself",
         )
     model = _Model(later, seen, sight, substep_ticks)

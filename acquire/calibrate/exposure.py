@@ -77,6 +77,23 @@ class Exposure:
             count = min(BLOCK_LINES, self.lines - first)
             yield self.recording.cut(self.first_line + first, count)
 
+    def samples(self) -> Iterator[tuple[NDArray[Any], NDArray[np.bool_]]]:
+        """The same of all columns, whatever they see: samples (arm, line, column) and which can be used."""
+        if self.recording.fibre is None:
+            yield from ((block.lines, block.mask) for block in self.blocks())
+            return
+        for first in range(0, self.lines, BLOCK_LINES):
+            count = min(BLOCK_LINES, self.lines - first)
+            yield self.recording.whole_lines(self.first_line + first, count)
+
+    @property
+    def lit(self) -> NDArray[np.bool_]:
+        """Columns (arm, column) that see the scene: behind a fibre those that a band ends on."""
+        fibre = self.recording.fibre
+        if fibre is None:
+            return np.ones((len(ARMS), self.recording.arms[ARMS[0]].pixels), np.bool_)
+        return np.stack([fibre.table(arm)[:, 0] >= 0 for arm in ARMS])
+
     def whole(self) -> Segment:
         """All of it at once."""
         return self.recording.cut(self.first_line, self.lines)
@@ -124,6 +141,7 @@ def instrument_of(recording: Recording) -> Instrument:
         substep_s=recording.line_period_ns * 1e-9 / geometry.substeps,
         layout=str(attrs["layout"]),
         cameras=cameras,
+        pixels=None if recording.fibre is None else recording.fibre.sensor_pixels,
     )
 
 
@@ -159,9 +177,9 @@ def moments(exposure: Exposure, progress: Progress = unseen) -> Moments:
     white = np.ceil(exposure.camera("white_dn"))[:, None, None]
     parts: list[tuple[NDArray[Any], ...]] = []
     done = 0
-    for block in exposure.blocks():
-        parts.append(_block_moments(block, white))
-        done += len(block.time_ns)
+    for samples, usable in exposure.samples():
+        parts.append(_block_moments(samples, usable, white))
+        done += samples.shape[1]
         progress(done, exposure.lines)
     counts, means, variances, own, zeros, saturated = (np.stack(each) for each in zip(*parts, strict=True))
     total = counts.sum(axis=0)
@@ -186,9 +204,11 @@ def moments(exposure: Exposure, progress: Progress = unseen) -> Moments:
     )
 
 
-def _block_moments(block: Segment, white: NDArray[Any]) -> tuple[NDArray[Any], ...]:
-    lines = block.lines.astype(np.float64)
-    arrived = np.asarray((block.mask | (lines >= white)).any(axis=2))
+def _block_moments(
+    samples: NDArray[Any], usable: NDArray[np.bool_], white: NDArray[Any]
+) -> tuple[NDArray[Any], ...]:
+    lines = samples.astype(np.float64)
+    arrived = np.asarray((usable | (lines >= white)).any(axis=2))
     counts = arrived.sum(axis=1)
     shape = (len(ARMS), lines.shape[2])
     found = [np.zeros(shape) for _ in range(5)]

@@ -21,9 +21,9 @@ from zarr.errors import GroupNotFoundError
 
 from acquire.calibrate.calibration import FORMAT, QUANTITIES, Calibration, Measured
 from acquire.errors import DataError, PlaceError, UsageError
-from acquire.store.camera_stream import DAMAGE, child_array
+from acquire.store.camera_stream import child_array
 from acquire.store.delivery import delivery_to
-from acquire.store.layout import group_document, to_json
+from acquire.store.layout import DAMAGE, group_document, to_json
 from acquire.store.opening import read_root
 from acquire.store.refusals import refused
 from acquire.store.remote import is_url
@@ -118,6 +118,6 @@ def _write(directory: Path, calibration: Calibration) -> None:
             array[...] = values
             names.append(key)
     if not names and not calibration.steps:
-        raise UsageError("a calibration that holds nothing", possible="one step at least")
+        raise UsageError("a calibration without a step cannot be written", possible="one step at least")
     nodes = {name: json.loads((directory / name / ROOT).read_bytes()) for name in names}
     (directory / ROOT).write_bytes(to_json(group_document(calibration.facts(), nodes)))

@@ -12,7 +12,7 @@ The dual arm needs B's charge to move across A's: a turn of 90 or 270 degrees.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,8 +20,6 @@ import numpy as np
 from acquire.errors import UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from numpy.typing import NDArray
 
     from acquire.lines import Segment
@@ -74,7 +72,7 @@ def view_named(name: str) -> View:
     """UsageError for a name that none has."""
     found = {view.name: view for view in VIEWS}
     if name not in found:
-        raise UsageError(f"orientation {name!r}", possible="; ".join(found))
+        raise UsageError(f"there is no orientation {name!r}", possible="; ".join(found))
     return found[name]
 
 
@@ -94,39 +92,8 @@ def oriented(segment: Segment, view: View) -> Segment:
             hint="turn one of the cameras by 90 degrees",
         )
     if view.mirrored:
-        segment = _mapped(segment, _mirror_b)
-    if view.swapped:
-        noise = None if segment.noise is None else segment.noise.swapped()
-        segment = replace(_mapped(segment, _swap), noise=noise)
-    return segment
-
-
-def _mirror_b(values: NDArray[Any]) -> NDArray[Any]:
-    return np.stack([values[0], values[1][..., ::-1]]) if values.ndim > 1 else values
-
-
-def _swap(values: NDArray[Any]) -> NDArray[Any]:
-    return np.ascontiguousarray(values[::-1])
-
-
-def _mapped(segment: Segment, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Segment:
-    """All that a segment has for each arm, changed alike; one number for both arms stays."""
-    black, gain = (
-        change(np.asarray(value, np.float64)) if np.ndim(value) else value
-        for value in (segment.black_level_dn, segment.responsivity_dn)
-    )
-    return replace(
-        segment,
-        lines=change(segment.lines),
-        mask=change(segment.mask),
-        black_level_dn=_plain(black),
-        responsivity_dn=_plain(gain),
-    )
-
-
-def _plain(value: Any) -> Any:
-    """One number per arm is a tuple."""
-    return tuple(value.tolist()) if np.ndim(value) == 1 else value
+        segment = segment.mirrored(1)
+    return segment.swapped() if view.swapped else segment
 
 
 def correlations(a: NDArray[Any], b: NDArray[Any]) -> dict[View, tuple[float, tuple[float, float]]]:

@@ -16,6 +16,7 @@ from acquire.calibrate.checks import (
     per_arm,
     refuse_coded,
 )
+from acquire.calibrate.curve import straightened
 from acquire.calibrate.exposure import moments, unseen
 from acquire.errors import UsageError
 from acquire.lines import ARMS
@@ -52,19 +53,20 @@ def transfer(exposures: Sequence[Exposure], known: Calibration, *, progress: Pro
     """
     dark_lines = int(known.steps.get("dark", {}).get("lines", 0))
     offset = offset_of(known, "transfer")
-    dark_noise = known.quantities["noise_dn"].value
+    dark_noise = straightened(known, offset, offset)[1] * known.quantities["noise_dn"].value
     usable = np.ones_like(offset, np.bool_) if known.usable is None else known.usable
     points: dict[str, list[Point]] = {arm: [] for arm in ARMS}
     for exposure in exposures:
         refuse_coded(exposure, "transfer")
         found = moments(exposure, progress)
+        light, slope = straightened(known, found.mean, offset)
         for i, arm in enumerate(ARMS):
             good = usable[i]
-            own, dark = found.own_variance[i, good], dark_noise[i, good] ** 2
+            own, dark = (slope**2 * found.own_variance)[i, good], dark_noise[i, good] ** 2
             errors = 2 * (own**2 / found.lines[i] + dark**2 / dark_lines)
             points[arm].append(
                 Point(
-                    light=float((found.mean - offset)[i, good].mean()),
+                    light=float(light[i, good].mean()),
                     variance=float((own - dark).mean()),
                     error=float(np.sqrt(errors.sum()) / good.sum()),
                     saturated=float(found.saturated[i, good].mean()),

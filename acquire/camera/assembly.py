@@ -65,13 +65,13 @@ def check_format(found: FrameFormat, spec: GenicamSpec) -> None:
     """Raise CameraError unless the lines are what the rig expects."""
     if spec.pixels and found.width != spec.pixels:
         raise CameraError(
-            f"camera {spec.serial}: lines of {found.width} pixels",
+            f"camera {spec.serial} delivers lines of {found.width} pixels",
             possible=f"{spec.pixels}, as the rig's geometry has stages",
             hint=f'the setting ["remote", "Width", {spec.pixels}]',
         )
     if spec.bits and found.layout.bits != spec.bits:
         raise CameraError(
-            f"camera {spec.serial}: pixel format {found.layout.name} of {found.layout.bits} bits",
+            f"camera {spec.serial} delivers pixel format {found.layout.name} of {found.layout.bits} bits",
             possible=f"{spec.bits} bits, as the rig's pixel_format",
             hint=f'the setting ["remote", "PixelFormat", "Mono{spec.bits}"]',
         )

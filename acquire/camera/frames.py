@@ -68,6 +68,7 @@ class Tally:
         grown = reading - self._reading
         if grown < 0:
             wrapped = (grown + (1 << bits) for bits in _COUNTER_BITS if self._reading < 1 << bits)
+            # A counter that wrapped has grown by little since the last frame; another was reset.
             grown = next((grown for grown in wrapped if grown < 1 << 15), reading)
         self._reading = reading
         self._total += grown

@@ -232,7 +232,7 @@ class HarvestersCamera:
         self._armed = False
         self._held.clear()
         self._ready.clear()
-        self._views.clear()
+        self._views.clear()  # before the memory that they show is freed
         _stop(self._acquirer)
 
     def statistics(self) -> dict[str, int]:

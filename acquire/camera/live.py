@@ -61,7 +61,7 @@ class LiveCamera:
         if isinstance(message, Readings):
             return message.of
         if self._worker.death is not None:
-            raise CameraError(f"{self._worker.name}: its process {self._worker.death}")
+            raise CameraError(f"{self._worker.name}: its process is gone: {self._worker.death}")
         return {}
 
     def close(self) -> None:

@@ -60,7 +60,7 @@ LAYOUTS = {
 def layout_of(name: str) -> PixelLayout:
     """The layout of an SFNC PixelFormat. Raises CameraError for one that cannot be recorded."""
     if name not in LAYOUTS:
-        raise CameraError(f"pixel format {name!r}", possible=", ".join(LAYOUTS))
+        raise CameraError(f"pixel format {name!r} cannot be recorded", possible=", ".join(LAYOUTS))
     return LAYOUTS[name]
 
 

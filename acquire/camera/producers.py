@@ -21,7 +21,7 @@ def find_producers(cti: str = "") -> list[Path]:
     found = [path for directory in directories for path in sorted(directory.glob("*.cti"))]
     if not found:
         raise CameraError(
-            "no GenTL producer",
+            "there is no GenTL producer",
             possible=f".cti files in the directories of {PATH}, which the maker of a frame grabber installs",
             hint=f"cti in the camera's table, or {PATH} in the environment",
         )

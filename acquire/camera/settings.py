@@ -94,17 +94,17 @@ def apply_settings(settings: Iterable[Setting], modules: Mapping[str, Features])
         _check_writable(setting, node)
         node.write(value)
         if node.kind != "command":
-            _compare(setting, node, "it reads back as")
+            _compare(setting, node, "when it is read back")
             written[setting.module, setting.feature] = (setting, node)
     for setting, node in written.values():
         if not node.selected:
-            _compare(setting, node, "a later setting has made it")
+            _compare(setting, node, "after a later setting")
 
 
 def find_node(module: str, feature: str, modules: Mapping[str, Features]) -> Node:
     """The feature. Raises CameraError that names what is there instead."""
     if module not in modules:
-        raise CameraError(f"setting of module {module!r}", possible=", ".join(modules))
+        raise CameraError(f"the camera has no module {module!r}", possible=", ".join(modules))
     node = modules[module].find(feature)
     if node is not None:
         return node
@@ -121,11 +121,11 @@ def coerce(setting: Setting, node: Node) -> Value:
     """The value as the feature's type has it. Raises CameraError for another type, or out of range."""
     value: Value | None = _COERCE[node.kind](setting.value)
     if value is None:
-        raise CameraError(f"{setting}: not a value for it", possible=describe(node))
+        raise CameraError(f"{setting}: the feature cannot have this value", possible=describe(node))
     if node.kind in ("integer", "float"):
         _check_range(setting, node, float(value))
     elif node.kind == "enumeration" and value not in node.entries():
-        raise CameraError(f"{setting}: no such entry", possible=describe(node))
+        raise CameraError(f"{setting}: the feature has no such entry", possible=describe(node))
     return value
 
 
@@ -151,7 +151,7 @@ def _check_range(setting: Setting, node: Node, value: float) -> None:
     low, high, step = node.limits()
     inside = low <= value <= high
     if not inside or (step and node.kind == "integer" and (value - low) % step):
-        raise CameraError(f"{setting}: out of range", possible=describe(node))
+        raise CameraError(f"{setting}: the value is out of range", possible=describe(node))
 
 
 def _check_writable(setting: Setting, node: Node) -> None:
@@ -163,7 +163,7 @@ def _check_writable(setting: Setting, node: Node) -> None:
         )
 
 
-def _compare(setting: Setting, node: Node, how: str) -> None:
+def _compare(setting: Setting, node: Node, when: str) -> None:
     if not node.readable:
         return
     found, wanted = node.read(), coerce_loosely(setting, node)
@@ -172,7 +172,7 @@ def _compare(setting: Setting, node: Node, how: str) -> None:
     else:
         same = found == wanted
     if not same:
-        raise CameraError(f"{setting}: {how} {found!r}", possible=describe(node))
+        raise CameraError(f"{setting}: the camera has {found!r} {when}", possible=describe(node))
 
 
 def coerce_loosely(setting: Setting, node: Node) -> Value:

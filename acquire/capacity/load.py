@@ -12,13 +12,13 @@ from acquire.config.recording import usual_chunk_lines, usual_tag_chunks
 from acquire.errors import UsageError
 from acquire.lines import ARMS
 from acquire.store import RecordingSpec
-from acquire.store.codecs import CODECS
+from acquire.store.shape import CODECS
 from acquire.trigger.base import TriggerRun
 
 if TYPE_CHECKING:
     from acquire.clock import ClockFit
     from acquire.config import RigConfig
-    from acquire.store.codecs import Codec
+    from acquire.store.shape import Codec
 
 CLOCK_HZ = 90_000_000
 
@@ -46,9 +46,11 @@ class Load:
         stream, recording = config.stream, config.recording
         codec = chosen if recording.codec == "auto" else recording.codec
         if codec is None:
-            raise UsageError("a load with codec 'auto'", possible=", ".join(CODECS), hint="choose it first")
+            raise UsageError(
+                "a load cannot have the codec 'auto'", possible=", ".join(CODECS), hint="choose it first"
+            )
         return cls(
-            pixels=config.geometry.stages,
+            pixels=config.pixels,
             dtype=config.cameras.a.dtype,
             line_rate_hz=config.line_rate_hz * config.simulation.speed,
             substeps=config.geometry.substeps,

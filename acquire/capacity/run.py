@@ -30,7 +30,7 @@ from acquire.sim.pattern import PatternCameraOpener
 from acquire.sim.trigger_model import TriggerModel
 from acquire.sim.twin_links import TwinTransport
 from acquire.store import RunCondition
-from acquire.stream import Capture, CapturePlan
+from acquire.stream import Begin, Capture, CapturePlan
 from acquire.trigger.driver import TriggerDriver
 
 if TYPE_CHECKING:
@@ -112,7 +112,9 @@ def _measure(
     load: Load, capture: Capture, path: Path, seconds: float, latencies: dict[str, Latencies]
 ) -> LoadReport:
     pids = {name: pid for name, pid in capture.pids.items() if pid} | {"owner": None}
-    capture.start(path, recording_spec(load, capture.clock), max(1, round(load.line_rate_hz * seconds)))
+    capture.start(
+        Begin(path, recording_spec(load, capture.clock), max(1, round(load.line_rate_hz * seconds)))
+    )
     for one in latencies.values():
         one.clear()
     before, begun = _cpu_s(pids), time.monotonic()

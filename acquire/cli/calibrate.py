@@ -9,6 +9,7 @@ import typer
 
 from acquire.cli.calibrate_all import calibrate_all
 from acquire.cli.calibrate_delay import delay
+from acquire.cli.calibrate_linearity import linearity
 from acquire.cli.completion import recordings
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, print_warning, say
 from acquire.cli.progress import stage_progress
@@ -40,7 +41,7 @@ CHANGED = 1
 
 def register(app: typer.Typer) -> None:
     group = typer.Typer(no_args_is_help=True, rich_markup_mode="rich")
-    for command in (dark, ambient, flat, transfer, orientation, align, delay, show, check):
+    for command in (dark, ambient, linearity, flat, transfer, orientation, align, delay, show, check):
         group.command()(command)
     group.command("all")(calibrate_all)
     app.add_typer(
@@ -303,8 +304,8 @@ def _any(place: str) -> Calibration:
     """A calibration, or the copy that a recording carries."""
     from acquire.calibrate import calibration_of
     from acquire.store import open_recording
+    from acquire.store.layout import READABLE
     from acquire.store.opening import format_of
-    from acquire.store.spec import READABLE
 
     if format_of(place) not in READABLE:
         return _known(place)

@@ -104,7 +104,7 @@ def _step(
         try:
             exposure = record(daemon, step.name, directory, lines, code=step.code)
             found = []
-            for look in _looks(step, exposure):
+            for look in _looks(step, exposure, out):
                 found.append(kept(out, exposure, look))
                 if not quiet:
                     _tell(found[-1])
@@ -118,9 +118,9 @@ def _step(
     raise AssertionError  # the last try returns or raises
 
 
-def _looks(step: Step, exposure: Exposure) -> Iterator[Callable[[Calibration], Finding]]:
-    """What is to be found in a step's recording, given what is known."""
-    from acquire.calibrate import columns, target
+def _looks(step: Step, exposure: Exposure, out: str) -> Iterator[Callable[[Calibration], Finding]]:
+    """What is to be found in a step's recording, given what is known; a ramp told more than a flat does."""
+    from acquire.calibrate import columns, open_calibration, target
     from acquire.calibrate.transfer import transfer
 
     looks: dict[str, Callable[[Calibration], Finding]] = {
@@ -130,7 +130,9 @@ def _looks(step: Step, exposure: Exposure) -> Iterator[Callable[[Calibration], F
         "orientation": lambda known: target.orientation(exposure, known),
         "align": lambda known: target.alignment(exposure, known),
     }
-    return (looks[name] for name in step.finds)
+    for name in step.finds:
+        if name != "transfer" or "linearity" not in open_calibration(out).steps:
+            yield looks[name]
 
 
 def _tell(found: Finding) -> None:

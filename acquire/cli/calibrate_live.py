@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from acquire.calibrate.calibration import Calibration, Finding
     from acquire.calibrate.exposure import Exposure
     from acquire.client import Client
-    from acquire.daemon.messages import LightCode, TriggerDelays
+    from acquire.daemon.messages import LightCode, TriggerDelays, TriggerWindow
 
 SEALED_S = 120.0
 """Longest wait for a recording to be sealed, beside the time that its lines take."""
@@ -53,8 +53,9 @@ def record(
     *,
     code: LightCode = "rig",
     delays: TriggerDelays | None = None,
+    window: TriggerWindow | None = None,
 ) -> Exposure:
-    """Arm with the light and the delays that are wanted, record ``NAME-1.zarr`` or the next free, disarm.
+    """Arm with the light and the timing that are wanted, record ``NAME-1.zarr`` or the next free, disarm.
 
     Again where lines were lost, which a busy host may do; DataError where they are each time.
     """
@@ -62,7 +63,10 @@ def record(
     from acquire.store import open_recording
 
     for _ in range(TRIES):
-        path = _recorded(daemon, free(directory, name), lines, code, delays)
+        if daemon.status().state == "armed":
+            daemon.disarm()
+        daemon.arm(code=code, calibration="none", delays=delays, window=window)
+        path = _recorded(daemon, free(directory, name), lines)
         made = open_recording(path)
         missing = max(0, lines - made.lines) + sum(gap.count for gap in made.gaps)
         if missing <= MOST_LOST * lines:
@@ -71,12 +75,9 @@ def record(
     raise DataError(f"{TRIES} recordings lacked lines", hint="acquire status, acquire bench")
 
 
-def _recorded(daemon: Client, path: Path, lines: int, code: LightCode, delays: TriggerDelays | None) -> Path:
+def _recorded(daemon: Client, path: Path, lines: int) -> Path:
     from acquire.client import SEALED
 
-    if daemon.status().state == "armed":
-        daemon.disarm()
-    daemon.arm(code=code, calibration="none", delays=delays)
     status = daemon.start(path, lines=lines)
     rates = [arm.rate_hz for arm in status.arms.values() if arm.rate_hz > 0]
     daemon.wait(SEALED, timeout_s=SEALED_S + lines / min(rates, default=1000.0))

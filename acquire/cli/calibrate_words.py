@@ -6,8 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from acquire.calibrate.calibration import Measured
+
 if TYPE_CHECKING:
-    from acquire.calibrate.calibration import AlignmentFound, Calibration, Finding, Measured
+    from acquire.calibrate.calibration import AlignmentFound, Calibration, Finding
     from acquire.calibrate.check import Check
 
 PER_ARM = {
@@ -31,6 +33,8 @@ def found_facts(found: Finding) -> dict[str, Any]:
     if found.step == "flat":
         facts["arm A's part of the light"] = f"{found.facts['part_a']:.2%}"
         facts["hidden by the optics"] = _columns(found.facts["optics_hide_columns"])
+    if found.step == "linearity":
+        facts |= _linearity(found)
     if found.step == "delay":
         tick_ns = 1e9 / found.facts["clock_hz"]
         late = found.quantities["light_late_ticks"].value * tick_ns
@@ -99,7 +103,36 @@ def _quantities(quantities: Any) -> dict[str, str]:
     for name, (label, unit) in PER_ARM.items():
         if name in quantities:
             facts[label] = _both(quantities[name], unit)
+    if "linearity_error" in quantities:
+        error = quantities["linearity_error"]
+        facts["linearity error"] = _both(Measured(100 * error.value, 100 * error.uncertainty), " %")
+    if "excess_dn" in quantities and quantities["excess_dn"].value.any():
+        facts["off the straight line by"] = _curve(quantities["excess_dn"])
     return facts
+
+
+def _linearity(found: Finding) -> dict[str, str]:
+    columns = (found.facts[name] for name in ("levels", "reached", "left_over", "powers"))
+    rows = list(zip("ab", *columns, strict=True))
+    return {
+        "levels": "; ".join(
+            f"{arm} {count}, up to {part:.0%} of saturation" for arm, count, part, *_ in rows
+        ),
+        "left over": "; ".join(
+            f"{arm} {left:.2g} % with the curve" if powers else f"{arm} is straight: no curve"
+            for arm, _, _, left, powers in ((*row[:3], 100 * row[3], row[4]) for row in rows)
+        ),
+    }
+
+
+def _curve(measured: Measured) -> str:
+    """Where samples are off the most, and how sure that is."""
+    worst = np.abs(measured.value).argmax(axis=1)
+    ends = measured.value.shape[1] - 1
+    return "; ".join(
+        f"{arm} {row[at]:+.1f} ± {error[at]:.2g} DN at {at / ends:.0%} of white"
+        for arm, row, error, at in zip("ab", measured.value, measured.uncertainty, worst, strict=True)
+    )
 
 
 def _range(measured: Measured, unit: str) -> str:

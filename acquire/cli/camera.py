@@ -94,7 +94,7 @@ def snapshot(
 def _check_out(path: Path) -> None:
     if path.suffix.lower() not in (".png", ".npy"):
         raise UsageError(
-            f"snapshot to {path}: its suffix names no format",
+            f"snapshot to {path}: its suffix is that of no format",
             possible=".png, .npy",
             hint=f"--out {path.with_suffix('.png')}",
         )

@@ -171,7 +171,9 @@ def eyes_of(config: str | None, serial: str | None, code: LightCode | None, clie
             ) from error
         return CameraEyes(Bench(None), serial)
     if code is not None:
-        raise UsageError("--code for cameras that the daemon has", hint=f"acquire arm --code {code}")
+        raise UsageError(
+            "--code cannot change the light of cameras that the daemon has", hint=f"acquire arm --code {code}"
+        )
     return RingEyes(client, serial)
 
 

@@ -117,6 +117,7 @@ def check(file: FileArgument, json: JsonFlag = False) -> None:
             "rig": facts["name"],
             "geometry": f"M = {facts['stages']} stages, S = {facts['substeps']} sub-steps, "
             f"n = {facts['size']} rows and columns",
+            "scene": facts["behind_fibre"],
             "lines": quantity(facts["line_rate_hz"], "Hz"),
             "sub-steps": quantity(facts["substep_rate_hz"], "Hz"),
             "data": f"{quantity(facts['bytes_per_s'], 'B')}/s from both arms, {facts['dtype']}",
@@ -162,7 +163,12 @@ def schema(
 
 
 def _facts(rig: RigConfig) -> dict[str, Any]:
-    stages, substeps = rig.geometry.stages, rig.geometry.substeps
+    stages, substeps, fibre = rig.geometry.stages, rig.geometry.substeps, rig.laid_out
+    tiles = None
+    if fibre is not None:
+        tiles = (
+            f"{fibre.rows} x {fibre.columns} behind a fibre: {fibre.tile_rows} x {fibre.tile_columns} tiles"
+        )
     sample_bytes = 1 if rig.cameras.a.dtype == "uint8" else 2
     return {
         "name": rig.name,
@@ -172,7 +178,9 @@ def _facts(rig: RigConfig) -> dict[str, Any]:
         "line_rate_hz": rig.line_rate_hz,
         "substep_rate_hz": rig.line_rate_hz * substeps,
         "dtype": rig.cameras.a.dtype,
-        "bytes_per_s": 2 * rig.line_rate_hz * stages * sample_bytes,
+        "behind_fibre": tiles,
+        "pixels": rig.pixels,
+        "bytes_per_s": 2 * rig.line_rate_hz * rig.pixels * sample_bytes,
         "upload_to": rig.recording.upload_to,
         "socket": str(rig.control.socket),
     }

@@ -1,4 +1,4 @@
-"""``acquire arm | start | stop | disarm | status``: one command to the daemon each."""
+"""``acquire arm | start | stop | disarm | status | reload``: one command to the daemon each."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import typer
 
 from acquire.cli.completion import states
 from acquire.cli.durations import seconds
-from acquire.cli.output import JsonFlag, print_warning
+from acquire.cli.output import JsonFlag, print_json, print_warning, say
 from acquire.cli.status_page import show, show_document
 from acquire.daemon.glance import NO_ANSWER, status_document
 from acquire.errors import DataError, UsageError
-from acquire.text import did_you_mean
+from acquire.text import did_you_mean, shown
 
 if TYPE_CHECKING:
     from acquire.client import Client
@@ -29,7 +29,7 @@ DAMAGED = ("INCOMPLETE", "ABORTED", None)
 
 
 def register(app: typer.Typer) -> None:
-    for command in (arm, start, mark, stop, disarm, status):
+    for command in (arm, start, mark, stop, disarm, status, reload):
         app.command(rich_help_panel="Capture")(command)
 
 
@@ -147,6 +147,26 @@ def disarm(socket: SocketOption = None, json: JsonFlag = False) -> None:
     """
     with _daemon(socket) as daemon:
         show(daemon.disarm(), json)
+
+
+def reload(socket: SocketOption = None, json: JsonFlag = False) -> None:
+    """Have the service read its rig file anew, and apply what has changed, also while it records.
+
+    The log level, hooks, the page, the disk's reserve and what is kept of endless recordings can change. A
+    file that changes anything else, such as cameras, geometry or code, is refused as a whole, exit code 2,
+    with the keys: end the service when it is idle and start it anew.
+
+    Example: [bold]acquire reload[/]
+    """
+    with _daemon(socket) as daemon:
+        done = daemon.reload()
+    if json:
+        print_json(done.model_dump(mode="json"))
+        return
+    for one in done.changed:
+        say(f"{one.key} = {shown(one.new)} {one.holds}; it was {shown(one.old)}")
+    if not done.changed:
+        say(f"{done.file} says what it said before")
 
 
 def status(

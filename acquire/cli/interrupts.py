@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
+import sys
 import threading
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
@@ -73,7 +73,8 @@ def _handled_by(handler: signal._HANDLER) -> Iterator[None]:
 
 def _end_now() -> None:
     """End our processes, and this one: by an exception, so that what is half-made is removed, or without."""
-    for child in multiprocessing.active_children():
+    processes = sys.modules.get("multiprocessing")  # who has started one has loaded it
+    for child in processes.active_children() if processes else ():
         child.kill()
     timer = threading.Timer(GRACE_S, os._exit, (EXIT_INTERRUPTED,))
     timer.name, timer.daemon = END_NOW, True

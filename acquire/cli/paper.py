@@ -18,6 +18,7 @@ from acquire.errors import UsageError
 
 if TYPE_CHECKING:
     from acquire.evaluate.paper import PaperFigure, Studio
+    from acquire.evaluate.paper.page import Drawn
 
 NAMES = ("fig6", "fig7", "fig8", "fig9", "fig10", "fig11")
 
@@ -65,42 +66,46 @@ def paper(
         chosen = _one_of_a_recording(figures)
     from acquire.cores import idle_cores, limit_blas
     from acquire.evaluate.paper import Studio, make
-    from acquire.evaluate.paper.page import draw, summarise, write_page
+    from acquire.evaluate.paper.page import draw, write_page
     from acquire.reconstruct import Options
 
     options = Options(preset, solver, None, budget)  # type: ignore[arg-type]  # checked there
-    made: list[dict[str, Any]] = []
-    pictures: dict[str, Path] = {}
+    made: list[Drawn] = []
     with new_directory(out), told() as tell, limit_blas(idle_cores()):
         for name in chosen:
             studio = Studio(out, options, seed, lambda text, name=name: tell(f"{name}: {text}"))  # type: ignore[misc]
             figure = make(name, studio) if recording is None else _recorded(recording, studio, first_line)
-            pictures |= draw(figure, out)
-            made.append(summarise(figure))
+            made.append(draw(figure, out, studio.host.busyness()))
             page = write_page(
-                made, pictures, studio, f"acquire {shlex.join(sys.argv[1:])}", datetime.now(UTC), recording
+                made, studio, f"acquire {shlex.join(sys.argv[1:])}", datetime.now(UTC), recording
             )
     if json:
-        print_json({"page": str(page), "figures": made})
+        print_json({"page": str(page), "figures": [each.facts for each in made]})
         return
     for each in made:
-        say(f"Fig. {each['name'][3:]}  {each['title']}")
-        print_table(("", "the paper", "here"), [tuple(row.values()) for row in each["rows"]])
+        say(f"Fig. {each.facts['name'][3:]}  {each.facts['title']}")
+        print_table(
+            ("", "the paper", "here", "against it", "by"), [_cells(row) for row in each.facts["rows"]]
+        )
         say()
     say(f"page  {page}")
 
 
+def _cells(row: dict[str, Any]) -> tuple[str, ...]:
+    return row["what"], row["paper"], row["ours"], row["verdict"], row["by"]
+
+
 def _one_of_a_recording(figures: list[str] | None) -> list[str]:
     if figures not in (None, [], ["fig9"]):
-        raise UsageError(f"{', '.join(figures)} from a recording", possible="fig9")
+        raise UsageError(f"{', '.join(figures)} cannot be made from a recording", possible="fig9")
     return ["fig9"]
 
 
 def _recorded(place: str, studio: Studio, first_line: int | None) -> PaperFigure:
     import matplotlib as mpl
 
-    from acquire.evaluate.figures import STYLE
     from acquire.evaluate.paper.fig9_recorded import figure_of
+    from acquire.evaluate.themed import STYLE
     from acquire.store import open_recording
 
     with mpl.rc_context(STYLE):

@@ -18,11 +18,13 @@ from acquire.cli.output import JsonFlag, note, print_facts, print_json, print_ta
 from acquire.cli.progress import stage_progress
 from acquire.cli.recordings import PlaceArgument
 from acquire.cli.stretch import FirstLineOption, FromOption, LinesOption, ToOption
+from acquire.cli.tiles import TilesOption, tiles_of
 from acquire.errors import EXIT_INTERRUPTED, UsageError
 
 if TYPE_CHECKING:
     from acquire.cli.reconstruct_request import Asked, Prepared
     from acquire.config.plan import ReconstructionPlan
+    from acquire.fibre import Tile
     from acquire.reconstruct import Options, Outcome, VideoRequest
     from acquire.store import Recording
 
@@ -129,6 +131,7 @@ def reconstruct(
             "--try-orientations", help="Swap or mirror the arms if the lines say clearly that they are."
         ),
     ] = False,
+    tiles: TilesOption = None,
     preview: Annotated[
         bool, typer.Option("--preview", help="Make a coarse video in a second or two.")
     ] = False,
@@ -164,6 +167,8 @@ def reconstruct(
         open_denoiser(denoiser)
     open_arrays(device if dask is None else "cpu", dtype)  # a cluster's devices are not here
     opened = open_recording(recording)
+    looks = {"--auto": auto, "--explain": explain, "--try-orientations": try_orientations}
+    asked_tiles = _tiles_asked(opened, tiles, looks)
     chosen = choose(opened, calibration)
     asked = Asked(
         first_line=first_line,
@@ -190,6 +195,7 @@ def reconstruct(
             solver_options=solver_options,
             denoiser=denoiser,
         ),
+        tiles=asked_tiles,
     )
     explained = explain_calibration(opened, chosen, asked, wanted=explain, json=json and out is None)
     if explained and not (out or auto):
@@ -222,6 +228,17 @@ def _check_something_asked(*wanted: object) -> None:
             "reconstruct needs --out, where the video goes",
             possible="--out NAME.zarr; --auto alone shows a plan, --explain what a calibration gives",
         )
+
+
+def _tiles_asked(recording: Recording, text: str | None, looks: dict[str, bool]) -> tuple[Tile, ...]:
+    """Those of a scene behind a fibre, which the options ``looks`` could not look at as a whole."""
+    tiles = tiles_of(recording, text)
+    if wanted := [option for option, asked in looks.items() if asked and tiles]:
+        raise UsageError(
+            f"{wanted[0]} needs lines that see one scene, and these see tiles behind a fibre",
+            possible="--nm, --tm, --voxels, --segment or --plan, which hold for every tile",
+        )
+    return tiles
 
 
 def _turned(recording: Recording, asked: Asked, *, wanted: bool) -> Asked:
@@ -275,7 +292,7 @@ def _run(
     """``where``: processes, or a cluster; ``began`` is when the budget did."""
     from acquire.reconstruct import Watcher, combine, open_pool
 
-    tasks, (workers, cluster) = len(request.stretches), where
+    tasks, (workers, cluster) = len(request.stretches) * max(1, len(request.tiles)), where
     at_once = workers or (None if options.device == "cpu" else 1)  # one process fills a GPU
     with (
         first_interrupt_asks("finishing the sub-segments under way, as far as they came") as interrupted,
@@ -302,7 +319,7 @@ def _report(outcomes: list[Outcome], *, json: bool, brief: bool) -> None:
         if len(segments) > 1:
             say()
             _print_segments(segments)
-        for text in dict.fromkeys(text for part in segments for text in part["warnings"]):
+        for text in outcome.provenance["warnings"]:
             print_warning(text)
 
 
@@ -320,6 +337,7 @@ def _readable(outcome: Outcome) -> dict[str, Any]:
         else f"the budget ended after {done} of {of} sub-segments"
         if outcome.cut
         else None,
+        "tiles": _tiles(facts),
         "trusted": f"frames {first} to {end - 1}" if end > first else f"none: {nothing}",
         "solver": f"{facts['solver']}, {_iterations(facts)}, {facts['seconds']:.1f} s",
         "corrected": ", ".join(facts["calibration"]["corrected"]) if facts["calibration"] else None,
@@ -331,6 +349,15 @@ def _readable(outcome: Outcome) -> dict[str, Any]:
         "noise": None if quality.get("noise") is None else _beside_noise(quality),
         "coverage": f"{quality['coverage']:.2%} of the samples usable",
     }
+
+
+def _tiles(facts: dict[str, Any]) -> str | None:
+    """Of a scene behind a fibre: which, and how many are there."""
+    if not (tiles := facts["tiles"]):
+        return None
+    there = len(facts["segments"]) * len(tiles) // facts["segments_asked"]
+    which = tiles[0] if len(tiles) == 1 else f"{tiles[0]} to {tiles[-1]}"
+    return f"{which}, {there} of {len(tiles)}"
 
 
 def _beside_noise(quality: dict[str, Any]) -> str:
@@ -348,7 +375,7 @@ def _iterations(facts: dict[str, Any]) -> str:
 def _print_segments(segments: list[dict[str, Any]]) -> None:
     rows = [
         (
-            part["name"] or number,
+            part["name"] or (f"tile {part['tile']}" if part["tile"] else number),
             f"{part['spatial_merge']}x{part['temporal_merge']}",
             part["end_substep"] - part["begin_substep"],
             f"{part['first_line']} to {part['first_line'] + part['lines'] - 1}",

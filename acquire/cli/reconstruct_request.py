@@ -16,13 +16,22 @@ from acquire.cores import idle_cores, limit_blas
 from acquire.errors import UsageError
 from acquire.recon.segments import Stretch, Voxels
 from acquire.reconstruct.learned import Choice, choose, recall
-from acquire.reconstruct.select import Selection, along_plan, by_lines, by_time, in_glimpses, in_voxels
+from acquire.reconstruct.select import (
+    Selection,
+    along_plan,
+    by_lines,
+    by_time,
+    in_glimpses,
+    in_tiles,
+    in_voxels,
+)
 from acquire.store.files import check_new_path
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from acquire.config.plan import ReconstructionPlan
+    from acquire.fibre import Tile
     from acquire.reconstruct import Options, VideoRequest
     from acquire.store import Recording
 
@@ -32,6 +41,8 @@ PREVIEW_BANDWIDTH = 0.5
 PREVIEW_MERGE = 4
 PREVIEW_LINES = 320
 """More than these are not looked at one after the other, but in glimpses."""
+PREVIEW_SIDE = 16
+"""Voxels of a tile of a scene behind a fibre, along either side."""
 GLIMPSES = 12
 GLIMPSE_MERGE = 16
 ENDS = {None: None, "trusted": False, "whole": True}
@@ -54,6 +65,7 @@ class Asked:
     preview: bool
     preset: str | None
     options: Options
+    tiles: tuple[Tile, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +83,8 @@ class Prepared:
 def prepare(recording: Recording, asked: Asked) -> Prepared:
     """What is to be done. UsageError and ConfigError for what cannot be."""
     prepared = _requests(recording, asked)
+    requests = {name: in_tiles(request, asked.tiles) for name, request in prepared.requests.items()}
+    prepared = replace(prepared, requests=requests)
     if asked.preview:
         return prepared
     learned = Choice(asked.preset, "") if asked.preset else _learned(prepared)
@@ -85,7 +99,8 @@ def _learned(prepared: Prepared) -> Choice:
     if options.budget_s is None or not known:
         return Choice(None, "")
     grids = [request.grid for request in prepared.requests.values()]
-    return choose(known, options.budget_s, sum(grid.frames * grid.side**2 for grid in grids))
+    tiles = max(1, *(len(request.tiles) for request in prepared.requests.values()))
+    return choose(known, options.budget_s, tiles * sum(grid.frames * grid.side**2 for grid in grids))
 
 
 def _requests(recording: Recording, asked: Asked) -> Prepared:
@@ -98,7 +113,7 @@ def _requests(recording: Recording, asked: Asked) -> Prepared:
         options = replace(
             asked.options, iterations=PREVIEW_ITERATIONS, bandwidth=PREVIEW_BANDWIDTH, check=False
         )
-        return Prepared({"": _preview(selection, whole=whole)}, options)
+        return Prepared({"": _preview(selection, len(asked.tiles), whole=whole)}, options)
     plan = _plan(recording, selection, asked)
     if plan is not None:
         if asked.save_plan is not None:
@@ -153,14 +168,18 @@ def _after_ns(recording: Recording, text: str | None) -> int | None:
     )
 
 
-def _preview(selection: Selection, *, whole: bool | None) -> VideoRequest:
+def _preview(selection: Selection, tiles: int, *, whole: bool | None) -> VideoRequest:
     """The whole of a selection in a second or two, however long it is: coarse, or glimpses of it."""
     stream = selection.stream
-    side = min(2 * stream.substeps, stream.geometry(1).size)
+    size = stream.geometry(1).size
+    side = min(2 * stream.substeps, size)
+    if tiles:  # a scene of so many is seen from farther away, in voxels that fill each
+        side = max(merge for merge in range(1, max(1, size // PREVIEW_SIDE) + 1) if not size % merge)
     begin, end = selection.extent(Voxels(1, 1), Voxels(1, 1), whole=False)
     lines = stream.sub_segment(Stretch(begin, end, Voxels(1, 1))).lines
-    if lines > PREVIEW_LINES and end - begin >= GLIMPSES * GLIMPSE_MERGE:
-        return in_glimpses(selection, Voxels(side, GLIMPSE_MERGE), GLIMPSES)
+    glimpses = max(1, GLIMPSES // max(1, tiles))
+    if lines > PREVIEW_LINES and end - begin >= glimpses * GLIMPSE_MERGE:
+        return in_glimpses(selection, Voxels(side, GLIMPSE_MERGE), glimpses)
     return in_voxels(selection, Voxels(side, PREVIEW_MERGE), whole_ends=whole, longest=1 << 62)
 
 

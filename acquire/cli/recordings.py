@@ -13,6 +13,7 @@ from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, q
 from acquire.cli.places import local_path
 from acquire.cli.progress import stage_progress
 from acquire.cli.stretch import FirstLineOption, FromOption, LinesOption, ToOption, lines_between
+from acquire.cli.tiles import TileOption, tile_of
 from acquire.errors import AcquireError, DataError, UsageError
 from acquire.text import shortened
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from acquire.lines import Segment
-    from acquire.store import Mirrored, Recording, Verification
+    from acquire.store import Mirrored, Outline, Verification
 
 PlaceArgument = Annotated[
     str,
@@ -80,9 +81,9 @@ def info(recording: PlaceArgument, json: JsonFlag = False) -> None:
 
     Example: [bold]acquire info run.zarr[/]
     """
-    from acquire.store import open_recording, suspect_lines
+    from acquire.store import open_outline, suspect_lines
 
-    opened = open_recording(recording)
+    opened = open_outline(recording)
     suspect = [found.to_dict() for found in suspect_lines(opened)]
     facts = opened.info() | {"damage": _damage(opened), "suspect": suspect}
     if json:
@@ -223,6 +224,7 @@ def cut(
         int,
         typer.Option(min=1, help="Lines and columns of a sensor without intra-line steps that are added up."),
     ] = 1,
+    tile: TileOption = None,
     json: JsonFlag = False,
 ) -> None:
     """Write a stretch of both arms to an npz file: lines, mask, code, time_ns, stages, substeps and scales.
@@ -242,7 +244,7 @@ def cut(
     first = opened.first_available_line if first is None else first
     count = opened.first_line + opened.lines - first if count is None else count
     with stage_progress(f"cutting {count} lines"):
-        segment = opened.cut(first, count)
+        segment = opened.cut(first, count, tile_of(opened, tile))
         size = _save(segment if merge == 1 else merged(segment, merge), out)
     facts = {"path": str(out), "first_line": first, "lines": count, "bytes": size}
     if json:
@@ -280,11 +282,11 @@ def _may_be_one(path: Path) -> bool:
 
 
 def _summary(path: Path) -> dict[str, Any]:
-    from acquire.store import open_recording
-    from acquire.store.camera_stream import DAMAGE
+    from acquire.store import open_outline
+    from acquire.store.layout import DAMAGE
 
     try:
-        opened = open_recording(path)
+        opened = open_outline(path)
         facts = opened.info() | {"damage": _damage(opened)}
     except AcquireError as error:
         return {"path": str(path), "error": error.message}
@@ -294,7 +296,7 @@ def _summary(path: Path) -> dict[str, Any]:
     return {key: facts[key] for key in keys}
 
 
-def _damage(recording: Recording) -> str | None:
+def _damage(recording: Outline) -> str | None:
     """What shows without reading the lines: files that are gone or cut short, segments that are not there."""
     from acquire.store.shortfall import first_shortfall, missing_segments
 
@@ -335,6 +337,7 @@ def _readable(facts: dict[str, Any]) -> dict[str, Any]:
         "duration": f"{facts['duration_s']:.6f} s at {quantity(facts['line_rate_hz'], 'Hz')}",
         "started": _utc(facts["start_ns"]),
         "geometry": f"M = {sizes['stages']}, S = {sizes['substeps']}, {sizes['pixels']} pixels",
+        "scene": _behind_fibre(sizes),
         "samples": facts["dtype"],
         "code": ", ".join(f"{key} {shortened(value, 60)}" for key, value in facts["code"].items()),
         "clock": f"{facts['clock']['clock_hz']} Hz, {_known_to(facts['clock']['uncertainty_ns'])}",
@@ -384,7 +387,7 @@ def _outage(segment: dict[str, Any] | None) -> str | None:
 
 def _stretches(stretches: list[list[Any]]) -> str | None:
     """Stretches of lines, at most some of them; what has no end is what a copy still needs."""
-    from acquire.store.retention import ALL_LINES
+    from acquire.store.terms import ALL_LINES
 
     shown = [
         f"{first} on" if count >= ALL_LINES else f"{first} to {first + count - 1}"
@@ -402,6 +405,18 @@ def _suspect(found: list[dict[str, Any]]) -> str | None:
     ]
     more = [f"and {len(found) - LISTED} more"] if len(found) > LISTED else []
     return ", ".join(shown + more) or None
+
+
+def _behind_fibre(sizes: dict[str, Any]) -> str | None:
+    """Of a recording whose columns see bands of a larger scene."""
+    if (fibre := sizes.get("fibre")) is None:
+        return None
+    side = sizes["stages"] * sizes["substeps"]
+    tiles = f"{fibre['rows'] // side} x {fibre['columns'] // side} tiles of {side} x {side}"
+    bands = " and ".join(str(len(fibre["bands"][arm])) for arm in ("a", "b"))
+    return (
+        f"{fibre['rows']} x {fibre['columns']} fine pixels behind a fibre, {tiles}; {bands} bands on a and b"
+    )
 
 
 def _disk(disk: dict[str, float] | None) -> str | None:
@@ -447,6 +462,7 @@ def _save(segment: Segment, out: Path) -> int:
             stages=segment.geometry.stages,
             substeps=segment.geometry.substeps,
             first_line=segment.first_line,
+            first_column=segment.first_column,
             substep_ns=segment.substep_ns,
             black_level_dn=segment.black_level_dn,
             responsivity_dn=segment.responsivity_dn,

@@ -26,7 +26,10 @@ def render(
         typer.Argument(metavar="VIDEO...", help="Videos, by path or URL; several are shown side by side."),
     ],
     out: Annotated[
-        Path, typer.Option(metavar="FILE", help="New file: .mp4, .gif, .webp, or .png (a sheet of frames).")
+        Path,
+        typer.Option(
+            metavar="FILE", help="New file: .mp4, .gif, .webp, .png (a sheet of frames), .html (a page)."
+        ),
     ],
     frames: Annotated[
         int | None,
@@ -39,7 +42,10 @@ def render(
     ] = None,
     json: JsonFlag = False,
 ) -> None:
-    """Make a movie, an animation or a sheet of stills of reconstructed videos.
+    """Make a movie, an animation, a sheet of stills or a page of reconstructed videos.
+
+    A page has a player that pauses and steps, what of the lines each frame leaves unexplained, and an account
+    of every sub-segment.
 
     Example: [bold]acquire render fish-1x820.zarr fish-3x4.zarr --out fish.mp4[/]
     """

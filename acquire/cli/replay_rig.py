@@ -18,6 +18,7 @@ from acquire.lines import ARMS
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from acquire.fibre import Fibre
     from acquire.store import Recording
 
 BLOCK_BYTES = 2**20
@@ -35,7 +36,8 @@ PATIENCE_S = 120.0
 def replay_rig(stored: Recording, speed: float, directory: Path, **simulation: Any) -> dict[str, Any]:
     """A rig file's table. Raises UsageError for a recording that no simulated rig can replay."""
     geometry = stored.attrs["geometry"]
-    if geometry["pixels"] != geometry["stages"]:
+    fibre = stored.fibre
+    if fibre is None and geometry["pixels"] != geometry["stages"]:
         raise UsageError(
             f"{stored} cannot be replayed: its lines have {geometry['pixels']} pixels",
             possible=f"as many as stages, {geometry['stages']}",
@@ -52,10 +54,27 @@ def replay_rig(stored: Recording, speed: float, directory: Path, **simulation: A
             "substep_ticks": stored.attrs["trigger"]["line_period_ticks"] // substeps,
             "tag_every_lines": max(1, min(256, slots * block // 4)),
         },
-        "cameras": {arm: _camera(stored, arm) for arm in ARMS},
+        "cameras": {arm: _camera(stored, arm) for arm in ARMS} | _layout(fibre),
+        "fibre": _table(fibre),
         "stream": {"block_lines": block, "ring_slots": slots, "reopen_s": PATIENCE_S},
         "recording": {"directory": str(directory), "chunk_lines": _chunk_lines(stored), "reserve_gb": 0.0},
         "simulation": {"speed": speed, "replay": str(stored.path.resolve()), **simulation},
+    }
+
+
+def _layout(fibre: Fibre | None) -> dict[str, str]:
+    return {} if fibre is None else {"layout": "fibre"}
+
+
+def _table(fibre: Fibre | None) -> dict[str, Any] | None:
+    if fibre is None:
+        return None
+    return {
+        "rows": fibre.rows,
+        "columns": fibre.columns,
+        "sensor_pixels": fibre.sensor_pixels,
+        "bands_a": fibre.bands_a,
+        "bands_b": fibre.bands_b,
     }
 
 

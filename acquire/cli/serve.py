@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from acquire.cli.completion import rigs
+
+if TYPE_CHECKING:
+    from acquire.config import RigConfig
 
 
 def register(app: typer.Typer) -> None:
@@ -43,7 +46,8 @@ def serve(
 ) -> None:
     """Own the rig's devices and take commands, until SIGTERM or Ctrl-C.
 
-    A recording under way is drained and sealed first; a second Ctrl-C seals what there is at once.
+    A recording under way is drained and sealed first; a second Ctrl-C seals what there is at once. Where no
+    terminal is its own, SIGHUP has it read the file anew, as `acquire reload` does.
 
     Example: [bold]acquire serve --config rig-demo[/]
     """
@@ -59,14 +63,20 @@ def serve(
     overrides = parse_settings(settings or [])
     if socket is not None:
         overrides["control.socket"] = str(socket.absolute())
-    rig = load_rig(config, overrides)
-    check_host(rig)
+    path = find(config, kind="rig").absolute()
+
+    def read() -> RigConfig:
+        rig = load_rig(path, overrides)
+        check_host(rig)
+        return rig
+
+    rig = read()
     check_upload(rig)
-    write_log(logging.INFO)
+    write_log(rig.service.level)
     logging.getLogger("uvicorn").setLevel(logging.WARNING)
     if owned:
         threading.Thread(target=end_with_owner, name="acquire-owner", daemon=True).start()
-    raise typer.Exit(run_daemon(rig, str(find(config, kind="rig").absolute())))
+    raise typer.Exit(run_daemon(rig, str(path), read))
 
 
 def end_with_owner() -> None:

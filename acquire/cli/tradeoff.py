@@ -22,6 +22,7 @@ from acquire.errors import UsageError
 
 if TYPE_CHECKING:
     from acquire.evaluate.cases import Case
+    from acquire.evaluate.host import HostWatch
     from acquire.evaluate.tradeoff import Run
     from acquire.recon.segments import Voxels
     from acquire.reconstruct.learned import Learned
@@ -88,6 +89,7 @@ def tradeoff(
     """
     from acquire.arrays import open_arrays
     from acquire.cli.reconstruct_request import parse_voxels
+    from acquire.evaluate.host import HostWatch
     from acquire.evaluate.tradeoff import table
     from acquire.evaluate.tradeoff_page import write_page
     from acquire.plugins import SOLVERS
@@ -105,11 +107,13 @@ def tradeoff(
         raise UsageError(f"a budget of {budget:g} s is out of range", possible="more than 0")
     with new_directory(out):
         cases, effects = _cases(sources, out, full_well or [], (first_line, lines, repeats))
-        runs, truths = _measure(cases, repeats, kinds, asked, budget)
+        host = HostWatch()
+        runs, truths = _measure(cases, repeats, kinds, asked, budget, host)
         heading = {
             "title": ", ".join(Path(source).stem for source in sources),
             "command": f"acquire {shlex.join(sys.argv[1:])}",
             "notes": _notes(cases, repeats),
+            "host": host.busyness().facts(),
         }
         page = write_page(runs, truths, effects, out, heading, datetime.now(UTC))
     kept = remember(_lessons(runs)) if learn else None
@@ -129,6 +133,7 @@ def _measure(
     kinds: tuple[Voxels, ...],
     asked: list[tuple[str, str, str]],
     longest_s: float,
+    host: HostWatch,
 ) -> tuple[list[Run], dict[tuple[str, Voxels], Any]]:
     """Every run, and the true frames beside those that are shown."""
     from acquire.cores import idle_cores, limit_threads
@@ -140,6 +145,7 @@ def _measure(
             tell(f"preparing {case.name}")
             judge = case.judge(repeat)
         for voxels, (solver, preset, exact) in itertools.product(kinds, asked):
+            host.look()
             what = f"{case.name}: {solver} {preset} {voxels}, {repeat + 1} of {repeats}"
             with stage_progress(what) as advance, limit_threads(idle_cores()):
                 run = measure(judge, solver, voxels, preset, longest_s, advance, dtype=exact)  # type: ignore[arg-type]  # checked before
@@ -147,18 +153,13 @@ def _measure(
             if repeat == 0:
                 true = judge.truth(voxels)
                 truths[case.name, voxels] = None if true is None else true[judge.picked(voxels)].copy()
+    host.look()
     return runs, truths
 
 
 def _notes(cases: list[Case], repeats: int) -> list[str]:
-    from acquire.cores import usable_cores
-
     differ = dict.fromkeys(case.repeats for case in cases)
-    notes = [f"{repeats} repeats: {each}." for each in differ] if repeats > 1 else ["One run of each kind."]
-    notes.append(
-        f"On {usable_cores()} cores, as busy as they were: wall time depends on that, processor time hardly."
-    )
-    return notes
+    return [f"{repeats} repeats: {each}." for each in differ] if repeats > 1 else ["One run of each kind."]
 
 
 def _cases(

@@ -104,8 +104,8 @@ def command_of(modules: Iterable[str]) -> Any:
 def _module_of(word: str) -> tuple[str, ...]:
     if word in BY_NAME:
         return (BY_NAME[word].module,)
-    what = "no such option" if word.startswith("-") else "no such command"
-    shown = f": {word}" if word.startswith("-") else f" {word!r}"
+    what = "there is no option" if word.startswith("-") else "there is no command"
+    shown = f" {word}" if word.startswith("-") else f" {word!r}"
     known = ("--version", *_HELP) if word.startswith("-") else tuple(BY_NAME)
     raise UsageError(
         f"{what}{shown}{did_you_mean(word, known)}", possible=", ".join(sorted(known)), hint="acquire --help"
@@ -141,10 +141,16 @@ def _as_ours(error: Any) -> UsageError:
     where = f"{command.removeprefix('acquire').lstrip()}: ".removeprefix(": ")
     meant = f"; did you mean {near[0]!r}?" if near else did_you_mean(_mistaken(said), _choices(context))
     return UsageError(
-        f"{where}{said[:1].lower()}{said[1:]}{meant}",
+        f"{where}{_sentence(said[:1].lower() + said[1:])}{meant}",
         possible=", ".join(sorted(near) if near else _choices(context)),
         hint=f"{command} --help",
     )
+
+
+def _sentence(said: str) -> str:
+    """With a verb where click has none."""
+    said = re.sub(r"^no such (option|command):? ", r"there is no \1 ", said)
+    return re.sub(r"^missing ((?:option|argument) .*)", r"the \1 is missing", said)
 
 
 def _mistaken(said: str) -> str:

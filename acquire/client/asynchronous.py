@@ -13,8 +13,8 @@ from pydantic import BaseModel
 
 from acquire.client import core
 from acquire.client.core import Call, EventReader, Target
-from acquire.daemon.facts import Health, News, Rings, Setup, Version
-from acquire.daemon.messages import CapacityStatus, LightCode, Status, TriggerDelays
+from acquire.daemon.facts import Health, News, Reloaded, Rings, Setup, Version
+from acquire.daemon.messages import CapacityStatus, LightCode, Status, TriggerDelays, TriggerWindow
 from acquire.daemon.peer import connect
 from acquire.errors import NoDaemonError
 
@@ -55,10 +55,12 @@ class AsyncClient:
         code: LightCode = "rig",
         calibration: Literal["rig", "none"] = "rig",
         delays: TriggerDelays | None = None,
+        window: TriggerWindow | None = None,
         request_id: str | None = None,
     ) -> Status:
         """idle → armed; the light follows ``code``."""
-        how = {"force": force, "code": code, "calibration": calibration, "delays": delays}
+        trigger = {"delays": delays, "window": window}
+        how = {"force": force, "code": code, "calibration": calibration, **trigger}
         return await self.call(core.arm(request_id=request_id, **how))
 
     async def start(
@@ -97,6 +99,10 @@ class AsyncClient:
     async def measure(self) -> CapacityStatus:
         """What ring, codec and disk sustain here, measured now; only while idle."""
         return await self.call(core.command("capacity", CapacityStatus))
+
+    async def reload(self) -> Reloaded:
+        """Have the daemon read its rig file anew; refused as a whole where a key cannot change meanwhile."""
+        return await self.call(core.command("reload", Reloaded))
 
     async def status(self) -> Status:
         return await self.call(core.fact("status", Status))

@@ -14,8 +14,8 @@ from pydantic import BaseModel
 
 from acquire.client import core
 from acquire.client.core import Call, EventReader, Target
-from acquire.daemon.facts import Health, News, Rings, Setup, Version
-from acquire.daemon.messages import CapacityStatus, LightCode, Status, TriggerDelays
+from acquire.daemon.facts import Health, News, Reloaded, Rings, Setup, Version
+from acquire.daemon.messages import CapacityStatus, LightCode, Status, TriggerDelays, TriggerWindow
 from acquire.daemon.peer import connect
 from acquire.daemon.starting import is_one_starting
 from acquire.daemon.states import State
@@ -81,15 +81,17 @@ class Client:
         code: LightCode = "rig",
         calibration: Literal["rig", "none"] = "rig",
         delays: TriggerDelays | None = None,
+        window: TriggerWindow | None = None,
         request_id: str | None = None,
     ) -> Status:
         """idle → armed: cameras and trigger run, nothing is written. ``force``: however slow the host.
 
         ``code``: what the light follows; ``"dark"`` is off and ``"steady"`` on, as calibration needs it.
         ``calibration="none"``: recordings get no copy of the one that the rig names. ``delays``: of light and
-        cameras, in place of the rig's.
+        cameras, ``window``: of the light in each lit sub-step, both in place of the rig's.
         """
-        how = {"force": force, "code": code, "calibration": calibration, "delays": delays}
+        trigger = {"delays": delays, "window": window}
+        how = {"force": force, "code": code, "calibration": calibration, **trigger}
         return self._do(core.arm(request_id=request_id, **how))
 
     def start(
@@ -133,6 +135,10 @@ class Client:
     def measure(self) -> CapacityStatus:
         """What ring, codec and disk sustain here, measured now; only while idle."""
         return self._do(core.command("capacity", CapacityStatus))
+
+    def reload(self) -> Reloaded:
+        """Have the daemon read its rig file anew; refused as a whole where a key cannot change meanwhile."""
+        return self._do(core.command("reload", Reloaded))
 
     # ---- facts
 
@@ -186,7 +192,7 @@ class Client:
             if time.monotonic() >= deadline:
                 staying = status.state is State.ARMED and State.IDLE in states
                 raise StateError(
-                    f"still {status.state} after waiting {timeout_s:g} s for {wanted}",
+                    f"the daemon is still {status.state} after {timeout_s:g} s of waiting for {wanted}",
                     hint="acquire disarm, or wait for sealed: a recording's end leaves the instrument armed"
                     if staying
                     else "",

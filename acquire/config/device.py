@@ -98,6 +98,12 @@ class TriggerConfig(FrozenModel):
         ticks = {"a": self.a.delay_ticks, "b": self.b.delay_ticks}
         return {arm: (self.light.lead_ticks + delay) / self.clock_hz for arm, delay in ticks.items()}
 
+    @property
+    def lit_part(self) -> tuple[float, float]:
+        """From where to where of a lit sub-step the light is on, as parts of it."""
+        closes = self.substep_ticks if self.light.close_ticks is None else self.light.close_ticks
+        return self.light.open_ticks / self.substep_ticks, closes / self.substep_ticks
+
     @model_validator(mode="before")
     @classmethod
     def _ticks_of_old(cls, table: Any) -> Any:
@@ -193,7 +199,11 @@ class CameraConfig(FrozenModel):
 class CamerasConfig(FrozenModel):
     """The camera of either arm; or one that has both, opened as table a says: of b only the image counts."""
 
-    layout: Literal["dual", "compact"] = "dual"
+    layout: Literal["dual", "compact", "fibre"] = Field(
+        default="dual",
+        description="'dual': a camera for each arm; 'compact': one for both; 'fibre': a camera for each arm, "
+        "behind the fibre that [fibre] describes",
+    )
     a: CameraConfig
     b: CameraConfig
 
@@ -209,7 +219,7 @@ class CamerasConfig(FrozenModel):
         if self.layout == "compact" and (self.a.serial, self.a.driver) != (self.b.serial, self.b.driver):
             raise ValueError("layout 'compact' is one camera: both arms need its serial and driver")
         if (
-            self.layout == "dual"
+            self.layout != "compact"
             and self.a.serial == self.b.serial
             and (self.a.driver, self.b.driver) != ("simulated", "simulated")
         ):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import tomllib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -95,19 +96,25 @@ def check_directory(rig: RigConfig) -> None:
         raise ConfigError(f"recording.directory: there is no directory {directory}", hint="create it first")
 
 
+_SETTINGS = "KEY=VALUE with a TOML value: code.seed=7, name='lab', cameras.a.serial='12'"
+_QUOTABLE = re.compile(r"[^'\x00-\x1f]{1,200}")
+
+
 def parse_settings(settings: Sequence[str]) -> dict[str, Any]:
     """``["code.seed=7", "name='x'"]`` as overrides of `load_rig`; values are TOML."""
     overrides = {}
     for setting in settings:
         key, equals, value = setting.partition("=")
+        if not equals:
+            raise ConfigError(f"setting {shown(setting)} has no '='", possible=_SETTINGS)
         try:
             overrides[key.strip()] = tomllib.loads(f"value = {value}")["value"]
         except (ValueError, RecursionError) as error:
+            quoted = f"""text needs quotes of its own: "{key}='{value}'" """.rstrip()
             raise ConfigError(
-                f"setting {shown(setting)}: {shortened(error)}"
-                if equals
-                else f"setting {shown(setting)} has no '='",
-                possible="KEY=VALUE with a TOML value: code.seed=7, name='lab', cameras.a.serial='12'",
+                f"setting {shown(setting)} holds no TOML value: {shortened(error)}",
+                possible=_SETTINGS,
+                hint=quoted if _QUOTABLE.fullmatch(value) else "",
             ) from error
     return overrides
 

@@ -43,7 +43,9 @@ class SegmentPlan(FrozenModel):
     def _one_length(self) -> SegmentPlan:
         given = [key for key in ("substeps", "lines", "seconds") if getattr(self, key) is not None]
         if len(given) > 1:
-            raise ValueError(f"one of substeps, lines and seconds, not {' and '.join(given)}")
+            raise ValueError(
+                f"{' and '.join(given)} exclude each other; possible: one of substeps, lines and seconds"
+            )
         return self
 
     @property

@@ -120,7 +120,7 @@ class RecordingConfig(FrozenModel):
             return None
         parts = urlsplit(url)
         if not parts.scheme or "://" not in url or not (parts.netloc or parts.path.strip("/")):
-            raise ValueError("not a URL; possible: s3://bucket/prefix, file:///mnt/archive")
+            raise ValueError("it is not a URL; possible: s3://bucket/prefix, file:///mnt/archive")
         if "@" in parts.netloc or parts.query or parts.fragment:
             raise ValueError("credentials and options come from the environment, as AWS_ACCESS_KEY_ID")
         return url.rstrip("/")

@@ -12,16 +12,17 @@ from acquire.codes import TAPS, Code, ConstantCode, PrbsCode
 from acquire.config.base import MOST_SECONDS, SEED_END, FilePath, FrozenModel
 from acquire.config.device import CamerasConfig, TriggerConfig
 from acquire.config.event import CheckConfig, EventsConfig
+from acquire.config.fibre import FibreConfig
 from acquire.config.recording import USUAL_CHUNK_BYTES, RecordingConfig, usual_chunk_lines, usual_tag_chunks
 from acquire.config.service import HooksConfig, ServiceConfig
 from acquire.config.web import WebConfig
-from acquire.errors import ConfigError
+from acquire.errors import ConfigError, UsageError
 from acquire.geometry import Geometry
 from acquire.place import builtin_names, default_socket
 from acquire.plugins import CAMERAS
 
 if TYPE_CHECKING:
-    pass
+    from acquire.fibre import Fibre
 
 RING_RESERVE_SHARE = 4
 """Of the ring's slots, one part in so many stays free for the cameras while a recording takes the past."""
@@ -36,7 +37,7 @@ MAX_RING_BYTES = 4 * 2**30
 class GeometryConfig(FrozenModel):
     """The sensor as the model sees it."""
 
-    stages: int = Field(ge=1, le=4096, description="M, TDI stages; also pixels per line")
+    stages: int = Field(ge=1, le=4096, description="M, TDI stages; also pixels per line, but behind a fibre")
     substeps: int = Field(ge=1, le=8, description="S, charge-transfer steps per line")
 
     def segment(self, lines: int) -> Geometry:
@@ -153,6 +154,9 @@ class RigConfig(FrozenModel):
     ] = PrbsConfig()
     trigger: TriggerConfig = Field(default_factory=TriggerConfig)
     cameras: CamerasConfig
+    fibre: FibreConfig | None = Field(
+        default=None, description="layout 'fibre': how the bands of a larger scene lie on the sensors"
+    )
     stream: StreamConfig = StreamConfig()
     recording: RecordingConfig = RecordingConfig()
     events: EventsConfig = EventsConfig()
@@ -169,19 +173,35 @@ class RigConfig(FrozenModel):
     web: WebConfig | None = Field(default=None, description="absent: the daemon starts no page")
 
     @model_validator(mode="after")
+    def _fibre_meant(self) -> RigConfig:
+        """Before the ring, which holds lines as wide as the sensor behind a fibre."""
+        laid = self.cameras.layout == "fibre"
+        if self.fibre is None and laid:
+            raise ValueError("cameras.layout = 'fibre' needs [fibre] with rows, columns and sensor_pixels")
+        if self.fibre is not None and not laid:
+            raise ValueError(
+                f"[fibre] goes with another cameras.layout than {self.cameras.layout!r}; possible: 'fibre'"
+            )
+        try:
+            self.laid_out  # noqa: B018  # what cannot be is refused when it is built
+        except UsageError as error:
+            raise ValueError(str(error)) from error
+        return self
+
+    @model_validator(mode="after")
     def _ring_fits(self) -> RigConfig:
         """Lines wait for their tag in the ring, of which half must stay free for the cameras."""
         lines = self.ring_slots * self.stream.block_lines
         pixel_bytes = 1 if self.cameras.a.dtype == "uint8" else 2
-        if (size := lines * self.geometry.stages * pixel_bytes) > MAX_RING_BYTES:
+        if (size := lines * self.pixels * pixel_bytes) > MAX_RING_BYTES:
             raise ValueError(
-                f"stream.{self._ring_keys} = {lines} lines of {self.geometry.stages} pixels "
+                f"stream.{self._ring_keys} = {lines} lines of {self.pixels} pixels "
                 f"are {size} bytes of memory per arm; possible: up to {MAX_RING_BYTES}"
             )
         if self.trigger.tag_every_lines > lines // 2:
             raise ValueError(
-                f"trigger.tag_every_lines = {self.trigger.tag_every_lines}; possible: 1 to {lines // 2}, "
-                f"half of what a ring holds (stream.{self._ring_keys})"
+                f"trigger.tag_every_lines cannot be {self.trigger.tag_every_lines}; possible: 1 to "
+                f"{lines // 2}, half of what a ring holds (stream.{self._ring_keys})"
             )
         return self
 
@@ -192,12 +212,12 @@ class RigConfig(FrozenModel):
             for _, feature, value in camera.settings:
                 if feature == "TDIStages" and value != f"TDI{self.geometry.stages}":
                     raise ValueError(
-                        f"cameras.{arm}.settings: TDIStages {value!r} with geometry.stages = "
+                        f"cameras.{arm}.settings: TDIStages is {value!r}, and geometry.stages is "
                         f"{self.geometry.stages}; possible: TDI{self.geometry.stages}"
                     )
             if self.geometry.substeps > 1 and camera.model in WHOLE_STEPS:
                 raise ValueError(
-                    f"geometry.substeps = {self.geometry.substeps} with cameras.{arm}.model = "
+                    f"geometry.substeps = {self.geometry.substeps} does not go with cameras.{arm}.model = "
                     f"{camera.model!r}, which moves its charge once a line; possible: substeps = 1, and as "
                     "many stages as it has TDI stages; acquire cut --merge makes intra-line lines of those"
                 )
@@ -209,7 +229,7 @@ class RigConfig(FrozenModel):
         longest_s = self.history_s - EVENT_DELAY_S * self.simulation.speed
         if self.events.sources and self.events.pre_s > longest_s:
             raise ValueError(
-                f"events.pre_s = {self.events.pre_s:g}; possible: up to {max(0.0, longest_s):.3g}, "
+                f"events.pre_s cannot be {self.events.pre_s:g}; possible: up to {max(0.0, longest_s):.3g}, "
                 f"since the ring holds {self.history_s:.3g} s; a longer one: stream.ring_seconds"
             )
         return self
@@ -245,9 +265,20 @@ class RigConfig(FrozenModel):
         return self.simulation.scene
 
     @property
+    def laid_out(self) -> Fibre | None:
+        """Layout 'fibre': which column sees what; None in the others."""
+        sizes = self.geometry
+        return None if self.fibre is None else self.fibre.build(sizes.stages, sizes.substeps)
+
+    @property
+    def pixels(self) -> int:
+        """Of a line of one arm: as many as there are stages, or as the sensors behind a fibre are wide."""
+        return self.geometry.stages if self.fibre is None else self.fibre.sensor_pixels
+
+    @property
     def columns(self) -> dict[str, tuple[int, int]]:
-        """Compact layout: arm → first column and the one after the last; empty in dual layout."""
-        if self.cameras.layout == "dual":
+        """Compact layout: arm → first column and the one after the last; empty in the others."""
+        if self.cameras.layout != "compact":
             return {}
         starts = {"a": self.cameras.a.first_column, "b": self.cameras.b.first_column}
         return {arm: (start, start + self.geometry.stages) for arm, start in starts.items()}
@@ -266,7 +297,7 @@ class RigConfig(FrozenModel):
         """Lines per chunk of a recording. A block of some MB is one chunk: it is written without a copy."""
         if self.recording.chunk_lines is not None:
             return self.recording.chunk_lines
-        line_bytes = self.geometry.stages * np.dtype(self.cameras.a.dtype).itemsize
+        line_bytes = self.pixels * np.dtype(self.cameras.a.dtype).itemsize
         block_lines = self.stream.block_lines
         if USUAL_CHUNK_BYTES // 4 <= block_lines * line_bytes <= USUAL_CHUNK_BYTES:
             return block_lines

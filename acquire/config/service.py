@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from typing import Literal
 from urllib.parse import urlsplit
 
@@ -19,6 +20,14 @@ class ServiceConfig(FrozenModel):
         "named after rig and time; both are tried again until they succeed or a command comes",
     )
     retry_s: float = Field(default=10.0, gt=0, le=3600, description="between two tries")
+    log_level: Literal["info", "warning", "error"] = Field(
+        default="info", description="of the daemon's log: what matters less is not written"
+    )
+
+    @property
+    def level(self) -> int:
+        """As `logging` has it."""
+        return logging.getLevelNamesMapping()[self.log_level.upper()]
 
 
 class HooksConfig(FrozenModel):
@@ -41,7 +50,7 @@ class HooksConfig(FrozenModel):
         """The configuration goes into every recording: no place for secrets."""
         parts = urlsplit(url or "http://x")
         if parts.scheme not in ("http", "https") or not parts.hostname:
-            raise ValueError("not a URL of http or https")
+            raise ValueError("it is not a URL of http or https")
         if "@" in parts.netloc:
             raise ValueError("credentials would be written into every recording: let a command send them")
         return url

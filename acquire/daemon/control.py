@@ -15,7 +15,6 @@ from starlette.exceptions import HTTPException
 
 from acquire import __version__
 from acquire.daemon.answers import Answers
-from acquire.daemon.local import Local
 from acquire.daemon.messages import HTTP_STATUS, ErrorMessage, error_body, http_status
 from acquire.daemon.routes import routes
 from acquire.errors import AcquireError, UsageError
@@ -24,8 +23,7 @@ from acquire.text import shortened, shown
 if TYPE_CHECKING:
     from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-    from acquire.daemon.local import Run
-    from acquire.daemon.service import Service
+    from acquire.daemon.routes import Api
 
 MAX_BODY_BYTES = 2**16
 """No request is longer than a path and a number."""
@@ -40,10 +38,10 @@ REFUSALS = {
 """What is refused before any command sees it."""
 
 
-def build_app(service: Service, run: Run) -> FastAPI:
-    """The API over ``service``; ``run`` carries a command out in the thread that owns the devices."""
+def build_app(api: Api) -> FastAPI:
+    """What the daemon serves, over its own service."""
     app = new_app("Control of the capture service.")
-    app.include_router(routes(Local(service, run), Answers()))
+    app.include_router(routes(api, Answers()))
     return app
 
 
@@ -101,7 +99,9 @@ def _add_errors(app: FastAPI) -> None:
     @app.exception_handler(HTTPException)
     async def unknown(request: Request, error: HTTPException) -> JSONResponse:
         asked = shortened(f"{request.method} {request.url.path}")
-        told = UsageError(f"{asked}: {shortened(error.detail)}", possible="/openapi.json")
+        told = UsageError(
+            f"the daemon cannot answer {asked}: {shortened(error.detail)}", possible="/openapi.json"
+        )
         return JSONResponse(error_body(told), error.status_code, error.headers)
 
     @app.exception_handler(Exception)

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import contextlib
 import math
-import os
 import select
 import time
 from dataclasses import dataclass, field
@@ -22,9 +21,10 @@ from typing import TYPE_CHECKING, Any
 
 from acquire.daemon.messages import ErrorMessage, UploadStatus
 from acquire.errors import AcquireError, PlaceError, UsageError
+from acquire.processes.rank import EARLY, stand_back
 from acquire.store import open_recording
 from acquire.store.attributes import segment_of
-from acquire.store.mirror import LOOK_S, Mirror, only_copy
+from acquire.store.mirroring import LOOK_S, Mirror, only_copy
 from acquire.store.opening import read_root
 from acquire.store.refusals import refusal
 from acquire.store.remote import RemoteSource, be_patient, check_url, url_below
@@ -102,7 +102,7 @@ def wait_s(tries: int) -> float:
 
 def copy_recordings(mailbox: Mailbox, target: str, copies: tuple[Copy, ...]) -> None:
     """Life of the process, until its owner ends it; it begins with ``copies``."""
-    os.nice(_NICE)
+    stand_back(_NICE, EARLY)
     be_patient()
     with contextlib.suppress(UsageError):  # each try says so
         check_url(target)  # what it imports takes a moment

@@ -31,7 +31,7 @@ LEAST_S = 5.0
 
 def disk_watch(config: RigConfig) -> DiskWatch:
     """Of the rig's directory."""
-    line_bytes = config.geometry.stages * np.dtype(config.cameras.a.dtype).itemsize
+    line_bytes = config.pixels * np.dtype(config.cameras.a.dtype).itemsize
     per_s = len(ARMS) * line_bytes * config.line_rate_hz * config.simulation.speed
     return DiskWatch(config.recording.directory.absolute(), round(config.recording.reserve_gb * 1e9), per_s)
 
@@ -62,6 +62,10 @@ class DiskWatch:
         self._looks: deque[tuple[float, int]] = deque()
         self._asked_s = -LOOK_EVERY_S
         self._thread: threading.Thread | None = None
+
+    def keep(self, reserve_bytes: int) -> None:
+        """Recordings leave so much free from now on."""
+        self._reserve_bytes = reserve_bytes
 
     def check(self, *, recording: bool) -> None:
         """Ask again, if it is time and the last question was answered."""

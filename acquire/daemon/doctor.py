@@ -158,7 +158,7 @@ def _memory(rig: RigConfig | None) -> Finding:
     there = available_bytes()
     if rig is None:
         return Finding("memory", "good", f"{there / 1e9:.1f} GB can be had")
-    line_bytes = rig.geometry.stages * np.dtype(rig.cameras.a.dtype).itemsize
+    line_bytes = rig.pixels * np.dtype(rig.cameras.a.dtype).itemsize
     rings = len(ARMS) * rig.ring_slots * rig.stream.block_lines * line_bytes
     text = f"{there / 1e9:.1f} GB can be had, the rings take {rings / 1e9:.2f} GB"
     if there > SPARE_MEMORY * rings:

@@ -88,7 +88,9 @@ def _own(directory: Path) -> None:
     try:
         found = directory.lstat() if in_tmp else directory.stat()
     except OSError as error:
-        raise UsageError(f"control socket in {directory}: {error.strerror}", hint=ELSEWHERE) from error
+        raise UsageError(
+            f"the control socket cannot be made in {directory}: {error.strerror}", hint=ELSEWHERE
+        ) from error
     if not stat.S_ISDIR(found.st_mode):
         raise UsageError(f"control socket in {directory}: that is no directory", hint=ELSEWHERE)
     if found.st_uid != os.geteuid():
@@ -139,7 +141,7 @@ def _listen(path: Path) -> Listener:
         listener.listen()
     except OSError as error:
         listener.close()
-        raise UsageError(f"control socket {path}: {error.strerror}") from error
+        raise UsageError(f"the control socket {path} cannot be made: {error.strerror}") from error
     finally:
         os.umask(before)
     return listener

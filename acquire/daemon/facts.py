@@ -25,6 +25,7 @@ NewsKind = Literal[
     "upload",
     "disk",
     "trouble",
+    "reload",
     "event",
     "missed",
 ]
@@ -94,6 +95,22 @@ class Setup(Message):
     black_dn: dict[str, float]
     history_s: float = Field(description="of lines from the past that the rings hold")
     versions: dict[str, str] = Field(description="of the libraries on the way from camera to disk")
+
+
+class ChangedKey(Message):
+    """A key of the configuration that has another value since the file was read anew."""
+
+    key: Text = Field(description="dotted")
+    old: Any
+    new: Any
+    holds: Text = Field(description="when: at once, from the next recording on, when the service starts next")
+
+
+class Reloaded(Message):
+    """What a reload has changed; one that is refused changes nothing."""
+
+    file: Text = Field(description="that was read")
+    changed: list[ChangedKey] = Field(description="empty: the file says what it said before")
 
 
 class RingPlace(Message):

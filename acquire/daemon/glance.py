@@ -31,7 +31,7 @@ def status_document(place: Path | None) -> dict[str, Any]:
         connection.request("GET", "/status", headers={"Connection": "close"})
         answer = connection.getresponse()
         if answer.status != http.HTTPStatus.OK:
-            raise ValueError(f"HTTP {answer.status}")
+            raise ValueError(f"the daemon answered with HTTP {answer.status}")
         document = json.loads(answer.read())
     finally:
         connection.close()

@@ -30,13 +30,19 @@ class Hooks:
     """Nothing is started where nobody is to be told."""
 
     def __init__(self, config: HooksConfig, news: NewsLog, rig: str) -> None:
-        self._config, self._news, self._rig = config, news, rig
+        self._news, self._rig = news, rig
         self._last_id = news.last_id
         self._happened = threading.Event()
         self._ended = False
         self._thread = threading.Thread(target=self._run, name="hooks", daemon=True)
-        if config.command or config.webhook:
-            news.listen(self._happened.set)
+        self.reconfigure(config)
+
+    def reconfigure(self, config: HooksConfig) -> None:
+        """Tell as ``config`` says what happens from now on."""
+        self._config = config
+        if (config.command or config.webhook) and not self._thread.is_alive():
+            self._last_id = self._news.last_id
+            self._news.listen(self._happened.set)
             self._thread.start()
 
     def close(self) -> None:

@@ -53,7 +53,7 @@ def _check_spec(config: RigConfig) -> None:
             run_id="check",
             stages=config.geometry.stages,
             substeps=config.geometry.substeps,
-            pixels=config.geometry.stages,
+            pixels=config.pixels,
             dtype=config.cameras.a.dtype,
             first_line=0,
             clock=ClockFit(config.trigger.clock_hz, 0, 0),
@@ -63,6 +63,8 @@ def _check_spec(config: RigConfig) -> None:
             cameras=cameras,
             config=config.model_dump(mode="json"),
             codec="none" if codec == "auto" else codec,
+            layout=config.cameras.layout,
+            fibre=config.laid_out,
             **storage_settings(config),
         )
     except UsageError as error:
@@ -81,7 +83,7 @@ def _check_disk(config: RigConfig) -> None:
             possible=f"below {total_gb:.3g}",
         )
     retention = recording.retention
-    line_bytes = config.geometry.stages * np.dtype(config.cameras.a.dtype).itemsize
+    line_bytes = config.pixels * np.dtype(config.cameras.a.dtype).itemsize
     shard_gb = len(ARMS) * config.chunk_lines * recording.shard_chunks * line_bytes / 1e9
     if retention is not None and retention.max_gb is not None and retention.max_gb < shard_gb:
         raise ConfigError(
@@ -91,10 +93,15 @@ def _check_disk(config: RigConfig) -> None:
         )
 
 
-def _check_memory(config: RigConfig) -> None:
-    line_bytes = config.geometry.stages * np.dtype(config.cameras.a.dtype).itemsize
+def needed_bytes(config: RigConfig) -> tuple[int, int]:
+    """Of memory: for the rings, and for a simulated scene."""
+    line_bytes = config.pixels * np.dtype(config.cameras.a.dtype).itemsize
     rings = len(ARMS) * config.ring_slots * config.stream.block_lines * line_bytes
-    scene = SIMULATING * _scene_bytes(config)
+    return rings, SIMULATING * _scene_bytes(config)
+
+
+def _check_memory(config: RigConfig) -> None:
+    rings, scene = needed_bytes(config)
     most = int(MEMORY_PART * memory_bytes())
     if rings + scene > most:
         raise ConfigError(
@@ -110,7 +117,8 @@ def _scene_bytes(config: RigConfig) -> int:
     if not config.needs_scene:
         return 0
     scene = load_scene(config.scene_file())
-    size = config.geometry.stages * config.geometry.substeps
+    fibre = config.laid_out
+    size = config.geometry.stages * config.geometry.substeps if fibre is None else fibre.side
     if scene.optics.layout == "interline":
         size *= scene.optics.baseline_factor
     return size * size * max(SCENE_BYTES, SCENE_BYTES // 4 * scene.sources)

@@ -15,12 +15,14 @@ from acquire.daemon.setup import rings_of, setup_of, version_of
 from acquire.daemon.states import State
 from acquire.daemon.stream import Streams
 from acquire.daemon.who import WHO
+from acquire.errors import UsageError
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from acquire.daemon.facts import Health, Rings, Setup, Version
+    from acquire.daemon.facts import Health, Reloaded, Rings, Setup, Version
     from acquire.daemon.messages import ArmRequest, CapacityStatus, MarkRequest, StartRequest, Status
+    from acquire.daemon.reload import Reloading
     from acquire.daemon.service import Service
 
 POLL_S = 0.02
@@ -31,9 +33,10 @@ Run = Callable[[Callable[[], None]], Awaitable[None]]
 class Local:
     """See the module; the methods are those of `acquire.daemon.routes.Api`."""
 
-    def __init__(self, service: Service, run: Run) -> None:
+    def __init__(self, service: Service, run: Run, reloading: Reloading | None = None) -> None:
         self._service = service
         self._run = run
+        self._reloading = reloading
         self._streams = Streams(service.news, service.status)
 
     async def status(self) -> Status:
@@ -65,6 +68,16 @@ class Local:
         found = self._service.status().capacity
         assert found is not None
         return found
+
+    async def reload(self) -> Reloaded:
+        """The file is read in a thread of its own: a slow disk must not keep devices from being watched."""
+        if self._reloading is None:
+            raise UsageError("this daemon's configuration is of no file", hint="end it, and start another")
+        done: list[Reloaded] = []
+        who = WHO.get() or "the control socket"
+        new, apply = await asyncio.to_thread(self._reloading.read, who), self._reloading.apply
+        await self._run(lambda: done.append(apply(new, who)))
+        return done[0]
 
     async def health(self) -> Health:
         status, config = self._service.status(), self._service.config

@@ -48,6 +48,13 @@ class TriggerDelays(Message):
     b: int = Field(ge=0, lt=2**24)
 
 
+class TriggerWindow(Message):
+    """When the light of a lit sub-step is on, in ticks of the trigger from the sub-step's beginning."""
+
+    open: int = Field(ge=0, lt=2**24)
+    close: int = Field(ge=1, lt=2**24)
+
+
 class ArmRequest(Message):
     """How to arm."""
 
@@ -61,6 +68,9 @@ class ArmRequest(Message):
     )
     delays: TriggerDelays | None = Field(
         default=None, description="in place of the rig's, as a search for them asks"
+    )
+    window: TriggerWindow | None = Field(
+        default=None, description="of the light, in place of the rig's, as a ramp of light asks"
     )
     force: bool = Field(
         default=False,

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from acquire.config import RigConfig
+    from acquire.config.web import WebConfig
 
 FIRST_WAIT_S, MOST_WAIT_S = 0.5, 30.0
 LIVED_S = 60.0
@@ -30,24 +31,30 @@ log = logging.getLogger("acquire.daemon")
 class Page:
     """For one thread; `poll` never waits."""
 
-    def __init__(self, config: RigConfig, socket: Path) -> None:
+    def __init__(self, socket: Path) -> None:
         """Nothing is started yet, and nothing ever where the rig has no ``[web]``."""
+        self._socket = socket
         self._words: list[str] | None = None
-        if config.web is not None:
-            given = {
-                "socket": str(socket),
-                "directory": str(config.recording.directory.absolute()),
-                "web": config.web.model_dump(mode="json"),
-            }
-            words = [sys.executable, "-m", "acquire", "web", "--owned", "--given", json.dumps(given)]
-            self._words = words
         self._process: subprocess.Popen[bytes] | None = None
         self._begun_s = self._not_before_s = 0.0
         self._wait_s = FIRST_WAIT_S
+        self._leaving: subprocess.Popen[bytes] | None = None
+        self._left_s = 0.0
 
-    def poll(self) -> None:
-        """Start it, or anew where it has ended."""
+    def poll(self, config: RigConfig) -> None:
+        """Start it as ``config`` says, or anew where it has ended or is to be another."""
         now_s = time.monotonic()
+        words = None if config.web is None else self._said(config, config.web)
+        if words != self._words:
+            if self._process is not None:
+                self._leaving, self._left_s = self._process, now_s
+                self._forget()
+            self._words, self._not_before_s, self._wait_s = words, now_s, FIRST_WAIT_S
+        if self._leaving is not None and self._leaving.poll() is None:  # it has the address yet
+            if now_s - self._left_s > END_S:
+                self._leaving.kill()
+            return
+        self._leaving = None
         if self._words is None or now_s < self._not_before_s:
             return
         if self._process is not None:
@@ -70,21 +77,30 @@ class Page:
             log.error("the operator's page cannot be started: %s", error)  # noqa: TRY400
             self._not_before_s = now_s + MOST_WAIT_S
 
+    def _said(self, config: RigConfig, web: WebConfig) -> list[str]:
+        """The words that start it."""
+        given = {
+            "socket": str(self._socket),
+            "directory": str(config.recording.directory.absolute()),
+            "web": web.model_dump(mode="json"),
+        }
+        return [sys.executable, "-m", "acquire", "web", "--owned", "--given", json.dumps(given)]
+
     @property
     def pid(self) -> int | None:
         return None if self._process is None else self._process.pid
 
     def close(self) -> None:
         """End it: by its standard input, then by force. Idempotent."""
-        process = self._process
-        if process is None:
-            return
+        processes = [one for one in (self._process, self._leaving) if one is not None]
         self._forget()
-        try:
-            process.wait(END_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+        self._leaving = None
+        for process in processes:
+            try:
+                process.wait(END_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
 
     def _forget(self) -> None:
         if self._process is not None and self._process.stdin is not None:

@@ -10,25 +10,24 @@ from typing import TYPE_CHECKING, Any
 
 from acquire.calibrate.choose import handed_on
 from acquire.config import ConstantCodeConfig
+from acquire.daemon.events import budget_lines, window_of
 from acquire.daemon.messages import CalibrationStatus
 from acquire.daemon.storage import choose_for, storage_settings
 from acquire.daemon.watching import watch_plan
 from acquire.store import RecordingSpec, next_segment
-from acquire.stream import END_S, NOW, Capture, CapturePlan
-from acquire.stream.messages import Note
-from acquire.trigger.base import Delays, TriggerRun
-from acquire.trigger.settings import with_delays
+from acquire.stream import END_S, Begin, Capture, CapturePlan
+from acquire.trigger.base import Delays, LightWindow, TriggerRun
+from acquire.trigger.settings import with_delays, with_window
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
     from acquire.config import RigConfig
-    from acquire.daemon.messages import ArmRequest, LightCode
+    from acquire.config.recording import RecordingConfig
+    from acquire.daemon.messages import ArmRequest, LightCode, StartRequest
     from acquire.rig import Rig
     from acquire.store import Codec, CodecChoice
-    from acquire.stream import CaptureStatus, Window
-    from acquire.stream.ring import RingShape
 
 
 class Run:
@@ -47,7 +46,7 @@ class Run:
         self._choose = choose
         self._choice: CodecChoice | None = None
         self._calibration = handed_on(config, rig.layout)
-        self._capture = Capture(capture_plan(config, rig, self.run_id), rig.trigger)
+        self.capture = Capture(capture_plan(config, rig, self.run_id), rig.trigger)
 
     @property
     def calibration(self) -> CalibrationStatus | None:
@@ -72,72 +71,34 @@ class Run:
         """
         if self._config.recording.codec == "auto":
             self._choice = self._choose(self._config)
-        self._capture.arm(self._config.stream.arm_timeout_s, tell)
+        self.capture.arm(self._config.stream.arm_timeout_s, tell)
 
-    def start(self, path: Path, lines: int | None, window: Window = NOW, *, resume: bool = False) -> Path:
-        """Record to ``path``, or, to ``resume`` what is there, to a segment beside it; says where.
+    def adopt(self, recording: RecordingConfig) -> None:
+        """Make the next recording as ``recording`` says."""
+        self._config = self._config.model_copy(update={"recording": recording})
 
-        Raises UsageError where it cannot be, before anything is touched.
-        """
-        spec = self._spec()
-        if resume:
-            path, spec = next_segment(path, spec)
-        self._capture.start(path, spec, lines, window)
-        return path
-
-    def mark(self, text: str) -> Note:
-        """An event of the operator's, at the newest line."""
-        return Note(self._capture.note("mark", text), "mark", text)
-
-    def note(self, kind: str, text: str) -> None:
-        """Something happens at the newest line: listed in the recording that holds it."""
-        self._capture.note(kind, text)
-
-    def extend(self, line: int) -> None:
-        """Let the recording under way not end before ``line``."""
-        self._capture.extend(line)
-
-    def events(self) -> list[Note]:
-        """What trigger and lines have told since the last call."""
-        return self._capture.take_events()
-
-    def stop(self, reason: str) -> None:
-        """End the recording at the newest line; ``reason`` is recorded."""
-        self._capture.stop(reason)
-
-    def poll(self) -> CaptureStatus:
-        """What the capture path does at this moment."""
-        return self._capture.poll()
-
-    def ring_places(self) -> dict[str, tuple[str, RingShape]]:
-        """Arm → path and shape of the memory through which its lines pass; empty once closed."""
-        return self._capture.ring_places()
-
-    def close(self) -> None:
-        """Seal what is being recorded and release the devices. Idempotent."""
-        self._capture.close()
-
-    def _spec(self) -> RecordingSpec:
+    def spec(self) -> RecordingSpec:
         """What the recording says of itself; the recorder fills in its first line."""
         config = self._config
         return RecordingSpec(
             run_id=self.run_id,
             stages=config.geometry.stages,
             substeps=config.geometry.substeps,
-            pixels=config.geometry.stages,
+            pixels=config.pixels,
             dtype=config.cameras.a.dtype,
             first_line=0,
-            clock=self._capture.clock,
+            clock=self.capture.clock,
             code=config.code.build().to_attrs(),
             substep_ticks=config.trigger.substep_ticks,
             trigger={**asdict(self._rig.trigger.identify()), "settings": config.trigger.model_dump()},
-            cameras={arm: self._camera(arm, facts) for arm, facts in self._capture.cameras.items()},
+            cameras={arm: self._camera(arm, facts) for arm, facts in self.capture.cameras.items()},
             config=config.model_dump(mode="json"),
             extra=self._rig.describe()
             | self._calibration.attrs
             | ({"codec_choice": self._choice.to_attrs()} if self._choice else {}),
             codec=self._codec,
             layout=self._rig.layout,
+            fibre=config.laid_out,
             **storage_settings(config),
         )
 
@@ -149,8 +110,20 @@ class Run:
             "responsivity_dn": camera.responsivity_dn,
             **camera.noise_facts,
         }
-        lines = self._capture.poll().lines.get(arm, {})
+        lines = self.capture.poll().lines.get(arm, {})
         return {**calibration, **facts, "clock": lines.get("clock", {})}
+
+
+def recording_of(request: StartRequest, config: RigConfig, spec: RecordingSpec) -> Begin:
+    """What the recorder is asked for; to resume what is at a path, that is a segment beside it.
+
+    Raises UsageError where it cannot be, before anything is touched.
+    """
+    path = request.path or default_path(config)
+    if request.resume:
+        path, spec = next_segment(path, spec)
+    rate_hz = config.line_rate_hz
+    return Begin(path, spec, budget_lines(request, rate_hz), window_of(request, rate_hz))
 
 
 def armed_as(config: RigConfig, request: ArmRequest) -> RigConfig:
@@ -158,10 +131,11 @@ def armed_as(config: RigConfig, request: ArmRequest) -> RigConfig:
     config = with_code(config, request.code)
     if request.calibration == "none":
         config = config.model_copy(update={"calibration": None})
-    if request.delays is None:
-        return config
-    delays = request.delays
-    trigger = with_delays(config.trigger, Delays(delays.light_lead, delays.a, delays.b))
+    trigger = config.trigger
+    if (delays := request.delays) is not None:
+        trigger = with_delays(trigger, Delays(delays.light_lead, delays.a, delays.b))
+    if (window := request.window) is not None:
+        trigger = with_window(trigger, LightWindow(window.open, window.close))
     return config.model_copy(update={"trigger": trigger})
 
 
@@ -187,7 +161,7 @@ def capture_plan(config: RigConfig, rig: Rig, run_id: str) -> CapturePlan:
     return CapturePlan(
         run=trigger_run(config, run_id),
         stages=config.geometry.stages,
-        pixels=config.geometry.stages,
+        pixels=config.pixels,
         dtype=config.cameras.a.dtype,
         block_lines=config.stream.block_lines,
         ring_slots=config.ring_slots,
@@ -215,6 +189,7 @@ def trigger_run(config: RigConfig, run_id: str) -> TriggerRun:
         substep_ticks=config.trigger.substep_ticks,
         tag_every_lines=config.trigger.tag_every_lines,
         delays=Delays.of(config.trigger),
+        window=LightWindow.of(config.trigger),
     )
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from acquire.daemon.messages import RecoveryStatus
 from acquire.errors import AcquireError, DataError, StateError
+from acquire.processes.rank import EARLY, stand_back
 from acquire.store import READABLE, Circumstances, recover
 from acquire.store.files import DISK, locked
 from acquire.store.host import has_run_on, is_here
@@ -88,7 +89,7 @@ def _look_at(path: Path, found: Found, *, known: bool) -> None:
 
 def salvage(mailbox: Mailbox, task: Task) -> None:
     """Life of the process: one recovery, with less of the processors than others get."""
-    os.nice(_NICE)
+    stand_back(_NICE, EARLY)
     mailbox.post(_salvage(mailbox, task))
 
 

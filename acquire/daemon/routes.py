@@ -12,7 +12,7 @@ from fastapi import APIRouter, Depends, Header, Query, Response
 from fastapi.responses import StreamingResponse
 
 from acquire.daemon.answers import LONGEST_ID, Answers
-from acquire.daemon.facts import Health, Rings, Setup, Version
+from acquire.daemon.facts import Health, Reloaded, Rings, Setup, Version
 from acquire.daemon.messages import (
     ArmRequest,
     CapacityStatus,
@@ -57,6 +57,7 @@ class Api(Protocol):
     async def stop(self) -> Status: ...
     async def disarm(self) -> Status: ...
     async def measure(self) -> CapacityStatus: ...
+    async def reload(self) -> Reloaded: ...
     async def health(self) -> Health: ...
     async def version(self) -> Version: ...
     async def setup(self) -> Setup: ...
@@ -110,6 +111,10 @@ def _add_commands(router: APIRouter, api: Api, answers: Answers) -> None:
     @router.post("/capacity", summary="idle: measure what ring, codec and disk sustain here, now")
     async def measure() -> CapacityStatus:
         return await api.measure()
+
+    @router.post("/reload", summary="Read the rig file anew; refused as a whole where a key cannot change")
+    async def reload() -> Reloaded:
+        return await api.reload()
 
 
 def _add_facts(router: APIRouter, api: Api) -> None:

@@ -23,19 +23,22 @@ from acquire.daemon.control import build_app
 from acquire.daemon.ending import END_S, LastResort, leave
 from acquire.daemon.endpoint import Endpoint
 from acquire.daemon.hooks import Hooks
+from acquire.daemon.local import Local
 from acquire.daemon.messages import ArmRequest
 from acquire.daemon.notify import notify
 from acquire.daemon.page import Page
 from acquire.daemon.plan import Run, armed_as, worker_modules
 from acquire.daemon.proof import Proof
+from acquire.daemon.reload import Reloading
 from acquire.daemon.salvage import Salvage
 from acquire.daemon.service import Service
 from acquire.daemon.states import State
 from acquire.daemon.troubles import Troubles
 from acquire.daemon.uploads import Uploads
-from acquire.errors import EXIT_INTERRUPTED, StateError
+from acquire.daemon.who import WHO
+from acquire.errors import EXIT_INTERRUPTED, AcquireError, StateError
 from acquire.processes.nursery import nursery, warm_up
-from acquire.rig import Rig
+from acquire.rig import Rig, check_rig
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -58,10 +61,11 @@ log = logging.getLogger("acquire.daemon")
 T = TypeVar("T")
 
 
-def serve(config: RigConfig, origin: str = "") -> int:
+def serve(config: RigConfig, origin: str = "", reread: Callable[[], RigConfig] | None = None) -> int:
     """Own the devices of ``config``, read from the file ``origin``, until a signal; the exit code.
 
-    Raises StateError where another daemon has the socket, before any device is touched.
+    ``reread`` gives the configuration as the file has it by now. Raises StateError where another daemon has
+    the socket, before any device is touched.
     """
     raise_descriptor_limit()
     troubles = Troubles()
@@ -75,17 +79,29 @@ def serve(config: RigConfig, origin: str = "") -> int:
         proof = Proof(config)
 
         def open_run(request: ArmRequest) -> Run:
-            return Run(armed_as(config, request), rig, proof.choose)
+            config = armed_as(service.config, request)
+            check_rig(config)
+            return Run(config, rig, proof.choose)
 
         service = Service(config, open_run, proof, salvage, uploads, troubles)
         service.origin = origin
-        page = Page(config, endpoint.path)
-        with contextlib.closing(page), contextlib.closing(Hooks(config.hooks, service.news, config.name)):
-            code = asyncio.run(Daemon(service, endpoint, page).run())
+        page, hooks = Page(endpoint.path), Hooks(config.hooks, service.news, config.name)
+        reloading = None if reread is None else Reloading(reread, service, hooks)
+        with contextlib.closing(page), contextlib.closing(hooks):
+            code = asyncio.run(Daemon(service, endpoint, page, reloading).run())
         last_resort = LastResort(endpoint.remove)
         last_resort.within(END_S)  # for devices that do not let go
     last_resort.cancel()
     return leave(code)
+
+
+def has_terminal() -> bool:
+    """Whether a terminal is this process's: when that is closed, SIGHUP means the end."""
+    try:
+        os.close(os.open("/dev/tty", os.O_RDWR | os.O_NOCTTY))
+    except OSError:
+        return False
+    return True
 
 
 def _journal(config: RigConfig, what: str) -> Path:
@@ -96,8 +112,17 @@ def _journal(config: RigConfig, what: str) -> Path:
 class Daemon:
     """One service on one endpoint, for the life of an event loop in the main thread."""
 
-    def __init__(self, service: Service, endpoint: Endpoint, page: Page | None = None) -> None:
+    def __init__(
+        self,
+        service: Service,
+        endpoint: Endpoint,
+        page: Page | None = None,
+        reloading: Reloading | None = None,
+    ) -> None:
         self._service = service
+        self._api = Local(service, self._command, reloading)
+        self._hangup_reloads = reloading is not None and not has_terminal()
+        self._hung_up: asyncio.Task[None] | None = None
         self._page = page
         self._endpoint = endpoint
         self._troubles = service.troubles
@@ -107,7 +132,7 @@ class Daemon:
         self._ending = asyncio.Event()
         self._last_resort = LastResort(endpoint.remove)
         self._exit_code = 0
-        self._server = ApiServer(build_app(service, self._command), endpoint.socket)
+        self._server = ApiServer(build_app(self._api), endpoint.socket)
 
     async def run(self) -> int:
         """Serve until a signal; the exit code."""
@@ -139,7 +164,7 @@ class Daemon:
         while not (self._ending.is_set() or serving.done()):
             try:
                 if self._page is not None:
-                    self._page.poll()
+                    self._page.poll(self._service.config)
                 nursery()  # another one, where it has died: the next run must find it warm
                 await self._in_device_thread(self._service.supervise)
             except Exception as error:  # noqa: BLE001 - a defect in one look must not end the service
@@ -210,7 +235,16 @@ class Daemon:
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             loop.add_signal_handler(number, self._on_signal, number)
 
+    async def _reload(self) -> None:
+        WHO.set(signal.SIGHUP.name)
+        with contextlib.suppress(AcquireError):  # it is in the log, and among the news
+            await self._api.reload()
+
     def _on_signal(self, number: signal.Signals) -> None:
+        if number is signal.SIGHUP and self._hangup_reloads:
+            if self._hung_up is None or self._hung_up.done():
+                self._hung_up = asyncio.create_task(self._reload())
+            return
         if self._ending.is_set():
             log.warning("%s again: ending without waiting for lines on the way", number.name)
             self._service.hurry()

@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING
 
 from acquire import __version__
 from acquire.daemon.disk_watch import disk_watch
-from acquire.daemon.events import StandingOrder, budget_lines, window_of
+from acquire.daemon.events import StandingOrder
 from acquire.daemon.messages import ArmRequest, LastRecording, Status, fault_error
 from acquire.daemon.news import NewsLog
-from acquire.daemon.plan import default_path
+from acquire.daemon.plan import default_path, recording_of
 from acquire.daemon.report import Rates, arm_statuses, trigger_status
 from acquire.daemon.salvage import Salvage
 from acquire.daemon.states import Event, State, after, commands, possible
@@ -29,7 +29,7 @@ from acquire.daemon.troubles import Troubles
 from acquire.daemon.uploads import Uploads
 from acquire.errors import AcquireError, DeviceError, StateError, UsageError
 from acquire.store import RunCondition
-from acquire.stream import CaptureStatus
+from acquire.stream import Begin, CaptureStatus, Note
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -37,8 +37,6 @@ if TYPE_CHECKING:
     from acquire.config import RigConfig
     from acquire.daemon.messages import CapacityStatus, RecoveryStatus, StartRequest
     from acquire.daemon.needs import OpenRun, Prove, Run
-    from acquire.stream import Window
-    from acquire.stream.messages import Note
     from acquire.stream.ring import RingShape
 
 RECOVERY_S = 20.0
@@ -63,7 +61,7 @@ class Service:
         uploads: Uploads | None = None,
         troubles: Troubles | None = None,
     ) -> None:
-        self.config = self._config = config
+        self.config = config
         self.origin = ""
         """The file that the configuration was read from."""
         self.news = NewsLog()
@@ -101,12 +99,12 @@ class Service:
     def ring_places(self) -> tuple[str | None, dict[str, tuple[str, RingShape]]]:
         """The run, and arm → path and shape of the memory through which its lines pass."""
         run = self._run
-        return (None, {}) if run is None else (run.run_id, run.ring_places())
+        return (None, {}) if run is None else (run.run_id, run.capture.ring_places())
 
     @property
     def patience_s(self) -> float:
         """Longest step of a command, or time in which nothing more of a recording reaches the disk."""
-        return max(self._config.recording.seal_timeout_s + RECOVERY_S, self._config.stream.arm_timeout_s)
+        return max(self.config.recording.seal_timeout_s + RECOVERY_S, self.config.stream.arm_timeout_s)
 
     @property
     def hurried(self) -> bool:
@@ -131,7 +129,7 @@ class Service:
             run.arm(self._tell)
             self._run, self._seen, self._rates = run, CaptureStatus(), Rates()
             self.armed_since = datetime.now(UTC)
-            self._order = StandingOrder(self._config)
+            self._order = StandingOrder(self.config)
             self._go(Event.ARM, run.run_id)
             if run.calibration is not None and not run.calibration.carried:
                 log.warning("calibration: %s", run.calibration.text)
@@ -140,16 +138,15 @@ class Service:
     def start(self, request: StartRequest) -> None:
         """armed → recording. Raises UsageError for a path that cannot be; the state is armed then."""
         with self._doing(Event.START):
-            rate_hz = self._config.line_rate_hz
-            window = window_of(request, rate_hz)
-            self._begin(request.path, budget_lines(request, rate_hz), window, resume=request.resume)
+            assert self._run is not None
+            self._begin(recording_of(request, self.config, self._run.spec()))
             self.supervise()
 
     def mark(self, text: str) -> None:
         """An event at the newest line; the state changes where it starts a recording."""
         with self._doing(Event.MARK):
             assert self._run is not None
-            self._heed(self._run.mark(text))
+            self._heed(Note(self._run.capture.note("mark", text), "mark", text))
 
     def stop(self) -> None:
         """recording → draining. What is on the way is written and sealed while `supervise` looks after it:
@@ -172,7 +169,7 @@ class Service:
         """Write down who gave a command: in the log, and among the events of the recording under way."""
         log.info("%s by %s", command, who)
         if self._run is not None and self._state in (State.RECORDING, State.DRAINING):
-            self._run.note("operator", f"{command} by {who}")
+            self._run.capture.note("operator", f"{command} by {who}")
 
     def measure(self) -> None:
         """What the host sustains, anew; nothing may be armed, since that would be measured, too."""
@@ -187,6 +184,19 @@ class Service:
         finally:
             self._busy = None
             self._publish()
+
+    def reconfigure(self, config: RigConfig, told: str) -> None:
+        """Work with ``config`` from now on; it differs where that does no harm (`acquire.daemon.reload`).
+
+        ``told``: who has changed what, for the recording under way.
+        """
+        self.config = config
+        self._disk.keep(round(config.recording.reserve_gb * 1e9))
+        if self._run is not None:
+            self._run.adopt(config.recording)
+            if self._state in (State.RECORDING, State.DRAINING):
+                self._run.capture.note("operator", told)
+        self._publish()
 
     # ---- supervision
 
@@ -246,7 +256,7 @@ class Service:
 
     def _idles(self, take: Take) -> bool:
         """Nothing more of the recording has reached the disk for as long as is allowed."""
-        return take.idle_s(self._seen) > self._config.recording.seal_timeout_s
+        return take.idle_s(self._seen) > self.config.recording.seal_timeout_s
 
     def _waits_too_long(self) -> bool:
         """A disk that does not answer must not keep the daemon from ending; the next one recovers."""
@@ -254,7 +264,7 @@ class Service:
 
     def _stop(self, reason: str) -> None:
         assert self._run is not None
-        self._run.stop(reason)
+        self._run.capture.stop(reason)
         self._go(Event.STOP, reason)
 
     def _look(self) -> None:
@@ -264,7 +274,7 @@ class Service:
             self._fail(seen.fault)
             return
         assert self._run is not None
-        for note in self._run.events():
+        for note in self._run.capture.take_events():
             self._heed_unasked(note)
         if self._state is State.RECORDING and (seen.draining or seen.done):
             self._go(Event.FULL)
@@ -274,12 +284,12 @@ class Service:
         if seen.done or self.hurried:
             self._finish(self._take)
         elif self._idles(self._take) and not seen.waiting:  # a disk may take its time
-            limit_s = self._config.recording.seal_timeout_s
+            limit_s = self.config.recording.seal_timeout_s
             self._fail(f"the recording was not sealed: nothing more of it reached the disk for {limit_s:g} s")
 
     def _poll(self) -> CaptureStatus:
         assert self._run is not None
-        before, self._seen = self._seen, self._run.poll()
+        before, self._seen = self._seen, self._run.capture.poll()
         self._tell_waiting(before)
         self._salvage.add(self._seen.orphans)
         if self._seen.path is not None:
@@ -298,22 +308,13 @@ class Service:
         if self._seen.recording and before.recording and before.path != self._seen.path:
             log.warning("%s goes on in %s", before.path, self._seen.path)
 
-    def _begin(
-        self,
-        path: Path | None,
-        lines: int | None,
-        window: Window,
-        *,
-        resume: bool = False,
-        by_event: bool = False,
-    ) -> None:
+    def _begin(self, begin: Begin, *, by_event: bool = False) -> None:
         assert self._run is not None
-        path = self._run.start(path or default_path(self._config), lines, window, resume=resume)
+        self._run.capture.start(begin)
+        path, lines = begin.path, begin.budget_lines
         self._salvage.began(path)
         self._uploads.forget(path)
         self._uploads.add(path)
-        if window.post_lines is not None:
-            lines = window.pre_lines + window.post_lines
         self._take = Take(path, lines, by_event)
         self._go(Event.START, f"{path}, {'until stopped' if lines is None else f'{lines} lines'}")
 
@@ -334,19 +335,20 @@ class Service:
             return
         take = self._take
         if take is None and self._order.waits:
-            self._begin(None, None, self._order.window(note), by_event=True)
+            window = self._order.window(note)
+            self._begin(Begin(default_path(self.config), self._run.spec(), window=window), by_event=True)
             self._order.used = True
         elif take is None:
             log.info("the event starts no recording: another did since the instrument was armed")
         elif take.by_event and self._state is State.RECORDING:
-            self._run.extend(self._order.end_line(note))
+            self._run.capture.extend(self._order.end_line(note))
         elif take.by_event and take.late is None:
             take.late = note
 
     def _finish(self, take: Take) -> None:
         """The recording is over: stay armed for the next, or release the devices."""
         aborted = self._seen.condition is RunCondition.ABORTED
-        stays = self._config.recording.after == "armed" or (take.by_event and self._order.rearm)
+        stays = self.config.recording.after == "armed" or (take.by_event and self._order.rearm)
         stays = stays and self._seen.done and not aborted and not self.hurried
         if stays:
             self._remember()
@@ -384,11 +386,11 @@ class Service:
             return
         run, self._run = self._run, None
         try:
-            run.close()
+            run.capture.close()
         except OSError as error:
             raise DeviceError(f"the devices could not be released in order: {error}") from error
         finally:
-            self._seen, self._rates = run.poll(), Rates()
+            self._seen, self._rates = run.capture.poll(), Rates()
             self._salvage.add(self._seen.orphans)
             for arm, account in self._seen.accounts.items():
                 if not account.balanced:
@@ -462,7 +464,7 @@ class Service:
             since=self._since,
             possible=[str(command) for command in commands(self._state)],
             busy=self._busy,
-            name=self._config.name,
+            name=self.config.name,
             version=__version__,
             pid=os.getpid(),
             uptime_s=0.0,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from pathlib import Path
 
 from acquire.cores import process_age_s
@@ -50,4 +51,8 @@ def _listens(process: Path) -> bool:
     """The process has a Unix socket that it accepts connections on: it listens, somewhere else."""
     rows = [row.split() for row in (process / "net" / "unix").read_text(errors="replace").splitlines()[1:]]
     accepting = {f"socket:[{row[6]}]" for row in rows if row[3] == ACCEPTS and len(row) > 7}
-    return any(str(fd.readlink()) in accepting for fd in (process / "fd").iterdir())
+    for descriptor in (process / "fd").iterdir():
+        with suppress(FileNotFoundError):  # who is starting opens and closes files all the time
+            if str(descriptor.readlink()) in accepting:
+                return True
+    return False

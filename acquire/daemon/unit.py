@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import grp
+import math
 import os
 import pwd
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from acquire.daemon.host import needed_bytes
+from acquire.place import default_socket
 
 if TYPE_CHECKING:
     from acquire.config import RigConfig
@@ -17,6 +21,8 @@ WATCHDOG_S = 30
 """Without a word from the daemon, which gives one twice a second, systemd ends and restarts it."""
 STOP_S = 60
 """Beyond what sealing a recording may take (`recording.seal_timeout_s`)."""
+PROCESSES_BYTES = 600_000_000
+"""Daemon, nursery, recorder, watcher, grabbers and page; 250 MB were measured (`pss`, 8 stages)."""
 UNIT = "acquire.service"
 SOCKET = "/run/acquire/acquire.sock"
 """Of the host's service, unless the rig says otherwise."""
@@ -55,6 +61,7 @@ def unit_text(rig: RigConfig, config: Path, *, user: bool, account: str | None =
         "Type=notify",
         "NotifyAccess=main",
         f"ExecStart={command}",
+        f"ExecReload={sys.executable} -m acquire reload{_socket(rig)}",
         *([] if user else [f"User={who}", *_groups(), "RuntimeDirectory=acquire"]),
         *([] if user else ["RuntimeDirectoryMode=0700", "Environment=XDG_RUNTIME_DIR=/run/acquire"]),
         f"WorkingDirectory={_quoted(recordings)}",
@@ -64,7 +71,7 @@ def unit_text(rig: RigConfig, config: Path, *, user: bool, account: str | None =
         "KillMode=mixed",
         f"TimeoutStopSec={stop_s}",
         f"TimeoutStartSec={STOP_S}",
-        "OOMPolicy=continue",
+        *_memory(rig),
         "LimitNOFILE=65536",
         "LimitRTPRIO=1",
         "LimitNICE=-15",
@@ -93,6 +100,7 @@ def _hardening(recordings: Path, rig: RigConfig) -> list[str]:
     """What the service does not need it cannot do. (Not MemoryDenyWriteExecute: the simulator compiles.)"""
     writable = {recordings, rig.control.socket.absolute().parent}
     return [
+        "# Where the host's memory ends, others are killed before the capture is; only root may ask for it.",
         "OOMScoreAdjust=-500",
         "NoNewPrivileges=yes",
         "UMask=0077",
@@ -111,6 +119,25 @@ def _hardening(recordings: Path, rig: RigConfig) -> list[str]:
         "RestrictAddressFamilies=AF_UNIX AF_INET AF_INET6 AF_NETLINK AF_PACKET",
         "SystemCallArchitectures=native",
         "CapabilityBoundingSet=",
+    ]
+
+
+def _socket(rig: RigConfig) -> str:
+    """Which the service's environment does not say."""
+    socket = rig.control.socket
+    return "" if socket == default_socket() else f" --socket {_quoted(socket.absolute())}"
+
+
+def _memory(rig: RigConfig) -> list[str]:
+    """What holds where memory ends, told where it is read by whoever would change it."""
+    needed_mb = math.ceil((sum(needed_bytes(rig)) + PROCESSES_BYTES) / 1e6)
+    return [
+        "# What the kernel kills where memory ends is replaced, and the capture goes on: the page's jobs go",
+        "# first, then page, recoveries, uploads. Where it kills the service, Restart= brings it back.",
+        "OOMPolicy=continue",
+        "# Rings and processes keep their memory when others want it. MemoryMax= is not set: it",
+        "# would have to be more, by what the videos need that jobs of the page make.",
+        f"MemoryLow={needed_mb}M",
     ]
 
 

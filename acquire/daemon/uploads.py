@@ -56,7 +56,7 @@ def check_upload(config: RigConfig) -> None:
         check_url(url)
     except UsageError as error:
         raise ConfigError(
-            f"recording.upload_to = {error.message}", possible=error.possible, hint=error.hint
+            f"recording.upload_to: {error.message}", possible=error.possible, hint=error.hint
         ) from error
 
 

@@ -45,6 +45,7 @@ def judge_of(config: RigConfig) -> Judge:
         code=config.code.build(),
         white_dn=config.cameras.a.white_dn,
         registration={"a": config.check.registration_a, "b": config.check.registration_b},
+        fibre=config.laid_out,
     )
 
 

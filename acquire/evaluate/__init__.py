@@ -10,7 +10,9 @@
 
     runs of every solver --> tradeoff  accuracy, time  --> tradeoff_page
     scenes of the paper  --> paper     its figures     --> paper.page
-    videos on disk       --> rendering movies, sheets
+    videos on disk       --> rendering movies, sheets, video_page
+
+    page (templates), themed (drawings), player (videos), host (how busy): what the pages have in common
 
 Nothing here opens a device or a socket. Only reports, pages and renderings write files; ``paper`` also
 makes the recordings that it needs.

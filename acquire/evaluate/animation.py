@@ -42,7 +42,10 @@ def save_animation(
             return step
         step *= 2
     path.unlink(missing_ok=True)
-    raise UsageError(f"animation of {frames} frames in {max_bytes} bytes", possible="more bytes per frame")
+    raise UsageError(
+        f"an animation of {frames} frames does not fit into {max_bytes} bytes",
+        possible="more bytes per frame",
+    )
 
 
 def write_webp(path: Path, pictures: list[Image.Image], duration_ms: int = FRAME_DURATION_MS) -> None:
@@ -64,9 +67,14 @@ def stills(path: Path) -> Iterator[bytes]:
     """The frames of an animation, each a WebP picture of its own: a player can stop at any."""
     with Image.open(path) as pictures:
         for picture in ImageSequence.Iterator(pictures):
-            file = BytesIO()
-            picture.convert("RGB").save(file, "WEBP", quality=75, method=2)
-            yield file.getvalue()
+            yield webp(picture.convert("RGB"), 75)
+
+
+def webp(picture: Image.Image, quality: int) -> bytes:
+    """One picture, lossy."""
+    file = BytesIO()
+    picture.save(file, "WEBP", quality=quality, method=2)
+    return file.getvalue()
 
 
 def draw_frame(result: DemoResult, frame: int) -> Image.Image:

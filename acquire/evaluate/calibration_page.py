@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import matplotlib as mpl
 import numpy as np
 
-from acquire.evaluate.figures import DPI, INK, MASKED, SOLVER_COLOURS, STYLE
-from acquire.evaluate.paper.drawing import canvas
-from acquire.evaluate.report import fill_template
+from acquire.calibrate.curve import curve_of, knots_dn
+from acquire.evaluate.page import fill_template
+from acquire.evaluate.themed import INK, MASKED, SOLVER_COLOURS, STYLE, canvas, save_drawing
 from acquire.lines import ARMS
 
 if TYPE_CHECKING:
@@ -29,8 +29,8 @@ PANELS = (
     ("gain", "gain"),
 )
 SPOKES = 9
-ENLARGED = 10.0
-"""Displacements are drawn so much larger where they are small."""
+ENLARGED = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+"""Displacements are drawn so many times as long, the most with which no arrow reaches the next point."""
 
 
 def write_page(known: Calibration, directory: Path, name: str, facts: Mapping[str, Any]) -> Path:
@@ -38,20 +38,18 @@ def write_page(known: Calibration, directory: Path, name: str, facts: Mapping[st
 
     ``facts`` are what the command prints: name → words.
     """
-    pictures = {}
     with mpl.rc_context(STYLE):
-        drawings = {"columns": _columns(known), "field": _field(known)}
-        for key, drawing in drawings.items():
-            if drawing is not None:
-                pictures[key] = directory / f"{key}.png"
-                drawing.savefig(pictures[key], dpi=DPI)
+        figures = {"columns": _columns(known), "curve": _curve(known), "field": _field(known)}
+        drawings = {
+            key: save_drawing(figure, directory, key) for key, figure in figures.items() if figure is not None
+        }
     text = json.dumps(known.to_attrs(), indent=1, allow_nan=False, ensure_ascii=False)
     (directory / "calibration.json").write_text(text + "\n", encoding="utf-8")
     shown = {key: value for key, value in facts.items() if value is not None and key not in known.steps}
     steps = [{"name": step, **about} for step, about in known.steps.items()]
     page = directory / "index.html"
     page.write_text(
-        fill_template("calibration.html.j2", {"name": name, "facts": shown, "steps": steps}, pictures),
+        fill_template("calibration.html.j2", {"name": name, "facts": shown, "steps": steps}, drawings),
         encoding="utf-8",
     )
     return page
@@ -87,6 +85,24 @@ def _panel(ax: Axes, known: Calibration, key: str) -> None:
         ax.plot(x[~good], value[~good], "x", color=MASKED, ms=6)
 
 
+def _curve(known: Calibration) -> Figure | None:
+    """By how much samples are off a straight line, with twice the standard uncertainty."""
+    if curve_of(known) is None:
+        return None
+    measured = known.quantities["excess_dn"]
+    figure = canvas(2.6)
+    ax = figure.subplots()
+    for arm, dn, value, error, colour in zip(
+        ARMS, knots_dn(known.instrument), measured.value, measured.uncertainty, SOLVER_COLOURS, strict=False
+    ):
+        ax.fill_between(dn, value - 2 * error, value + 2 * error, color=colour, alpha=0.25, lw=0)
+        ax.plot(dn, value, color=colour, lw=1.2, label=f"camera {arm.upper()}")
+    ax.axhline(0, color=INK, lw=0.6)
+    ax.set(xlabel="sample (DN)", ylabel="too high by (DN)")
+    figure.legend(loc="outside upper right", ncols=2)
+    return figure
+
+
 def _field(known: Calibration) -> Figure | None:
     """Where points of the scene lie in arm B's image beside arm A's."""
     if known.alignment is None:
@@ -96,7 +112,7 @@ def _field(known: Calibration) -> Figure | None:
     points = np.stack(np.meshgrid(at, at, indexing="ij")).reshape(2, -1)
     moved = alignment.matrix @ points + np.array([[alignment.rows], [alignment.columns]]) - points
     largest = float(np.hypot(*moved).max())
-    factor = ENLARGED if largest * ENLARGED < half / 3 else 1.0
+    factor = max((each for each in ENLARGED if each * largest < at[1] - at[0]), default=1)
     figure = canvas(4.6)
     ax = figure.subplots()
     ax.quiver(
@@ -118,6 +134,6 @@ def _field(known: Calibration) -> Figure | None:
         xlim=(-1.15 * half, 1.15 * half),
         ylim=(1.15 * half, -1.15 * half),
     )
-    drawn = "" if factor == 1 else f",\ndrawn {factor:g} × as long"
+    drawn = "" if factor == 1 else f",\ndrawn {factor} × as long"
     ax.set_title(f"Up to {largest:.2f} fine pixels{drawn}")
     return figure

@@ -102,7 +102,7 @@ def region_mean(video: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[np.floa
     if video.ndim != 3 or mask.shape != video.shape[1:] or mask.dtype != np.bool_ or not mask.any():
         mask_text = f"{np.count_nonzero(mask)} pixels of a {mask.dtype} mask {mask.shape}"
         raise UsageError(
-            f"mean of a video {video.shape} over {mask_text}",
+            f"a video {video.shape} has no mean over {mask_text}",
             possible="a boolean mask of the frame's shape with at least one pixel",
         )
     means: NDArray[np.float64] = video[:, mask].mean(axis=1, dtype=np.float64)
@@ -153,7 +153,9 @@ def compare_curve(
     """
     theory, measured = np.asarray(theory, np.float64), np.asarray(measured, np.float64)
     if theory.shape != measured.shape:
-        raise UsageError(f"comparison of a curve {measured.shape} with a theory {theory.shape}")
+        raise UsageError(
+            f"a curve {measured.shape} cannot be compared with a theory {theory.shape}", possible="one length"
+        )
     theory_fit = fit_sine(theory, interval_s, harmonics=harmonics)
     check_finite(measured, "the measured curve")
     return CurveComparison(
@@ -172,11 +174,13 @@ def _check_curve(values: NDArray[np.float64], interval_s: float, harmonics: int)
     least = 2 * harmonics + 2
     if values.ndim != 1 or harmonics < 1 or len(values) < least:
         raise UsageError(
-            f"sinusoid with {harmonics} harmonics through {values.shape} values",
+            f"a sinusoid with {harmonics} harmonics cannot be fitted to {values.shape} values",
             possible=f"a curve (t,) of at least {least} values, 1 harmonic or more",
         )
     if not (np.isfinite(interval_s) and interval_s > 0):
-        raise UsageError(f"sampling interval of {interval_s} s", possible="a positive number of seconds")
+        raise UsageError(
+            f"the sampling interval cannot be {interval_s} s", possible="a positive number of seconds"
+        )
     check_finite(values, "the curve")
 
 
@@ -191,7 +195,10 @@ def _visible_harmonics(frequency_hz: float, interval_s: float, harmonics: int) -
     """How many multiples of the frequency lie below half the sampling rate; UsageError for none."""
     nyquist_hz = 0.5 / interval_s
     if not 0 < frequency_hz < nyquist_hz:
-        raise UsageError(f"sinusoid of {frequency_hz} Hz", possible=f"above 0 and below {nyquist_hz:g} Hz")
+        raise UsageError(
+            f"a sinusoid of {frequency_hz} Hz cannot be fitted to samples every {interval_s:g} s",
+            possible=f"above 0 and below {nyquist_hz:g} Hz",
+        )
     return min(harmonics, int(np.ceil(nyquist_hz / frequency_hz)) - 1)
 
 

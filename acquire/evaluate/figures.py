@@ -1,8 +1,8 @@
 """The figures of the report, after Fig. 9 of the paper: line streams, frames, curves, error over time.
 
-Each function makes one matplotlib ``Figure`` from a :class:`~acquire.evaluate.result.DemoResult`, without
-pyplot and its global state; :func:`save_figures` writes all of them as PNG, and curves as SVG, too. This and
-`themed` are imported late, so that no command pays for matplotlib which draws nothing.
+Each function makes one matplotlib ``Figure`` from a :class:`~acquire.evaluate.result.DemoResult`;
+:func:`save_figures` writes all of them as PNG and SVG. This and `themed` are
+imported late, so that no command pays for matplotlib which draws nothing.
 """
 
 from __future__ import annotations
@@ -11,99 +11,60 @@ from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
-from matplotlib.patheffects import withStroke
 from matplotlib.ticker import MaxNLocator
 
 from acquire.evaluate.curves import region_mean
-from acquire.evaluate.themed import save_drawing
+from acquire.evaluate.themed import (
+    HIGHLIGHT,
+    INK,
+    MASKED,
+    SOLVER_COLOURS,
+    STYLE,
+    THEORY,
+    canvas,
+    save_drawing,
+)
 from acquire.lines import ARMS
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
     from acquire.evaluate.curves import CurveComparison
     from acquire.evaluate.result import DemoResult, Region
+    from acquire.evaluate.themed import Drawing
 
-DPI = 150
-WIDTH_IN = 10.0
 FRAME_COLUMNS = 6
 DETAIL_PERIODS = 3
 DETAIL_SHARE = 0.1
 ERROR_SHARE = 0.5
 """The error's scale ends at this share of the peak."""
 
-DRAWINGS = ("curves", "psnr")
-INK, EDGE, GRID = "#1f2933", "#7b8794", "#e4e7eb"
-THEORY = "#9aa5b1"
-HIGHLIGHT = "#f0b429"
-MASKED = "#d55e00"
-SOLVER_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
-"""Okabe and Ito's palette, which stays distinct under the common colour deficiencies."""
-
-STYLE: Any = {
-    "font.size": 9.5,
-    "axes.titlesize": 10.5,
-    "axes.titlelocation": "left",
-    "axes.titleweight": "bold",
-    "axes.labelcolor": INK,
-    "axes.edgecolor": EDGE,
-    "axes.linewidth": 0.7,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": GRID,
-    "grid.linewidth": 0.6,
-    "axes.axisbelow": True,
-    "text.color": INK,
-    "xtick.color": INK,
-    "ytick.color": INK,
-    "xtick.major.width": 0.7,
-    "ytick.major.width": 0.7,
-    "legend.frameon": False,
-    "image.interpolation": "nearest",
-    "figure.facecolor": "white",
-    "savefig.facecolor": "white",
-}
+NARROW_LINES_IN, NARROW_FRAMES = 3.4, 0.5
+"""On narrow pages: the height of the lines' picture; of the frames' as a share of that on a wide page."""
 
 
-DARK = {
-    INK: "#e4e9ef",
-    EDGE: "#8592a0",
-    GRID: "#303a46",
-    THEORY: "#6b7785",
-    SOLVER_COLOURS[0]: "#4aa8e0",
-    SOLVER_COLOURS[1]: "#f0894a",
-}
-"""Colours of curves → those of a dark page."""
-
-
-def save_figures(result: DemoResult, directory: Path) -> dict[str, Path]:
-    """Write ``lines.png``, ``frames.png``, ``curves.png`` and ``psnr.png``; returns name -> path.
-
-    Curves are written as SVG, too, and these are returned. Without regions there are no curves.
-    """
+def save_figures(result: DemoResult, directory: Path) -> dict[str, Drawing]:
+    """Write lines, frames, curves (where there are regions) and psnr as PNG and SVG; name -> drawing."""
     makers = {"lines": line_streams, "frames": frames, "curves": intensity_curves, "psnr": psnr_over_time}
     if not result.regions:
         del makers["curves"]
-    paths = {name: directory / f"{name}.png" for name in makers}
+    drawings = {}
     with mpl.rc_context(STYLE):
         for name, make in makers.items():
             figure = make(result)
-            figure.savefig(paths[name], dpi=DPI)
-            if name in DRAWINGS:
-                paths[name] = directory / f"{name}.svg"
-                save_drawing(figure, paths[name], DARK)
-    return paths
+            heights = {"lines": NARROW_LINES_IN, "frames": NARROW_FRAMES * figure.get_figheight()}
+            drawings[name] = save_drawing(figure, directory, name, narrow_in=heights.get(name))
+    return drawings
 
 
 def line_streams(result: DemoResult) -> Figure:
     """Both arms' lines as pictures, time downwards (Fig. 9a); samples that are masked stand out in colour."""
     segment, times = result.segment, result.line_ms
-    figure = _figure(4.6)
+    figure = canvas(4.6)
     axes = figure.subplots(1, 2, sharey=True, squeeze=False)[0]
     usable = segment.lines[segment.mask]
     low, high = (float(usable.min()), float(usable.max())) if usable.size else (0.0, 1.0)
@@ -116,7 +77,7 @@ def line_streams(result: DemoResult) -> Figure:
         ax.set_title(f"Camera {ARMS[arm].upper()}")
         masked = np.count_nonzero(~segment.mask[arm])
         if masked:
-            ax.set_title(f"{masked} samples masked", loc="right", color=MASKED, fontweight="normal")
+            ax.set_title(f"{masked} masked", loc="right", color=MASKED, fontsize=8.5, fontweight="normal")
         ax.set_xlabel("pixel of the line")
         ax.grid(visible=False)
     axes[0].set_ylabel("time since start (ms)")
@@ -132,14 +93,14 @@ def frames(result: DemoResult) -> Figure:
         rows += [(solver.label.replace(" (", "\n("), solver.video, False), ("|error|", error, True)]
     picks = representative_frames(result)
     aspect = result.truth.shape[1] / result.truth.shape[2]
-    figure = _figure(0.3 + 1.5 * aspect * len(rows))
+    figure = canvas(0.3 + 1.5 * aspect * len(rows))
     axes = figure.subplots(len(rows), len(picks), squeeze=False)
     for (label, video, is_error), row in zip(rows, axes, strict=True):
         for frame, ax in zip(picks, row, strict=True):
             _show_frame(ax, result, video[frame], is_error=is_error)
-            if not is_error:
-                stamp(ax, f"#{frame}  {result.frame_ms[frame]:.2f} ms")
-        row[0].set_ylabel(label, fontweight="normal" if is_error else "bold")
+        row[0].set_ylabel(label, fontsize=8, fontweight="normal" if is_error else "bold")
+    for frame, ax in zip(picks, axes[0], strict=True):
+        stamp(ax, f"#{frame}\n{result.frame_ms[frame]:.2f} ms")
     _colour_bar(figure, axes[0], "intensity", "neither")
     _colour_bar(figure, axes[2], "|error|", "max")
     return figure
@@ -147,7 +108,7 @@ def frames(result: DemoResult) -> Figure:
 
 def intensity_curves(result: DemoResult) -> Figure:
     """Mean intensity of each region against theory (Fig. 9c): where, the whole, a few periods, the fits."""
-    figure = _figure(0.7 + 1.45 * len(result.regions))
+    figure = canvas(0.7 + 1.45 * len(result.regions))
     axes = figure.subplots(len(result.regions), 3, squeeze=False, width_ratios=[1, 4.6, 2.1])
     for row, (where, whole, detail) in enumerate(axes):
         window = _detail_window(result, row)
@@ -159,11 +120,10 @@ def intensity_curves(result: DemoResult) -> Figure:
         _plot_curves(detail, result, row)
         detail.set_xlim(*window)
         detail.tick_params(labelleft=False)
-        detail.xaxis.set_major_locator(MaxNLocator(3))
+        detail.xaxis.set_major_locator(MaxNLocator(2))
         _list_fits(detail, result, row)
     axes[0, 2].set_title("detail")
-    for ax in axes[-1, 1:]:
-        ax.set_xlabel("time since start (ms)")
+    figure.supxlabel("time since start (ms)", fontsize=9.5)
     handles, labels = axes[0, 1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=len(labels))
     return figure
@@ -171,7 +131,7 @@ def intensity_curves(result: DemoResult) -> Figure:
 
 def psnr_over_time(result: DemoResult) -> Figure:
     """PSNR of each frame for every solver, with the PSNR of the whole video as a dashed line."""
-    figure = _figure(2.9)
+    figure = canvas(2.9)
     ax = figure.subplots()
     for solver, colour in _coloured(result):
         ax.plot(result.frame_ms, solver.psnr_per_frame, color=colour, lw=1.1, label=solver.label)
@@ -267,10 +227,6 @@ def _coloured(result: DemoResult) -> list[tuple[Any, str]]:
     return list(zip(result.solvers, colours, strict=True))
 
 
-def _figure(height_in: float) -> Figure:
-    return Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
-
-
 def bare(ax: Axes) -> None:
     """A picture without ticks and frame."""
     ax.set(xticks=[], yticks=[])
@@ -280,6 +236,5 @@ def bare(ax: Axes) -> None:
 
 
 def stamp(ax: Axes, text: str) -> None:
-    """Time within the picture, lower left; outlined, because it may lie on white."""
-    outline = [withStroke(linewidth=1.6, foreground="black")]
-    ax.text(0.03, 0.03, text, color="white", fontsize=7, transform=ax.transAxes, path_effects=outline)
+    """Time above a picture."""
+    ax.set_title(text, fontsize=7.5, fontweight="normal", pad=3)

@@ -61,7 +61,10 @@ def ssim_per_frame(
     video, truth = check_pair(video, truth)
     window = 2 * SSIM_RADIUS + 1
     if min(video.shape[1:]) < window:
-        raise UsageError(f"SSIM of frames {video.shape[1:]}", possible=f"at least {window} x {window} pixels")
+        raise UsageError(
+            f"frames {video.shape[1:]} are too small for an SSIM",
+            possible=f"at least {window} x {window} pixels",
+        )
     peak = checked_peak(truth, data_range)
     # frame by frame: the five filtered moments of a whole video would be five more videos in memory
     return np.array([_ssim_frame(x, y, peak) for x, y in zip(video, truth, strict=True)])
@@ -72,7 +75,7 @@ def check_pair(video: NDArray[Any], truth: NDArray[Any]) -> tuple[NDArray[Any], 
     video, truth = np.asarray(video), np.asarray(truth)
     if video.shape != truth.shape or video.ndim not in {2, 3} or video.size == 0:
         raise UsageError(
-            f"comparison of a video {video.shape} with a truth {truth.shape}",
+            f"a video {video.shape} cannot be compared with a truth {truth.shape}",
             possible="two arrays of one shape (time, row, column) or (row, column)",
         )
     check_finite(video, "the video")
@@ -91,7 +94,7 @@ def checked_peak(truth: NDArray[Any], peak: float | None = None) -> float:
     """``peak``, or the truth's maximum; UsageError unless it is positive and finite."""
     value = float(np.max(truth)) if peak is None else float(peak)
     if not (np.isfinite(value) and value > 0):
-        raise UsageError(f"peak {value} for a comparison", possible="a positive number")
+        raise UsageError(f"the peak of a comparison cannot be {value}", possible="a positive number")
     return value
 
 

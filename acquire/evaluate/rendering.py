@@ -1,4 +1,4 @@
-"""Videos as people watch them: MP4, GIF, WebP, or one PNG sheet of frames; several side by side.
+"""Videos as people watch them: MP4, GIF, WebP, one PNG sheet of frames, or a page; several side by side.
 
 Every panel shows the frame of its own video at the common time, so that other voxels of the same lines (a
 selective reconstruction) run together. Grey is linear from 0 to ``peak``.
@@ -28,7 +28,7 @@ BAR_PX, GAP_PX = 26, 8
 PAPER, WORDS, SOFT = "#12181f", "#ffffff", "#cbd2d9"
 PEAK_QUANTILE = 0.999
 SHEET_COLUMNS = 6
-SUFFIXES = (".mp4", ".gif", ".webp", ".png")
+SUFFIXES = (".mp4", ".gif", ".webp", ".png", ".html")
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,9 +50,13 @@ class Panel:
 
     def at(self, time_ns: int) -> NDArray[Any]:
         """The frame that is shown at a time."""
-        index = int(np.searchsorted(self.file.time_ns, time_ns, "right")) - 1
-        frame: NDArray[Any] = np.asarray(self.file.video[min(max(index, 0), self.file.video.shape[0] - 1)])
+        frame: NDArray[Any] = np.asarray(self.file.video[self.index(time_ns)])
         return frame
+
+    def index(self, time_ns: int) -> int:
+        """Its number."""
+        index = int(np.searchsorted(self.file.time_ns, time_ns, "right")) - 1
+        return min(max(index, 0), self.file.video.shape[0] - 1)
 
 
 def check_suffix(path: Path) -> None:
@@ -61,7 +65,8 @@ def check_suffix(path: Path) -> None:
         raise UsageError(
             f"{path} cannot be rendered: "
             + (f"{path.suffix} is no format that is known" if path.suffix else "its name has no suffix"),
-            possible=".mp4 (a movie), .gif or .webp (an animation), .png (a sheet of stills)",
+            possible=".mp4 (a movie), .gif or .webp (an animation), .png (a sheet of stills), "
+            ".html (a page with a player)",
             hint=f"--out {path.with_suffix('.mp4')}",
         )
 
@@ -99,6 +104,10 @@ def render(
     check_suffix(path)
     times = common_times(panels, count)
     peaks = [look.peak or _peak(panel) for panel in panels]
+    if path.suffix.lower() == ".html":
+        from acquire.evaluate.video_page import write_page  # which draws, and so costs more
+
+        return write_page(panels, peaks, times, path, look, progress)
     pictures = _pictures(panels, times, peaks, look, progress)
     match path.suffix.lower():
         case ".png":
@@ -182,7 +191,7 @@ def _write_mp4(path: Path, pictures: Iterator[Image.Image], fps: float) -> None:
         import av
     except ModuleNotFoundError as error:
         raise UsageError(
-            f"rendering to {path.name} without PyAV",
+            f"{path.name} cannot be rendered without PyAV",
             possible=", ".join(suffix for suffix in SUFFIXES if suffix != ".mp4"),
             hint="pip install 'tdi-acquire[video]'",
         ) from error

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from acquire.evaluate.host import Busyness
     from acquire.lines import Segment
 
 
@@ -150,7 +151,8 @@ class DemoResult:
 
     ``frame_time_ns`` (t,) are the UTC times of the trusted frames, which ``truth`` and every solver's
     video hold; ``start_ns`` is the time of the recording's first line, from which the figures count.
-    ``solvers[0]`` is the default one, which the headline quotes. Raises UsageError when the arrays do not
+    ``solvers[0]`` is the default one, which the headline quotes; ``host`` is what the machine was like
+    meanwhile. Raises UsageError when the arrays do not
     fit together.
     """
 
@@ -167,15 +169,21 @@ class DemoResult:
     solvers: tuple[SolverResult, ...]
     regions: tuple[Region, ...]
     stages: tuple[Stage, ...]
+    host: Busyness
 
     def __post_init__(self) -> None:
         frames = len(self.frame_time_ns)
         if self.truth.ndim != 3 or self.truth.shape[0] != frames or frames < 2:
-            raise UsageError(f"report of a truth {self.truth.shape} with {frames} time stamps")
+            raise UsageError(
+                f"a report cannot have a truth {self.truth.shape} with {frames} time stamps",
+                possible="2 frames (time, row, column) or more, with a time stamp each",
+            )
         if not self.solvers:
-            raise UsageError("report without a reconstruction", possible="one or more")
+            raise UsageError("a report needs a reconstruction", possible="one or more")
         if set(self.capture.arms) != set(ARMS):
-            raise UsageError(f"report with ledgers of {sorted(self.capture.arms)}", possible=f"{list(ARMS)}")
+            raise UsageError(
+                f"a report cannot have ledgers of {sorted(self.capture.arms)}", possible=f"{list(ARMS)}"
+            )
         for region in self.regions:
             found = (region.mask.shape, region.theory.shape)
             self._check(f"region {region.name!r}", found, (self.truth.shape[1:], (frames,)))
@@ -187,7 +195,9 @@ class DemoResult:
     @staticmethod
     def _check(what: str, found: tuple[Any, ...], expected: tuple[Any, ...]) -> None:
         if found != expected:
-            raise UsageError(f"report of {what} with {found}", possible=f"{expected}, as the truth has it")
+            raise UsageError(
+                f"a report cannot have {what} with {found}", possible=f"{expected}, as the truth has it"
+            )
 
     @property
     def frame_ms(self) -> NDArray[np.float64]:

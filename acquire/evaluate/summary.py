@@ -28,6 +28,7 @@ def summarise(result: DemoResult) -> dict[str, Any]:
         "when": result.when.astimezone(UTC).isoformat(timespec="seconds"),
         "command": result.command,
         "seed": result.seed,
+        "host": result.host.facts(),
         "total_s": rounded(sum(stage.seconds for stage in result.stages), 2),
         "stages": [{**asdict(stage), "seconds": rounded(stage.seconds, 2)} for stage in result.stages],
         "rig": rig_summary(result),

@@ -1,39 +1,134 @@
-"""Drawings for a page: SVG whose ink follows the reader's theme."""
+"""Drawings for a page: SVG whose ink follows the reader's theme, for wide pages and for narrow ones.
+
+From one figure come a PNG for elsewhere, and both shapes of the SVG: letters keep their size, and what lies
+between them is laid out anew.
+"""
 
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from io import StringIO
 from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from pathlib import Path
 
-    from matplotlib.figure import Figure
+DPI = 150
+WIDTH_IN, NARROW_IN = 10.0, 4.6
+"""Of a page, and of a telephone: at its width a letter is as large as the page's small print."""
 
+INK, EDGE, GRID = "#1f2933", "#7b8794", "#e4e7eb"
+SOFT = "#52606d"
+THEORY = "#9aa5b1"
+HIGHLIGHT = "#f0b429"
+MASKED = "#d55e00"
+SOLVER_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
+"""Okabe and Ito's palette, which stays distinct under the common colour deficiencies."""
+
+DARK = {
+    INK: "#e4e9ef",
+    EDGE: "#8592a0",
+    GRID: "#303a46",
+    SOFT: "#a3b0be",
+    THEORY: "#6b7785",
+    SOLVER_COLOURS[0]: "#4aa8e0",
+    SOLVER_COLOURS[1]: "#f0894a",
+    SOLVER_COLOURS[2]: "#2fcf9f",
+    SOLVER_COLOURS[3]: "#e6a3cc",
+}
+"""Colours of drawings → those that take their place on a dark page."""
+
+STYLE: Any = {
+    "font.size": 9.5,
+    "axes.titlesize": 10.5,
+    "axes.titlelocation": "left",
+    "axes.titleweight": "bold",
+    "axes.labelcolor": INK,
+    "axes.edgecolor": EDGE,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": GRID,
+    "grid.linewidth": 0.6,
+    "axes.axisbelow": True,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+    "legend.frameon": False,
+    "image.interpolation": "none",  # a picture lies in the SVG pixel by pixel, and small
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+}
+
+ROOM_IN = 0.08
+"""Around the axes: twice the usual."""
 SVG: Any = {"svg.fonttype": "none", "svg.hashsalt": "acquire", "font.family": "sans-serif"}
 """Text stays text, in the reader's own font; the same figure gives the same file."""
 
 
-def save_drawing(figure: Figure, path: Path, dark: Mapping[str, str]) -> None:
-    """Write ``figure`` as SVG without a background. ``dark``: colour → what takes its place on a dark page,
-    that of plain text first.
+def canvas(height_in: float, width_in: float = WIDTH_IN) -> Figure:
+    """An empty figure without pyplot and its global state, with room for a reader's font that is larger."""
+    return Figure(figsize=(width_in, height_in), layout=ConstrainedLayoutEngine(w_pad=ROOM_IN, h_pad=ROOM_IN))
+
+
+@dataclass(frozen=True, slots=True)
+class Drawing:
+    """A figure as SVG for a page, and for a narrow one where that has another shape."""
+
+    svg: str
+    narrow: str | None = None
+
+
+def save_drawing(
+    figure: Figure,
+    directory: Path,
+    name: str,
+    *,
+    narrow: Figure | None = None,
+    narrow_in: float | None = None,
+) -> Drawing:
+    """Write ``NAME.png`` and ``NAME.svg``; returns what a page takes in, as `drawing_of`."""
+    figure.savefig(directory / f"{name}.png", dpi=DPI)
+    drawing = drawing_of(figure, narrow=narrow, narrow_in=narrow_in)
+    (directory / f"{name}.svg").write_text(drawing.svg, encoding="utf-8")
+    return drawing
+
+
+def drawing_of(figure: Figure, *, narrow: Figure | None = None, narrow_in: float | None = None) -> Drawing:
+    """A figure without a background. On narrow pages ``narrow`` stands in its place, or the same in another
+    shape, ``narrow_in`` high (absent: as high as it is). A figure that is narrow serves both.
     """
+    wide = _svg(figure)
+    if narrow is None and figure.get_figwidth() <= NARROW_IN:
+        return Drawing(wide)
+    if narrow is None:
+        figure.set_size_inches(NARROW_IN, narrow_in or figure.get_figheight())
+        narrow = figure
+    return Drawing(wide, _svg(narrow))
+
+
+def _svg(figure: Figure) -> str:
     file = StringIO()
     with mpl.rc_context(SVG):
         figure.savefig(file, format="svg", transparent=True, metadata={"Date": None})
-    path.write_text(_themed(file.getvalue(), dark), encoding="utf-8")
+    return _themed(file.getvalue())
 
 
-def _themed(svg: str, dark: Mapping[str, str]) -> str:
-    names = {colour: f"--ink{number}" for number, colour in enumerate(dark)}
+def _themed(svg: str) -> str:
+    svg = re.sub(r' d="[^"]*"', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]), svg)  # 0.01 pt is enough
+    names = {colour: f"--ink{number}" for number, colour in enumerate(DARK)}
     for colour, name in names.items():
         svg = re.sub(rf"(?<=[:\s]){colour}\b", f"var({name})", svg)
     light = "".join(f"{name}:{colour};" for colour, name in names.items())
-    night = "".join(f"{names[colour]}:{other};" for colour, other in dark.items())
-    dark_rule = f"@media (prefers-color-scheme: dark){{svg{{{night}}}}}"
-    style = f"<style>svg{{{light}}}{dark_rule}text{{fill:var(--ink0)}}</style>"
+    night = "".join(f"{names[colour]}:{other};" for colour, other in DARK.items())
+    dark_rule = f"@media screen and (prefers-color-scheme: dark){{svg{{{night}}}}}"
+    style = f"<style>svg{{{light}}}{dark_rule}text{{fill:var({names[INK]})}}</style>"
     return re.sub(r"(<svg[^>]*>)", lambda found: found[1] + style, svg, count=1)

@@ -229,6 +229,7 @@ def measure(
         dtype=dtype,
         refuse=False,
         look=look,
+        check=False,  # what explains the lines better is no part of what a solver takes
     )
     prediction = None if np.isnan(result.quality.prediction) else result.quality.prediction
     last = Point(result.iterations, result.seconds, result.processor_s, "end", prediction=prediction)

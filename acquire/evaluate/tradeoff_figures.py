@@ -1,4 +1,4 @@
-"""Pictures of a trade-off: narrow enough for a telephone, in light and in dark.
+"""Pictures of a trade-off, narrow enough for a telephone.
 
 Axes hold at least what matters, so that a difference of a tenth of a decibel looks like one.
 """
@@ -6,20 +6,21 @@ Axes hold at least what matters, so that a difference of a tenth of a decibel lo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from acquire.evaluate.figures import STYLE, bare
+from acquire.evaluate.figures import bare
 from acquire.evaluate.knees import Clock, band, plain
+from acquire.evaluate.themed import SOFT, SOLVER_COLOURS, STYLE, canvas
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
     from acquire.evaluate.tradeoff import Point, Run
@@ -33,28 +34,6 @@ MARKERS = {"fast": "o", "balanced": "s", "best": "D"}
 FRAMES = 5
 LEAST_OCTAVES, MANY_OCTAVES = 2.0, 3.5
 """Of time: what an axis shows at least, and beyond which it has fewer ticks."""
-
-
-class Theme(NamedTuple):
-    """Colours of a picture, to be read on the page's card."""
-
-    style: Any
-    solvers: tuple[str, ...]
-    soft: str
-
-
-LIGHT = Theme(dict(STYLE), ("#0072b2", "#d55e00", "#009e73", "#cc79a7"), "#52606d")
-_DARK_INK, _DARK_SOFT = "#e4e9ef", "#a3b0be"
-DARK = Theme(
-    STYLE
-    | dict.fromkeys(("text.color", "axes.labelcolor", "xtick.color", "ytick.color"), _DARK_INK)
-    | dict.fromkeys(("figure.facecolor", "savefig.facecolor", "axes.facecolor"), "#1b222b")
-    | {"axes.edgecolor": _DARK_SOFT, "grid.color": "#303a46"},
-    ("#56b4e9", "#e69f00", "#2fcf9f", "#e6a3cc"),
-    _DARK_SOFT,
-)
-THEMES = {"": LIGHT, "-dark": DARK}
-"""What is added to a picture's name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,23 +75,23 @@ def in_series(runs: Sequence[Run]) -> dict[Series, list[Run]]:
     return found
 
 
-def curves(runs: Sequence[Run], metric: Metric, clock: Clock, theme: Theme) -> Figure:
+def curves(runs: Sequence[Run], metric: Metric, clock: Clock) -> Figure:
     """A quantity over time: the median of the repeats, their band, and where each run ended."""
-    with mpl.rc_context(theme.style):
-        figure = Figure(figsize=(WIDTH_IN, HEIGHT_IN), layout="constrained")
+    with mpl.rc_context(STYLE):
+        figure = canvas(HEIGHT_IN, WIDTH_IN)
         ax = figure.subplots()
         solvers: list[str] = list(dict.fromkeys(run.solver for run in runs))
         for series, repeats in in_series(runs).items():
-            _curve(ax, repeats, metric, clock, theme.solvers[solvers.index(series[0]) % len(theme.solvers)])
+            _curve(ax, repeats, metric, clock, SOLVER_COLOURS[solvers.index(series[0]) % len(SOLVER_COLOURS)])
         if metric is DECIBELS and (mean_db := yardstick(runs)) is not None:
-            ax.axhline(
-                mean_db, color=theme.soft, lw=1.2, ls=(0, (1, 1.5)), zorder=1, label="the truth's mean"
-            )
+            ax.axhline(mean_db, color=SOFT, lw=1.2, ls=(0, (1, 1.5)), zorder=1, label="the truth's mean")
         _time_axis(ax, CLOCKS[clock])
         _value_axis(ax, metric)
-        for line, solver in zip(theme.solvers, solvers, strict=False):
+        for line, solver in zip(SOLVER_COLOURS, solvers, strict=False):
             ax.plot([], [], color=line, lw=2.2, label=solver)
-        figure.legend(*ax.get_legend_handles_labels(), loc="outside upper left", ncols=3)
+        handles, labels = ax.get_legend_handles_labels()
+        shape = {"ncols": 4, "fontsize": 8.5, "handlelength": 1.3, "columnspacing": 1.0}
+        figure.legend(handles, labels, loc="outside upper left", **shape)
         return figure
 
 
@@ -169,27 +148,32 @@ def _value_axis(ax: Axes, metric: Metric) -> None:
     ax.yaxis.set_minor_formatter(NullFormatter())
 
 
-def frames(run: Run, truth: NDArray[Any] | None, theme: Theme) -> Figure:
+def frames(run: Run, truth: NDArray[Any] | None) -> Figure:
     """One frame as it was after more and more time of one run, and as it is in truth."""
     points = _spread(run.points)
-    last = run.end.frame
-    assert last is not None
-    peak = float(np.quantile(last if truth is None else truth, 0.999)) or 1.0
-    with mpl.rc_context(theme.style):
-        figure = Figure(figsize=(WIDTH_IN, 3.5), layout="constrained")
+    peak = white(run, truth)
+    with mpl.rc_context(STYLE):
+        figure = canvas(3.5, WIDTH_IN)
         axes = figure.subplots(2, 3).ravel()
         for ax in axes:
             bare(ax)
             ax.set_visible(False)
-        shown = [(point.frame, _caption(point)) for point in points]
+        shown = [(point.frame, in_caption(point)) for point in points]
         for ax, (frame, title) in zip(axes, [*shown, (truth, "truth")], strict=False):
             if frame is None:
                 continue
             ax.set_visible(True)
-            ax.imshow(frame, cmap="gray", vmin=0, vmax=peak, interpolation="nearest")
-            ax.spines[:].set(visible=True, color=theme.soft)
+            ax.imshow(frame, cmap="gray", vmin=0, vmax=peak)
+            ax.spines[:].set(visible=True, color=SOFT)
             ax.set_title(title, fontsize=9.5, loc="left")
         return figure
+
+
+def white(run: Run, truth: NDArray[Any] | None) -> float:
+    """The value that pictures of a run show white."""
+    shown = run.end.frame if truth is None else truth
+    assert shown is not None
+    return float(np.quantile(shown, 0.999)) or 1.0
 
 
 def _spread(points: Sequence[Point]) -> list[Point]:
@@ -200,6 +184,7 @@ def _spread(points: Sequence[Point]) -> list[Point]:
     return [points[place] for place in sorted(places)]
 
 
-def _caption(point: Point) -> str:
+def in_caption(point: Point) -> str:
+    """What an answer took, and how good it was."""
     quality = "" if point.psnr_db is None else f": {point.psnr_db:.0f} dB"
     return f"{plain(point.seconds)} s{quality}"

@@ -4,34 +4,46 @@ from __future__ import annotations
 
 import csv
 import json
-from functools import partial
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
 import matplotlib as mpl
 
-from acquire.evaluate.figures import DPI, SOLVER_COLOURS, STYLE
 from acquire.evaluate.knees import sentences
-from acquire.evaluate.paper.drawing import canvas
-from acquire.evaluate.report import fill_template
+from acquire.evaluate.page import fill_template
+from acquire.evaluate.player import beside, clip_of
+from acquire.evaluate.themed import GRID, SOLVER_COLOURS, STYLE, canvas, save_drawing
 from acquire.evaluate.tradeoff import table
-from acquire.evaluate.tradeoff_figures import METRICS, THEMES, curves, frames, in_series, known, yardstick
+from acquire.evaluate.tradeoff_figures import (
+    METRICS,
+    curves,
+    frames,
+    in_caption,
+    in_series,
+    known,
+    white,
+    yardstick,
+)
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
     from datetime import datetime
     from pathlib import Path
 
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
+    from acquire.evaluate.knees import Clock
+    from acquire.evaluate.themed import Drawing
     from acquire.evaluate.tradeoff import Run
-    from acquire.evaluate.tradeoff_figures import Theme
+    from acquire.evaluate.tradeoff_figures import Metric
     from acquire.recon.segments import Voxels
     from acquire.simulate import Study
 
     Truths = Mapping[tuple[str, Voxels], NDArray[Any] | None]
 
+SHOWN_MS = 400
+"""Each answer, in the player."""
 QUANTITIES = ("seconds", "processor_s", "psnr_db", "ssim", "amplitude_error", "frequency_error_hz")
 
 
@@ -45,8 +57,8 @@ def write_page(
 ) -> Path:
     """Write ``index.html``, ``tradeoff.csv``, ``tradeoff.json`` and the pictures into ``directory``.
 
-    ``truths`` are the true frames beside those that runs show; ``heading`` has ``title``, ``command`` and
-    ``notes``, sentences about all of it.
+    ``truths`` are the true frames beside those that runs show; ``heading`` has ``title``, ``command``,
+    ``notes``, sentences about all of it, and ``host``, how busy the machine was.
     """
     rows = table(runs)
     facts: dict[str, Any] = {
@@ -56,20 +68,27 @@ def write_page(
         "study": _study_facts(study),
         "sections": [],
     }
-    pictures: dict[str, Path] = {}
+    drawings: dict[str, Drawing] = {}
+    movies = []
     for number, (case, voxels) in enumerate(dict.fromkeys((run.case, run.voxels) for run in runs)):
         own = [run for run in runs if (run.case, run.voxels) == (case, voxels)]
-        drawn = _draw(own, truths.get((case, voxels)), directory, f"case-{number}", pictures)
+        shown = max((run for run in own if run.repeat == 0), key=lambda run: run.end.psnr_db or 0.0)
+        truth = truths.get((case, voxels))
+        drawn = _draw(own, shown, truth, f"case-{number}")
+        for name, (_, figure) in drawn.items():
+            drawings[name] = save_drawing(figure, directory, name)
+        movies.append(_movie(shown, truth))
         facts["sections"].append(
             {
                 "case": case,
                 "voxels": str(voxels),
+                "shown": f"{shown.solver}, {shown.preset}",
                 "sentences": [
                     *(text for repeats in in_series(own).values() for text in sentences(repeats)),
                     *_beside_a_still(own),
                 ],
                 "ends": [_end(repeats) for repeats in in_series(own).values()],
-                "pictures": drawn,
+                "pictures": [{"name": name, "what": what} for name, (what, _) in drawn.items()],
             }
         )
     text = json.dumps(facts, indent=1, allow_nan=False, ensure_ascii=False)
@@ -79,40 +98,42 @@ def write_page(
         writer.writeheader()
         writer.writerows(rows)
     if study is not None and study.effects:
-        pictures["effects"] = directory / "effects.png"
         with mpl.rc_context(STYLE):
-            _effects(study).savefig(pictures["effects"], dpi=DPI)
+            drawings["effects"] = save_drawing(_effects(study), directory, "effects")
     page = directory / "index.html"
-    page.write_text(fill_template("tradeoff.html.j2", facts, pictures), encoding="utf-8")
+    text = fill_template("tradeoff.html.j2", facts | {"movies": movies, "shown_ms": SHOWN_MS}, drawings)
+    page.write_text(text, encoding="utf-8")
     return page
 
 
 def _draw(
-    runs: Sequence[Run],
-    truth: NDArray[Any] | None,
-    directory: Path,
-    prefix: str,
-    pictures: dict[str, Path],
-) -> list[dict[str, str]]:
-    """Pictures of one case in one kind of voxels, in light and dark; their names and what they show."""
-    best = max((run for run in runs if run.repeat == 0), key=lambda run: run.end.psnr_db or 0.0)
-    metrics = [metric for metric in METRICS if known(runs, metric)]
-    made: list[dict[str, str]] = []
+    runs: Sequence[Run], shown: Run, truth: NDArray[Any] | None, prefix: str
+) -> dict[str, tuple[str, Figure]]:
+    """One case in one kind of voxels: name → what it shows, and its figure."""
+    asked: list[tuple[Metric, str, str, Clock]] = [
+        (metric, metric.name, "wall time", "seconds") for metric in METRICS if known(runs, metric)
+    ]
+    if asked:
+        asked.insert(1, (asked[0][0], "processor", "processor time", "processor_s"))
+    drawn = {
+        f"{prefix}-{name}": (f"{metric.label} over {time}", curves(runs, metric, clock))
+        for metric, name, time, clock in asked
+    }
+    what = f"one frame on the way: {shown.solver}, {shown.preset}"
+    return drawn | {f"{prefix}-frames": (what, frames(shown, truth))}
 
-    def save(name: str, what: str, draw: Callable[[Theme], Figure]) -> None:
-        made.append({"name": f"{prefix}-{name}", "what": what})
-        for suffix, theme in THEMES.items():
-            place = pictures[f"{prefix}-{name}{suffix}"] = directory / f"{prefix}-{name}{suffix}.png"
-            draw(theme).savefig(place, dpi=DPI)
 
-    for metric in metrics[:1]:
-        save(metric.name, f"{metric.label} over wall time", partial(curves, runs, metric, "seconds"))
-    save("frames", f"one frame on the way: {best.solver}, {best.preset}", partial(frames, best, truth))
-    for metric in metrics[:1]:
-        save("processor", f"{metric.label} over processor time", partial(curves, runs, metric, "processor_s"))
-    for metric in metrics[1:]:
-        save(metric.name, f"{metric.label} over wall time", partial(curves, runs, metric, "seconds"))
-    return made
+def _movie(run: Run, truth: NDArray[Any] | None) -> dict[str, Any]:
+    """Every answer of a run, beside the truth where it is known, for the page's player."""
+    peak = white(run, truth)
+    pictures = [
+        beside([each.frame] if truth is None else [each.frame, truth], peak)
+        for each in run.points
+        if each.frame is not None
+    ]
+    clip = clip_of(pictures)
+    labels = [in_caption(each) for each in run.points if each.frame is not None]
+    return {"frames": clip.frames, "labels": labels[:: clip.step], "beside": truth is not None}
 
 
 def _beside_a_still(runs: Sequence[Run]) -> list[str]:
@@ -155,9 +176,7 @@ def _effects(study: Study) -> Figure:
     for worth, cost, size in zip(known, costs, sizes, strict=True):
         label = worth.effect.replace("_", " ")
         ax.annotate(label, (cost, size), textcoords="offset points", xytext=(7, 4), fontsize=8.5)
-    ax.axhspan(
-        ax.get_ylim()[0] if min(sizes) > 0.05 else min(sizes) / 3, 0.05, color="#e4e7eb", zorder=0, lw=0
-    )
+    ax.axhspan(ax.get_ylim()[0] if min(sizes) > 0.05 else min(sizes) / 3, 0.05, color=GRID, zorder=0, lw=0)
     ax.set(
         xscale="log",
         yscale="log",

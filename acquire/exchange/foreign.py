@@ -20,7 +20,7 @@ import numpy as np
 from acquire.errors import DataError, PlaceError, UsageError
 from acquire.exchange.libraries import library
 from acquire.reading import kind_of
-from acquire.store.camera_stream import DAMAGE
+from acquire.store.layout import DAMAGE
 from acquire.store.refusals import refused
 
 if TYPE_CHECKING:
@@ -151,7 +151,9 @@ def _check(file: LineFile) -> None:
 def _cropped(file: LineFile, columns: tuple[int, int]) -> LineFile:
     first, end = columns
     if not 0 <= first < end <= file.pixels:
-        raise UsageError(f"columns {first}:{end} of {file.path}", possible=f"0:{file.pixels} or a part of it")
+        raise UsageError(
+            f"{file.path} has no columns {first}:{end}", possible=f"0:{file.pixels} or a part of it"
+        )
 
     def read(arm: int | None, start: int, stop: int) -> NDArray[Any]:
         return file.read(arm, start, stop)[:, first:end]

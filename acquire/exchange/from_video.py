@@ -10,7 +10,7 @@ import numpy as np
 from acquire import __version__
 from acquire.errors import DataError, UsageError
 from acquire.exchange.content import Array, Axis, Block, Content, block, little
-from acquire.store.camera_stream import DAMAGE
+from acquire.store.layout import DAMAGE
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -136,7 +136,9 @@ def _checked(arms: Mapping[str, Arm], instrument: Instrument, most_lines: int | 
     counts = {arm: source.file.lines for arm, source in arms.items()}
     if most_lines is not None:
         if not 1 <= most_lines <= min(counts.values()):
-            raise UsageError(f"{most_lines} lines to import", possible=f"1 to {min(counts.values())}")
+            raise UsageError(
+                f"{most_lines} lines cannot be imported", possible=f"1 to {min(counts.values())}"
+            )
         counts = dict.fromkeys(counts, most_lines)
     if len(set(counts.values())) > 1:
         raise UsageError(
@@ -145,7 +147,7 @@ def _checked(arms: Mapping[str, Arm], instrument: Instrument, most_lines: int | 
             hint=f"--lines {min(counts.values())} takes so many of each",
         )
     if len({source.file.dtype.newbyteorder("=") for source in arms.values()}) > 1:
-        raise UsageError("arms of different types", possible="uint8 or uint16 for both")
+        raise UsageError("the arms have different types", possible="uint8 or uint16 for both")
     for arm, source in arms.items():
         if source.file.pixels != instrument.stages:
             raise UsageError(

@@ -36,7 +36,9 @@ def check_movie(content: Content) -> None:
             hint="acquire reconstruct, and export its video",
         )
     if max(content.image.shape[1:]) > MOST_SIDE:
-        raise UsageError(f"an MP4 file of {content.image.shape[1:]} pixels", possible=f"up to {MOST_SIDE}")
+        raise UsageError(
+            f"an MP4 file cannot have {content.image.shape[1:]} pixels", possible=f"up to {MOST_SIDE}"
+        )
     library("av", "video", "an MP4 file")
 
 

@@ -64,9 +64,30 @@ def read_video(path: Any) -> list[Layer]:
 
 
 def read_recording(path: Any) -> list[Layer]:
-    """The lines of both arms side by side, in pages that the slider turns."""
+    """The lines of both arms side by side, in pages that the slider turns; where there is one, an overview.
+
+    The overview lies beside them, hidden: who shows it sees the whole recording at once.
+    """
     recording = open_recording(str(path))
-    return [_arm(recording, arm, number) for number, arm in enumerate(ARMS)]
+    arms = [_arm(recording, arm, number) for number, arm in enumerate(ARMS)]
+    return [*(layer for arm in ARMS for layer in _overview(recording, arm, arms)), *arms]
+
+
+def _overview(recording: Recording, arm: str, arms: list[Layer]) -> list[Layer]:
+    found = recording.overview(arm)
+    if found is None:
+        return []
+    _, place, _ = arms[ARMS.index(arm)]
+    options = {
+        "name": f"{_name(recording)}, arm {arm}, overview ({found.lines_per_row} lines a row)",
+        "translate": place["translate"][1:],
+        "contrast_limits": place["contrast_limits"],
+        "visible": False,
+        "multiscale": False,
+        "rgb": False,
+        "metadata": {"first_line": found.first_line, "lines_per_row": found.lines_per_row},
+    }
+    return [(found.rows, options, "image")]
 
 
 def _arm(recording: Recording, arm: str, number: int) -> Layer:

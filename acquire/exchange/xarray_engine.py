@@ -56,7 +56,7 @@ class AcquireBackend(BackendEntrypoint):
 
 def _video(place: str, group: str | None) -> xarray.Dataset:
     if group is not None:
-        raise UsageError(f"group {group!r} of {place}", possible="none: a video has no groups")
+        raise UsageError(f"{place} has no group {group!r}", possible="none: a video has no groups")
     levels = open_video(place).attrs["ome"]["multiscales"][0]["datasets"]
     smaller = [str(level["path"]) for level in levels[1:]]
     store = source_of(place).zarr_store()
@@ -66,7 +66,7 @@ def _video(place: str, group: str | None) -> xarray.Dataset:
 
 def _arm(recording: Recording, arm: str) -> xarray.Dataset:
     if arm not in ARMS:
-        raise UsageError(f"group {arm!r} of {recording}", possible=", ".join(ARMS))
+        raise UsageError(f"{recording} has no group {arm!r}", possible=", ".join(ARMS))
     store = recording.source.zarr_store()
     dataset: xarray.Dataset = xarray.open_zarr(store, group=arm, consolidated=True, chunks=None)
     first = recording.first_line

@@ -45,7 +45,7 @@ class DualArm:
         alignment: Alignment | None = None,
     ) -> None:
         if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.float64)):
-            raise UsageError(f"operator of dtype {np.dtype(dtype)}", possible="float32, float64")
+            raise UsageError(f"an operator cannot have dtype {np.dtype(dtype)}", possible="float32, float64")
         self.geometry = geometry
         self.spatial_merge = spatial_merge
         self.temporal_merge = temporal_merge
@@ -103,5 +103,5 @@ class DualArm:
 
     def _checked(self, array: NDArray[Any], shape: tuple[int, ...], what: str) -> NDArray[Any]:
         if array.shape != shape:
-            raise UsageError(f"{what} of shape {array.shape}", possible=f"{shape}")
+            raise UsageError(f"{what} of shape {array.shape} does not fit the operator", possible=f"{shape}")
         return np.ascontiguousarray(array, dtype=self.dtype)

@@ -36,7 +36,7 @@ def column_merging(geometry: Geometry, spatial_merge: int) -> NDArray[np.int64]:
 def merge_video(video: NDArray[Any], spatial_merge: int, temporal_merge: int) -> NDArray[Any]:
     """Mean of a fine video (T, n, n) over the blocks of each voxel: (⌈T/T_m⌉, ⌈n/N_m⌉, ⌈n/N_m⌉)."""
     if video.ndim != 3:
-        raise UsageError(f"video of shape {video.shape}", possible="(time, row, column)")
+        raise UsageError(f"a video of shape {video.shape} cannot be merged", possible="(time, row, column)")
     merged = video.astype(np.result_type(video.dtype, np.float32))
     for axis, merge in enumerate((temporal_merge, spatial_merge, spatial_merge)):
         if merge == 1:

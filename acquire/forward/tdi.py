@@ -62,8 +62,9 @@ def _checked_code(code: NDArray[np.uint8], span: int) -> NDArray[np.uint8]:
     code = np.asarray(code)
     if code.shape != (span,):
         raise UsageError(
-            f"exposure code of shape {code.shape}", possible=f"({span},): T = S·(M + L_R) − 1 bits"
+            f"an exposure code of shape {code.shape} does not fit",
+            possible=f"({span},): T = S·(M + L_R) − 1 bits",
         )
     if not np.isin(code, (0, 1)).all():
-        raise UsageError("exposure code with values other than 0 and 1", possible="E ∈ {0, 1}")
+        raise UsageError("the exposure code has values other than 0 and 1", possible="E ∈ {0, 1}")
     return np.ascontiguousarray(code, dtype=np.uint8)

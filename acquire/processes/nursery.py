@@ -132,6 +132,7 @@ class Nursery:
     def __init__(self, modules: tuple[str, ...] = ()) -> None:
         """Start it; it imports ``modules`` meanwhile, those that are there."""
         self.modules = modules
+        # Sequential packets: a message stays whole, with the descriptors that were sent with it.
         self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         path = os.pathsep.join(entry for entry in sys.path if entry)
         with theirs:
@@ -336,6 +337,7 @@ def _begin(channel: socket.socket, children: dict[int, tuple[int, socket.socket]
     """First steps of a worker: let go of all that is the nursery's."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     channel.close()
+    # Of other workers: the owner takes the end of such a socket for the nursery's, which a copy would hide.
     for pidfd, (_, status) in children.items():
         status.close()
         os.close(pidfd)

@@ -87,17 +87,18 @@ def available_bytes() -> int:
 def _allocate(name: str, size: int) -> int:
     if size > (available := available_bytes()):
         raise DeviceError(
-            f"{name}: {size / 2**20:.0f} MiB of shared memory",
-            possible=f"{available / 2**20:.0f} MiB are available",
+            f"{name} needs {size / 2**20:.0f} MiB of shared memory",
+            possible=f"{available / 2**20:.0f} MiB",
             hint="fewer or shorter ring slots, or fewer seconds (stream.ring_slots, ring_seconds)",
         )
     fd = os.memfd_create(f"acquire-{name}")
     try:
+        # An error now, in place of a SIGBUS at some later store into a page that cannot be had.
         os.posix_fallocate(fd, 0, size)
     except OSError as error:
         os.close(fd)
         raise DeviceError(
-            f"{name}: {size / 2**20:.0f} MiB of shared memory: {error.strerror}",
+            f"{name} needs {size / 2**20:.0f} MiB of shared memory: {error.strerror}",
             hint="fewer or shorter ring slots",
         ) from error
     return fd

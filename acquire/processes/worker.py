@@ -102,7 +102,7 @@ class Worker:
             self.pipe.close()
             raise DeviceError(f"{name}: the process cannot be started: {error}") from error
         finally:
-            theirs.close()
+            theirs.close()  # else the pipe would not end with the child
 
     @property
     def pid(self) -> int | None:
@@ -175,8 +175,9 @@ class Worker:
         if isinstance(message, kind):
             self._child.pid(max(0.0, deadline - time.monotonic()))
             return message
+        # A process that dies closes its pipe a moment before `death` can tell how it ended.
         self._child.exit_code(_LAST_WORD_S if message is None else 0.0)
-        raise DeviceError(f"{self.name}: {self.death or 'no answer in time'}")
+        raise DeviceError(f"{self.name}: {self.death or 'it did not answer in time'}")
 
     def end(self, deadline: float) -> None:
         """End the process: by word until the monotonic ``deadline``, then by force. Idempotent.

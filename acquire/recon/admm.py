@@ -155,7 +155,7 @@ class Admm:
         direction, energy = self._xp.asarray(scaled, copy=True), dot(residual, scaled)
         enough = self._parameters.gradient_share**2 * energy
         for _ in range(self._parameters.gradient_steps):
-            if not energy > 0:
+            if not energy > 0:  # zero, or not a number
                 return
             lifted = self._operator.adjoint(direction)
             image = self._operator.forward(lifted) + rho * direction

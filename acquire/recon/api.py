@@ -11,8 +11,10 @@ import numpy as np
 
 from acquire.arrays import Dtype, open_arrays
 from acquire.cores import idle_cores, limit_threads
+from acquire.recon.balance import balance_of, divided
 from acquire.recon.clock import IterationClock
 from acquire.recon.denoisers import open_denoiser
+from acquire.recon.faster import tell_faster_light
 from acquire.recon.judge import frame_error, judge
 from acquire.recon.least import check_budget, least_seconds
 from acquire.recon.options import SolveOptions, Stop
@@ -63,7 +65,8 @@ def reconstruct(
 
     Parameters
     ----------
-    segment : lines of both arms, code and mask; masked samples and outliers have no influence
+    segment : lines of both arms, code and mask; masked samples and outliers have no influence. Unless it is
+        `balanced`, arms that get clearly different shares of the light are made equal, and it is said
     preset : how many iterations at most: ``"fast"``, ``"balanced"``, ``"best"``
     budget_s : the answer is there after so much wall time, within 10 % + 0.3 s, with fewer iterations than
         the preset's if need be (at least one is made). Compiling (once after installation) is no part of it
@@ -111,6 +114,7 @@ def reconstruct(
     arrays = open_arrays(device, dtype)
     options.check_shapes(segment.geometry.size, segment.geometry.video_shape(spatial_merge, temporal_merge))
     clock = IterationClock(count, budget_s, progress, stop, began)
+    segment, warnings, balance = _balanced(segment)
     held_out = HOLD_OUT if chosen.holds_out and static_image is None else 0.0
     # threads that wait for a core that others use make times that nobody can foresee
     with limit_threads(idle_cores()) if budget_s is not None else nullcontext():
@@ -121,7 +125,22 @@ def reconstruct(
         if look is not None:
             clock.looks = _looking(look, problem, chosen)
         estimate = _solve(segment, problem, options, chosen, clock)
-        return _finish(segment, problem, options, chosen, estimate, clock, check=check)
+        result = _finish(segment, problem, options, chosen, estimate, clock, check=check)
+    return replace(
+        result,
+        warnings=(*warnings, *result.warnings),
+        parameters={**result.parameters, **({} if balance is None else {"balance": balance})},
+    )
+
+
+def _balanced(segment: Segment) -> tuple[Segment, tuple[str, ...], dict[str, Any] | None]:
+    """The segment with arms of the same light, what to say of it, and what was found, as JSON."""
+    balance = None if segment.balanced else balance_of([segment])
+    if balance is None:
+        return segment, (), None
+    if not balance.clear:
+        return segment, (), balance.facts(corrected=False)
+    return divided(segment, balance), (balance.corrected_words,), balance.facts(corrected=True)
 
 
 def _solve(
@@ -163,6 +182,12 @@ def _finish(
     trusted = segment.geometry.trusted_frames(T_m)
     asked = check and options.static_image is None and clock.ended != "stopped"
     told = tell(segment, quality, clock) if asked else Told()
+    facts = estimate.facts()
+    cosines = facts.get("temporal_coefficients", len(video))
+    resolved_hz = cosines / (2e-9 * segment.substep_ns * T_m * len(video))
+    faster: tuple[str, ...] = ()
+    if asked and told.believed:
+        faster = tell_faster_light(segment, problem, predicted, video, resolved_hz, clock)
     return Reconstruction(
         video=video,
         time_ns=segment.frame_time_ns(T_m),
@@ -178,12 +203,13 @@ def _finish(
         ended=clock.ended,
         believed=told.believed,
         masked=problem.masked_by,
-        warnings=(*judge(segment, problem, quality, trusted), *told.warnings, *clock.shortcuts),
+        warnings=(*judge(segment, problem, quality, trusted), *told.warnings, *faster, *clock.shortcuts),
         parameters={
             "spatial_merge": options.spatial_merge,
             "temporal_merge": T_m,
             "dtype": problem.arrays.dtype,
             **solver.model_dump(mode="json"),
-            **estimate.facts(),
+            **facts,
+            "resolved_hz": resolved_hz,
         },
     )

@@ -56,7 +56,8 @@ class TemporalBasis:
     def __init__(self, frames: int, count: int, arrays: Arrays = HOST) -> None:
         if not 1 <= count <= frames:
             raise UsageError(
-                f"{count} temporal coefficients", possible=f"1 to {frames} (frames of the segment)"
+                f"there cannot be {count} temporal coefficients",
+                possible=f"1 to {frames} (frames of the segment)",
             )
         self.frames, self.count, self.cosines, self.arrays = frames, count, count, arrays
 
@@ -64,7 +65,9 @@ class TemporalBasis:
         """D (K, grid) at ``grid`` ≥ K equidistant instants of the span (default: the frames)."""
         points = grid or self.frames
         if points < self.count:
-            raise UsageError(f"{points} instants for {self.count} cosines", possible=f"{self.count} or more")
+            raise UsageError(
+                f"{points} instants are too few for {self.count} cosines", possible=f"{self.count} or more"
+            )
         k = np.arange(self.count)[:, None]
         rows = np.sqrt(2 / points) * np.cos(np.pi * k * (np.arange(points) + 0.5) / points)
         rows[0] /= np.sqrt(2)
@@ -109,3 +112,10 @@ class LearnedBasis:
 def _product(arrays: Arrays, matrix: NDArray[Any], frames: Array) -> Array:
     """``matrix`` of the host along the first axis."""
     return arrays.xp.tensordot(arrays.asarray(matrix), frames, axes=1)
+
+
+def resized(theta: Array, basis: TemporalBasis) -> Array:
+    """Coefficients of another number of cosines."""
+    xp, kept = basis.arrays.xp, theta[: min(basis.count, theta.shape[0]), ...]
+    missing = basis.arrays.zeros((basis.count - kept.shape[0], *theta.shape[1:]))
+    return xp.concat([kept, missing])

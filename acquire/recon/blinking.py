@@ -18,7 +18,7 @@ from acquire.arrays import host
 from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import band_operator
 from acquire.recon.bandwidth import FEWEST_COEFFICIENTS, MARGIN, estimate_coefficients, light_beyond
-from acquire.recon.basis import TemporalBasis
+from acquire.recon.basis import TemporalBasis, resized
 from acquire.recon.estimates import InBand, Refined
 from acquire.recon.patterns import ROUND, Refinement, find_patterns
 
@@ -51,7 +51,7 @@ HELD_BACK = 100.0
 TRIAL = 20
 """Iterations after which few frames are asked whether they do."""
 EXPLAINED = 0.1
-"""Relative error of prediction below which they do."""
+"""Relative error of prediction below which they do, and a still is what cosines begin from."""
 STILL = AdmmParameters(tv_weight=5e-6, tv_penalty=1e-5, sign_penalty=3e-6, gradient_steps=6)
 """For a single frame. All sub-steps add up in it, so that the mean light has an eigenvalue some thousand
 times that of a detail: lower penalties let details through, more gradient steps reach them."""
@@ -69,11 +69,15 @@ def solve_blinking(
 
 
 def look_in_cosines(
-    segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock
+    segment: Segment,
+    problem: Problem,
+    options: SolveOptions,
+    clock: IterationClock,
+    still: Array | None = None,
 ) -> InBand:
-    """A first look in the band that was asked for or found."""
+    """A first look in the band that was asked for or found, from the coefficients (1, n′, n′) of a still."""
     count = find_band(segment, problem, options, clock)
-    return _look(segment, problem, options, clock, count)
+    return _look(segment, problem, options, clock, count, still)
 
 
 def go_on(
@@ -95,18 +99,24 @@ def go_on(
         )
         return found
     clock.begin_anew()
-    first = _look(segment, problem, options, clock, round(MARGIN * (beyond + 1)))
+    still = first.solver.theta[:1, ...]
+    first = _look(segment, problem, options, clock, round(MARGIN * (beyond + 1)), still)
     wider = _go_on(segment, problem, options, clock, first)
     better = problem.prediction_error(wider.predict()) < problem.prediction_error(predicted)
     return wider if better else found
 
 
 def _look(
-    segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock, count: int
+    segment: Segment,
+    problem: Problem,
+    options: SolveOptions,
+    clock: IterationClock,
+    count: int,
+    still: Array | None = None,
 ) -> InBand:
     frames = segment.geometry.video_shape(options.spatial_merge, options.temporal_merge)[0]
     basis = TemporalBasis(frames, min(frames, count), problem.arrays)
-    return _first_look(segment, problem, options, basis, clock)
+    return _first_look(segment, problem, options, basis, clock, still)
 
 
 def _go_on(
@@ -121,9 +131,19 @@ def _go_on(
 
 
 def _first_look(
-    segment: Segment, problem: Problem, options: SolveOptions, basis: TemporalBasis, clock: IterationClock
+    segment: Segment,
+    problem: Problem,
+    options: SolveOptions,
+    basis: TemporalBasis,
+    clock: IterationClock,
+    still: Array | None,
 ) -> InBand:
-    """In the cosines; few frames with lower penalties from where they turn out to explain the lines."""
+    """In the cosines; few frames with lower penalties from where they turn out to explain the lines.
+
+    From darkness the least video that explains the lines is lit with the code, since they say nothing of
+    sub-steps without light, and total variation leaves flat light as it is. From a still, the least change
+    that explains them is looked for.
+    """
     N_m, T_m = options.spatial_merge, options.temporal_merge
     frames, side, _ = segment.geometry.video_shape(N_m, T_m)
     operator = band_operator(segment.geometry, segment.code, basis, N_m, T_m, segment.alignment)
@@ -141,7 +161,7 @@ def _first_look(
         )
         return InBand(solver, operator, basis, problem, parameters)
 
-    start = None
+    start = None if still is None else resized(still, basis)
     if options.initial is not None:
         start = basis.analyze(problem.arrays.asarray(options.initial / problem.scale))
     estimate = begin(start)

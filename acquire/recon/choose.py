@@ -5,9 +5,11 @@
     smooth     few cosines, quadratic in second differences       what flows
     cosines    the whole band, total variation of coefficients    what blinks, then as patterns and curves
 
-A stronger prior is preferred to one that is not clearly better: noise that a weak one lets through hardly
-shows in the lines, which are sums. Nothing here sees the truth, and no weight is fixed: those in the code are
-where searches begin.
+Where a still explains most, and a volume is not clearly better, cosines begin from it: lines say nothing of
+sub-steps without light, so that what begins in darkness stays lit with the code. A stronger prior is
+preferred to one that is not clearly better: noise that a weak one lets through hardly shows in the lines,
+which are sums. Nothing here sees the truth, and no weight is fixed: those in the code are where searches
+begin.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from acquire.arrays import host
-from acquire.recon.blinking import go_on, look_in_cosines, solve_blinking
+from acquire.recon.blinking import EXPLAINED, go_on, look_in_cosines, solve_blinking
 from acquire.recon.holdout import HeldOut
 from acquire.recon.patterns import find_patterns
 from acquire.recon.solver import Preset, Solver
@@ -71,13 +73,16 @@ def solve_admm(segment: Segment, problem: Problem, options: SolveOptions, clock:
     if clock.spent(SEARCH_SHARE):
         clock.shortcuts.append("the budget left no time to try more than one kind of motion")
         return bench.finish(volume)
-    first = look_in_cosines(segment, problem, options, clock)
+    still = bench.attempt(bench.fitting(STILL), FIRST_ITERATIONS)
+    rests = still.error < EXPLAINED and not held_out.clearly_less(volume.errors, still.errors)
+    first = look_in_cosines(segment, problem, options, clock, still.admm.theta if rests else None)
     bench.note({"prior": "cosines"} | first.facts(), first.predict())
-    still = bench.attempt(STILL, FIRST_ITERATIONS)
     best = _better(volume, still)
     if bench.error(first.predict()) > OUTDONE * best.error:
         best = _search(bench, still, volume, first, trials)
-    if not _worth_going_on(bench, first, best):
+    elif not clock.spent(SEARCH_SHARE) and not _in_patterns(first):
+        best = _challenge(bench, still, first, trials) or best
+    if not _worth_going_on(bench, first, still, best):
         return bench.finish(best)
     blinking = go_on(segment, problem, options, clock, first)
     errors = bench.note({"prior": "patterns"} | blinking.facts(), blinking.predict())
@@ -112,15 +117,39 @@ def _search(bench: Workbench, still: Trial, volume: Trial, first: InBand, trials
     volume = bench.climb(volume, trials)
     if smooth.error < FAR * volume.error:
         smooth = bench.climb(smooth, trials)
-    moving = smooth if smooth.error < SMOOTHER * volume.error else volume
-    return _better(moving, still)
+    flows = smooth.error < SMOOTHER * volume.error and bench.held_out.clearly_less(
+        smooth.errors, still.errors
+    )
+    return _better(smooth if flows else volume, still)
 
 
-def _worth_going_on(bench: Workbench, first: InBand, best: Trial) -> bool:
-    """Whether a first look in the cosines, which more iterations and patterns would improve, may yet win."""
+def _challenge(bench: Workbench, still: Trial, first: InBand, trials: int) -> Trial | None:
+    """A scene that flickers as a whole, or one that flows, where cosines are far ahead of a still and of a
+    volume and yet no patterns; None where neither predicts better than they."""
+    rival = bench.error(first.predict())
+    bright = bench.brighten(still, first.basis.count, DOUBTFUL * rival)
+    smooth = bench.attempt(bench.fitting(SMOOTH), FIRST_ITERATIONS)
+    found = smooth if bright is None or smooth.error < SMOOTHER * bright.error else bright
+    flows = found is smooth
+    if found.error < FAR * rival:
+        found = bench.climb(found, trials)
+    return found if found.error < (SMOOTHER if flows else 1.0) * rival else None
+
+
+def _worth_going_on(bench: Workbench, first: InBand, still: Trial, best: Trial) -> bool:
+    """Whether a first look in the cosines, which more iterations and patterns would improve, may yet win.
+
+    One that predicts no better than a first still has found nothing.
+    """
     error = bench.error(first.predict())
+    if error > still.error:
+        return False
     if error < CLOSE * best.error:
         return True
     if error > DOUBTFUL * best.error:
         return False
+    return _in_patterns(first)
+
+
+def _in_patterns(first: InBand) -> bool:
     return find_patterns(host(first.solver.theta), beyond_doubt=True) is not None

@@ -73,7 +73,7 @@ class HaarShrink:
 
     def __init__(self, levels: int = 3) -> None:
         if levels < 1:
-            raise UsageError(f"{levels} wavelet levels", possible="1 or more")
+            raise UsageError(f"there cannot be {levels} wavelet levels", possible="1 or more")
         self._levels = levels
 
     def prox(self, frames: Array, weight: float | Array) -> Array:

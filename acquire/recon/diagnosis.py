@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.cores import limit_threads
+from acquire.recon.balance import balance_of
 from acquire.recon.hypotheses import Hypothesis, Turn, Witness, compare
 from acquire.recon.search import Candidate, Inquiry, Standing, inquire
 from acquire.recon.suspects import Suspicion, black_level_off, suspicions, unusable
@@ -99,7 +100,15 @@ def diagnose(segment: Segment, bits: Callable[[int, int], NDArray[np.uint8]] | N
     # matrices are small: more threads would wait for each other
     with limit_threads(1):
         found = _asked(Witness(segment, bits))
-    return replace(found, suspicions=(*found.suspicions, *black_level_off(segment)))
+    return replace(found, suspicions=(*found.suspicions, *_unequal(segment), *black_level_off(segment)))
+
+
+def _unequal(segment: Segment) -> list[Suspicion]:
+    """Arms that get different shares of the light, whatever the code."""
+    balance = balance_of([segment])
+    if balance is None or not balance.clear:
+        return []
+    return [Suspicion("gain_ratio", f"{balance.words}: gains or beam splitter")]
 
 
 def _asked(witness: Witness) -> Diagnosis:
@@ -194,22 +203,8 @@ def _row(candidate: Candidate, said: Candidate) -> Row:
 
 def put_right(segment: Segment, turn: Turn) -> Segment:
     """The segment with its arms turned back, so that the forward model holds for it."""
-    lines, mask = segment.lines, segment.mask
-    gains = (segment.black_level_dn, segment.responsivity_dn)
     if turn.rows and turn.pixels:
-        swapped = [value[::-1] if isinstance(value, tuple) else value for value in gains]
-        return replace(
-            segment,
-            lines=lines[::-1],
-            mask=mask[::-1],
-            black_level_dn=swapped[0],
-            responsivity_dn=swapped[1],
-        )
+        return segment.swapped()
     if not (turn.rows or turn.pixels):
         return segment
-    flipped = 0 if turn.rows else 1
-    return replace(
-        segment,
-        lines=np.stack([arm[:, ::-1] if i == flipped else arm for i, arm in enumerate(lines)]),
-        mask=np.stack([arm[:, ::-1] if i == flipped else arm for i, arm in enumerate(mask)]),
-    )
+    return segment.mirrored(0 if turn.rows else 1)

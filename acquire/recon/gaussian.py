@@ -242,10 +242,6 @@ class Model:
         scale = float((rest**2 / self._variance).mean())
         return float(amounts[1]), float(np.sqrt(scale * covariance[1, 1]))
 
-    def level_error(self, fit: Fit) -> float:
-        """Standard error of a fit's level."""
-        return float(np.sqrt(fit.scale * self.regress(fit.modes, [self._level])[1][0, 0]))
-
 
 def best_model(response: Response, arms: list[Floats]) -> Model:
     """With the prior of the ladder under which the lines of all ``arms`` are likeliest."""

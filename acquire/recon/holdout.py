@@ -38,9 +38,11 @@ def held_out_blocks(
     nor where so few would be drawn that not even single samples make it up.
     """
     if not 0 <= share <= 0.5:
-        raise UsageError(f"held-out share {share}", possible="0 to 0.5")
+        raise UsageError(f"the held-out share cannot be {share}", possible="0 to 0.5")
     if lines < 1 or pixels < 1:
-        raise UsageError(f"held-out blocks of {lines} lines × {pixels} pixels", possible="1 or more of each")
+        raise UsageError(
+            f"held-out blocks cannot have {lines} lines × {pixels} pixels", possible="1 or more of each"
+        )
     rng = np.random.default_rng(seed)
     size = _fitting(usable.size * share, lines, pixels)
     drawn = np.stack([_drawn(arm.shape, size, share, rng) for arm in usable])

@@ -69,7 +69,7 @@ class SolveOptions:
         _check_array("initial video", self.initial, video_shape)
         _check_array("static image", self.static_image, (size, size))
         if self.static_image is not None and not np.any(self.static_image):
-            raise UsageError("static image that is dark everywhere", possible="the scene at rest, lit")
+            raise UsageError("the static image is dark everywhere", possible="the scene at rest, lit")
 
 
 def _check_array(what: str, given: NDArray[Any] | None, shape: tuple[int, ...]) -> None:
@@ -78,8 +78,8 @@ def _check_array(what: str, given: NDArray[Any] | None, shape: tuple[int, ...]) 
     if np.shape(given) != shape:
         raise UsageError(f"{what} of shape {np.shape(given)} does not fit", possible=f"{shape}")
     if not np.isfinite(given).all():
-        raise UsageError(f"{what} with values that are not finite")
+        raise UsageError(f"{what} has values that are not finite")
     if np.min(given) < -NEGATIVE_SHARE * np.max(np.abs(given)):
         raise UsageError(
-            f"{what} with values down to {np.min(given):.3g}", possible="light: 0 or more, in any units"
+            f"{what} has values down to {np.min(given):.3g}", possible="light: 0 or more, in any units"
         )

@@ -53,7 +53,9 @@ class Stretch:
 
     def __post_init__(self) -> None:
         if self.end <= self.begin:
-            raise UsageError(f"a stretch from sub-step {self.begin} to {self.end}", possible="1 or more")
+            raise UsageError(
+                f"a stretch cannot go from sub-step {self.begin} to {self.end}", possible="1 or more"
+            )
 
 
 @dataclass(frozen=True, slots=True)

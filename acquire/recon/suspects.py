@@ -26,7 +26,6 @@ SURE = 5.0
 CONSTANT_SHARE, CONSTANT_ERROR = 0.03, 0.012
 """Of an arm's mean light: less that follows no code costs little, and what is not known as well as this is
 not told, since a scene that changes smoothly looks much like it."""
-RATIO = 0.05
 FEW_ELECTRONS = 100.0
 """A sample's mean light over its noise, squared: what shot noise alone would leave of so many electrons."""
 STUCK_SHARE = 0.5
@@ -96,16 +95,14 @@ def black_level_off(segment: Segment) -> list[Suspicion]:
 
 
 def suspicions(witness: Witness, hypothesis: Hypothesis) -> list[Suspicion]:
-    """Black level, ambient light, gains, too little light, if this is the case."""
+    """Black level, ambient light, too little light, if this is the case."""
     views = [witness.view(hypothesis, arm) for arm in (0, 1)]
     found = []
-    levels = []
-    for name, lines, view, arm in zip("ab", witness.arms, views, (0, 1), strict=True):
+    for name, lines, view in zip("ab", witness.arms, views, strict=True):
         mean = float(lines.mean())
         found += _constant(name, lines, view.model, mean)
         found += _little_light(name, lines, view.model, mean)
-        levels.append((view.fits[arm].level, view.model.level_error(view.fits[arm])))
-    return found + _ratio(levels)
+    return found
 
 
 def _constant(name: str, lines: Floats, model: Model, mean: float) -> list[Suspicion]:
@@ -138,14 +135,3 @@ def _little_light(name: str, lines: Floats, model: Model, mean: float) -> list[S
         f"sample had {electrons:.0f} electrons"
     )
     return [Suspicion("little_light", words)]
-
-
-def _ratio(levels: list[tuple[float, float]]) -> list[Suspicion]:
-    (a, a_error), (b, b_error) = levels
-    if min(a, b) <= 0:
-        return []
-    ratio, error = b / a, float(b / a * np.hypot(a_error / a, b_error / b))
-    if abs(ratio - 1) < max(SURE * error, RATIO):
-        return []
-    words = f"arm b sees {ratio:.2f} ± {error:.2f} times the light of arm a: gains or beam splitter"
-    return [Suspicion("gain_ratio", words)]

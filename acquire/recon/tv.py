@@ -30,7 +30,7 @@ class FrameTv:
 
     def __init__(self, iterations: int) -> None:
         if iterations < 1:
-            raise UsageError(f"{iterations} iterations of the TV prox", possible="1 or more")
+            raise UsageError(f"the TV prox cannot have {iterations} iterations", possible="1 or more")
         self.iterations = iterations
         self._dual: Array = None
 

@@ -39,9 +39,11 @@ class VolumeTv:
 
     def __init__(self, pace: float = 1.0, iterations: int = 6) -> None:
         if not 0 <= pace < math.inf:
-            raise UsageError(f"pace {pace} of a volume's total variation", possible="a number of at least 0")
+            raise UsageError(
+                f"a volume's total variation cannot have pace {pace}", possible="a number of at least 0"
+            )
         if iterations < 1:
-            raise UsageError(f"{iterations} iterations of the TV prox", possible="1 or more")
+            raise UsageError(f"the TV prox cannot have {iterations} iterations", possible="1 or more")
         self.pace, self.iterations = pace, iterations
         self._dual: Array = None
         self._instants: Array = None
@@ -116,7 +118,7 @@ class Smooth:
 
     def __init__(self, pace: float = 1.0) -> None:
         if not 0 <= pace < math.inf:
-            raise UsageError(f"pace {pace} of a smooth volume", possible="a number of at least 0")
+            raise UsageError(f"a smooth volume cannot have pace {pace}", possible="a number of at least 0")
         self.pace = pace
         self._cosines: tuple[Array, Array] | None = None
 

@@ -15,7 +15,7 @@ import numpy as np
 from acquire.arrays import host
 from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import band_operator
-from acquire.recon.basis import TemporalBasis
+from acquire.recon.basis import TemporalBasis, resized
 from acquire.recon.brightness import fit_brightness
 from acquire.recon.tv import FrameTv
 from acquire.recon.volume import Smooth, VolumeTv
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from acquire.arrays import Array
     from acquire.lines import Segment
     from acquire.recon.clock import IterationClock
     from acquire.recon.denoisers import Denoiser
@@ -107,16 +106,21 @@ class Workbench:
         self._best: Trial | None = None
         self._response = self._energy_of_a_voxel() / USUAL_ENERGY
 
-    def brighten(self, still: Trial, cosines: int) -> Trial | None:
-        """A calm volume times the brightness of the whole scene, found in turn; None where there is none."""
+    def brighten(self, still: Trial, cosines: int, most: float = np.inf) -> Trial | None:
+        """A calm volume times the brightness of the whole scene, found in turn; None where there is none.
+
+        It is not followed up from an error of more than ``most``.
+        """
+        if self._clock.spent(SEARCH_SHARE):
+            return None
         lit = still
-        for _ in range(BRIGHT_STILLS if not self._clock.spent(SEARCH_SHARE) else 0):
+        for _ in range(BRIGHT_STILLS):
             self._fit_brightness(lit, cosines)
             lit = self.attempt(replace(still.candidate, brightness=True), FIRST_ITERATIONS)
-        if not lit.error < BRIGHTER * still.error:
-            return None
+            if not lit.error < BRIGHTER * still.error:
+                return None
         best = lit = self.attempt(replace(self.fitting(CALM), brightness=True), FIRST_ITERATIONS, lit)
-        for _ in range(BRIGHT_ROUNDS):
+        for _ in range(BRIGHT_ROUNDS if lit.error < most else 0):
             self._fit_brightness(lit, cosines)
             lit = self.attempt(lit.candidate, NEXT_ITERATIONS, lit)
             if not lit.error < (1 - LEAST_GAIN) * best.error:
@@ -135,8 +139,14 @@ class Workbench:
         self._operators = {key: kept for key, kept in self._operators.items() if not key[1]}
 
     def fitting(self, candidate: Candidate) -> Candidate:
-        """The candidate with no more cosines than there are frames."""
-        return replace(candidate, coefficients=min(candidate.coefficients, self.frames))
+        """The candidate with no more cosines than there are frames.
+
+        To a video of few frames all that changes within one is noise: the search begins at a larger weight,
+        which few trials would not reach.
+        """
+        larger = max(1.0, VOLUME.coefficients / self.frames) ** 2
+        cosines = min(candidate.coefficients, self.frames)
+        return replace(candidate, coefficients=cosines, weight=larger * candidate.weight)
 
     def attempt(self, candidate: Candidate, iterations: int, start: Trial | None = None) -> Trial:
         """Solve a candidate for so many iterations, or as many as there is time for, from ``start``."""
@@ -150,7 +160,7 @@ class Workbench:
             shape,
             basis,
             parameters(candidate, self.frames, self._response),
-            start=None if start is None else _resized(start.admm.theta, basis),
+            start=None if start is None else resized(start.admm.theta, basis),
             denoiser=denoiser,
         )
         if start is not None and start.candidate.coefficients == candidate.coefficients:
@@ -237,6 +247,7 @@ class Workbench:
         )
         admm.resume(best.admm)
         last = replace(best, admm=admm)
+        self._clock.begin_anew()
         for _ in self._clock.run(LAST_ITERATIONS, "solve", video=partial(self.video, last)):
             admm.step()
         if self._clock.ended == "done":
@@ -324,10 +335,3 @@ def parameters(candidate: Candidate, frames: int, response: float) -> AdmmParame
         gradient_share=0.0 if steps < STILL_STEPS else STILL_SHARE,
         preconditioned=True,
     )
-
-
-def _resized(theta: Array, basis: TemporalBasis) -> Array:
-    """Coefficients of another number of cosines."""
-    xp, kept = basis.arrays.xp, theta[: min(basis.count, theta.shape[0]), ...]
-    missing = basis.arrays.zeros((basis.count - kept.shape[0], *theta.shape[1:]))
-    return xp.concat([kept, missing])

@@ -14,7 +14,15 @@ Memory is bounded by what the pool works on; the recording is read and the video
 from acquire.recon import reconstruct
 from acquire.reconstruct.combine import Outcome, Watcher, combine
 from acquire.reconstruct.pools import Pool, open_pool
-from acquire.reconstruct.select import VideoRequest, along_plan, by_lines, by_time, in_glimpses, in_voxels
+from acquire.reconstruct.select import (
+    VideoRequest,
+    along_plan,
+    by_lines,
+    by_time,
+    in_glimpses,
+    in_tiles,
+    in_voxels,
+)
 from acquire.reconstruct.single import describe, save_reconstruction
 from acquire.reconstruct.work import Options
 
@@ -30,6 +38,7 @@ __all__ = [
     "combine",
     "describe",
     "in_glimpses",
+    "in_tiles",
     "in_voxels",
     "open_pool",
     "reconstruct",

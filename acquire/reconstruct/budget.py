@@ -59,9 +59,9 @@ class Budget:
             return
         needed_s = self.seconds - self.left_s + self._least_s(tasks, geometry)
         if needed_s > (1 + MARGIN) * self.seconds + MARGIN_S:
-            what = "this segment" if len(tasks) == 1 else f"these {len(tasks)} sub-segments"
+            what = "this segment needs" if len(tasks) == 1 else f"these {len(tasks)} sub-segments need"
             raise UsageError(
-                f"a budget of {self.seconds:g} s cannot be kept: {what} need at least {needed_s:.2g} s here",
+                f"a budget of {self.seconds:g} s cannot be kept: {what} at least {needed_s:.2g} s here",
                 possible="--budget with more, fewer lines, larger voxels, or a machine that is less busy",
             )
 

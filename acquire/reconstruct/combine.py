@@ -6,7 +6,7 @@ import time
 from collections import deque
 from concurrent.futures import CancelledError, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
@@ -18,10 +18,11 @@ from acquire.calibrate.choose import provenance
 from acquire.errors import AcquireError
 from acquire.recon.diagnosis import TURNED
 from acquire.recon.segments import Stitcher
+from acquire.reconstruct.arms import balance_of_recording
 from acquire.reconstruct.budget import Budget
+from acquire.reconstruct.sheet import open_sheet
 from acquire.reconstruct.times import Times
 from acquire.reconstruct.work import Task
-from acquire.store import VideoGrid, VideoWriter
 from acquire.store.remote import is_url
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
     from pathlib import Path
 
-    from acquire.recon.segments import Grid, SubSegment
+    from acquire.recon.segments import SubSegment
     from acquire.reconstruct.pools import Pool
     from acquire.reconstruct.select import VideoRequest
     from acquire.reconstruct.work import Options, Part
@@ -85,59 +86,49 @@ def combine(
 ) -> Outcome:
     """Reconstruct the stretches of a request and write their video.
 
-    ``out`` is a new path or URL. When the watcher says stop, what was solved so far is written, marked as
-    interrupted; DataError and whatever a sub-segment raises leave nothing. The options' budget is wall time
-    from ``began`` (`time.monotonic`; else now) to the video's end; UsageError where it cannot be kept.
+    ``out`` is a new path or URL. Behind a fibre one tile of the scene is solved after the other. When the
+    watcher says stop, what was solved so far is written, marked as interrupted; DataError and whatever a
+    sub-segment raises leave nothing. The options' budget is wall time from ``began`` (`time.monotonic`; else
+    now) to the video's end; UsageError where it cannot be kept.
     """
     called, grid = time.monotonic(), request.grid
     segments = request.sub_segments()
     place = str(recording) if is_url(str(recording)) else str(recording.path.resolve())
-    tasks = [Task(place, segment, grid, options) for segment in segments]
+    balance, balance_facts, warnings = balance_of_recording(recording, options)
+    options = replace(options, balance=balance)
+    tiles = request.tiles or (None,)
+    tasks = [Task(place, each, grid, options, tile=tile) for tile in tiles for each in segments]
     budget = Budget(options.budget_s, called if began is None else began, pool.workers)
     budget.check(tasks, request.stream.geometry(1))
     times, anchor = Times.of(recording), _anchor(recording, request)
-    stitcher = Stitcher(grid)
-    solved: list[SubSegment] = []
     done: list[dict[str, Any]] = []
-    with VideoWriter(
-        out,
-        (grid.side, grid.side),
-        np.dtype(np.float32),
-        _place(times, grid),
-        quality=True,
-    ) as writer:
+    with open_sheet(out, request, times, anchor) as sheet:
         for part, task, following in _solved(tasks, pool, watcher, budget):
-            arrived = time.monotonic()
+            if len(done) % len(segments) == 0:
+                stitcher = Stitcher(grid)
+            arrived, first = time.monotonic(), stitcher.frames
             video, error = stitcher.add(task.segment, (part.video, part.error), following)
             if len(video):
-                begins = grid.edges(slice(writer.frames, writer.frames + len(video)))[:-1]
-                writer.append(video, times.utc_ns(begins, anchor), error)
+                sheet.take(task.tile, first, video, error)
             budget.written(video.size, time.monotonic() - arrived, part.facts["compiled_s"])
-            solved.append(task.segment)
             done.append(part.facts)  # not the part: memory must not grow with the stream
         if not done:
             raise KeyboardInterrupt  # there is nothing to keep
         facts = describe_parts(recording, request, done, options)
         cut = len(done) < len(tasks) and not watcher.stopped
+        told = [*warnings, *(text for part in done for text in part["warnings"])]
+        facts |= {"balance": balance_facts, "warnings": list(dict.fromkeys(told))}
         facts["state"] = "interrupted" if cut or watcher.stopped else "complete"
         facts["seconds"] = round(time.monotonic() - called, 3)
-        whole = _whole_stretch([(each, part["trusted"]) for each, part in zip(solved, done, strict=True)])
-        facts["trusted"] = _trusted_frames(request, writer.frames, whole)
-        writer.finish(facts)
-    return Outcome(out, (writer.frames, grid.side, grid.side), watcher.stopped, facts, cut)
-
-
-def _place(times: Times, grid: Grid) -> VideoGrid:
-    """Where the voxels lie: in pixels of the scene at full resolution, and seconds after the first line."""
-    side, begin_s = grid.voxels.spatial_merge, (grid.begin - times.first_substep) * times.substep_ns * 1e-9
-    step = (times.substep_ns * grid.voxels.temporal_merge * 1e-9, float(side), float(side))
-    return VideoGrid(step, (begin_s, (side - 1) / 2, (side - 1) / 2), None)
+        facts["trusted"] = _trusted_frames(request, sheet.frames, _common_stretch(request, segments, done))
+        sheet.finish(facts)
+    return Outcome(out, (sheet.frames, *sheet.shape), watcher.stopped, facts, cut)
 
 
 def _solved(
     tasks: Sequence[Task], pool: Pool, watcher: Watcher, budget: Budget
 ) -> Iterator[tuple[Part, Task, SubSegment | None]]:
-    """Solved tasks in order, each with the sub-segment after it, until the watcher or budget ends it."""
+    """Solved tasks in order, each with its tile's next sub-segment, until watcher or budget ends it."""
     submitted = 0
     waiting: deque[Future[Part]] = deque()
     for index, task in enumerate(tasks):
@@ -150,7 +141,8 @@ def _solved(
             submitted += 1
         if not waiting or (part := _result(waiting, pool, watcher)) is None:
             return
-        yield part, task, tasks[index + 1].segment if index + 1 < len(tasks) else None
+        following = tasks[index + 1 : index + 2]
+        yield part, task, following[0].segment if following and following[0].tile == task.tile else None
 
 
 def _result(waiting: deque[Future[Part]], pool: Pool, watcher: Watcher) -> Part | None:
@@ -184,7 +176,10 @@ def describe_parts(
     recording: Recording, request: VideoRequest, parts: Sequence[dict[str, Any]], options: Options
 ) -> dict[str, Any]:
     """Where the video comes from and how good it is, as JSON: as a whole, and each sub-segment."""
-    names, reasons = request.names or ("",) * len(parts), request.reasons or ("",) * len(parts)
+    tiles = max(1, len(request.tiles))
+    names, reasons = (
+        each * tiles if each else ("",) * len(parts) for each in (request.names, request.reasons)
+    )
     segments = [
         {"name": name, "why": why, **part} for name, why, part in zip(names, reasons, parts, strict=False)
     ]
@@ -210,7 +205,8 @@ def describe_parts(
         "compiled_s": round(max(part["compiled_s"] for part in parts), 3),
         "quality": {key: _rms([part["quality"][key] for part in parts]) for key in QUALITY_KEYS},
         "segments": segments,
-        "segments_asked": len(request.stretches),
+        "segments_asked": len(request.stretches) * tiles,
+        "tiles": [str(tile) for tile in request.tiles],
         "calibration": provenance(options.calibration),
         "turned": TURNED.get(options.turn),
         "versions": {"acquire": __version__},
@@ -220,6 +216,21 @@ def describe_parts(
 def _rms(values: Sequence[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return float(np.sqrt(np.mean(np.square(known)))) if known else None
+
+
+def _common_stretch(
+    request: VideoRequest, segments: Sequence[SubSegment], parts: Sequence[dict[str, Any]]
+) -> tuple[int, int]:
+    """What is trusted of every tile, in sub-steps; nothing while a tile lacks a sub-segment."""
+    begin, count = segments[0].begin, len(segments)
+    if request.tiles and len(parts) < count * len(request.tiles):
+        return begin, begin
+    found = [
+        _whole_stretch([(each, part["trusted"]) for each, part in zip(segments, of_tile, strict=False)])
+        for of_tile in (parts[first : first + count] for first in range(0, len(parts), count))
+    ]
+    low, high = max(low for low, _ in found), min(high for _, high in found)
+    return low, max(low, high)
 
 
 def _whole_stretch(segments: Sequence[tuple[SubSegment, bool]]) -> tuple[int, int]:

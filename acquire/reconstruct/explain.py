@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from acquire.calibrate import calibrated
+from acquire.calibrate.curve import curve_of
 from acquire.calibrate.orientation import MODEL, view_named
 from acquire.recon import reconstruct
 
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 ITERATIONS = 80
 MOST_LINES = 264
-OFFSETS, GAINS = ("offset_dn", "ambient_dn"), ("gain",)
+OFFSETS, GAINS, CURVE = ("offset_dn", "ambient_dn"), ("gain",), ("excess_dn",)
 NOTHING, ALL = "nothing", "all of it"
 
 
@@ -54,7 +55,8 @@ def explain(
     Raises what `calibrated` and `reconstruct` raise.
     """
     merges = (spatial_merge, temporal_merge)
-    reconstruct(calibrated(segment, known), *merges, iterations=1)  # compiles, so that no trial has to
+    # compiles, so that no trial has to
+    reconstruct(calibrated(segment, known), *merges, iterations=1, check=False)
     frames = segment.geometry.video_shape(*merges)[0]
     parts = dict(_without(known))
     total = len(parts) + 2
@@ -81,7 +83,7 @@ class _Trial:
 
 
 def _trial(segment: Segment, merges: tuple[int, int], bandwidth: float | None) -> _Trial:
-    result = reconstruct(segment, *merges, iterations=ITERATIONS, bandwidth=bandwidth)
+    result = reconstruct(segment, *merges, iterations=ITERATIONS, bandwidth=bandwidth, check=False)
     coefficients = int(result.parameters.get("temporal_coefficients", 1))
     seconds = result.seconds / max(result.iterations, 1) * ITERATIONS
     return _Trial(result.quality.prediction, seconds, coefficients)
@@ -90,6 +92,7 @@ def _trial(segment: Segment, merges: tuple[int, int], bandwidth: float | None) -
 def _without(known: Calibration) -> Iterator[tuple[str, Calibration]]:
     """Name of a part → the calibration without it, as far as it holds it."""
     for name, quantities in (
+        *([("the cameras' curves", CURVE)] if curve_of(known) else []),
         ("offsets per column", OFFSETS),
         ("gains per column", GAINS),
         ("the arms' balance", ("balance",)),

@@ -12,6 +12,7 @@ from acquire.reconstruct.times import Times, duration
 
 if TYPE_CHECKING:
     from acquire.config.plan import ReconstructionPlan
+    from acquire.fibre import Tile
     from acquire.store import Recording
 
 SPANS_PER_SEGMENT = 4
@@ -56,7 +57,8 @@ class VideoRequest:
     """Stretches of a stream that follow one another, and the grid of their common video.
 
     ``trusted`` are the sub-steps that are sampled in full; ``names`` and ``reasons`` are the stretches'.
-    ``glimpses`` are what is looked at where that is less than all of each stretch.
+    ``glimpses`` are what is looked at where that is less than all of each stretch. ``tiles`` are those of a
+    scene behind a fibre, row by row; none: there is no fibre.
     """
 
     stream: Stream
@@ -67,10 +69,27 @@ class VideoRequest:
     names: tuple[str, ...] = ()
     reasons: tuple[str, ...] = ()
     glimpses: tuple[SubSegment, ...] = ()
+    tiles: tuple[Tile, ...] = ()
 
     def sub_segments(self) -> tuple[SubSegment, ...]:
         """What is solved, in order."""
         return self.glimpses or self.stream.arrange(self.stretches, self.fade)
+
+
+def in_tiles(request: VideoRequest, tiles: tuple[Tile, ...]) -> VideoRequest:
+    """The request for each of some tiles of a scene behind a fibre; none: there is no fibre.
+
+    UsageError for voxels that do not end where a tile does: its neighbour's would begin elsewhere.
+    """
+    grid = request.grid
+    if tiles and grid.size % grid.voxels.spatial_merge:
+        divisors = [str(merge) for merge in range(1, grid.size + 1) if not grid.size % merge]
+        raise UsageError(
+            f"voxels of N_m = {grid.voxels.spatial_merge} do not fill the tiles behind the fibre, which are "
+            f"{grid.size} fine pixels wide",
+            possible=f"N_m of {', '.join(divisors)}",
+        )
+    return replace(request, tiles=tiles)
 
 
 def stream_of(recording: Recording) -> Stream:

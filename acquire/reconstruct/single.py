@@ -59,5 +59,6 @@ def describe(result: Reconstruction, recording: Recording, segment: Segment) -> 
         "parameters": result.parameters,
         "quality": quality,
         "trusted": [result.trusted.start, result.trusted.stop],
+        "warnings": list(result.warnings),
         "versions": {"acquire": __version__},
     }

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from acquire.calibrate import calibrated
 from acquire.recon import reconstruct
+from acquire.recon.balance import divided
 from acquire.recon.diagnosis import put_right
 from acquire.recon.hypotheses import AS_BUILT
 from acquire.recon.judge import POOR_MISFIT
@@ -22,7 +23,10 @@ if TYPE_CHECKING:
 
     from acquire.arrays import Dtype
     from acquire.calibrate import Calibration
+    from acquire.fibre import Tile
+    from acquire.lines import Segment
     from acquire.recon import Preset, Progress, Reconstruction
+    from acquire.recon.balance import Balance
     from acquire.recon.hypotheses import Turn
     from acquire.recon.segments import Grid, SubSegment
 
@@ -35,8 +39,9 @@ class Options:
     """How to solve; see `acquire.recon.reconstruct`. ``budget_s`` is for all that is asked for.
 
     ``calibration`` is what lines are read with; None: as the cameras' configuration says. ``turn`` is how the
-    arms are to be put right beyond that, and ``check`` whether what is not explained is looked into. The
-    options of the solver and the denoiser's name are those of whoever's solver that is.
+    arms are to be put right beyond that, ``balance`` what arm B's light is then divided by, and ``check``
+    whether what is not explained is looked into. The options of the solver and the denoiser's name are those
+    of whoever's solver that is.
     """
 
     preset: Preset = "balanced"
@@ -51,12 +56,14 @@ class Options:
     check: bool = True
     solver_options: Mapping[str, Any] = field(default_factory=dict)
     denoiser: str | None = None
+    balance: Balance | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
     """A sub-segment of a recording, and the grid on which its frames are wanted. Picklable.
 
+    ``tile`` is what of the scene is solved behind a fibre; None: there is none.
     ``due`` (`time.monotonic` of this machine) is when it is to be done; where that is not known, the options'
     budget is for it.
     """
@@ -66,6 +73,7 @@ class Task:
     grid: Grid
     options: Options
     due: float | None = None
+    tile: Tile | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,10 +103,12 @@ class Watch(Protocol):
 def solve(task: Task, watch: Watch) -> Part:
     """Cut, reconstruct, bring to the grid. Raises what `Recording.cut` and `reconstruct` raise."""
     segment, options, voxels = task.segment, task.options, task.segment.voxels
-    lines = open_recording(task.recording).cut(segment.first_line, segment.lines)
-    if options.calibration is not None:
-        lines = calibrated(lines, options.calibration)
-    lines = put_right(lines, options.turn)
+    lines = open_recording(task.recording).cut(segment.first_line, segment.lines, task.tile)
+    lines = as_read(lines, options)
+    if options.balance is not None:
+        lines = divided(lines, options.balance)
+    # by all of the recording: sub-segments by their own lines would differ in brightness
+    lines = replace(lines, balanced=True)
 
     done = 0.0
 
@@ -130,6 +140,7 @@ def solve(task: Task, watch: Watch) -> Part:
     watch.advance(1 - done)
     substeps = lines.geometry.substeps
     why = _why_not_trusted(result, segment)
+    whose = "" if task.tile is None else f"tile {task.tile}: "
     return Part(
         video=task.grid.resample(result.video, segment, substeps),
         error=task.grid.resample_time(result.frame_error, segment, substeps),
@@ -144,14 +155,23 @@ def solve(task: Task, watch: Watch) -> Part:
             "iterations_asked": result.iterations_asked,
             "ended": result.ended,
             "seconds": round(result.seconds, 3),
+            "processor_s": round(result.processor_s, 3),
             "compiled_s": round(result.compiled_s, 3),
             "masked": result.masked,
             "trusted": why is None,
-            "warnings": [*([] if why is None else [why]), *result.warnings],
+            "tile": None if task.tile is None else str(task.tile),
+            "warnings": [whose + text for text in (*([] if why is None else [why]), *result.warnings)],
             "parameters": result.parameters,
             "quality": {name: _json(value) for name, value in asdict(result.quality).items()},
         },
     )
+
+
+def as_read(lines: Segment, options: Options) -> Segment:
+    """With the calibration, and the arms put right."""
+    if options.calibration is not None:
+        lines = calibrated(lines, options.calibration)
+    return put_right(lines, options.turn)
 
 
 def _why_not_trusted(result: Reconstruction, segment: SubSegment) -> str | None:
@@ -164,8 +184,8 @@ def _why_not_trusted(result: Reconstruction, segment: SubSegment) -> str | None:
     why = "broken off" if result.ended == "stopped" else "ended by its budget"
     last = segment.first_line + segment.lines - 1
     return (
-        f"the sub-segment of lines {segment.first_line} to {last} was {why} after {result.iterations} of "
-        f"{result.iterations_asked} iterations and misses its lines by {missed:.0%}: it is not trusted"
+        f"the sub-segment of lines {segment.first_line} to {last} was {why} after {result.iterations} "
+        f"iterations and misses its lines by {missed:.0%}: it is not trusted"
     )
 
 

@@ -16,8 +16,9 @@ Names are imported when they are asked for: a rig with a simulated trigger and r
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from acquire.lazy import lazily
 
 if TYPE_CHECKING:
     from acquire.sim.functions import FunctionScene
@@ -52,8 +53,4 @@ _HOMES = {
     "truth": "voxels",
 }
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+__getattr__, __dir__ = lazily(__name__, _HOMES, __all__)

@@ -92,7 +92,8 @@ class PulseTrain:
     simulated time; ``code`` is what `acquire.codes.code_from_attrs` reads; ``stopped_after`` is the
     number of pulses after which the train ended, None while it lasts; ``budget`` is the number that it
     does not exceed unless more are allowed, None where only a stop ends it; ``settled_s`` is by how much the
-    trigger starts an arm's line after the light of its first sub-step, by its lead and delays.
+    trigger starts an arm's line after the light of its first sub-step, by its lead and delays; ``lit_part``
+    is from where to where of a lit sub-step the light is on.
     """
 
     run: int
@@ -103,6 +104,7 @@ class PulseTrain:
     stopped_after: int | None = None
     budget: int | None = None
     settled_s: Mapping[str, float] = field(default_factory=dict)
+    lit_part: tuple[float, float] = (0.0, 1.0)
 
     def issued(self, now_ns: int) -> int:
         """Pulses issued by ``now_ns``, pulse 0 at the start included; 0 before the start."""
@@ -171,16 +173,19 @@ class Wire:
         start_ns: int | None = None,
         budget: int | None = None,
         settled_s: Mapping[str, float] | None = None,
+        lit_part: tuple[float, float] = (0.0, 1.0),
     ) -> PulseTrain:
         """Begin a train now, or at ``start_ns``; DeviceError while another one lasts."""
         with self._writing:
             sequence, latest = self._observe()
             if latest.running:
                 raise DeviceError(f"pulse train {latest.run} still runs", hint="stop it first")
-            run, settled = latest.run + 1, dict(settled_s or {})
-            train = PulseTrain(run, 0, line_period_ns, speed, dict(code), budget=budget, settled_s=settled)
+            train = PulseTrain(latest.run + 1, 0, line_period_ns, speed, dict(code), budget=budget)
+            train = replace(train, settled_s=dict(settled_s or {}), lit_part=lit_part)
             if len(_encode(train)) > _ROOM:
-                raise UsageError(f"code of {len(_encode(train))} bytes", possible=f"{_ROOM} on the wire")
+                raise UsageError(
+                    f"a code of {len(_encode(train))} bytes is too long", possible=f"{_ROOM} on the wire"
+                )
             return self._write(
                 sequence, lambda now_ns: replace(train, start_ns=now_ns if start_ns is None else start_ns)
             )
@@ -275,13 +280,15 @@ class Wire:
 
 
 def _encode(train: PulseTrain) -> bytes:
-    fields = (train.run, train.start_ns, str(train.line_period_ns), str(train.speed), dict(train.code))
-    return json.dumps([*fields, train.stopped_after, train.budget, dict(train.settled_s)]).encode()
+    timing = (train.run, train.start_ns, str(train.line_period_ns), str(train.speed), dict(train.code))
+    limits = (train.stopped_after, train.budget)
+    return json.dumps([*timing, *limits, dict(train.settled_s), train.lit_part]).encode()
 
 
 def _decode(payload: bytes) -> PulseTrain:
-    run, start_ns, line_period_ns, speed, code, *others = json.loads(payload)
-    return PulseTrain(run, start_ns, Fraction(line_period_ns), Fraction(speed), code, *others)
+    run, start_ns, line_period_ns, speed, code, stopped, budget, settled_s, lit = json.loads(payload)
+    timing = run, start_ns, Fraction(line_period_ns), Fraction(speed), code
+    return PulseTrain(*timing, stopped, budget, settled_s, (lit[0], lit[1]))
 
 
 def _receive(duplicate: Any) -> Wire:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from acquire.config import GeometryConfig
     from acquire.config.device import CameraConfig
     from acquire.config.scene import SceneConfig
+    from acquire.fibre import Fibre
     from acquire.sim.clock import PulseTrain, Reading, Wire
     from acquire.sim.pins import PinWire
     from acquire.sim.pipeline import Camera
@@ -61,6 +62,11 @@ class SimulatedOptics:
     arm: str
     geometry: GeometryConfig
     scene: SceneConfig
+    fibre: Fibre | None = None
+
+    @property
+    def pixels(self) -> int:
+        return self.geometry.stages if self.fibre is None else self.fibre.sensor_pixels
 
     def expose(self, train: PulseTrain, code: Code, config: CameraConfig) -> Camera:
         """The lines that the arm's camera gives under a train's timing and the light's code."""
@@ -68,7 +74,15 @@ class SimulatedOptics:
 
         substep_s = float(train.line_period_ns / (self.geometry.substeps * NS_PER_S))
         cameras = dict.fromkeys(ARMS, config)
-        bench = Bench(self.scene, self.geometry, cameras, substep_s, settled_s=train.settled_s)
+        bench = Bench(
+            self.scene,
+            self.geometry,
+            cameras,
+            substep_s,
+            settled_s=train.settled_s,
+            lit_part=train.lit_part,
+            fibre=self.fibre,
+        )
         return bench.camera(self.arm, code)
 
 
@@ -102,10 +116,12 @@ class SimulatedCamera:
         return CameraIdentity("acquire", "simulated TDI camera", self._config.serial, __version__)
 
     def settings(self) -> dict[str, Any]:
+        # optics of plug-ins that know nothing of fibres have as many pixels as stages
+        pixels = getattr(self._optics, "pixels", self._optics.geometry.stages)
         return {
             "DeviceScanType": "Linescan",
-            "SensorWidth": self._optics.geometry.stages,
-            "Width": self._optics.geometry.stages,
+            "SensorWidth": pixels,
+            "Width": pixels,
             "OffsetX": 0,
             "PixelFormat": self._config.pixel_format,
             "AcquisitionMode": "Continuous",

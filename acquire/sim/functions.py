@@ -75,7 +75,7 @@ def checked_light(light: Any, shape: tuple[int, ...], what: str) -> NDArray[np.f
     if not np.isfinite(frames).all():
         raise UsageError(f"light of {what}: {np.isnan(frames).sum()} pixels are NaN, or some infinite")
     if frames.size and frames.min() < 0:
-        raise UsageError(f"light of {what}: {frames.min():g}", possible="0 or more")
+        raise UsageError(f"light of {what} goes down to {frames.min():g}", possible="0 or more")
     return frames
 
 

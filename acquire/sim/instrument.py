@@ -105,7 +105,7 @@ class SimulatedDevices:
         config = self.config
         self._look_at_scene()
         assert self._scene is not None
-        optics = SimulatedOptics(arm, config.geometry, self._scene)
+        optics = SimulatedOptics(arm, config.geometry, self._scene, config.laid_out)
         camera = config.cameras.arm(arm)
         return SimulatedCameraOpener(
             self.pulses(arm), optics, camera, config.stream.block_lines, config.line_rate_hz
@@ -121,6 +121,7 @@ class SimulatedDevices:
             config.cameras.arm(arm),
             config.stream.block_lines,
             config.line_rate_hz,
+            config.pixels,
         )
 
     def pulses(self, arm: str) -> Wire | PinWire:
@@ -145,12 +146,15 @@ class SimulatedDevices:
         return self._scene.optics.layout
 
     def scene(self) -> Scene:
-        """What the cameras see, in camera A's rows and columns; sub-step 0 is the run's first."""
+        """What the cameras see, in camera A's rows and columns; sub-step 0 is the run's first.
+
+        Behind a fibre a square, in the middle of which the fibre's field lies (`acquire.fibre.Fibre.field`).
+        """
         trigger, geometry = self.config.trigger, self.config.geometry
         scene = self._scene or load_scene(self.config.scene_file())
-        return build_scene(
-            scene, geometry.stages * geometry.substeps, trigger.substep_ticks / trigger.clock_hz
-        )
+        fibre = self.config.laid_out
+        size = geometry.stages * geometry.substeps if fibre is None else fibre.side
+        return build_scene(scene, size, trigger.substep_ticks / trigger.clock_hz)
 
     def close_cameras(self) -> None:
         """Take the cameras away that have processes of their own."""
@@ -181,10 +185,11 @@ def _check_scene(config: RigConfig, scene: SceneConfig) -> None:
     """Raise UsageError here rather than in a camera's process."""
     if config.trigger.driver == "rtl" and any(effect.kind == "delays" for effect in scene.effects):
         raise UsageError(
-            "effect 'delays' on the pins of the gateware", possible="trigger.driver = 'simulated'"
+            "effect 'delays' cannot act on the pins of the gateware", possible="trigger.driver = 'simulated'"
         )
     code = ConstantCode(0)
     substep_s = config.trigger.substep_ticks / config.trigger.clock_hz
-    bench = Bench(scene, config.geometry, {arm: config.cameras.arm(arm) for arm in ARMS}, substep_s)
+    cameras = {arm: config.cameras.arm(arm) for arm in ARMS}
+    bench = Bench(scene, config.geometry, cameras, substep_s, fibre=config.laid_out)
     for arm in ARMS:
         bench.camera(arm, code)

@@ -12,7 +12,7 @@ A scene of K driven masks has K sources; any other scene stands in the light of 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -51,6 +51,13 @@ class Illumination:
     def gated(cls, bits: Series, drives: Series) -> Illumination:
         """Code AND drive."""
         return cls(bits, drives, lambda first, count: drives(first, count) * bits(first, count))
+
+    def on_for(self, part: float) -> Illumination:
+        """The same sources, on for a part of every lit sub-step."""
+        if part == 1:
+            return self
+        whole = self.light
+        return replace(self, light=lambda first, count: whole(first, count) * part)
 
 
 class Tiled:

@@ -28,12 +28,14 @@ from acquire.config.scene import ArmOptics, OpticsConfig
 from acquire.errors import UsageError
 from acquire.lines import ARMS
 from acquire.sim.light import Illumination
+from acquire.sim.optics import laid_out
 from acquire.sim.scene import SeparableScene, frames_at
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.codes import Code
+    from acquire.fibre import Fibre
     from acquire.sim.scene import Scene
 
 TILE_LINES = 256
@@ -54,11 +56,12 @@ class StreamingArm:
     stages, substeps : M and S
     arm : "a", or "b", which sees the scene turned by 90° counter-clockwise
     optics : how the arm sees the scene, if it is not that
+    fibre : that lays out what lies in the middle of a larger scene, instead of optics; None: there is none
 
     Raises
     ------
     UsageError
-        The scene is not M·S wide, or there is no such arm.
+        The scene is not M·S wide, or not what the fibre asks for, or there is no such arm.
     """
 
     def __init__(
@@ -69,20 +72,30 @@ class StreamingArm:
         substeps: int,
         arm: str,
         optics: ArmOptics | None = None,
+        *,
+        fibre: Fibre | None = None,
     ) -> None:
-        if scene.size != stages * substeps:
+        wanted = stages * substeps if fibre is None else fibre.side
+        if scene.size != wanted:
             raise UsageError(
-                f"scene of size {scene.size} for {stages} stages of {substeps} sub-steps",
-                possible=f"n = {stages * substeps}",
+                f"a scene of size {scene.size} does not fit {stages} stages of {substeps} sub-steps",
+                possible=f"n = {wanted}",
             )
         if arm not in ARMS:
-            raise UsageError(f"arm {arm!r}", possible=", ".join(ARMS))
+            raise UsageError(f"there is no arm {arm!r}", possible=", ".join(ARMS))
         optics = optics or getattr(OpticsConfig(), arm)
         light = code if isinstance(code, Illumination) else Illumination.of(scene, code)
+        seen_scene, width = scene, scene.size
+        if fibre is not None:  # which lays the scene out as the arm sees it: nothing is left to turn
+            seen_scene, width, optics = (
+                laid_out(scene, fibre, arm),
+                substeps * fibre.sensor_pixels,
+                ArmOptics(),
+            )
         self._lines: _Lines = (
-            SeparableLines(scene, light, substeps, optics)
-            if isinstance(scene, SeparableScene)
-            else FrameLines(scene, light, substeps, optics)
+            SeparableLines(seen_scene, light, substeps, optics)
+            if isinstance(seen_scene, SeparableScene)
+            else FrameLines(seen_scene, light, substeps, optics, width)
         )
 
     def lines(self, first_line: int, count: int) -> NDArray[np.float32]:
@@ -140,24 +153,29 @@ class SeparableLines:
 
 
 class FrameLines:
-    """Lines of any scene; what unfinished packets have gathered is kept for the call that continues."""
+    """Lines of any scene; what unfinished packets have gathered is kept for the call that continues.
 
-    def __init__(self, scene: Scene, light: Illumination, substeps: int, optics: ArmOptics) -> None:
+    ``width``: of the frames; a scene that a fibre has laid out is wider than it has rows.
+    """
+
+    def __init__(
+        self, scene: Scene, light: Illumination, substeps: int, optics: ArmOptics, width: int
+    ) -> None:
         from acquire.sim import kernels  # a compiler, which separable scenes do without
 
         self._kernels = kernels
         self._scene, self._source, self._substeps = scene, light, substeps
-        n = scene.size
-        self._block = max(1, _BLOCK_BYTES // (4 * n**2))
+        n, self._width = scene.size, width
+        self._block = max(1, _BLOCK_BYTES // (4 * n * width))
         self._along_rows = optics.turn_deg % 180 == 0
-        place = np.empty(n * n, np.int64)
-        place[seen(np.arange(n * n).reshape(1, n, n), optics).ravel()] = np.arange(n * n)
-        row, column = (place // n).reshape(n, n), (place % n).reshape(n, n)
+        place = np.empty(n * width, np.int64)
+        place[seen(np.arange(n * width).reshape(1, n, width), optics).ravel()] = np.arange(n * width)
+        row, column = (place // width).reshape(n, width), (place % width).reshape(n, width)
         # Of a row of the scene, or of a column where charge moves along those: its row on the sensor, and
         # of the other axis its column there.
         self._rows = row[:, 0] if self._along_rows else row[0]
         self._columns = column[0] if self._along_rows else column[:, 0]
-        self._unfinished = np.zeros((n, n))
+        self._unfinished = np.zeros((n, width))
         self._next_line: int | None = None
 
     def lines(self, first_line: int, count: int) -> NDArray[np.float32]:
@@ -165,14 +183,12 @@ class FrameLines:
             self._some_lines(first, min(_GATHERED_LINES, first_line + count - first))
             for first in range(first_line, first_line + count, _GATHERED_LINES)
         ]
-        return (
-            np.concatenate(parts) if parts else np.empty((0, self._scene.size // self._substeps), np.float32)
-        )
+        return np.concatenate(parts) if parts else np.empty((0, self._width // self._substeps), np.float32)
 
     def _some_lines(self, first_line: int, count: int) -> NDArray[np.float32]:
         S, n = self._substeps, self._scene.size
         # Always (along the moving charge, across it) or the reverse, as the kernel walks through the frames.
-        packets = np.zeros((S * count + n, n) if self._along_rows else (n, S * count + n))
+        packets = np.zeros((S * count + n, self._width) if self._along_rows else (n, S * count + n))
         gathered = packets if self._along_rows else packets.T
         begin, end = S * first_line, S * (first_line + count) + n - 1
         if first_line == self._next_line:
@@ -183,7 +199,7 @@ class FrameLines:
         self._unfinished = gathered[S * count :].copy()
         self._next_line = first_line + count
         whole = gathered[: S * count, :: 1 if self._columns[0] <= self._columns[-1] else -1]
-        merged = np.zeros((count, n // S))
+        merged = np.zeros((count, self._width // S))
         for u, c in np.ndindex(S, S):
             merged += whole[u::S, c::S]
         return merged.astype(np.float32)

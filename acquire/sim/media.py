@@ -128,7 +128,7 @@ def open_media(path: Path) -> Source:
     try:
         return _PictureFile(path)
     except (Image.DecompressionBombError, Image.DecompressionBombWarning) as error:
-        raise UsageError(f"{path}: {error}") from error
+        raise UsageError(f"{path} cannot be read: {error}") from error
     except (OSError, SyntaxError, ValueError):
         return _open_container(path)
 
@@ -192,10 +192,10 @@ class _ArrayFile:
         self._video: NDArray[Any] = video[None] if video.ndim == 2 else video
         if self._video.ndim != 3 or 0 in self._video.shape:
             raise UsageError(
-                f"{path}: array of shape {video.shape}", possible="(time, row, column) or (row, column)"
+                f"{path} is an array of shape {video.shape}", possible="(time, row, column) or (row, column)"
             )
         if self._video.dtype.kind not in "buif":
-            raise UsageError(f"{path}: array of {self._video.dtype}", possible="numbers")
+            raise UsageError(f"{path} is an array of {self._video.dtype}", possible="numbers")
         self._white = float(np.iinfo(video.dtype).max) if video.dtype.kind in "ui" else 1.0
         step = max(1, _CHECKED_VALUES // self._video[0].size)
         for at in range(0, len(self._video), step):
@@ -254,7 +254,9 @@ def _white(mode: str) -> float:
 
 def _check_size(path: Path, width: int, height: int) -> None:
     if not 0 < width * height <= MAX_PIXELS:
-        raise UsageError(f"{path}: frames of {width} × {height} pixels", possible=f"1 to {MAX_PIXELS} pixels")
+        raise UsageError(
+            f"{path} has frames of {width} × {height} pixels", possible=f"1 to {MAX_PIXELS} pixels"
+        )
 
 
 def _open_container(path: Path) -> Source:

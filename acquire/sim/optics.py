@@ -1,4 +1,4 @@
-"""Scenes as optics and coarser sensors show them; separable scenes stay separable."""
+"""Scenes as optics, fibres and coarser sensors show them; separable scenes stay separable."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from acquire.fibre import Fibre
+
     Image = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
 
@@ -26,6 +28,18 @@ def binned(scene: Scene, factor: int) -> Scene:
     return _BinnedMasks(scene, factor) if isinstance(scene, SeparableScene) else _BinnedFrames(scene, factor)
 
 
+def laid_out(scene: Scene, fibre: Fibre, arm: str) -> Scene:
+    """The middle of a square scene as a fibre lays it out on an arm's sensor: n rows, as wide as that."""
+    rows, columns = fibre.field()
+
+    def image(frames: NDArray[np.float32]) -> NDArray[np.float32]:
+        return fibre.laid(frames[:, rows, columns], arm)
+
+    if isinstance(scene, SeparableScene):
+        return _MappedMasks(scene, image)
+    return _MappedFrames(scene, image, fibre.size)
+
+
 class _MappedMasks(MaskScene):
     def __init__(self, scene: SeparableScene, image: Image) -> None:
         self._scene = scene
@@ -36,8 +50,9 @@ class _MappedMasks(MaskScene):
 
 
 class _MappedFrames:
-    def __init__(self, scene: Scene, image: Image) -> None:
-        self.size = scene.size
+    def __init__(self, scene: Scene, image: Image, size: int | None = None) -> None:
+        """``size``: rows of the image, where the map changes them."""
+        self.size = scene.size if size is None else size
         self._scene, self._image = scene, image
 
     def frames(self, first: int, count: int) -> NDArray[np.float32]:

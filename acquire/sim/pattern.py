@@ -36,6 +36,10 @@ class PatternOptics:
     geometry: GeometryConfig
     pattern: Pattern
 
+    @property
+    def pixels(self) -> int:
+        return self.pattern.pixels
+
     def expose(self, train: PulseTrain, code: Code, config: CameraConfig) -> PatternLight:  # noqa: ARG002
         return PatternLight(self.pattern)
 

@@ -9,7 +9,8 @@
 In brackets what `acquire.sim.effects` gives. With nothing listed `Sensor.read` is Eq. (1), a factor, an
 offset and a rounding. The layouts differ in what stands around it: ``compact`` has two images side by side on
 one sensor, ``emulated`` a sensor of M·S stages whose raw lines are merged S × S, ``interline`` a coarse
-sensor under the fine scene.
+sensor under the fine scene. Behind a fibre (`acquire.fibre`) the scene is drawn as a square that its field
+fits in, effects act on that image, and the field is then laid out on the sensor.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from acquire.config.scene import OpticsConfig
 from acquire.errors import UsageError
 from acquire.lines import ARMS
 from acquire.sim.effects import in_order
@@ -38,7 +40,8 @@ if TYPE_CHECKING:
     from acquire.codes import Code
     from acquire.config import GeometryConfig
     from acquire.config.device import CameraConfig
-    from acquire.config.scene import OpticsConfig, SceneConfig
+    from acquire.config.scene import SceneConfig
+    from acquire.fibre import Fibre
     from acquire.sim.scene import Scene
     from acquire.sim.stopwatch import Stopwatch
 
@@ -78,6 +81,9 @@ class Bench:
     stopwatch: Stopwatch | None = None
     settled_s: Mapping[str, float] = field(default_factory=dict)
     """Arm → by how much the trigger starts the charge's moves after the light's (s); absent: not at all."""
+    lit_part: tuple[float, float] = (0.0, 1.0)
+    """From where to where of a lit sub-step the trigger lets the light on."""
+    fibre: Fibre | None = None
 
     def without(self, *effects: str) -> Bench:
         """The same bench, some effects not listed."""
@@ -88,6 +94,13 @@ class Bench:
         """The lines that the camera of ``arm`` gives under a code. UsageError for what cannot be."""
         optics = self.scene.optics
         converter = Converter.of(self.cameras[arm])
+        if self.fibre is not None:
+            if optics != OpticsConfig():
+                raise UsageError(
+                    "the scene has optics of its own, which the rig's fibre leaves no room for",
+                    possible="a scene without [optics]; or a rig without [fibre]",
+                )
+            return _sensor(self, arm, code, converter, {arm: 0}, self.fibre.sensor_pixels)
         match optics.layout:
             case "emulated":
                 return _emulated(self, arm, code, converter)
@@ -98,12 +111,13 @@ class Bench:
 
     def fine_scene(self) -> Scene:
         """What the cameras look at, as fine as they can tell: in camera A's rows and columns."""
-        size = self.geometry.stages * self.geometry.substeps
+        size = self.geometry.stages * self.geometry.substeps if self.fibre is None else self.fibre.side
         if self.scene.optics.layout != "interline":
             return build_scene(self.scene, size, self.substep_s)
         if self.geometry.substeps != 1:
             raise UsageError(
-                f"layout 'interline' with S = {self.geometry.substeps}", possible="geometry.substeps = 1"
+                f"layout 'interline' cannot have S = {self.geometry.substeps}",
+                possible="geometry.substeps = 1",
             )
         factor = self.scene.optics.baseline_factor
         return build_scene(self.scene, size * factor, self.substep_s / factor)
@@ -282,6 +296,8 @@ def _sensor(
         responsivity_dn=converter.responsivity_dn,
         gain_dn_per_e=bench.scene.system_gain_dn_per_e,
         settled_s=bench.settled_s.get(name[0], 0.0),
+        lit_part=bench.lit_part,
+        fibre=bench.fibre,
     )
     stages = _stages(bench, setting)
     images = []
@@ -315,10 +331,14 @@ def _image(
     light = Illumination.of(scene if factor == 1 else binned(scene, factor), code)
     for stage in common:
         light = stage.run(light) if stage.place == "light" else light
+    light = light.on_for(setting.lit_part[1] - setting.lit_part[0])
     for stage in own:
         scene = mapped(scene, stage.run) if stage.place == "image" else scene
     scene = scene if factor == 1 else binned(scene, factor)
-    streaming = StreamingArm(scene, light, setting.stages, setting.substeps, arm, getattr(optics, arm))
+    own_optics = getattr(optics, arm)
+    streaming = StreamingArm(
+        scene, light, setting.stages, setting.substeps, arm, own_optics, fibre=setting.fibre
+    )
     return _Image(streaming, [stage for stage in own if stage.place in ("image", "signal")], column)
 
 
@@ -331,12 +351,13 @@ def _compact(bench: Bench, arm: str, code: Code, converter: Converter) -> Cut:
     low, high = sorted(columns.values())
     if high < low + M or high + M > optics.sensor_pixels:
         raise UsageError(
-            f"compact layout with images of {M} columns at {columns['a']} and {columns['b']}",
+            f"a compact layout cannot have images of {M} columns at {columns['a']} and {columns['b']}",
             possible=f"two ranges beside each other on {optics.sensor_pixels} columns",
         )
     if converter != Converter.of(bench.cameras["b"]) or converter != Converter.of(bench.cameras["a"]):
         raise UsageError(
-            "compact layout with two different cameras", possible="cameras.a and .b alike: it has one"
+            "a compact layout cannot have two different cameras",
+            possible="cameras.a and .b alike: it has one",
         )
     sensor = _sensor(bench, "ab", code, converter, columns, optics.sensor_pixels)
     return Cut(sensor, slice(columns[arm], columns[arm] + M))
@@ -347,8 +368,8 @@ def _emulated(bench: Bench, arm: str, code: Code, converter: Converter) -> Merge
     raw_white = (1 << bench.scene.optics.raw_bits) - 1
     if raw_white * S**2 > converter.white_dn:
         raise UsageError(
-            f"layout 'emulated': {S} x {S} samples of {bench.scene.optics.raw_bits} bits in lines up to "
-            f"{converter.white_dn} DN",
+            f"layout 'emulated': {S} x {S} samples of {bench.scene.optics.raw_bits} bits do not fit into "
+            f"lines up to {converter.white_dn} DN",
             possible="cameras with a wider pixel_format, as Mono16, or fewer optics.raw_bits",
         )
     raw = replace(

@@ -120,7 +120,9 @@ class ArrayScene:
 
     def __init__(self, video: NDArray[Any]) -> None:
         if video.ndim != 3 or 0 in video.shape or video.shape[1] != video.shape[2]:
-            raise UsageError(f"video of shape {video.shape}", possible="(time, n, n), nothing empty")
+            raise UsageError(
+                f"a scene cannot be a video of shape {video.shape}", possible="(time, n, n), nothing empty"
+            )
         self.video = video
 
     @property

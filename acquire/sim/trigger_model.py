@@ -255,7 +255,8 @@ class TriggerModel:
         self._hear(run.start_tick - self._lead() - RUN_CLOCKS)
         period_ns = Fraction(run.line_clocks * NS_PER_S, self._clock_hz)
         attrs = light_attrs(self.registers.get)
-        self._wire.start(period_ns, self._speed, attrs, start_ns, self._lines_allowed(), self._settled_s())
+        optics = self._settled_s(), self._lit_part()
+        self._wire.start(period_ns, self._speed, attrs, start_ns, self._lines_allowed(), *optics)
 
     def _settled_s(self) -> dict[str, float]:
         """Arm → how much later its line starts than the light of the line's first sub-step."""
@@ -263,6 +264,12 @@ class TriggerModel:
         return {
             arm: (self._lead() + self.registers.get(delay)) / self._clock_hz for arm, delay in delays.items()
         }
+
+    def _lit_part(self) -> tuple[float, float]:
+        """From where to where of a lit sub-step the light is on."""
+        begin, end = self.registers.get(r.WINDOW_OPEN), self.registers.get(r.WINDOW_CLOSE)
+        clocks = self.registers.get(r.SUBSTEP_CLOCKS)
+        return begin / clocks, end / clocks
 
     def _hear(self, tick: int) -> None:
         """The host lived at ``tick``: that is what it may be silent from.

@@ -27,7 +27,7 @@ def truth(
     """
     if count < 1 or temporal_merge < 1 or not 1 <= spatial_merge <= scene.size:
         raise UsageError(
-            f"truth of {count} sub-steps with N_m = {spatial_merge}, T_m = {temporal_merge}",
+            f"a truth cannot have {count} sub-steps with N_m = {spatial_merge}, T_m = {temporal_merge}",
             possible=f"at least 1 sub-step, N_m from 1 to {scene.size}, T_m of 1 or more",
         )
     side = -(-scene.size // spatial_merge)

@@ -2,33 +2,50 @@
 
 ::
 
-    whole recordings   writer                     reader, opening, suspect  verify  recover  mirror  video
-      with             retention room resume      attributes extent         scan    mend     place
-      kept from loss   removal, links             shortfall                         rebuild
-    one arm            arm_writer                 camera_stream
-    one array          array_writer → shard       stretch → chunks          tables: table, table_reader
-    what is written    terms, spec (attributes), layout (metadata), codecs (bytes)
+    whole recordings   writer                     reader              verification recovery mirroring  video
+      with             retention room resume      outline suspect     scan         mend     place
+      kept from loss   removal, links             opening attributes               rebuild
+                                                  extent shortfall
+    one arm            arm_writer                 camera_stream  ┐
+    one array          array_writer → shard       stretch → chunks → array_files
+    tables             table                      table_reader
+    what is written    terms, spec (attributes), layout and shape (metadata), codecs (bytes)
     where              files (disk), pages, host  source → disk | remote (URLs)
+
+An `Outline` is a recording without its lines: it and all below it need no library of arrays. What is asked
+for here is imported when it is asked for, so a list of recordings comes at once. No module may have the name
+of a function: importing it would put it in the function's place.
 """
 
-from acquire.store.camera_stream import CameraStream
-from acquire.store.codecs import Codec, CodecChoice, choose_codec
-from acquire.store.files import measure_disk
-from acquire.store.mirror import Mirrored, mirror
-from acquire.store.opening import format_of, open_recording
-from acquire.store.reader import Recording
-from acquire.store.recover import Circumstances, Recovery, recover
-from acquire.store.resume import next_segment
-from acquire.store.retention import Hold, hold
-from acquire.store.spec import FORMAT, READABLE, RecordingSpec, RunCondition
-from acquire.store.suspect import Suspect, suspect_lines
-from acquire.store.table_reader import Event, Gap
-from acquire.store.terms import Continuation, Retention
-from acquire.store.verify import Verification, verify
-from acquire.store.video import VideoFile, open_video, write_video
-from acquire.store.video_layout import VideoGrid
-from acquire.store.video_writer import VideoWriter
-from acquire.store.writer import RecordingWriter
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from acquire.lazy import lazily
+
+if TYPE_CHECKING:
+    from acquire.store.camera_stream import CameraStream
+    from acquire.store.codecs import CodecChoice, choose_codec
+    from acquire.store.files import measure_disk
+    from acquire.store.layout import FORMAT, READABLE
+    from acquire.store.mirroring import Mirrored, mirror
+    from acquire.store.mosaic_writer import MosaicWriter
+    from acquire.store.opening import format_of
+    from acquire.store.outline import Outline, open_outline
+    from acquire.store.reader import Recording, open_recording
+    from acquire.store.recovery import Circumstances, Recovery, recover
+    from acquire.store.resume import next_segment
+    from acquire.store.retention import Hold, hold
+    from acquire.store.shape import Codec
+    from acquire.store.spec import RecordingSpec, RunCondition
+    from acquire.store.suspect import Suspect, suspect_lines
+    from acquire.store.table_reader import Event, Gap
+    from acquire.store.terms import Continuation, Retention
+    from acquire.store.verification import Verification, verify
+    from acquire.store.video import VideoFile, open_video, write_video
+    from acquire.store.video_layout import VideoGrid
+    from acquire.store.video_writer import VideoWriter
+    from acquire.store.writer import RecordingWriter
 
 __all__ = [
     "FORMAT",
@@ -42,6 +59,8 @@ __all__ = [
     "Gap",
     "Hold",
     "Mirrored",
+    "MosaicWriter",
+    "Outline",
     "Recording",
     "RecordingSpec",
     "RecordingWriter",
@@ -59,6 +78,7 @@ __all__ = [
     "measure_disk",
     "mirror",
     "next_segment",
+    "open_outline",
     "open_recording",
     "open_video",
     "recover",
@@ -66,3 +86,46 @@ __all__ = [
     "verify",
     "write_video",
 ]
+
+_HOMES = {
+    "CameraStream": "camera_stream",
+    "Circumstances": "recovery",
+    "Codec": "shape",
+    "CodecChoice": "codecs",
+    "Continuation": "terms",
+    "Event": "table_reader",
+    "FORMAT": "layout",
+    "Gap": "table_reader",
+    "Hold": "retention",
+    "Mirrored": "mirroring",
+    "MosaicWriter": "mosaic_writer",
+    "Outline": "outline",
+    "READABLE": "layout",
+    "Recording": "reader",
+    "RecordingSpec": "spec",
+    "RecordingWriter": "writer",
+    "Recovery": "recovery",
+    "Retention": "terms",
+    "RunCondition": "spec",
+    "Suspect": "suspect",
+    "Verification": "verification",
+    "VideoFile": "video",
+    "VideoGrid": "video_layout",
+    "VideoWriter": "video_writer",
+    "choose_codec": "codecs",
+    "format_of": "opening",
+    "hold": "retention",
+    "measure_disk": "files",
+    "mirror": "mirroring",
+    "next_segment": "resume",
+    "open_outline": "outline",
+    "open_recording": "reader",
+    "open_video": "video",
+    "recover": "recovery",
+    "suspect_lines": "suspect",
+    "verify": "verification",
+    "write_video": "video",
+}
+"""What is asked for here, and the module that has it."""
+
+__getattr__, __dir__ = lazily(__name__, _HOMES, __all__)

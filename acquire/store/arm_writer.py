@@ -131,7 +131,7 @@ class ArmWriter:
     def _check(self, block: TaggedBlock) -> None:
         if block.first_line != self.next_line:
             raise DataError(
-                f"arm {block.arm}: a block from line {block.first_line} on",
+                f"arm {block.arm}: the next block cannot begin at line {block.first_line}",
                 possible=f"line {self.next_line}, the next; a lost line keeps its row, flagged as missing",
             )
         for column, array in self._arrays.items():

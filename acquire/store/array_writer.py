@@ -17,7 +17,8 @@ import numpy as np
 from acquire.store.codecs import EncodeOnce, encode
 from acquire.store.files import DISK
 from acquire.store.pages import aligned_bytes
-from acquire.store.shard import DIRECT_BYTES, Pages, ShardWriter, shard_key, small_piece
+from acquire.store.shape import shard_key
+from acquire.store.shard import DIRECT_BYTES, Pages, ShardWriter, small_piece
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -27,7 +28,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.store.files import Disk
-    from acquire.store.shard import ArrayShape, Piece
+    from acquire.store.shape import ArrayShape
+    from acquire.store.shard import Piece
 
 ENCODED_AHEAD = 4
 """Chunks of an array that are encoded while others are filled and written."""

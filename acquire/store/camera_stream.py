@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.showing import in_words
+from acquire.store.array_files import COLUMNS, ArmFiles
 from acquire.store.chunks import ChunkReader
-from acquire.store.layout import line_columns
 from acquire.store.stretch import Stretch
 
 if TYPE_CHECKING:
@@ -20,11 +20,8 @@ if TYPE_CHECKING:
     from acquire.store.layout import Document
     from acquire.store.source import Source
 
-DAMAGE = (OSError, ValueError, RuntimeError, LookupError, TypeError, AttributeError, ArithmeticError)
-"""What zarr and arithmetic raise for metadata or chunks that are not what they should be."""
 
-
-class CameraStream:
+class CameraStream(ArmFiles):
     """One arm: arrays that are read when they are sliced; row i of each is line ``first_line + i``.
 
     ``documents`` are the metadata of its arrays by name, ``group`` opens it in zarr-python.
@@ -38,20 +35,9 @@ class CameraStream:
         first_line: int,
         group: Callable[[], zarr.Group],
     ) -> None:
-        self.arm = arm
-        self.first_line = first_line
-        self._source = source
         self._group = group
-        self._readers = {
-            column.name: ChunkReader(source, f"{arm}/{column.name}", documents[column.name])
-            for column in line_columns("any")
-        }
-
-    def __len__(self) -> int:
-        return self._readers["lines"].rows
-
-    def __str__(self) -> str:
-        return f"{self._source}/{self.arm}"
+        self._readers = {name: ChunkReader(source, f"{arm}/{name}", documents[name]) for name in COLUMNS}
+        super().__init__(source, arm, self._readers, first_line)
 
     def __repr__(self) -> str:
         count = f"{len(self)} from {self.first_line} on"
@@ -61,11 +47,6 @@ class CameraStream:
     def dtype(self) -> np.dtype[Any]:
         """Of a sample."""
         return self._readers["lines"].shape.dtype
-
-    @property
-    def pixels(self) -> int:
-        """Samples of a line."""
-        return self._readers["lines"].shape.row_shape[0]
 
     @property
     def lines(self) -> zarr.Array[Any]:

@@ -4,18 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from acquire.store.codecs import BLOSC_HEADER, CRC_BYTES, check_size, crc32c, decode, stored_size
-from acquire.store.layout import parse_line_array
-from acquire.store.pages import PAGE
-from acquire.store.shard import ABSENT, index_bytes, shard_key, unpack_index
+from acquire.store.array_files import ArrayFiles
+from acquire.store.codecs import BLOSC_HEADER, check_size, crc32c, decode, stored_size
+from acquire.store.shape import ABSENT, CRC_BYTES, index_bytes
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    from acquire.store.layout import Document
-    from acquire.store.source import Source
 
 READ_ATTEMPTS = 3
 """An index may be met in the instant of its replacement; its checksum tells, and it is read again."""
@@ -29,16 +23,8 @@ class DamagedChunkError(ValueError):
     """The chunk is on disk, but its length or checksum is wrong, or it cannot be unpacked."""
 
 
-class ChunkReader:
-    """The chunks of one array of an arm; ``document`` is its metadata. Raises `layout.PARSE_ERRORS`."""
-
-    def __init__(self, source: Source, key: str, document: Document) -> None:
-        self.key = key
-        self.shape, self.rows = parse_line_array(document)
-        self._source = source
-
-    def __str__(self) -> str:
-        return f"{self._source}/{self.key}"
+class ChunkReader(ArrayFiles):
+    """The chunks of one array of an arm."""
 
     def expect_index(self, shard: int) -> None:
         """The index of a shard will be read soon: it is fetched meanwhile. Raises OSError."""
@@ -57,20 +43,10 @@ class ChunkReader:
         for shard in range(numbers.start // per_shard, -(-numbers.stop // per_shard)):
             entries, intact = self.index(shard)
             for number in numbers if intact else ():
-                offset, size = entries[number % per_shard].tolist()
+                offset, size = entries[number % per_shard]
                 if number // per_shard == shard and size <= self.most_bytes and offset < 2**62:
                     found[number] = offset, size  # of what is absent, both are larger
         return found
-
-    @property
-    def most_bytes(self) -> int:
-        """Of a chunk as it lies in its file, however badly it was packed."""
-        return 2 * self.shape.chunk_bytes + PAGE
-
-    @property
-    def chunks(self) -> int:
-        """Chunks that the rows are in."""
-        return -(-self.rows // self.shape.chunk_rows)
 
     def chunk(self, number: int, place: tuple[int, int] | None = None) -> NDArray[Any]:
         """All rows of one chunk, with what pads it; ``place`` is its offset and size, if known.
@@ -127,30 +103,6 @@ class ChunkReader:
         offset, size = entries[number % self.shape.shard_chunks]
         if ABSENT in (offset, size):
             raise AbsentChunkError("it is not on disk")
-        if int(size) > self.most_bytes or int(offset) >= 2**62:
+        if size > self.most_bytes or offset >= 2**62:
             raise DamagedChunkError("the index of its file is damaged: the chunk would be too large")
-        return int(offset), int(size)
-
-    def file_bytes(self, shard: int) -> int:
-        """Size of a shard's file; 0 where there is none. Raises OSError."""
-        try:
-            return self._source.size(self.shard_file(shard))
-        except FileNotFoundError:
-            return 0
-
-    def index(self, shard: int) -> tuple[NDArray[np.uint64], bool]:
-        """(chunk, 2) offsets and sizes of a shard, ABSENT where there is none; whether they are intact."""
-        chunks = self.shape.shard_chunks
-        try:
-            data = self._source.read_range(self.shard_file(shard), 0, index_bytes(chunks))
-        except FileNotFoundError:
-            return np.full((chunks, 2), ABSENT, np.uint64), True
-        return unpack_index(data, chunks)
-
-    def file(self, chunk: int) -> str:
-        """Key of the file that has a chunk."""
-        return self.shard_file(chunk // self.shape.shard_chunks)
-
-    def shard_file(self, shard: int) -> str:
-        """Key of a shard."""
-        return f"{self.key}/{shard_key(shard, len(self.shape.chunk_shape))}"
+        return offset, size

@@ -8,23 +8,21 @@ from __future__ import annotations
 import struct
 import time
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from awscrt import checksums
 from numcodecs import blosc
 
 from acquire.errors import UsageError
+from acquire.store.shape import CODECS, CRC_BYTES
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
     from typing_extensions import Buffer
 
-Codec = Literal["none", "lz4", "zstd"]
-CODECS: tuple[Codec, ...] = ("none", "lz4", "zstd")
-CRC_BYTES = 4
+    from acquire.store.shape import Codec
+
 _MOST_KEPT = 4
 BLOSC_HEADER = 16
 """Bytes; the second word is the unpacked size, the fourth the packed one."""
@@ -92,7 +90,7 @@ def check_size(payload: memoryview, size: int, codec: Codec) -> None:
     if codec != "none" and have >= BLOSC_HEADER:
         have, stored = struct.unpack_from("<4xI4xI", payload)
     if (have, stored) != (size, len(payload)):
-        raise ValueError(f"{len(payload)} bytes that do not make {size}")
+        raise ValueError(f"{len(payload)} bytes do not make {size}")
 
 
 def stored_size(header: bytes, size: int, codec: Codec) -> int:
@@ -125,7 +123,9 @@ def choose_codec(
     """
     if not lines.size or bytes_per_s <= 0 or disk_bytes_per_s <= 0:
         raise UsageError(
-            f"choosing a codec for {lines.shape} lines at {bytes_per_s:g} B/s", possible="above 0"
+            f"no codec can be chosen for {lines.shape} lines at {bytes_per_s:g} B/s and a disk of "
+            f"{disk_bytes_per_s:g} B/s",
+            possible="all above 0",
         )
     measured = tuple(measure_codec(lines, codec) for codec in CODECS)
     needed = bytes_per_s * margin
@@ -154,15 +154,3 @@ def measure_codec(lines: NDArray[Any], codec: Codec, seconds: float = 0.1) -> Co
 def _sustained(speed: CodecSpeed, disk_bytes_per_s: float, threads: int) -> float:
     """Bytes of lines per second: packing and writing go on beside each other, the slower one counts."""
     return min(speed.megabytes_per_s * 1e6 * threads, disk_bytes_per_s * speed.ratio)
-
-
-def codec_of(chain: Sequence[dict[str, Any]]) -> Codec:
-    """The codec of a Zarr codec chain of ours: `bytes`, perhaps `blosc`, `crc32c`. ValueError for others."""
-    names = [codec["name"] for codec in chain]
-    if names == ["bytes", "crc32c"]:
-        return "none"
-    if names == ["bytes", "blosc", "crc32c"]:
-        for codec in CODECS:
-            if codec == chain[1]["configuration"]["cname"]:
-                return codec
-    raise ValueError(f"codecs {', '.join(names)}")

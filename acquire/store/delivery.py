@@ -107,9 +107,8 @@ class _FarDelivery:
     def deliver(self) -> None:
         _check_free(self._target)
         files = [file for file in self.partial.rglob("*") if file.is_file()]
-        files.sort(
-            key=lambda file: (file == self.partial / ROOT, file.name != ROOT)
-        )  # what it is comes first
+        # First what arrays are, by which `_check_free` knows what a failed upload has left; the root last.
+        files.sort(key=lambda file: (file == self.partial / ROOT, file.name != ROOT))
         with refused(self._target, "written"):
             for file in files:
                 key = file.relative_to(self.partial).as_posix()

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from acquire.lines import ARMS
+from acquire.flags import ARMS
+from acquire.store.array_files import COLUMNS
 from acquire.store.attributes import MOST_LINES
-from acquire.store.layout import line_columns
 
 if TYPE_CHECKING:
-    from acquire.store.reader import Recording
+    from acquire.store.outline import Outline
 
 MOST_ABSENT_CHUNKS = 2**17
 """Of an array, that a recording may claim and that are not on disk: terabytes of an accident, and seconds of
@@ -17,37 +17,33 @@ a scan. Only a recording that claims more than these has its files counted when 
 """
 
 
-def check_lengths(recording: Recording) -> None:
+def check_lengths(recording: Outline) -> None:
     """Raise ValueError where a recording cannot be as long as its root says."""
-    readers = {
-        f"{arm}/{column.name}": stream.reader(column.name)
-        for arm, stream in recording.arms.items()
-        for column in line_columns("any")
-    }
-    first = readers[f"{ARMS[0]}/lines"]
-    for key, reader in readers.items():
-        if reader.shape.shard_rows != first.shape.shard_rows:
+    arrays = {f"{arm}/{name}": files.files(name) for arm, files in recording.arms.items() for name in COLUMNS}
+    first = arrays[f"{ARMS[0]}/lines"]
+    for key, array in arrays.items():
+        if array.shape.shard_rows != first.shape.shard_rows:
             raise ValueError(f"files of {key} have other rows than those of {ARMS[0]}/lines")
-        if reader.rows > MOST_LINES:
-            raise ValueError(f"{key} claims {reader.rows} lines")
+        if array.rows > MOST_LINES:
+            raise ValueError(f"{key} claims {array.rows} lines")
     _check_dropped(recording)
     claimed = kept_shards(recording)
-    chunks = max(reader.shape.shard_chunks for reader in readers.values())
+    chunks = max(array.shape.shard_chunks for array in arrays.values())
     if claimed * chunks <= MOST_ABSENT_CHUNKS:
         return
-    there = max(len(recording.source.names(f"{key}/c")) for key in readers)
+    there = max(len(recording.source.names(f"{key}/c")) for key in arrays)
     if (claimed - there) * chunks > MOST_ABSENT_CHUNKS:
         most = there * first.shape.shard_rows
         raise ValueError(f"{recording.lines} lines are claimed, and there are files for {most} at most")
 
 
-def kept_shards(recording: Recording) -> int:
+def kept_shards(recording: Outline) -> int:
     """Files of each array that hold lines which retention has not dropped, as the root says."""
-    size = recording.arms[ARMS[0]].reader("lines").shape.shard_rows
+    size = recording.arms[ARMS[0]].files("lines").shape.shard_rows
     return sum((rows.stop - 1) // size - rows.start // size + 1 for rows in recording.kept_rows())
 
 
-def _check_dropped(recording: Recording) -> None:
+def _check_dropped(recording: Outline) -> None:
     """Dropped stretches are parts of the recording, one after the other."""
     end = 0
     for rows in sorted(recording.dropped_rows(), key=lambda rows: rows.start):

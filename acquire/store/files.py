@@ -87,9 +87,11 @@ class ShardFile:
     """
 
     def __init__(self, path: Path, *, direct: bool, fd: int = -1) -> None:
-        """``fd``: the file is there already, open under this descriptor, which is taken over."""
+        """``fd``: the file is there already, open under this descriptor, which is taken over; ``path`` may
+        then be a link, as /proc has one for every descriptor.
+        """
         self._fd = os.open(path, _NEW, 0o666) if fd < 0 else fd
-        self._direct = open_direct(path) if direct else -1
+        self._direct = open_direct(path, follow=fd >= 0) if direct else -1
         self._cached = (0, 0)
 
     @property
@@ -102,6 +104,7 @@ class ShardFile:
         if self.direct and self._write_direct(parts, offset):
             return
         self.write(parts, offset)
+        # What was written before these: the kernel keeps pages that are not on the disk yet.
         os.posix_fadvise(self._fd, *self._cached, os.POSIX_FADV_DONTNEED)
         self._cached = offset, sum(memoryview(part).nbytes for part in parts)
 
@@ -260,6 +263,7 @@ def _nameless(directory: Path) -> ShardFile:
     try:
         fd = os.open(directory, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600)
     except OSError as error:
+        # EISDIR: a kernel that does not know the flag takes it for a directory that is to be written to.
         if error.errno not in (errno.EOPNOTSUPP, errno.EISDIR, errno.EINVAL):
             raise
         path = directory / _MEASURED.format(os.getpid())

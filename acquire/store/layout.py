@@ -12,25 +12,29 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from acquire.lines import LineFlag
-from acquire.store.codecs import codec_of
-from acquire.store.shard import ArrayShape
+from acquire.flags import LineFlag
+from acquire.store.shape import ITEM_BYTES, ArrayShape, codec_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from acquire.store.codecs import Codec
+    from acquire.store.shape import Codec
     from acquire.store.spec import RecordingSpec
 
 Document = dict[str, Any]
 """The content of one zarr.json."""
 
+FORMAT = "acquire-recording/2"
+"""Of what is written. In format 1 the code's ``seed`` is the register's state, and the number that the user
+gave is not there; lines that contradict their code have the flag of lines without a tag.
+"""
+READABLE = ("acquire-recording/1", FORMAT)
+
+DAMAGE = (OSError, ValueError, RuntimeError, LookupError, TypeError, AttributeError, ArithmeticError)
+"""What zarr and arithmetic raise for metadata or chunks that are not what they should be."""
 PARSE_ERRORS = (LookupError, TypeError, ValueError, AttributeError)
 """What a document that is not what it should be raises when it is taken apart."""
 
@@ -38,8 +42,6 @@ MAX_READ_BYTES = 2**31
 """Of one chunk that a reader takes into memory; those that are written are much smaller."""
 MAX_READ_CHUNKS = 1024
 """Of one file, for a reader."""
-
-DATA_TYPES = ("uint8", "uint16", "uint64", "int64")
 
 BYTES = {"name": "bytes", "configuration": {"endian": "little"}}
 CRC32C = {"name": "crc32c"}
@@ -144,7 +146,7 @@ def column_shape(column: Column, spec: RecordingSpec) -> ArrayShape:
     codec: Codec = spec.codec if pixels or spec.codec != "none" else "lz4"
     joined = 1 if pixels else spec.tag_chunks
     return ArrayShape(
-        dtype=np.dtype(column.dtype).newbyteorder("<"),
+        data_type=column.dtype,
         row_shape=(spec.pixels,) if pixels else (),
         chunk_rows=spec.chunk_lines * joined,
         shard_chunks=spec.shard_chunks // joined,
@@ -156,13 +158,13 @@ def line_array(column: Column, shape: ArrayShape, rows: int) -> Document:
     """Metadata of an arm's array of ``rows`` lines."""
     sharding = {
         "chunk_shape": list(shape.chunk_shape),
-        "codecs": [BYTES, *_packing(shape), CRC32C],
+        "codecs": [BYTES, *packing(shape), CRC32C],
         "index_codecs": [BYTES, CRC32C],
         "index_location": "start",
     }
     return array_document(
         shape=(rows, *shape.row_shape),
-        data_type=shape.dtype.name,
+        data_type=shape.data_type,
         dimensions=("line", "pixel")[: len(shape.chunk_shape)],
         chunk_shape=shape.shard_shape,
         codecs=[{"name": "sharding_indexed", "configuration": sharding}],
@@ -179,16 +181,16 @@ def parse_line_array(document: Document) -> tuple[ArrayShape, int]:
     chunk_rows, *chunk_rest = map(int, inner["chunk_shape"])
     shard_rows, *shard_rest = map(int, document["chunk_grid"]["configuration"]["chunk_shape"])
     if not row_shape == chunk_rest == shard_rest or min(rows + 1, chunk_rows, shard_rows // chunk_rows) < 1:
-        raise ValueError(f"shape {document['shape']} in chunks {inner['chunk_shape']}")
-    if inner["index_location"] != "start" or document["data_type"] not in DATA_TYPES:
-        raise ValueError(f"index at the {inner['index_location']}, samples {document['data_type']}")
-    dtype = np.dtype(document["data_type"]).newbyteorder("<")
-    if math.prod((chunk_rows, *row_shape)) * dtype.itemsize > MAX_READ_BYTES:
-        raise ValueError(f"chunks of {inner['chunk_shape']} samples")
-    if shard_rows // chunk_rows > MAX_READ_CHUNKS:
-        raise ValueError(f"files of {shard_rows // chunk_rows} chunks")
+        raise ValueError(f"shape {document['shape']} does not fit chunks {inner['chunk_shape']}")
+    if inner["index_location"] != "start" or document["data_type"] not in ITEM_BYTES:
+        raise ValueError(f"the index is at the {inner['index_location']}, of samples {document['data_type']}")
     codec = codec_of(inner["codecs"])
-    return ArrayShape(dtype, tuple(row_shape), chunk_rows, shard_rows // chunk_rows, codec), rows
+    shape = ArrayShape(document["data_type"], tuple(row_shape), chunk_rows, shard_rows // chunk_rows, codec)
+    if shape.chunk_bytes > MAX_READ_BYTES:
+        raise ValueError(f"chunks of {inner['chunk_shape']} samples are too large")
+    if shape.shard_chunks > MAX_READ_CHUNKS:
+        raise ValueError(f"files of {shape.shard_chunks} chunks are too large")
+    return shape, rows
 
 
 def array_document(
@@ -243,14 +245,15 @@ def _inner(document: Document) -> Document:
     return group_document(document["attributes"], {})
 
 
-def _packing(shape: ArrayShape) -> list[Document]:
+def packing(shape: ArrayShape) -> list[Document]:
+    """What packs the bytes of a chunk, if anything does."""
     if shape.codec == "none":
         return []
     blosc = {
         "cname": shape.codec,
         "clevel": 1,
         "shuffle": "bitshuffle",
-        "typesize": shape.dtype.itemsize,
+        "typesize": ITEM_BYTES[shape.data_type],
         "blocksize": 0,
     }
     return [{"name": "blosc", "configuration": blosc}]

@@ -7,12 +7,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from acquire.store.chunks import DamagedChunkError
 from acquire.store.codecs import crc32c, encode
 from acquire.store.pages import PAGE, page_up
-from acquire.store.shard import ABSENT, pack_index
+from acquire.store.shape import ABSENT, pack_index
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -32,23 +30,22 @@ def mend_index(disk: Disk, path: Path, reader: ChunkReader, shard: int, *, grow:
     """
     entries, intact = reader.index(shard)
     first = shard * len(entries)
-    mended = np.full_like(entries, ABSENT)
+    mended = [(ABSENT, ABSENT)] * len(entries)
     for slot, (offset, size) in enumerate(entries):
-        if intact or _holds(reader, first + slot, int(offset), int(size)):
+        if intact or _holds(reader, first + slot, offset, size):
             mended[slot] = offset, size
     if grow:
         _grow(reader, first, mended)
-    if intact and np.array_equal(mended, entries):
+    if intact and mended == entries:
         return False
     disk.patch(path / reader.shard_file(shard), pack_index(mended), 0)
     return True
 
 
-def _grow(reader: ChunkReader, first: int, entries: NDArray[np.uint64]) -> None:
+def _grow(reader: ChunkReader, first: int, entries: list[tuple[int, int]]) -> None:
     """Add what lies behind the last chunk that ``entries`` know; chunk ``first`` is in slot 0."""
-    present = np.flatnonzero(entries[:, 0] != ABSENT)
-    slot = int(present[-1]) + 1 if len(present) else 0
-    offset = page_up(int(entries[slot - 1].sum())) if slot else PAGE
+    slot = max((slot + 1 for slot, (offset, _) in enumerate(entries) if offset != ABSENT), default=0)
+    offset = page_up(sum(entries[slot - 1])) if slot else PAGE
     while slot < len(entries):
         size = reader.size_at(first + slot, offset)
         if not _holds(reader, first + slot, offset, size):
@@ -70,9 +67,8 @@ def rewrite_chunk(disk: Disk, path: Path, reader: ChunkReader, chunk: int, rows:
         offset = PAGE
         disk.make_directory(file.parent, parents=True)
         disk.write_file(file, bytes(PAGE) + data, durable=False)
-    changed = entries.copy()
-    changed[chunk % len(entries)] = offset, len(data)
-    disk.patch(file, pack_index(changed), 0)
+    entries[chunk % len(entries)] = offset, len(data)
+    disk.patch(file, pack_index(entries), 0)
 
 
 def _holds(reader: ChunkReader, chunk: int, offset: int, size: int) -> bool:

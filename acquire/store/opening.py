@@ -2,53 +2,50 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from acquire.codes import code_from_attrs
 from acquire.errors import DataError, PlaceError, UsageError
-from acquire.lines import ARMS
+from acquire.flags import ARMS
 from acquire.reading import OddFileError, parse_object
+from acquire.store.array_files import COLUMNS
 from acquire.store.attributes import check_attributes
-from acquire.store.camera_stream import DAMAGE, CameraStream
 from acquire.store.extent import check_lengths
-from acquire.store.layout import line_columns
-from acquire.store.reader import Recording
+from acquire.store.layout import DAMAGE, READABLE
 from acquire.store.refusals import refusal, refused
 from acquire.store.source import source_of
-from acquire.store.spec import READABLE
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from acquire.errors import AcquireError
+    from acquire.store.array_files import ArmFiles
     from acquire.store.layout import Document
+    from acquire.store.outline import Outline
     from acquire.store.source import Source
 
+Kind = TypeVar("Kind", bound="Outline")
 
-def open_recording(place: Path | str) -> Recording:
-    """Open a recording, growing or sealed.
 
-    Raises PlaceError where there is none, DataError for a damaged one, and StoreError where that cannot be
-    found out.
+def opened(source: Source, kind: type[Kind]) -> Kind:
+    """What lies in a source as a `Recording`, or as an `Outline`, which has no lines.
+
+    Raises PlaceError where there is no recording, DataError for a damaged one, and StoreError where that
+    cannot be found out.
     """
-    return open_source(source_of(place))
-
-
-def open_source(source: Source) -> Recording:
-    """`open_recording` of what lies in a source."""
     document = read_root(source)
     _check_format(source, _format(document))
     try:
         check_attributes(document["attributes"])
-        recording = Recording(source, document, open_source)
-        _check_complete(recording)
-        check_lengths(recording)
+        found = kind(source, document)
+        _check_complete(found)
+        check_lengths(found)
     except (*DAMAGE, UsageError) as error:
         raise DataError(
             f"{source}: the metadata of the recording is damaged: {type(error).__name__}: {error}",
             hint="a copy of the recording",
         ) from error
-    return recording
+    return found
 
 
 def format_of(place: Path | str) -> str | None:
@@ -127,7 +124,7 @@ def _check_format(source: Source, name: str | None) -> None:
     )
 
 
-def _check_complete(recording: Recording) -> None:
+def _check_complete(recording: Outline) -> None:
     """Touch everything that a recording needs; what is absent or impossible raises DAMAGE or UsageError."""
     code_from_attrs(recording.attrs["code"])
     recording.geometry_for(1)
@@ -138,11 +135,11 @@ def _check_complete(recording: Recording) -> None:
         node["node_type"]
     for table in ("gaps", "events"):
         int(recording.document["consolidated_metadata"]["metadata"][table]["attributes"]["not_listed"])
-    for stream in recording.arms.values():
-        _check_arm(stream)
+    for arm in recording.arms.values():
+        _check_arm(arm)
 
 
-def _check_arm(stream: CameraStream) -> None:
-    for column in line_columns("any"):
-        if len(stream.reader(column.name).shape.chunk_shape) != (2 if column.name == "lines" else 1):
-            raise ValueError(f"{stream.arm}/{column.name} has the wrong number of axes")
+def _check_arm(arm: ArmFiles) -> None:
+    for name in COLUMNS:
+        if len(arm.files(name).shape.chunk_shape) != (2 if name == "lines" else 1):
+            raise ValueError(f"{arm.arm}/{name} has the wrong number of axes")

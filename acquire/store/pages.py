@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import ctypes
 import mmap
 import os
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 if TYPE_CHECKING:
     from pathlib import Path
 
+    import numpy as np
     from numpy.typing import NDArray
 
 PAGE = 4096
@@ -35,6 +33,8 @@ def aligned_bytes(size: int) -> NDArray[np.uint8]:
 
     They are written once here: the first touch of a page costs more than all later ones together.
     """
+    import numpy as np  # for those who write: lists of recordings need files and pages, too
+
     memory = np.frombuffer(mmap.mmap(-1, max(PAGE, page_up(size))), np.uint8)
     memory.fill(0)
     return memory
@@ -47,6 +47,8 @@ def keep_freed_memory() -> bool:
     Each packed chunk is some MB that are allocated anew: taken from the system and returned every time, their
     first touch costs a third of the packing.
     """
+    import ctypes  # as numpy above: for those who write
+
     library = ctypes.CDLL(None)
     if not hasattr(library, "mallopt"):  # not glibc
         return False
@@ -58,9 +60,12 @@ def is_aligned(array: NDArray[Any]) -> bool:
     return int(array.__array_interface__["data"][0]) % PAGE == 0
 
 
-def open_direct(path: Path) -> int:
-    """A descriptor that writes ``path`` past the page cache; -1 where the file system has no such thing."""
+def open_direct(path: Path, *, follow: bool = False) -> int:
+    """A descriptor that writes ``path`` past the page cache; -1 where the file system has no such thing, or
+    where ``path`` is a link that is not to be followed.
+    """
+    flags = os.O_WRONLY | os.O_CLOEXEC | os.O_DIRECT
     try:
-        return os.open(path, os.O_WRONLY | os.O_CLOEXEC | os.O_DIRECT | os.O_NOFOLLOW)
+        return os.open(path, flags if follow else flags | os.O_NOFOLLOW)
     except OSError:
         return -1

@@ -1,7 +1,6 @@
 """Reading recordings: what they say about themselves, and segments cut out of them for reconstruction.
 
-A `Recording` is a snapshot: of one that is still growing it shows what was committed when it was opened;
-`refreshed` shows more. Nothing is read before it is asked for.
+Nothing is read before it is asked for.
 """
 
 from __future__ import annotations
@@ -13,29 +12,30 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.clock import NS_PER_S, ClockFit
+from acquire.clock import NS_PER_S
 from acquire.codes import code_from_attrs
 from acquire.errors import DataError, UsageError
-from acquire.geometry import Geometry
 from acquire.lines import ARMS, LineFlag, Segment
 from acquire.noise import Noise
-from acquire.showing import as_table, in_words
+from acquire.showing import PICTURE_PX, as_picture, as_table, in_words
 from acquire.store.camera_stream import CameraStream
-from acquire.store.files import DISK
-from acquire.store.layout import line_columns
-from acquire.store.source import LocalSource
-from acquire.store.table_reader import read_events, read_gaps
+from acquire.store.opening import opened
+from acquire.store.outline import Outline
+from acquire.store.overview import read_overview
+from acquire.store.source import source_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Mapping
 
     import zarr
     from numpy.typing import NDArray
 
+    from acquire.fibre import Tile
+    from acquire.geometry import Geometry
     from acquire.store.layout import Document
+    from acquire.store.overview import Overview
     from acquire.store.source import Source
     from acquire.store.stretch import Stretch
-    from acquire.store.table_reader import Event, Gap
 
 CUT_COLUMNS = ("lines", "flags", "code", "code_index", "time")
 """Arrays that a segment is made of."""
@@ -44,29 +44,27 @@ NOISE_KEYS = ("dn_per_electron", "read_noise_e")
 UNUSABLE = LineFlag.MISSING | LineFlag.INCOMPLETE
 
 
-class Recording:
+def open_recording(place: Path | str) -> Recording:
+    """Open a recording, growing or sealed.
+
+    Raises PlaceError where there is none, DataError for a damaged one, and StoreError where that cannot be
+    found out.
+    """
+    return open_source(source_of(place))
+
+
+def open_source(source: Source) -> Recording:
+    """`open_recording` of what lies in a source."""
+    return opened(source, Recording)
+
+
+class Recording(Outline):
     """One recording, opened for reading; `open_recording` makes it."""
 
-    def __init__(self, source: Source, document: Document, opener: Callable[[Source], Recording]) -> None:
-        """``document`` is the root's zarr.json; ``opener`` opens further segments.
+    arms: Mapping[str, CameraStream]
 
-        Raises one of `camera_stream.DAMAGE` where the document is damaged.
-        """
-        self.source = source
-        self._opener = opener
-        self.document = document
-        self.attrs: dict[str, Any] = document["attributes"]
-        self._nodes = nodes = document["consolidated_metadata"]["metadata"]
-        columns = [column.name for column in line_columns("any")]
-        self.arms = {
-            arm: CameraStream(
-                source, arm, {name: nodes[f"{arm}/{name}"] for name in columns}, self.first_line, self._open
-            )
-            for arm in ARMS
-        }
-
-    def __str__(self) -> str:
-        return str(self.source)
+    def _arm(self, arm: str, documents: dict[str, Document]) -> CameraStream:
+        return CameraStream(self.source, arm, documents, self.first_line, self._open)
 
     def __repr__(self) -> str:
         state = self.attrs["run_condition"] or self.state
@@ -74,7 +72,21 @@ class Recording:
 
     def _repr_html_(self) -> str:
         facts = {"run": self.attrs["run_id"], "state": self.attrs["run_condition"] or self.state}
-        return as_table(str(self), {**facts, **self._holds(), "end": self.attrs["end_reason"]})
+        return as_table(
+            str(self), {**facts, **self._holds(), "end": self.attrs["end_reason"]}, self._picture()
+        )
+
+    def _picture(self) -> str:
+        """Both arms side by side, where there is an overview that can be read."""
+        try:
+            overviews = [found.rows for arm in ARMS if (found := self.overview(arm)) is not None]
+        except DataError:
+            return ""
+        if not overviews:
+            return ""
+        both = np.hstack(overviews)
+        rows, columns = (-(-size // PICTURE_PX) for size in both.shape)
+        return as_picture(both[::rows, ::columns], "both arms, time downwards")
 
     def _holds(self) -> dict[str, str]:
         """What it holds, in words; nothing is read for it."""
@@ -84,7 +96,7 @@ class Recording:
             "lines": f"{first} to {first + count - 1} of each arm" if count else "none yet",
             "duration": f"{count * period_ns / NS_PER_S:.6g} s at {NS_PER_S / period_ns:.6g} lines/s",
             "geometry": f"M = {sizes['stages']}, S = {sizes['substeps']}",
-            "samples": f"{self.arms[ARMS[0]].pixels} pixels {self.arms[ARMS[0]].dtype.name}",
+            "samples": f"{self.arms[ARMS[0]].pixels} pixels {self.arms[ARMS[0]].data_type}",
             "code": self.attrs["code"]["kind"],
         }
 
@@ -103,69 +115,6 @@ class Recording:
     def _open(self) -> zarr.Group:
         return self.group
 
-    @property
-    def is_here(self) -> bool:
-        """It lies on a disk of this machine."""
-        return isinstance(self.source, LocalSource)
-
-    def refreshed(self) -> Recording:
-        """The recording as it is now: of one that is growing, what was committed since."""
-        return self._opener(self.source)
-
-    @property
-    def state(self) -> str:
-        """``recording`` until it is sealed."""
-        return str(self.attrs["state"])
-
-    @property
-    def first_line(self) -> int:
-        """The trigger's number of the line in row 0."""
-        return int(self.attrs["first_line"])
-
-    @property
-    def lines(self) -> int:
-        """Rows of each arm."""
-        return min(len(stream) for stream in self.arms.values())
-
-    @property
-    def clock(self) -> ClockFit:
-        return ClockFit.from_attrs(self.attrs["clock"])
-
-    @property
-    def line_period_ns(self) -> float:
-        return int(self.attrs["trigger"]["line_period_ticks"]) * NS_PER_S / self.clock.clock_hz
-
-    @property
-    def substeps(self) -> int:
-        """S."""
-        return int(self.attrs["geometry"]["substeps"])
-
-    @property
-    def dropped(self) -> tuple[tuple[int, int], ...]:
-        """Lines that retention has deleted: first line and count of every stretch."""
-        return tuple((int(first), int(count)) for first, count in self.attrs.get("dropped", ()))
-
-    @property
-    def first_available_line(self) -> int:
-        """The first line that retention has left."""
-        line = self.first_line
-        for first, count in sorted(self.dropped):
-            line = first + count if first == line else line
-        return line
-
-    def dropped_rows(self) -> list[range]:
-        """The same, in rows."""
-        return [range(first - self.first_line, first - self.first_line + n) for first, n in self.dropped]
-
-    @cached_property
-    def segments(self) -> tuple[Recording, ...]:
-        """Recordings that continue this one after an outage, in order. Raises DataError for a damaged one."""
-        return tuple(self.beside(name) for name in self.attrs.get("segments", ()))
-
-    def beside(self, name: str) -> Recording:
-        """The recording of this name in the same place. Raises DataError."""
-        return self._opener(self.source.beside(name))
-
     def end_ns(self) -> int | None:
         """UTC at which the line after the last is read out; None without lines."""
         if not self.lines:
@@ -173,70 +122,28 @@ class Recording:
         last = int(self.arms[ARMS[0]].read("time", self.lines - 1, self.lines)[0])
         return last + round(self.line_period_ns)
 
-    def kept_rows(self) -> list[range]:
-        """Rows that have not been deleted; retention deletes whole files."""
-        kept, start = [], 0
-        for dropped in sorted(self.dropped_rows(), key=lambda rows: rows.start):
-            kept.append(range(start, dropped.start))
-            start = dropped.stop
-        return [rows for rows in [*kept, range(start, self.lines)] if rows]
-
-    def lost_rows(self, arm: str, lines: int | None = None) -> list[range]:
-        """Rows of one arm that are listed in gaps; of the first ``lines`` rows, or of all that there are."""
-        start, end = self.first_line, self.lines if lines is None else lines
-        gaps = [
-            range(gap.first_line - start, min(end, gap.first_line - start + gap.count))
-            for gap in self.gaps
-            if gap.arm == arm
-        ]
-        return [rows for rows in gaps if rows]
-
-    @cached_property
-    def gaps_not_listed(self) -> int:
-        """Gaps for which the table had no room."""
-        return int(self._nodes["gaps"]["attributes"]["not_listed"])
-
     def camera(self, arm: str) -> CameraStream:
         """The arrays of arm ``"a"`` or ``"b"``."""
         if arm not in self.arms:
             raise UsageError(f"{self} has no arm {arm!r}", possible=", ".join(self.arms))
         return self.arms[arm]
 
-    def geometry_for(self, lines: int) -> Geometry:
-        """Geometry of a segment of ``lines`` lines."""
-        sizes = self.attrs["geometry"]
-        return Geometry(int(sizes["stages"]), int(sizes["substeps"]), lines)
-
-    @cached_property
-    def gaps(self) -> tuple[Gap, ...]:
-        """Lost lines in the order in which they were noticed."""
-        return read_gaps(self.source, self._nodes)
-
-    @cached_property
-    def events(self) -> tuple[Event, ...]:
-        """What happened, in the order in which it was noted."""
-        return read_events(self.source, self._nodes)
-
-    def cut(self, first_line: int, lines: int) -> Segment:
-        """The segment of ``lines`` lines from the trigger's line ``first_line`` on.
+    def cut(self, first_line: int, lines: int, tile: Tile | None = None) -> Segment:
+        """The segment of ``lines`` lines from the trigger's line ``first_line`` on; behind a fibre, of a
+        ``tile`` of the scene.
 
         A sample is masked when its line is missing or incomplete, or when it stands at the top of the range.
-        Raises UsageError for lines that are not there, and DataError when the file is damaged or the code
-        that the attributes describe is not the one recorded with the lines.
+        Raises UsageError for lines and tiles that are not there, and DataError when the file is damaged or
+        the code that the attributes describe is not the one recorded with the lines.
         """
         if (segment := self._segment_with(first_line)) is not None:
-            return segment.cut(first_line, lines)
+            return segment.cut(first_line, lines, tile)
         start, stop = self._rows(first_line, lines)
-        geometry = self.geometry_for(lines)
-        if (pixels := self.arms["a"].pixels) != geometry.stages:
-            raise UsageError(
-                f"lines with {pixels} pixels cannot be cut for reconstruction",
-                possible=f"M = {geometry.stages} pixels",
-            )
+        geometry, columns = self.geometry_for(lines), self._columns(tile)
         stretches = self._fetched(start, stop)
-        samples = np.empty((len(ARMS), lines, pixels), self.arms["a"].dtype)
-        for arm, of_arm in zip(stretches.values(), samples, strict=True):
-            arm["lines"].read(out=of_arm)
+        samples = np.empty((len(ARMS), lines, geometry.stages), self.arms["a"].dtype)
+        for arm, of_arm, those in zip(stretches.values(), samples, columns, strict=True):
+            arm["lines"].read(out=of_arm, columns=those)
         flags = np.stack([arm["flags"].read() for arm in stretches.values()])
         return Segment(
             lines=samples,
@@ -249,7 +156,46 @@ class Recording:
             black_level_dn=self._per_arm("black_level_dn"),
             responsivity_dn=self._per_arm("responsivity_dn"),
             noise=self._noise(),
+            first_column=(columns[0].start, columns[1].start),
         )
+
+    def whole_lines(self, first_line: int, lines: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+        """Samples (arm, line, pixel) of ``lines`` lines from ``first_line`` on and which can be used,
+        whatever they see: for what is a matter of columns. Raises as `cut` does.
+        """
+        if (segment := self._segment_with(first_line)) is not None:
+            return segment.whole_lines(first_line, lines)
+        rows = self._rows(first_line, lines)
+        streams = self.arms.values()
+        samples = np.stack([stream.stretch("lines", *rows).read() for stream in streams])
+        flags = np.stack([stream.stretch("flags", *rows).read() for stream in streams])
+        return samples, self._usable(samples, flags)
+
+    def _columns(self, tile: Tile | None) -> tuple[slice, slice]:
+        """Of the lines of arms A and B: those that see a tile, or all."""
+        if self.fibre is not None:
+            if tile is None:
+                raise UsageError(
+                    f"{self} shows {len(self.fibre.tiles)} tiles of a scene behind a fibre; none was named",
+                    possible=f"a tile ROW,COLUMN from 0,0 to {self.fibre.tiles[-1]}",
+                )
+            return self.fibre.pixels(tile)
+        pixels, stages = self.arms["a"].pixels, self.geometry_for(1).stages
+        if pixels != stages:
+            raise UsageError(
+                f"lines with {pixels} pixels cannot be cut for reconstruction",
+                possible=f"M = {stages} pixels",
+            )
+        if tile is not None:
+            raise UsageError(f"{self} has no tile {tile}: its lines see one scene", possible="no tile")
+        return slice(0, pixels), slice(0, pixels)
+
+    def overview(self, arm: str) -> Overview | None:
+        """All of an arm in at most a thousand rows; None where it was written without, or still grows.
+
+        Raises DataError for a damaged one.
+        """
+        return read_overview(self, self.camera(arm).arm)
 
     def _fetched(self, start: int, stop: int) -> dict[str, dict[str, Stretch]]:
         """Arm → array → its rows ``start .. stop - 1``, all on their way from the disk at once."""
@@ -264,57 +210,11 @@ class Recording:
             stretch.expect()
         return found
 
-    def info(self) -> dict[str, Any]:
-        """What one wants to know of a recording at a glance; everything is JSON."""
-        period_ns, lines = self.line_period_ns, self.lines
-        keys = ("run_id", "state", "run_condition", "end_reason", "layout", "geometry", "code", "clock")
-        return {
-            "path": str(self),
-            **{key: self.attrs[key] for key in keys},
-            "first_line": self.first_line,
-            "lines": lines,
-            "first_available_line": self.first_available_line,
-            "dropped": [list(stretch) for stretch in self.dropped],
-            "holds": self.attrs.get("holds", []),
-            "duration_s": lines * period_ns / NS_PER_S,
-            "line_rate_hz": NS_PER_S / period_ns,
-            "start_ns": self._start_ns(),
-            "dtype": self.arms["a"].dtype.name,
-            "bytes": self.source.total_bytes(),
-            "segment": self.attrs.get("segment"),
-            "segments": self.attrs.get("segments", []),
-            "gaps": len(self.gaps),
-            "lost_lines": {arm: sum(gap.count for gap in self.gaps if gap.arm == arm) for arm in ARMS},
-            "events": len(self.events),
-            "simulated": bool(self.attrs.get("simulated", False)),
-            "cameras": self.attrs["cameras"],
-            "imported": self.attrs.get("imported"),
-            "calibration": self.attrs.get("calibration"),
-            "calibration_missing": self.attrs.get("calibration_missing"),
-            "disk": self._disk_facts(),
-            "ledger": self.attrs["ledger"],
-            "durability": self.attrs.get("durability", {}),
-            "versions": self.attrs["versions"],
-        }
-
-    def _disk_facts(self) -> dict[str, float] | None:
-        """While it grows here: bytes free, bytes per second that it takes, seconds until the disk is full."""
-        if self.state == "sealed" or not isinstance(self.source, LocalSource) or not self.lines:
-            return None
-        free = DISK.free_bytes(self.source.path)
-        rate = self.source.total_bytes() * NS_PER_S / (self.lines * self.line_period_ns)
-        return {"free_bytes": free, "bytes_per_s": rate, "seconds_to_full": free / rate}
-
     def _segment_with(self, line: int) -> Recording | None:
         """The further segment that has a line which is not here."""
         if line < self.first_line + self.lines:
             return None
         return next((s for s in self.segments if s.first_line <= line < s.first_line + s.lines), None)
-
-    def _start_ns(self) -> int | None:
-        """When the first line that there is was read out."""
-        row = self.first_available_line - self.first_line
-        return int(self.arms[ARMS[0]].read("time", row, row + 1)[0]) if row < self.lines else None
 
     def _rows(self, first_line: int, lines: int) -> tuple[int, int]:
         start = first_line - self.first_line

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from acquire.errors import DataError
 from acquire.lines import ARMS
 from acquire.reading import read_object
-from acquire.store import layout
+from acquire.store import layout, overview
 from acquire.store.files import SCRATCH, Publisher
 from acquire.store.removal import COPY, ROOT
 from acquire.store.table import event_table, gap_table
@@ -123,10 +123,10 @@ def _arms(path: Path, attributes: dict[str, Any]) -> dict[str, layout.Document]:
 
 
 def _tables(path: Path) -> dict[str, layout.Document]:
-    """Metadata of the tables, as far as it is there: what they list is not needed for the lines."""
+    """Metadata of tables and overview, as far as it is there: what they say is not needed for the lines."""
     nodes: dict[str, layout.Document] = {}
-    for table in (gap_table(path), event_table(path)):
-        own = {key: _own(path / key) for key in table.nodes()}
+    for keys in (gap_table(path).nodes(), event_table(path).nodes(), overview.KEYS):
+        own = {key: _own(path / key) for key in keys}
         if all(own.values()):
             nodes |= {key: document for key, document in own.items() if document}
     return {key: _bare(document) for key, document in nodes.items()}

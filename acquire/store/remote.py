@@ -250,7 +250,7 @@ def _told(url: str) -> Iterator[None]:
         yield
     except (ValueError, ImportError) as error:
         raise UsageError(
-            f"{url}: {error}",
+            f"{url} cannot be opened: {error}",
             possible=f"{', '.join(OBJECT_STORES)}, file, memory and what else fsspec has a package for",
             hint="pip install 'tdi-acquire[remote]'",
         ) from error

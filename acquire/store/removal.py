@@ -11,7 +11,7 @@ from acquire.lines import ARMS
 from acquire.store.files import SCRATCH
 from acquire.store.layout import line_columns
 from acquire.store.links import refuse_link, refuse_links
-from acquire.store.shard import shard_key
+from acquire.store.shape import shard_key
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -21,7 +21,8 @@ from acquire.store.attributes import segment_of
 from acquire.store.files import DISK, SCRATCH, Publisher, locked
 from acquire.store.layout import to_json
 from acquire.store.links import refuse_link
-from acquire.store.opening import open_recording, read_root
+from acquire.store.opening import read_root
+from acquire.store.reader import open_recording
 from acquire.store.source import LocalSource
 from acquire.store.terms import Continuation
 
@@ -108,7 +109,7 @@ def _segments_beside(first: Path) -> list[str]:
 
 def _check_alike(first: Recording, spec: RecordingSpec) -> None:
     asked = {
-        "geometry": {"stages": spec.stages, "substeps": spec.substeps, "pixels": spec.pixels},
+        "geometry": spec.geometry,
         "code": spec.code,
         "layout": spec.layout,
     }

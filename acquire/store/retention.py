@@ -23,10 +23,11 @@ from acquire.reading import read_object
 from acquire.store.files import DISK, Publisher
 from acquire.store.layout import PARSE_ERRORS
 from acquire.store.links import refuse_link
-from acquire.store.opening import open_recording
+from acquire.store.reader import open_recording
 from acquire.store.refusals import refusal
 from acquire.store.remote import url_below
 from acquire.store.removal import Dropped, remove, shard_files
+from acquire.store.terms import ALL_LINES
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
     from acquire.store.files import Disk
     from acquire.store.terms import Retention
 
-ALL_LINES = 2**62
 _NOT_COPIED = "not copied yet"
 
 HOLDS = ".holds"
@@ -82,6 +82,7 @@ def hold(path: Path, first_line: int, count: int, why: str = "", disk: Disk = DI
         Publisher(directory / f".{name}", disk).replace(directory / name, text, durable=True)
     except OSError as error:
         raise refusal(f"{path}: lines {first_line} to {first_line + count - 1}", error, "held") from error
+    # Only now: the writer looks for holds before it drops a shard, and once more before it deletes it.
     for first, gone in open_recording(path).dropped:
         if first < first_line + count and first_line < first + gone:
             last = min(first + gone, first_line + count) - 1
@@ -170,6 +171,7 @@ class Keeper:
         self.marked = self._marks()
         held = [hold.lines for hold in (*self.holds, *self.marked)]
         newest = self.first_line + rows
+        # Of the shard that is being written, only the end tells the size: it is taken for the largest.
         partly = max(self.sizes.values(), default=0)
         excess = missing_bytes
         if self.policy.max_bytes is not None:
@@ -194,7 +196,8 @@ class Keeper:
         held = [hold.lines for hold in self._marks()]
         saved = [shard for shard in shards if self._held(shard, held) or not self._delete(shard)]
         for shard in saved:
-            self._restore(shard)
+            self.gone = _without(self.gone, shard)
+            self.sizes[shard] = shard_bytes(self.path, shard)
         return saved
 
     def _delete(self, shard: int) -> bool:
@@ -239,10 +242,6 @@ class Keeper:
     def _held(self, shard: int, held: list[range]) -> bool:
         lines, margin = self._lines(shard), self.policy.margin_lines
         return any(h.start - margin < lines.stop and lines.start < h.stop + margin for h in held)
-
-    def _restore(self, shard: int) -> None:
-        self.gone = _without(self.gone, shard)
-        self.sizes[shard] = shard_bytes(self.path, shard)
 
 
 def shard_bytes(path: Path, shard: int) -> int:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from acquire.lines import LineFlag
-from acquire.store.layout import NO_LINE, line_columns
+from acquire.store.array_files import COLUMNS
+from acquire.store.layout import NO_LINE
+from acquire.store.shortfall import Damage
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -18,26 +20,6 @@ if TYPE_CHECKING:
 
     from acquire.store.camera_stream import CameraStream
     from acquire.store.reader import Recording
-
-COLUMNS = tuple(column.name for column in line_columns("any"))
-
-
-@dataclass(frozen=True, slots=True)
-class Damage:
-    """Lines of one array that are not intact on disk."""
-
-    arm: str
-    array: str
-    first_line: int
-    count: int
-    what: str
-
-    def __str__(self) -> str:
-        last = self.first_line + self.count - 1
-        return f"{self.arm}/{self.array}: lines {self.first_line} to {last}: {self.what}"
-
-    def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,15 +14,15 @@ chunk.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from itertools import accumulate
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from acquire.store.codecs import CRC_BYTES, crc32c
+from acquire.store.codecs import crc32c
 from acquire.store.pages import PAGE, aligned_bytes, is_aligned, page_up
+from acquire.store.shape import ABSENT, CRC_BYTES, pack_index
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from typing_extensions import Buffer
 
-    from acquire.store.codecs import Codec
     from acquire.store.files import Disk
 
 MAX_SHARD_CHUNKS = 255
@@ -40,59 +39,6 @@ MAX_CHUNK_BYTES = 2**26
 """Each array holds one chunk in memory while it fills, lost if the process is killed; blosc takes 2 GiB."""
 DIRECT_BYTES = 2**16
 """Chunks of at least so many bytes are written past the page cache; smaller ones are quicker through it."""
-
-ABSENT = np.uint64(2**64 - 1)
-
-
-@dataclass(frozen=True, slots=True)
-class ArrayShape:
-    """How an array is cut into pieces: rows of ``row_shape`` samples, rows per chunk, chunks per file."""
-
-    dtype: np.dtype[Any]
-    row_shape: tuple[int, ...]
-    chunk_rows: int
-    shard_chunks: int
-    codec: Codec
-
-    @property
-    def chunk_shape(self) -> tuple[int, ...]:
-        return (self.chunk_rows, *self.row_shape)
-
-    @property
-    def chunk_bytes(self) -> int:
-        """Bytes of a chunk's samples."""
-        return math.prod(self.chunk_shape) * self.dtype.itemsize
-
-    @property
-    def shard_rows(self) -> int:
-        return self.chunk_rows * self.shard_chunks
-
-    @property
-    def shard_shape(self) -> tuple[int, ...]:
-        return (self.shard_rows, *self.row_shape)
-
-
-def shard_key(shard: int, dimensions: int) -> str:
-    """Where shard number ``shard`` lies below an array with ``dimensions`` axes, cut along the first only."""
-    return "/".join(["c", str(shard), *["0"] * (dimensions - 1)])
-
-
-def index_bytes(chunks: int) -> int:
-    """Size of the index of ``chunks`` chunks."""
-    return 16 * chunks + CRC_BYTES
-
-
-def pack_index(entries: NDArray[np.uint64]) -> bytes:
-    """(chunk, 2) offsets and sizes as they stand in the file."""
-    data = entries.astype("<u8").tobytes()
-    return data + crc32c(data)
-
-
-def unpack_index(data: Buffer, chunks: int) -> tuple[NDArray[np.uint64], bool]:
-    """(chunk, 2) offsets and sizes, and whether their checksum agrees; what is not there is ABSENT."""
-    page = bytes(data)[: index_bytes(chunks)].ljust(index_bytes(chunks), b"\xff")
-    entries, checksum = page[:-CRC_BYTES], page[-CRC_BYTES:]
-    return np.frombuffer(entries, "<u8").reshape(chunks, 2), crc32c(entries) == checksum
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +58,7 @@ class ShardWriter:
     def __init__(self, disk: Disk, path: Path, chunks: int, *, direct: bool) -> None:
         self._file = disk.create(path, direct=direct)
         self._in_pages = direct
-        self._index = np.full((chunks, 2), ABSENT, np.uint64)
+        self._index = [(ABSENT, ABSENT)] * chunks
         try:
             self._file.write([pack_index(self._index)], 0)
         except OSError:
@@ -140,7 +86,7 @@ class ShardWriter:
         write(piece.parts, self._end)
         ends = list(accumulate(map(page_up, piece.sizes), initial=self._end))
         new = slice(self.chunks, self.chunks + len(piece.sizes))
-        self._index[new, 0], self._index[new, 1] = ends[:-1], piece.sizes
+        self._index[new] = zip(ends, piece.sizes, strict=False)  # the last end is where the next one begins
         self.chunks += len(piece.sizes)
         self._end = ends[-1]
 
@@ -175,9 +121,11 @@ class Pages:
         free = self._at_least(sum(page_up(len(rest) + CRC_BYTES) for rest in rests))
         parts: list[Buffer] = []
         for payload, whole, rest in zip(payloads, wholes, rests, strict=True):
-            size = page_up(len(rest) + CRC_BYTES)
-            last, free = free[:size], free[size:]
-            _fill(last, rest, crc32c(payload.data))
+            end = len(rest) + CRC_BYTES
+            last, free = free[: page_up(end)], free[page_up(end) :]
+            last[: len(rest)] = rest
+            last[len(rest) : end] = np.frombuffer(crc32c(payload.data), np.uint8)
+            last[end:] = 0
             parts += [payload[:whole].data, last.data]
         return Piece(parts, [len(payload) + CRC_BYTES for payload in payloads])
 
@@ -192,11 +140,3 @@ def small_piece(payloads: Sequence[NDArray[np.uint8]]) -> Piece:
     chunks = [payload.tobytes() + crc32c(payload.data) for payload in payloads]
     whole = b"".join(chunk.ljust(page_up(len(chunk)), b"\0") for chunk in chunks)
     return Piece([whole], [len(chunk) for chunk in chunks])
-
-
-def _fill(pages: NDArray[np.uint8], rest: NDArray[np.uint8], checksum: bytes) -> None:
-    """The last pages of a chunk."""
-    size = len(rest)
-    pages[:size] = rest
-    pages[size : size + CRC_BYTES] = np.frombuffer(checksum, np.uint8)
-    pages[size + CRC_BYTES :] = 0

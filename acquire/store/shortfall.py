@@ -7,41 +7,55 @@ its loss is told already.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-import numpy as np
+from dataclasses import asdict, dataclass
+from functools import cache, partial
+from typing import TYPE_CHECKING, Any
 
 from acquire.errors import AcquireError
-from acquire.lines import LineFlag
-from acquire.store.scan import COLUMNS, Damage, covered, runs
-from acquire.store.shard import ABSENT
+from acquire.store.array_files import COLUMNS
+from acquire.store.shape import ABSENT
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
-    from numpy.typing import NDArray
-
-    from acquire.store.camera_stream import CameraStream
-    from acquire.store.chunks import ChunkReader
+    from acquire.store.array_files import ArrayFiles
+    from acquire.store.outline import Outline
     from acquire.store.reader import Recording
 
 
-def shortfalls(recording: Recording, shards: range | None = None) -> Iterator[Damage]:
+@dataclass(frozen=True, slots=True)
+class Damage:
+    """Lines of one array that are not intact on disk."""
+
+    arm: str
+    array: str
+    first_line: int
+    count: int
+    what: str
+
+    def __str__(self) -> str:
+        last = self.first_line + self.count - 1
+        return f"{self.arm}/{self.array}: lines {self.first_line} to {last}: {self.what}"
+
+    def to_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def shortfalls(recording: Outline, shards: range | None = None) -> Iterator[Damage]:
     """Of all files of a recording, or of those of some shards. Raises DataError where gaps cannot be read."""
-    for arm, stream in recording.arms.items():
+    whole = cache(partial(_with_lines, recording))
+    for arm, files in recording.arms.items():
         lost = sorted(recording.lost_rows(arm), key=lambda rows: rows.start)
         for name in COLUMNS:
-            reader = stream.reader(name)
-            for rows in _by_shard(recording, reader.shape.shard_rows, shards):
-                absent = _absent(reader, rows)
-                if absent.any():
-                    absent &= ~covered(lost, rows)
-                    absent &= ~_flagged(stream, rows, absent)
-                for first, count in runs(absent, recording.first_line + rows.start):
-                    yield Damage(arm, name, first, count, "the file is gone or cut short")
+            array = files.files(name)
+            for rows in _by_shard(recording, array.shape.shard_rows, shards):
+                for absent in _outside(lost, _absent(array, rows)):
+                    for found in _unflagged(whole, arm, absent):
+                        first = recording.first_line + found.start
+                        yield Damage(arm, name, first, len(found), "the file is gone or cut short")
 
 
-def first_shortfall(recording: Recording, shards: range | None = None) -> Damage | None:
+def first_shortfall(recording: Outline, shards: range | None = None) -> Damage | None:
     """The first one, if any; what retention has deleted meanwhile is none."""
     found = next(shortfalls(recording, shards), None)
     if found is not None and recording.state != "sealed":
@@ -50,7 +64,7 @@ def first_shortfall(recording: Recording, shards: range | None = None) -> Damage
     return found
 
 
-def missing_segments(recording: Recording) -> Iterator[str]:
+def missing_segments(recording: Outline) -> Iterator[str]:
     """What is wrong with the segments that a recording lists, in words."""
     for name in recording.attrs.get("segments", ()):
         try:
@@ -62,7 +76,7 @@ def missing_segments(recording: Recording) -> Iterator[str]:
             yield f"its segment {name} is of another run, {segment.attrs['run_id']}"
 
 
-def _by_shard(recording: Recording, size: int, shards: range | None) -> Iterator[range]:
+def _by_shard(recording: Outline, size: int, shards: range | None) -> Iterator[range]:
     """Rows that should be there, one shard after the other."""
     for kept in recording.kept_rows():
         for shard in range(kept.start // size, -(-kept.stop // size)):
@@ -70,30 +84,58 @@ def _by_shard(recording: Recording, size: int, shards: range | None) -> Iterator
                 yield range(max(kept.start, shard * size), min(kept.stop, (shard + 1) * size))
 
 
-def _absent(reader: ChunkReader, rows: range) -> NDArray[np.bool_]:
-    """Which of the rows, all of one shard, lie in chunks that the file is too short for."""
-    shard = rows.start // reader.shape.shard_rows
+def _absent(array: ArrayFiles, rows: range) -> Iterator[range]:
+    """Those of the rows, all of one shard, that lie in chunks which the file is too short for."""
+    shard, size = rows.start // array.shape.shard_rows, array.shape.chunk_rows
     try:
-        entries, intact = reader.index(shard)
-        size = reader.file_bytes(shard)
+        entries, intact = array.index(shard)
+        there = array.file_bytes(shard)
     except OSError:
-        return np.ones(len(rows), bool)
-    ends = entries.astype(np.float64).sum(axis=1)  # of what is absent, far beyond any file
-    absent = (ends > size) | (entries == ABSENT).any(axis=1)
-    if not intact:
-        absent[:] = True
-    slots = np.arange(rows.start, rows.stop) // reader.shape.chunk_rows - shard * reader.shape.shard_chunks
-    result: NDArray[np.bool_] = absent[slots]
-    return result
+        yield rows
+        return
+    start = None
+    for chunk in range(rows.start // size, -(-rows.stop // size)):
+        entry = entries[chunk % array.shape.shard_chunks]
+        if not intact or ABSENT in entry or sum(entry) > there:
+            start = max(rows.start, chunk * size) if start is None else start
+        elif start is not None:
+            yield range(start, chunk * size)
+            start = None
+    if start is not None:
+        yield range(start, rows.stop)
 
 
-def _flagged(stream: CameraStream, rows: range, where: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which of the rows are flagged as missing, as far as anybody asks and the flags can be read."""
-    if not where.any():
-        return where
+def _outside(lost: list[range], stretches: Iterable[range]) -> Iterator[range]:
+    """What of the stretches is not in ``lost``, which is in order."""
+    for rows in stretches:
+        start = rows.start
+        for gone in lost:
+            if gone.start >= rows.stop:
+                break
+            if start < gone.start:
+                yield range(start, gone.start)
+            start = max(start, gone.stop)
+        if start < rows.stop:
+            yield range(start, rows.stop)
+
+
+def _with_lines(recording: Outline) -> Recording:
+    from acquire.store.reader import (
+        open_source,  # libraries of arrays, which nobody needs where nothing is gone
+    )
+
+    return open_source(recording.source)
+
+
+def _unflagged(whole: Callable[[], Recording], arm: str, rows: range) -> Iterator[range]:
+    """Which of the rows are not flagged as missing; all of them where their flags cannot be read."""
+    from acquire.store.present import flags_of
+    from acquire.store.scan import missing_rows, runs
+
     try:
-        flags = stream.read("flags", rows.start, rows.stop)
+        missing = missing_rows(flags_of(whole(), arm, rows.start, rows.stop))
     except AcquireError:
-        return np.zeros(len(rows), bool)
-    missing: NDArray[np.bool_] = (flags & LineFlag.MISSING) != 0
-    return missing
+        yield rows
+        return
+    for first, count in runs(~missing, rows.start):
+        yield range(first, first + count)

@@ -13,22 +13,18 @@ import numpy as np
 import acquire
 from acquire.codes import code_from_attrs
 from acquire.errors import UsageError
+from acquire.fibre import Fibre
 from acquire.geometry import Geometry
 from acquire.lines import ARMS
 from acquire.store.array_writer import ENCODED_AHEAD
-from acquire.store.codecs import CODECS, Codec
 from acquire.store.host import this_host
+from acquire.store.layout import FORMAT
+from acquire.store.shape import CODECS, Codec
 from acquire.store.shard import MAX_CHUNK_BYTES, MAX_SHARD_CHUNKS
 
 if TYPE_CHECKING:
     from acquire.clock import ClockFit
     from acquire.store.terms import Continuation, Retention
-
-FORMAT = "acquire-recording/2"
-"""Of what is written. In format 1 the code's ``seed`` is the register's state, and the number that the user
-gave is not there; lines that contradict their code have the flag of lines without a tag.
-"""
-READABLE = ("acquire-recording/1", FORMAT)
 
 CAMERA_KEYS = ("white_dn", "black_level_dn", "responsivity_dn")
 """What a reader needs of each camera to turn DN into samples of Eq. (1)."""
@@ -91,7 +87,8 @@ class RecordingSpec:
     retention : what of an endless recording is kept; None: everything
     reserve_bytes : of the disk that are left free: the recording should end when nothing else is left
     continues : what this recording is a further segment of, if it is one
-    layout : of the instrument: ``dual``, ``compact``, ``emulated``, ``interline``
+    layout : of the instrument: ``dual``, ``compact``, ``emulated``, ``interline``, ``fibre``
+    fibre : which column sees what; of layout ``fibre``, and of no other
     """
 
     run_id: str
@@ -118,15 +115,23 @@ class RecordingSpec:
     reserve_bytes: int = 2**28
     continues: Continuation | None = None
     layout: str = "dual"
+    fibre: Fibre | None = None
 
     def __post_init__(self) -> None:
         self._check_choices()
         self._check_numbers()
+        self._check_fibre()
         self._check_attributes()
 
     @property
     def line_dtype(self) -> np.dtype[Any]:
         return np.dtype(self.dtype).newbyteorder("<")
+
+    @property
+    def geometry(self) -> dict[str, Any]:
+        """As it stands in the attributes."""
+        sizes = {"stages": self.stages, "substeps": self.substeps, "pixels": self.pixels}
+        return sizes if self.fibre is None else {**sizes, "fibre": self.fibre.to_attrs()}
 
     @property
     def durability(self) -> Durability:
@@ -140,13 +145,29 @@ class RecordingSpec:
             "dtype": ("uint8", "uint16"),
             "codec": CODECS,
             "fsync": ("commit", "seal"),
-            "layout": ("dual", "compact", "emulated", "interline"),
+            "layout": ("dual", "compact", "emulated", "interline", "fibre"),
         }
         for name, allowed in choices.items():
             if getattr(self, name) not in allowed:
                 raise UsageError(
-                    f"recording with {name} = {getattr(self, name)!r}", possible=", ".join(allowed)
+                    f"a recording cannot have {name} = {getattr(self, name)!r}", possible=", ".join(allowed)
                 )
+
+    def _check_fibre(self) -> None:
+        if (self.layout == "fibre") != (self.fibre is not None):
+            raise UsageError(
+                f"layout {self.layout!r} does not go with {'no' if self.fibre is None else 'a'} fibre",
+                possible="layout 'fibre', and what its columns see",
+            )
+        if self.fibre is None:
+            return
+        told = (self.fibre.stages, self.fibre.substeps, self.fibre.sensor_pixels)
+        if told != (self.stages, self.substeps, self.pixels):
+            raise UsageError(
+                f"a recording of M = {self.stages}, S = {self.substeps}, {self.pixels} pixels has a fibre of "
+                f"M = {told[0]}, S = {told[1]}, {told[2]} pixels",
+                possible="the same",
+            )
 
     def _check_numbers(self) -> None:
         limits = {
@@ -165,11 +186,12 @@ class RecordingSpec:
         for name, (low, high) in limits.items():
             if not low <= getattr(self, name) <= high:
                 raise UsageError(
-                    f"recording with {name} = {getattr(self, name)}", possible=f"{low} to {high}"
+                    f"a recording cannot have {name} = {getattr(self, name)}", possible=f"{low} to {high}"
                 )
         if self.shard_chunks % self.tag_chunks:
             raise UsageError(
-                f"recording with tag_chunks = {self.tag_chunks}", possible=f"a divisor of {self.shard_chunks}"
+                f"a recording cannot have tag_chunks = {self.tag_chunks}",
+                possible=f"a divisor of {self.shard_chunks}",
             )
 
     def _check_attributes(self) -> None:
@@ -177,7 +199,7 @@ class RecordingSpec:
         for arm in ARMS:
             for key in CAMERA_KEYS:
                 if key not in self.cameras.get(arm, {}):
-                    raise UsageError(f"recording without {key} of camera {arm}", possible="a number")
+                    raise UsageError(f"a recording needs {key} of camera {arm}", possible="a number")
         clash = sorted(set(self.extra) & set(_own_attributes(self, None)))
         if clash:
             raise UsageError(f"extra attributes {', '.join(clash)} are the format's own")
@@ -213,8 +235,7 @@ def _segment(spec: RecordingSpec, continues: Continuation) -> dict[str, Any]:
 def readout_ns(spec: RecordingSpec, line: int) -> int:
     """UTC at which the read-out of a line begins."""
     readout = Geometry(spec.stages, spec.substeps, 1).readout_substep
-    tick = np.array([(spec.substeps * line + readout) * spec.substep_ticks], np.uint64)
-    return int(spec.clock.time_ns(tick)[0])
+    return spec.clock.instant_ns((spec.substeps * line + readout) * spec.substep_ticks)
 
 
 def _own_attributes(spec: RecordingSpec, ending: Ending | None) -> dict[str, Any]:
@@ -231,7 +252,7 @@ def _own_attributes(spec: RecordingSpec, ending: Ending | None) -> dict[str, Any
         "end_reason": ending.reason if ending else None,
         "layout": spec.layout,
         "first_line": spec.first_line,
-        "geometry": {"stages": spec.stages, "substeps": spec.substeps, "pixels": spec.pixels},
+        "geometry": spec.geometry,
         "trigger": {
             **spec.trigger,
             "clock_hz": spec.clock.clock_hz,

@@ -46,16 +46,18 @@ class Stretch:
             for chunk, place in self._places.items():
                 self._reader.expect(chunk, *place)
 
-    def read(self, out: NDArray[Any] | None = None) -> NDArray[Any]:
-        """The rows, into ``out`` if given. Raises DataError when they are not intact on disk."""
+    def read(self, out: NDArray[Any] | None = None, columns: slice | None = None) -> NDArray[Any]:
+        """The rows, into ``out`` if given, which takes only ``columns`` of them if these are.
+
+        Raises DataError when they are not intact on disk.
+        """
         shape = self._reader.shape
         rows = np.empty((self._stop - self._start, *shape.row_shape), shape.dtype) if out is None else out
         size = shape.chunk_rows
         for chunk in self._chunks:
             low, high = max(self._start, chunk * size), min(self._stop, (chunk + 1) * size)
-            rows[low - self._start : high - self._start] = self._chunk(chunk)[
-                low - chunk * size : high - chunk * size
-            ]
+            found = self._chunk(chunk)[low - chunk * size : high - chunk * size]
+            rows[low - self._start : high - self._start] = found if columns is None else found[:, columns]
         return rows
 
     def _chunk(self, chunk: int) -> NDArray[Any]:

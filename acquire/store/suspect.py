@@ -17,10 +17,10 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
-from acquire.lines import ARMS
+from acquire.flags import ARMS
 
 if TYPE_CHECKING:
-    from acquire.store.reader import Recording
+    from acquire.store.outline import Outline
 
 DOUBTFUL = {arm: f"code_doubtful_{arm}" for arm in ARMS}
 """Arm → kind of the event from whose line on its lines are suspect; its text says why."""
@@ -46,12 +46,12 @@ class Suspect:
         return asdict(self)
 
 
-def suspect_lines(recording: Recording) -> tuple[Suspect, ...]:
+def suspect_lines(recording: Outline) -> tuple[Suspect, ...]:
     """Of both arms, in their order. Raises DataError where the events cannot be read."""
     return tuple(found for arm in ARMS for found in _of_arm(recording, arm))
 
 
-def _of_arm(recording: Recording, arm: str) -> list[Suspect]:
+def _of_arm(recording: Outline, arm: str) -> list[Suspect]:
     end = recording.first_line + recording.lines
     found: list[Suspect] = []
     doubt: tuple[int, str] | None = None

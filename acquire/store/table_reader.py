@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numcodecs.vlen import VLenUTF8
-
 from acquire.errors import DataError
-from acquire.store.codecs import CRC_BYTES, crc32c
 from acquire.store.layout import PARSE_ERRORS
+from acquire.store.shape import CRC_BYTES, small_crc32c
 
 if TYPE_CHECKING:
     from acquire.store.layout import Document
     from acquire.store.source import Source
 
 
-NUMBERS = ("uint8", "uint64")
+NUMBERS = {"uint8": "B", "uint64": "Q"}
+"""Data types of cells, and what `struct` calls them."""
 MOST_ROWS = 2**20
 
 
@@ -67,18 +66,18 @@ class _Table:
             document = self.nodes[f"{self.name}/{column}"]
             (rows,), data_type = document["shape"], document["data_type"]
             if data_type not in (("string",) if text else NUMBERS) or not 0 <= rows <= MOST_ROWS:
-                raise ValueError(f"{rows} cells of type {data_type}")
+                raise ValueError(f"it has {rows} cells of type {data_type}")
             if rows == 0:
                 return []
             data = self._chunk(column)
             if data_type == "string":
-                return [str(text) for text in VLenUTF8().decode(data)[:rows]]
-            return list(np.frombuffer(data, np.dtype(data_type).newbyteorder("<"), rows))
-        except (*PARSE_ERRORS, OSError) as error:
+                return _texts(data, rows)
+            return list(struct.unpack_from(f"<{rows}{NUMBERS[data_type]}", data))
+        except (*PARSE_ERRORS, struct.error, OSError) as error:
             raise DataError(f"{self.source}: table {self.name}/{column} cannot be read: {error!r}") from error
 
     def numbers(self, column: str) -> list[int]:
-        return [int(value) for value in self.cells(column)]
+        return self.cells(column)
 
     def words(self, column: str) -> list[str]:
         """A column of CF flag values as their meanings."""
@@ -95,6 +94,21 @@ class _Table:
         """The column's one chunk; it may have more rows than the root knows."""
         data = self.source.read(f"{self.name}/{column}/c/0")
         payload, checksum = data[:-CRC_BYTES], data[-CRC_BYTES:]
-        if crc32c(payload) != checksum:
+        if small_crc32c(payload) != checksum:
             raise ValueError("the checksum is wrong")
         return payload
+
+
+def _texts(data: bytes, rows: int) -> list[str]:
+    """The first texts of a chunk of Zarr's ``vlen-utf8``: how many there are, and each after its length."""
+    (there,) = struct.unpack_from("<I", data)
+    if there < rows:
+        raise ValueError(f"it has {there} texts, not {rows}")
+    texts, at = [], 4
+    for _ in range(rows):
+        (size,) = struct.unpack_from("<I", data, at)
+        at += 4 + size
+        if at > len(data):
+            raise ValueError("a text goes on behind the end")
+        texts.append(data[at - size : at].decode())
+    return texts

@@ -7,6 +7,9 @@ from typing import Any
 
 from acquire.errors import UsageError
 
+ALL_LINES = 2**62
+"""Count of a hold that has no end."""
+
 
 @dataclass(frozen=True, slots=True)
 class Retention:
@@ -33,7 +36,7 @@ class Retention:
     def __post_init__(self) -> None:
         numbers = (self.max_bytes or 1, self.max_age_lines or 1, self.margin_lines + 1, *self.hold_lines)
         if min(numbers) < 0 or 0 in (self.max_bytes, self.max_age_lines, self.margin_lines + 1):
-            raise UsageError(f"retention {self}", possible="numbers above 0")
+            raise UsageError(f"the terms of retention are impossible: {self}", possible="numbers above 0")
 
 
 @dataclass(frozen=True, slots=True)

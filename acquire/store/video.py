@@ -26,7 +26,8 @@ import numpy as np
 
 from acquire.errors import DataError, PlaceError, UsageError
 from acquire.showing import as_picture, as_table, in_words
-from acquire.store.camera_stream import DAMAGE, child_array
+from acquire.store.camera_stream import child_array
+from acquire.store.layout import DAMAGE
 from acquire.store.opening import read_root
 from acquire.store.refusals import refused
 from acquire.store.source import source_of
@@ -187,10 +188,14 @@ def _check(
     provenance: Mapping[str, Any],
 ) -> None:
     if video.ndim != 3 or video.size == 0 or video.dtype.name not in DTYPES:
-        raise UsageError(f"video {video.dtype} {video.shape}", possible=f"(t, y, x) of {', '.join(DTYPES)}")
+        raise UsageError(
+            f"a video cannot be {video.dtype} {video.shape}", possible=f"(t, y, x) of {', '.join(DTYPES)}"
+        )
     if time_ns.shape != video.shape[:1] or time_ns.dtype != np.int64:
-        raise UsageError(f"time stamps {time_ns.dtype} {time_ns.shape}", possible=f"int64 ({len(video)},)")
+        raise UsageError(
+            f"time stamps cannot be {time_ns.dtype} {time_ns.shape}", possible=f"int64 ({len(video)},)"
+        )
     for name, value in (("pixel size", pixel_size), ("frame interval", frame_interval_ns)):
         if not (math.isfinite(value) and value > 0):
-            raise UsageError(f"video with {name} {value}", possible="a finite number above 0")
+            raise UsageError(f"a video cannot have a {name} of {value}", possible="a finite number above 0")
     check_provenance(provenance)

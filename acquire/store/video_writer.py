@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import PurePosixPath
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -42,7 +42,11 @@ class VideoWriter:
         grid: layout.VideoGrid,
         *,
         quality: bool = False,
+        tile_side: int | None = None,
+        fill_value: float = 0,
     ) -> None:
+        """``tile_side``: rows and columns of a chunk; absent: those of a frame. ``fill_value``: of voxels
+        that are not written."""
         import zarr
 
         self._place, self._delivery, self._grid = place, delivery_to(place), grid
@@ -50,9 +54,17 @@ class VideoWriter:
         self._window, self._begin_ns = layout.Window(), 0
         with refused(place, "written"):
             self._group = zarr.create_group(self._delivery.partial, zarr_format=3)
-            frames = max(1, CHUNK_BYTES // (shape[0] * shape[1] * dtype.itemsize))
+            chunk = shape if tile_side is None else (tile_side, tile_side)
+            frames = max(1, CHUNK_BYTES // (chunk[0] * chunk[1] * dtype.itemsize))
             self._levels = [
-                _image(self._group, str(number), (frames, *each), dtype)
+                _image(
+                    self._group,
+                    str(number),
+                    each,
+                    (frames, min(chunk[0], each[0]), min(chunk[1], each[1])),
+                    dtype,
+                    fill_value,
+                )
                 for number, each in enumerate(layout.level_shapes(shape))
             ]
             self._columns = {
@@ -88,9 +100,13 @@ class VideoWriter:
         ``provenance["trusted"]``, first frame and the one after the last, marks the frames.
         """
         if not self.frames:
-            raise UsageError(f"{self._place}: a video without a frame")
+            raise UsageError(f"{self._place}: the video has no frame")
         check_provenance(provenance)
         self._flush(whole_chunks=False)
+        self._end(provenance)
+
+    def _end(self, provenance: Mapping[str, Any]) -> None:
+        """All frames are there: mark them, say what the video is, and show it."""
         first, end = provenance.get("trusted") or (0, 0)
         with refused(self._place, "written"):
             if "trusted" in provenance:
@@ -128,7 +144,7 @@ class VideoWriter:
                 _append(level, frames)
                 frames = layout.halved(frames) if level is not self._levels[-1] else frames
 
-    def __enter__(self) -> VideoWriter:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(
@@ -166,14 +182,20 @@ def _append(array: zarr.Array[Any], values: NDArray[Any]) -> None:
 
 
 def _image(
-    group: zarr.Group, name: str, chunk: tuple[int, int, int], dtype: np.dtype[Any]
+    group: zarr.Group,
+    name: str,
+    shape: tuple[int, int],
+    chunk: tuple[int, int, int],
+    dtype: np.dtype[Any],
+    fill_value: float,
 ) -> zarr.Array[Any]:
-    """A level whose chunks are whole frames; all levels have as many in each."""
+    """A level of frames of a shape; all levels have as many frames in a chunk."""
     return group.create_array(
         name,
-        shape=(0, *chunk[1:]),
+        shape=(0, *shape),
         dtype=dtype,
         chunks=chunk,
+        fill_value=fill_value,
         compressors=_packed(),
         dimension_names=("t", "y", "x"),
     )

@@ -27,6 +27,7 @@ from acquire.store import layout
 from acquire.store.arm_writer import ArmWriter
 from acquire.store.codecs import EncodeOnce
 from acquire.store.files import DISK, SCRATCH, Publisher, check_new_path, lock
+from acquire.store.overview import Passing, withdraw_overview, write_overview
 from acquire.store.pages import keep_freed_memory
 from acquire.store.rebuild import write_copy
 from acquire.store.refusals import refusal
@@ -94,6 +95,8 @@ class RecordingWriter:
         self._watch = RoomWatch(disk, path, spec.reserve_bytes)
         self._looked = self._watch.room
         self._stuck = False
+        self._overview: dict[str, Passing] = {arm: Passing(spec.pixels) for arm in ARMS}
+        self._no_overview: str | None = None
         self._committed = 0
         self._own_due_s = 0.0
         self._failure: str | None = None
@@ -209,6 +212,7 @@ class RecordingWriter:
         self._check_alive()
         with self._failing(f"writing lines of arm {block.arm}"):
             self._arms[block.arm].append(block, behind)
+        self._overview[block.arm].add(block, self.spec.first_line)
         written = min(arm.written_rows for arm in self._arms.values())
         if written - self._committed >= self.spec.commit_lines:
             self.commit()
@@ -229,13 +233,16 @@ class RecordingWriter:
         Visible at the next commit. Their rows are appended like any others, flagged as missing.
         """
         if count < 1 or first_line < 0:
-            raise UsageError(f"gap of {count} lines from line {first_line}")
+            raise UsageError(
+                f"a gap cannot have {count} lines from line {first_line}",
+                possible="1 or more, from line 0 or later",
+            )
         self._gaps.add({"first_line": first_line, "count": count, "cause": cause, "arm": ARMS.index(arm)})
 
     def add_event(self, kind: str, tick: int, line: int, text: str = "") -> None:
         """Note what happened when, on the trigger's clock; visible at the next commit."""
         if tick < 0 or line < 0:
-            raise UsageError(f"event {kind!r} at tick {tick}, line {line}", possible="0 or more")
+            raise UsageError(f"event {kind!r} cannot be at tick {tick}, line {line}", possible="0 or more")
         self._events.add({"tick": tick, "line": line, "kind": kind, "text": text})
         if self._keeper is not None:
             self._keeper.note(kind, line)
@@ -287,9 +294,9 @@ class RecordingWriter:
         with self._failing("sealing"):
             rows = self._rescue() if self._failure else self._pad()
             self._disk.remove(self._reserve)
-            self._disk.sync_tree(self.path)
-            nodes = self._publish_parts(rows, own=True)
-            self._disk.sync_tree(self.path)
+            self._disk.sync_tree(self.path)  # the lines, before what tells of them
+            nodes = self._publish_parts(rows, own=True) | self._publish_overview(rows)
+            self._disk.sync_tree(self.path)  # and that, before the root
             ending = Ending(condition, end_reason, {**ledger, "store": self._ledger(rows)})
             self._publish_copy(ending)
             self._publish_root(rows, nodes, ending)
@@ -354,6 +361,15 @@ class RecordingWriter:
             nodes |= table.nodes()
         return nodes
 
+    def _publish_overview(self, rows: int) -> dict[str, layout.Document]:
+        """Write the overview; a recording is whole without one."""
+        try:
+            return write_overview(self._publisher, self.path, self._overview, self.spec, rows)
+        except (OSError, MemoryError) as error:
+            self._no_overview = str(error) or "no memory"
+            withdraw_overview(self._disk, self.path)
+            return {}
+
     def _publish_kept(self, rows: int, nodes: dict[str, layout.Document], room: Room) -> None:
         """The commit, without the lines that retention lets go; their files are deleted once it is told."""
         looked, self._looked = self._looked is not room, room
@@ -394,6 +410,7 @@ class RecordingWriter:
             "gaps_not_listed": self._gaps.not_listed,
             "events_not_listed": self._events.not_listed,
             "disk_error": self._failure,
+            **({"no_overview": self._no_overview} if self._no_overview else {}),
         }
 
     def _check_open(self) -> None:
@@ -404,7 +421,7 @@ class RecordingWriter:
         self._check_open()
         if self._failure:
             raise DataError(
-                f"{self.path}: no more lines after a disk error ({self._failure})", possible=self._safe()
+                f"{self.path} takes no more lines after a disk error ({self._failure})", possible=self._safe()
             )
 
     def _safe(self) -> str:

@@ -12,14 +12,15 @@ Grabbers, recorder and watcher are processes, the supervisor is a thread; `Captu
 shared memory: nothing between a camera's buffer and the recorder's is sent, and no camera waits for a reader.
 
 `losses` causes · `ring` · `observer` of a ring · `messages` · `grabber` · `tagger` · `window` of lines around
-an event · `session` one recording · `recorder` · `lightcheck`, `threshold`, `watcher` · `external_counts` of
-trigger, cameras and watcher · `ledger` of every pulse · `plan` · `succession` of what was killed ·
-`supervisor` · `capture`
+an event · `session` one recording · `recorder` and its `recorder_states` · `lightcheck`, `threshold`,
+`watcher` · `external_counts` of trigger, cameras and watcher · `ledger` of every pulse · `plan` ·
+`succession` of what was killed · `lifecycle` of a recording · `supervisor` · `capture`
 """
 
 from acquire.stream.capture import Capture
+from acquire.stream.messages import Begin, Note
 from acquire.stream.plan import END_S, CapturePlan, CaptureStatus
 from acquire.stream.succession import Orphan
 from acquire.stream.window import NOW, Window
 
-__all__ = ["END_S", "NOW", "Capture", "CapturePlan", "CaptureStatus", "Orphan", "Window"]
+__all__ = ["END_S", "NOW", "Begin", "Capture", "CapturePlan", "CaptureStatus", "Note", "Orphan", "Window"]

@@ -21,27 +21,25 @@ from acquire.lines import ARMS
 from acquire.processes.messages import Quit, Ready
 from acquire.processes.shared import Counters
 from acquire.processes.worker import Worker
-from acquire.stream import grabber, recorder, recorder_plan, watcher
+from acquire.stream import grabber, recorder, recorder_plan, recorder_states, watcher
 from acquire.stream.external_counts import TRIGGER, TRIGGER_COUNTERS, WATCHER
 from acquire.stream.kept import Kept
 from acquire.stream.ledger import Counted, account
+from acquire.stream.lifecycle import MEANINGS, Stage
 from acquire.stream.losses import Cause
-from acquire.stream.messages import Begin, Interrupt, Note, RunStarted
+from acquire.stream.messages import Note, RunStarted
 from acquire.stream.plan import END_S, CaptureStatus
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.succession import Succession
 from acquire.stream.supervisor import RECORDER, Supervisor
-from acquire.stream.window import NOW
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from acquire.clock import ClockFit
-    from acquire.store import RecordingSpec
     from acquire.stream.ledger import ArmLedger
+    from acquire.stream.messages import Begin
     from acquire.stream.plan import CapturePlan
-    from acquire.stream.window import Window
     from acquire.trigger.base import Trigger
 
 _TAG_RING = RingShape(slots=64, rows=256, width=3, dtype="uint64")
@@ -100,22 +98,18 @@ class Capture:
                 error.add_note(f"while undoing it: {second}")
             raise
 
-    def start(self, path: Path, spec: RecordingSpec, lines: int | None = None, window: Window = NOW) -> None:
-        """Record ``lines`` lines, or until `stop`, to ``path``.
+    def start(self, begin: Begin) -> None:
+        """Record; returns once the recording exists.
 
-        From the next line that both arms can give, unless ``window`` begins earlier. ``spec`` tells all but
-        the first line, which the recorder sets. Returns once the recording exists. Raises UsageError or
-        DataError when it cannot be made, or when the rings do not hold what the window asks for; nothing
-        has changed then.
+        Raises UsageError or DataError when it cannot be made, or when the rings do not hold what the window
+        asks for; nothing has changed then.
         """
         supervisor = self._running("start")
-        if supervisor.recording:
-            raise StateError("start: a recording is being written", hint="stop it first")
         if supervisor.fault:
             raise StateError(f"start: the capture has failed ({supervisor.fault})", hint="arm again")
-        if lines is not None and lines < 1:
-            raise UsageError(f"start with a budget of {lines} lines", possible="1 or more")
-        supervisor.begin(Begin(path, spec, lines, window))
+        if begin.lines is not None and begin.lines < 1:
+            raise UsageError(f"start: a recording cannot have {begin.lines} lines", possible="1 or more")
+        supervisor.begin(begin)
 
     def note(self, kind: str, text: str, line: int | None = None) -> int:
         """Something happens at ``line``, or at the newest: listed in every recording that holds the line.
@@ -138,11 +132,8 @@ class Capture:
 
     def stop(self, reason: str = "stopped") -> None:
         """End the recording at the newest line; `poll` tells when it is sealed. Idempotent."""
-        supervisor = self._running("stop")
-        if supervisor.began is None:
-            raise StateError("stop: nothing has been recorded", possible="start")
-        if supervisor.recording:
-            supervisor.end_recording(reason, max(ring.newest_line for ring in self._rings.values()))
+        newest_line = max((ring.newest_line for ring in self._rings.values()), default=0)
+        self._running("stop").end_recording(reason, newest_line)
 
     def poll(self) -> CaptureStatus:
         """What is seen at this moment; after `close`, what was seen last."""
@@ -192,7 +183,7 @@ class Capture:
             facts |= dict.fromkeys(cameras, worker.expect(Ready, time.monotonic() + timeout_s).facts)
         self.cameras = facts
         tell("trigger")
-        self._trigger_used = True
+        self._trigger_used = True  # from now on it has to be stopped, whatever `prepare` comes to
         self._trigger.prepare(self._plan.run)
         self.clock = self._trigger.start()
         self._workers[RECORDER].post(RunStarted(self.clock))
@@ -264,7 +255,7 @@ class Capture:
             counters[f"stored_{arm}"] = ring.released_lines - others
         worker = self._new_recorder()
         assert self._supervisor is not None
-        kept = {arm: self._supervisor.kept(arm, ring.released_line) for arm, ring in self._rings.items()}
+        kept = {arm: self._supervisor.life.kept(arm, ring.released_line) for arm, ring in self._rings.items()}
         worker.post(RunStarted(self.clock, kept))
         return worker
 
@@ -301,7 +292,7 @@ class Capture:
     # ---- watch
 
     def _look(self, supervisor: Supervisor) -> CaptureStatus:
-        began, sealed, counters = supervisor.began, supervisor.sealed, self._counters[RECORDER]
+        began, sealed, counters = supervisor.life.began, supervisor.life.sealed, self._counters[RECORDER]
         status = CaptureStatus(
             accounts={arm: self._account(arm, supervisor) for arm in ARMS},
             ring={arm: self._ring_counts(arm) for arm in ARMS},
@@ -309,7 +300,7 @@ class Capture:
             waiting=self._waiting(supervisor),
             fault=supervisor.fault,
             pids={name: pid for name, pid in self.pids.items() if pid is not None},
-            orphans=supervisor.orphans,
+            orphans=supervisor.life.orphans,
             trigger={
                 "clock_hz": self.clock.clock_hz,
                 "uncertainty_ns": self.clock.uncertainty_ns,
@@ -324,7 +315,7 @@ class Capture:
             recording=supervisor.recording,
             draining=supervisor.recording and bool(counters["draining"]),
             done=sealed is not None,
-            path=None if supervisor.path is None else str(supervisor.path),
+            path=None if supervisor.life.path is None else str(supervisor.life.path),
             first_line=began.first_line,
             recorded_lines=counters["recorded"],
             committed_lines=counters["committed"],
@@ -341,9 +332,10 @@ class Capture:
             return f"the {who} for {supervisor.silent_s:.0f} s{room}"
         since_ns = self._counters[RECORDER]["store_since_ns"]
         if since_ns and (store_s := time.monotonic() - since_ns / 1e9) > TOLD_S:
-            return f"the disk has been at work for {store_s:.0f} s to create or seal a recording"
-        if why := supervisor.resumption.why:
-            return f"the recording goes on in a further segment when the disk lets it: {why}"
+            doing = recorder_states.MEANINGS[recorder_states.STATES[self._counters[RECORDER]["state"]]]
+            return f"the disk has been at work for {store_s:.0f} s: {doing}"
+        if why := supervisor.life.resumption.why:
+            return f"{MEANINGS[Stage.PAUSED]}: {why}"
         return ""
 
     def _room(self) -> str:
@@ -381,11 +373,12 @@ class Capture:
 
     def _account(self, arm: str, supervisor: Supervisor) -> ArmLedger:
         """Counts are read against the way of the lines: what one knows of, the next has counted."""
-        recorded, ring = self._counters[RECORDER], self._rings[arm]
+        recorded, ring, began = self._counters[RECORDER], self._rings[arm], supervisor.life.began
         stored, discarded = recorded[f"stored_{arm}"], self._discarded(arm)
         lost = self._lost(arm)
         next_line = max(self._counters[arm]["next_line"], ring.newest_line)
         depth = self._plan.depth_lines
+        # Before the first line, the counter's 0 is the number of none.
         next_line = next_line if self._counters[arm]["delivered"] else -depth
         known = max(supervisor.pulses, self._counters[TRIGGER]["pulses"], next_line + depth)
         counted = Counted(
@@ -395,7 +388,7 @@ class Capture:
             stored=stored,
             discarded=discarded,
             lost=lost,
-            recorded_to=supervisor.began.first_line + recorded[f"rows_{arm}"] if supervisor.began else 0,
+            recorded_to=began.first_line + recorded[f"rows_{arm}"] if began else 0,
             room=ring.shape.slots * ring.shape.rows,
             block=ring.shape.rows,
         )
@@ -431,7 +424,7 @@ class Capture:
         supervisor = self._supervisor
         if supervisor is None or not supervisor.recording:
             return
-        self._workers[RECORDER].post(Interrupt("the capture was closed", ARMS, Cause.INTERRUPTED))
+        supervisor.interrupt_recording("the capture was closed")
         committed = self._counters[RECORDER]["committed"]
         while not supervisor.wait_sealed(time.monotonic() + timeout_s):
             if committed == (committed := self._counters[RECORDER]["committed"]):
@@ -466,7 +459,7 @@ class Capture:
         for name in self._supervisor.dead if self._supervisor else ():
             self._settle_books(self._plan.grabbers.get(name, ()))
         for arm, ring in self._rings.items():
-            kept = Kept(self._supervisor.kept(arm, ring.released_line) if self._supervisor else ())
+            kept = Kept(self._supervisor.life.kept(arm, ring.released_line) if self._supervisor else ())
             blocks = ring.empty()
             stored = sum(kept.count(lines.start, lines.stop) for lines in blocks)
             self._counters[RECORDER].add(f"stored_{arm}", stored)

@@ -89,7 +89,9 @@ def grab(mailbox: Mailbox, *arms: tuple[GrabberPlan, Ring, Counters]) -> None:
             try:
                 _pump(mailbox, camera, intakes)
             except CameraLostError as lost:
-                camera = _reopen(mailbox, plan, camera, lost)
+                with contextlib.suppress(AcquireError):
+                    _let_go(camera)
+                camera = _open_again(mailbox, plan, lost.message)
                 for intake in intakes:
                     intake.realign()
     except BaseException as error:  # the only way out
@@ -100,13 +102,6 @@ def grab(mailbox: Mailbox, *arms: tuple[GrabberPlan, Ring, Counters]) -> None:
         raise
 
 
-def _reopen(mailbox: Mailbox, plan: GrabberPlan, camera: Camera, lost: CameraLostError) -> Camera:
-    """The camera, open and armed again."""
-    with contextlib.suppress(AcquireError):
-        _let_go(camera)
-    return _open_again(mailbox, plan, lost.message)
-
-
 def _open_again(mailbox: Mailbox, plan: GrabberPlan, why: str) -> Camera:
     """The camera, open and armed; CameraLostError when that does not succeed in time."""
     deadline = time.monotonic() + plan.reopen_timeout_s
@@ -115,7 +110,7 @@ def _open_again(mailbox: Mailbox, plan: GrabberPlan, why: str) -> Camera:
             raise CameraLostError(
                 f"camera {plan.arm} is gone: {why}", hint=f"it was waited for {plan.reopen_timeout_s:g} s"
             )
-        mailbox.take()
+        mailbox.take()  # raises OwnerGone once nobody wants the camera any more
         time.sleep(_REOPEN_PAUSE_S)
     return camera
 
@@ -201,7 +196,7 @@ class Intake:
             if block.time_ns is None and block.flags.all():
                 return  # an incomplete frame has no time, and the next one may have
             self._come_back(block)
-            block = replace(block, losses=())
+            block = replace(block, losses=())  # these are among what it missed
         first = block.first_line + self._shift
         self._note_jump(first, block.losses)
         if block.time_ns is not None:
@@ -226,7 +221,7 @@ class Intake:
         shape = self._ring.shape
         if block.pixels.shape != (len(block.flags), shape.width) or block.pixels.dtype != shape.dtype:
             raise CameraError(
-                f"camera {self._plan.arm}: a block of {block.pixels.shape} {block.pixels.dtype} "
+                f"camera {self._plan.arm} gave a block of {block.pixels.shape} {block.pixels.dtype} "
                 f"with {len(block.flags)} flags",
                 possible=f"(lines, {shape.width}) {shape.dtype} with a flag per line",
             )
@@ -241,6 +236,7 @@ class Intake:
             )
         self._away = False
         self._shift = line - block.first_line
+        # A line further off than that is left for `_note_jump` to refuse.
         if 0 <= line - self._next <= self._plan.max_jump_lines:
             self._lose(self._next, line - self._next, self._away_for)
             self._next = line

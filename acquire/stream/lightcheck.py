@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.codes import Code
+    from acquire.fibre import Fibre
 
 CERTAIN = 14.0
 """Standard deviations from which on a peak is one: of ten thousand delays, the highest by chance has six, or
@@ -103,6 +104,7 @@ class Judge:
     code : the run's
     white_dn : the camera's range
     registration : arm → sub-steps by which its lines are known to show late, as its image lies off
+    fibre : that lays several tiles of the scene on the same rows; None: a line's pixels see one scene
     """
 
     stages: int
@@ -110,6 +112,7 @@ class Judge:
     code: Code
     white_dn: int
     registration: dict[str, int]
+    fibre: Fibre | None = None
 
     def look(self, first_line: int, sights: dict[str, Sight]) -> dict[str, Finding]:
         """The verdict on each arm from the same lines of both, ``first_line`` on."""
@@ -119,7 +122,10 @@ class Judge:
         start = self.substeps * first_line - reach
         bits = self.code.bits(start, self.substeps * lines + span + 2 * reach)
         # Camera B's rows are the scene's columns from right to left: each sees the other's pixels that way.
-        others = {"a": sights["b"].profile, "b": sights["a"].profile[::-1]}
+        profiles = {arm: sight.profile for arm, sight in sights.items()}
+        if self.fibre is not None:
+            profiles = {arm: self.fibre.folded(profile, arm) for arm, profile in profiles.items()}
+        others = {"a": profiles["b"], "b": profiles["a"][::-1]}
         return {
             arm: self._judge(sights[arm], others[arm], bits, reach - self.registration.get(arm, 0))
             for arm in sights

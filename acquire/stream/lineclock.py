@@ -41,6 +41,7 @@ class LineClock:
     def take_over(self, line: int, time_ns: int, drift_ppb: int) -> None:
         """Go on for a clock that had noted ``line`` last, and knew the drift."""
         period_ns = self._nominal_ns * (1 + drift_ppb / 1e9)
+        # As if a stamp of long ago were known: of the earlier ones only the drift is left.
         self._first = self._middle = Stamp(line - _FRESH_LINES, time_ns - round(_FRESH_LINES * period_ns))
         self._last = Stamp(line, time_ns)
 
@@ -51,6 +52,7 @@ class LineClock:
             self._first = self._middle = self._last = stamp
             return
         expected = self._last.time_ns + (line - self._last.line) * self.period_ns
+        # The worst of the last thousand blocks or so: one late stamp does not count for ever.
         self._jitter_ns = max(abs(time_ns - expected), self._jitter_ns * 0.999)
         self._last = stamp
         assert self._middle is not None

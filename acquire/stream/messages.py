@@ -38,16 +38,27 @@ class RunStarted:
 
 @dataclass(frozen=True, slots=True)
 class Begin:
-    """Write a recording of the lines in ``window`` to ``path``, ``lines`` of them or until told to end.
+    """A recording that is asked for, by whoever asks, down to the recorder.
 
-    Not past ``end_line``, wherever it begins.
+    Attributes
+    ----------
+    path, spec : where, and all that it says of itself but the first line, which the recorder sets
+    lines : its budget; None: until it is told to end
+    window : from the next line that both arms can give, unless it begins earlier
+    end_line : it does not go past this, wherever it begins
     """
 
     path: Path
     spec: RecordingSpec
-    lines: int | None
+    lines: int | None = None
     window: Window = NOW
     end_line: int | None = None
+
+    @property
+    def budget_lines(self) -> int | None:
+        """Lines in all, those before the window's event counted; None: until it is told to end."""
+        after = self.window.post_lines
+        return self.lines if after is None else self.window.pre_lines + after
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,11 +27,10 @@ class Opening:
     begin: Begin
     span: Span | None
     writer: Future[RecordingWriter]
-    cancelled: bool = False
 
-    def is_wanted(self, first_line: int) -> bool:
-        """Nobody has cancelled it, and it would not begin where it should have ended."""
-        return not self.cancelled and (self.begin.end_line is None or first_line < self.begin.end_line)
+    def is_over(self, first_line: int) -> bool:
+        """It would begin where it should have ended."""
+        return self.begin.end_line is not None and first_line >= self.begin.end_line
 
     def lines_from(self, first_line: int) -> int | None:
         """How many lines it takes from there on; None: until it is told to end."""

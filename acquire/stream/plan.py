@@ -92,16 +92,20 @@ class CapturePlan:
 
     def __post_init__(self) -> None:
         if tuple(sorted(self.openers)) != ARMS:
-            raise UsageError(f"capture with cameras {', '.join(self.openers)}", possible=", ".join(ARMS))
+            raise UsageError(
+                f"a capture cannot have the cameras {', '.join(self.openers)}", possible=", ".join(ARMS)
+            )
         if not 1 <= self.run.substeps <= MAX_SUBSTEPS:
-            raise UsageError(f"capture with S = {self.run.substeps}", possible=f"1 to {MAX_SUBSTEPS}")
+            raise UsageError(
+                f"a capture cannot have S = {self.run.substeps}", possible=f"1 to {MAX_SUBSTEPS}"
+            )
         if self.dtype not in ("uint8", "uint16"):
-            raise UsageError(f"capture of {self.dtype!r} samples", possible="uint8, uint16")
+            raise UsageError(f"a capture cannot have {self.dtype!r} samples", possible="uint8, uint16")
         # Lines wait for their tag in the ring, of which half must stay free for the cameras.
         most = self.ring_shape.slots * self.block_lines // 2
         if not 1 <= self.run.tag_every_lines <= most:
             raise UsageError(
-                f"capture with a tag every {self.run.tag_every_lines} lines",
+                f"a capture cannot have a tag every {self.run.tag_every_lines} lines",
                 possible=f"1 to {most}, half of what a ring holds",
                 hint="more tags, or more ring slots",
             )

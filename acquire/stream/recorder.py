@@ -1,11 +1,8 @@
 """The process that empties both rings: while armed it discards, while recording it writes.
 
-::
-
-    discarding ──Begin──▶ opening ──▶ recording ──last line──▶ closing ──▶ discarding
-
-Lines are discarded while a recording is opened as well: its first line is chosen when it can take lines.
-Unless it begins with what was before (`window`): that is taken back from the rings at once, and waits there.
+What it may do next is a table (`recorder_states`). Lines are discarded while a recording is opened as well:
+its first line is chosen when it can take lines. Unless it begins with what was before (`window`): that is
+taken back from the rings at once, and waits there.
 A block waits in its ring until a tag of the trigger confirms its lines, but not longer than ``tag_wait_s``
 and not once the ring is half full; then its lines are written flagged. A recording that cannot be written as
 fast as lines come ends, sealed, while the rings still hold all of it (`stalls.Backlog`).
@@ -35,6 +32,7 @@ from acquire.stream.kept import Kept
 from acquire.stream.losses import Cause
 from acquire.stream.messages import Began, Begin, Cancel, End, Extend, Interrupt, Note, Refused, RunStarted
 from acquire.stream.opening import Notes, Opening, is_verdict
+from acquire.stream.recorder_states import BUSY, STATES, TABLE, RecorderEvent, RecorderState, after
 from acquire.stream.session import OPEN_END, Session
 from acquire.stream.stalls import HELD_UP_S, Arm, Backlog, DiskWaits, HoldUps, Lent, find_stall
 from acquire.stream.tagger import Tagger
@@ -56,6 +54,8 @@ _CALM_BLOCKS = 2
 """Waiting in a ring. With more, the disk is kept busy while blocks are made ready: two processors for one."""
 _LONGEST_DRAIN_S = 0.05
 """While messages and commits wait."""
+_CROSSING = {Cancel: RecorderEvent.CANCEL, Extend: RecorderEvent.EXTEND, End: RecorderEvent.END}
+"""Commands that may be on the way while a recording ends by itself: without a row they change nothing."""
 
 
 def record(
@@ -99,6 +99,7 @@ class Recorder:
         self._counters = counters
         self._disk = disk
         self._external = external
+        self._state = RecorderState.WAITING
         self._tagger: Tagger | None = None
         self._opening: Opening | None = None
         self._session: Session | None = None
@@ -134,7 +135,7 @@ class Recorder:
             if self._session is None:
                 raise
             self._close(self._session, error)
-        return self._owner or any((self._opening, self._session, self._closing))
+        return self._owner or self._state in BUSY
 
     def wait(self) -> None:
         """Until something may have come, at most for a moment; not at all while there is work."""
@@ -149,7 +150,9 @@ class Recorder:
     def _listen(self) -> None:
         try:
             while self._owner and (message := self._mailbox.take()) is not None:
-                self._obey(message)
+                event = _CROSSING.get(type(message))
+                if event is None or (self._state, event) in TABLE:
+                    self._obey(message)
         except OwnerGone as gone:
             self._owner = False
             self._waiting.unregister(self._mailbox)
@@ -162,10 +165,12 @@ class Recorder:
                     arm.kept = Kept(kept.get(name, ()))
                 self._tagger = Tagger(self._plan.run, self._plan.stages, clock)
                 self._line_rate_hz = clock.clock_hz / self._plan.run.line_period_ticks
+                self._go(RecorderEvent.RUN)
             case Begin():
                 self._begin(message)
             case Cancel() if self._opening is not None:
-                self._opening = replace(self._opening, span=None, cancelled=True)
+                self._opening = replace(self._opening, span=None)
+                self._go(RecorderEvent.CANCEL)
             case Cancel() if self._session is not None:
                 self._session.end(self._common_line(), "cancelled", RunCondition.INTERRUPTED)
             case Note():
@@ -177,20 +182,23 @@ class Recorder:
             case Interrupt(reason, lost, cause):
                 self._interrupt(reason, dict.fromkeys(lost, cause))
 
+    def _go(self, event: RecorderEvent) -> None:
+        self._state = after(self._state, event)
+        self._counters["state"] = STATES.index(self._state)
+
     def _begin(self, begin: Begin) -> None:
         """Lines go on being discarded until the recording can take them."""
-        if self._tagger is None or self._opening or self._session or self._closing:
-            self._mailbox.post(Refused(StateError("start: the recorder is not armed, or is recording")))
-            return
         try:
+            after(self._state, RecorderEvent.BEGIN)  # before anything is touched
             span = None if begin.window.is_now else self._hold(begin)
-        except UsageError as error:
+        except (StateError, UsageError) as error:
             self._mailbox.post(Refused(error))
             return
         writer = self._disk.submit(
             self._waits.elsewhere, RecordingWriter.prepare, begin.path, begin.spec, self._plan.disk
         )
         self._opening = Opening(begin, span, writer)
+        self._go(RecorderEvent.BEGIN)
 
     def _hold(self, begin: Begin) -> Span:
         """Keep from being discarded what the recording begins with."""
@@ -216,7 +224,7 @@ class Recorder:
     def _interrupt(self, reason: str, lost: dict[str, Cause]) -> None:
         """What is lost stays lost: a recording that is only being created will know."""
         before = self._trouble[1] if self._trouble else {}
-        self._trouble = reason, lost | before
+        self._trouble = reason, lost | before  # the first cause of an arm's loss stays
         if self._session is not None:
             self._session.lost = lost | self._session.lost
             self._session.end(self._common_line(), reason, RunCondition.INTERRUPTED)
@@ -242,7 +250,8 @@ class Recorder:
             self._opened(opening)
         if self._closing is not None and self._closing[1].done():
             (session, sealed), self._closing = self._closing, None
-            self._publish(session)
+            self._go(RecorderEvent.SEALED)
+            self._publish(session)  # without what the disk did not keep
             for name, lines in session.surplus.items():
                 self._forget(name, lines, session.end_line, "discarded")
             for name, lines in session.left_out.items():
@@ -255,7 +264,9 @@ class Recorder:
 
     def _is_ready_for(self, opening: Opening) -> bool:
         """What waits goes first: a recording must not begin with rings that are about to overflow."""
-        if opening.span is not None or opening.cancelled or opening.writer.exception() is not None:
+        if opening.span is not None or self._state is RecorderState.CANCELLED:
+            return True
+        if opening.writer.exception() is not None:
             return True
         return all(2 * arm.ring.fill < arm.ring.shape.slots for arm in self._arms.values())
 
@@ -279,12 +290,13 @@ class Recorder:
                 self._check_wanted(opening, writer, first_line)
                 writer.begin(first_line)
         except AcquireError as error:
-            self._refuse(opening, error)
+            self._refuse(error)
             return
         except (OSError, ValueError, MemoryError) as error:
-            self._refuse(opening, StoreError(f"the recording cannot be created: {error!r}"))
+            self._refuse(StoreError(f"the recording cannot be created: {error!r}"))
             return
         self._cut_short = False
+        self._go(RecorderEvent.CREATED)
         self._session = self._new_session(writer, opening, first_line)
         for arm in self._arms.values():
             arm.revive(time.monotonic())
@@ -296,13 +308,14 @@ class Recorder:
         if self._trouble is not None:
             self._interrupt(*self._trouble)
 
-    def _refuse(self, opening: Opening, error: AcquireError) -> None:
-        if not opening.cancelled:  # else nobody waits for the answer
+    def _refuse(self, error: AcquireError) -> None:
+        if self._state is not RecorderState.CANCELLED:  # else nobody waits for the answer
             self._mailbox.post(Refused(error))
+        self._go(RecorderEvent.REFUSED)
 
     def _check_wanted(self, opening: Opening, writer: RecordingWriter, first_line: int) -> None:
         """Raises UsageError for a recording that nobody wants any more, once nothing of it is left."""
-        if not opening.is_wanted(first_line):
+        if self._state is RecorderState.CANCELLED or opening.is_over(first_line):
             writer.abandon()
             raise UsageError(f"start: line {first_line} is past the recording's end; nothing was recorded")
 
@@ -331,6 +344,7 @@ class Recorder:
             except (AcquireError, OSError) as another:
                 error = error or another
         self._session = None
+        self._go(RecorderEvent.LAST_LINE)
         self._publish(session)
         self._closing = session, self._disk.submit(self._waits.elsewhere, session.close, error)
 
@@ -388,7 +402,7 @@ class Recorder:
             self._cut_short = True
             full = f"the ring of arm {name} was full at line {line}"
             session.cut(line, f"too slow to write: {full}{self._held_up}")
-        self._count_overrun(name, block, session)
+        self._count_overrun(name, block, session)  # before the book goes past the lines in question
         with self._waits.loop():
             written = session.take(name, block, hurry=arm.ring.fill > _CALM_BLOCKS)
         if written:

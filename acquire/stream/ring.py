@@ -52,9 +52,9 @@ if TYPE_CHECKING:
 _HEAD, _PEAK, _DROPPED_BLOCKS, _DROPPED_LINES, _NEWEST, _DROPPED_END = range(6)
 _TAIL = 8
 _OBSERVERS = 16
-_LINE_WORDS = 8
+_LINE_WORDS = 8  # a cache line: writers in different processes do not wait for each other's
 _SEQUENCE, _FIRST_LINE, _COUNT, _TIME_NS, _TOTAL, _LOSS_COUNT, _LOSSES = range(7)
-_HEADER_WORDS = 32
+_HEADER_WORDS = 32  # six, and three for each of MAX_LOSSES, in whole cache lines
 _PAGE_BYTES = 4096
 _CAUSES = tuple(Cause)
 LEAST_RESERVE = 2
@@ -77,10 +77,12 @@ class RingShape:
     def __post_init__(self) -> None:
         if min(self.slots, self.rows, self.width) < 1:
             raise UsageError(
-                f"ring of {self.slots} slots of {self.rows} x {self.width}", possible="1 or more"
+                f"a ring cannot have {self.slots} slots of {self.rows} x {self.width}", possible="1 or more"
             )
         if self.reserve < LEAST_RESERVE:
-            raise UsageError(f"ring with a reserve of {self.reserve}", possible=f"{LEAST_RESERVE} or more")
+            raise UsageError(
+                f"a ring cannot have a reserve of {self.reserve}", possible=f"{LEAST_RESERVE} or more"
+            )
 
     @property
     def history_slots(self) -> int:
@@ -191,7 +193,7 @@ class Ring:
         header[_SEQUENCE] = 2 * head + 2
         self._control[_NEWEST] = first_line + count
         self._control[_PEAK] = max(self._control[_PEAK], head + 1 - self._control[_TAIL])
-        self._control[_HEAD] = head + 1
+        self._control[_HEAD] = head + 1  # last: a producer killed before this has handed over nothing
         os.eventfd_write(self._bell, 1)
 
     def drop(self, first_line: int, lines: int) -> None:
@@ -260,6 +262,7 @@ class Ring:
     @property
     def fill(self) -> int:
         """Blocks committed and not yet released."""
+        # Tail first: a head that is read later is never behind it, though both may go on in between.
         tail = self._control[_TAIL]
         return int(min(self._control[_HEAD] - tail, self.shape.slots))
 
@@ -332,7 +335,7 @@ class Ring:
             time_ns=header[_TIME_NS],
             losses=_read_losses(header) if header[_LOSS_COUNT] else (),
         )
-        return block if self.is_whole(number) else None
+        return block if self.is_whole(number) else None  # its header may have been another's by then
 
     def is_whole(self, number: int) -> bool:
         """The slot holds this block, and all of it."""
@@ -343,7 +346,7 @@ class Ring:
         """What belongs to an observer alone; zero at first. The caller releases the view before `close`."""
         if not 0 <= number < self.shape.observers:
             raise UsageError(
-                f"observer {number} of ring {self.name}", possible=f"0 to {self.shape.observers - 1}"
+                f"ring {self.name} has no observer {number}", possible=f"0 to {self.shape.observers - 1}"
             )
         at = _OBSERVERS + number * _LINE_WORDS
         return self._control[at : at + _LINE_WORDS]
@@ -413,7 +416,9 @@ class Ring:
 
 def _write_losses(header: memoryview, losses: Sequence[Loss]) -> None:
     if len(losses) > MAX_LOSSES:
-        raise UsageError(f"{len(losses)} losses before one ring slot", possible=f"up to {MAX_LOSSES}")
+        raise UsageError(
+            f"one ring slot cannot have {len(losses)} losses before it", possible=f"up to {MAX_LOSSES}"
+        )
     for position, loss in enumerate(losses):
         at = _LOSSES + 3 * position
         header[at], header[at + 1] = loss.first_line, loss.count

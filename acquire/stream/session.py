@@ -232,7 +232,7 @@ class Session:
         """End before ``line``, although one arm may be past it: the other's ring had no room for it."""
         if line >= self.end_line:
             return
-        if self._floor is not RunCondition.INTERRUPTED:
+        if self._floor is not RunCondition.INTERRUPTED:  # else the first reason stays
             self.end_reason = reason
             self._note("fault", line, reason)
         self.end_line = line
@@ -320,7 +320,7 @@ class Session:
             for of, lines, cause in self._gaps:
                 if of == arm:
                     missed[cause] += max(0, lines.stop - max(lines.start, self.end_line))
-            forgotten[arm] = book.end_at(self.end_line, +missed)
+            forgotten[arm] = book.end_at(self.end_line, +missed)  # +: without causes that have no line left
         self._gaps = [(arm, lines, cause) for arm, lines, cause in self._gaps if lines.stop <= self.end_line]
         return forgotten
 

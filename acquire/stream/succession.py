@@ -136,6 +136,7 @@ class Succession:
 def continuation(begin: Begin, began: Began, committed_lines: int, why: str) -> Begin:
     """What has a recorder go on with a recording that was cut off after ``committed_lines`` lines."""
     at = began.first_line + committed_lines
+    # One at least, as a window must have: all lines may be committed of a recording that was not sealed.
     left = None if began.end_line is None else max(1, began.end_line - at)
     cause = f"its recorder was {why}"
     text = f"goes on from {begin.path.name}: {cause}"

@@ -8,29 +8,20 @@ import contextlib
 import threading
 import time
 from collections import deque
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from acquire.errors import AcquireError, DeviceError, TriggerError
 from acquire.lines import ARMS
 from acquire.processes.messages import Failed, Ready
 from acquire.stream.external_counts import TRIGGER, TRIGGER_COUNTERS, WATCHER
+from acquire.stream.lifecycle import UNDER_WAY, Lifecycle, Stage
+from acquire.stream.losses import Cause
 from acquire.stream.messages import Began, Cancel, Checked, End, Extend, Interrupt, Note, Refused, Sealed
 from acquire.stream.stalls import Excess, Heartbeat
-from acquire.stream.succession import (
-    Orphan,
-    Resumption,
-    Succession,
-    continuation,
-    once_more,
-    replacement_note,
-    resumed,
-)
+from acquire.stream.succession import Succession, replacement_note
 from acquire.stream.tagger import tag_rows
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from acquire.processes.shared import Counters
     from acquire.processes.worker import Worker
     from acquire.stream.messages import Begin
@@ -46,23 +37,18 @@ _ANSWER_S = 120.0
 """For a recording to be created. A recorder that hangs, rather than waits for the disk, is noticed sooner."""
 _JOIN_S = 30.0
 _MOST_EVENTS = 1024
-_MOST_KEPT = 256
-"""Recordings whose lines are remembered; those that a ring still holds lines of are fewer."""
 _ASK_EVERY_S = 1.0
 
 
 class Supervisor:
-    """Owns the thread. What it learnt can be read at any time: `began`, `sealed`, `fault`.
+    """Owns the thread. What it learnt can be read at any time.
 
     Where time is told, it holds the cameras' count of lines against the trigger's (`stalls.Excess`).
 
     Attributes
     ----------
-    began : the answer to the latest `begin`, unless that was refused
-    sealed : how the latest recording ended
+    life : what became of the latest recording
     fault : what failed first
-    path : where the latest recording is: not where it was begun, if its recorder was killed meanwhile
-    resumption : when a recording that the disk has ended goes on, and why it has not yet
     """
 
     def __init__(
@@ -74,16 +60,11 @@ class Supervisor:
         plan: CapturePlan,
         succession: Succession | None = None,
     ) -> None:
-        self.began: Began | None = None
-        self.sealed: Sealed | None = None
         self.fault: str | None = None
-        self.path: Path | None = None
+        self.life = Lifecycle(goes_on=plan.goes_on)
         self._trigger = trigger
         self._workers = workers
         self._succession = succession or Succession({})
-        self._asked: Begin | None = None
-        self._begin: Begin | None = None
-        self._end_reason: str | None = None
         self._tags = tags
         self._plan = plan
         self._loop = Heartbeat(counters[RECORDER], "turns")
@@ -94,26 +75,20 @@ class Supervisor:
         self._counters = counters
         self._ask_s = 0.0
         self._newest_pulse: int | None = None
-        self._refused: Refused | None = None
         self._trigger_lost = False
         self._trigger_told_s = time.monotonic()
         self._events: deque[Note] = deque(maxlen=_MOST_EVENTS)
         self._dead: set[str] = set()
-        self._orphans: list[Orphan] = []
-        self._kept: dict[str, deque[tuple[int, int]]] = {arm: deque(maxlen=_MOST_KEPT) for arm in ARMS}
-        self._going_on = False
-        self.resumption = Resumption()
-        self._cut_short: Sealed | None = None
         self._hung: str | None = None
         self._last_words: dict[str, str] = {}
-        self._news = threading.Condition()
+        self._news = threading.Condition()  # on a lock that its holder may take again: `_note` may `_fail`
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._live, name="acquire-supervisor", daemon=True)
 
     @property
     def recording(self) -> bool:
         """A recording is open, as far as the living can tell."""
-        return self.began is not None and self.sealed is None and RECORDER not in self._dead
+        return self.life.stage in UNDER_WAY
 
     @property
     def silent_s(self) -> float:
@@ -129,18 +104,6 @@ class Supervisor:
     def dead(self) -> frozenset[str]:
         """Processes that died, and whose place nobody took."""
         return frozenset(self._dead)
-
-    @property
-    def orphans(self) -> tuple[Orphan, ...]:
-        """Recordings that were not sealed; not while another recorder only begins, which has more to do."""
-        return () if self._going_on else tuple(self._orphans)
-
-    def kept(self, arm: str, released_line: int) -> list[tuple[int, int]]:
-        """Ranges of the arm's lines that recordings hold, the one under way up to ``released_line``."""
-        ranges = list(self._kept[arm])
-        if self.began is not None and self.sealed is None:
-            ranges.append((self.began.first_line, max(self.began.first_line, released_line)))
-        return ranges
 
     @property
     def pulses(self) -> int:
@@ -168,50 +131,48 @@ class Supervisor:
 
     def mark_unsealed(self) -> None:
         """Every process has ended: a recording that is not sealed now will not be."""
-        self._going_on = False
-        if self.began is not None and self.sealed is None and self.path is not None:
-            why = self.fault or "its recorder did not end in time"
-            self._orphans.append(Orphan(self.path, why, self._committed_lines))
+        self.life.mark_unsealed(self.fault or "its recorder did not end in time", self._committed_lines)
 
     def begin(self, message: Begin) -> None:
         """Have the recorder begin; returns when it has. Raises what it refuses with."""
         with self._news:
-            self.began = self.sealed = self._refused = self._begin = self._end_reason = self._cut_short = None
-            self.resumption = Resumption()
-            self._asked = message
+            self.life.begin(message)
             self._workers[RECORDER].post(message)
-            self._news.wait_for(lambda: self.began or self._refused or self.fault, _ANSWER_S)
-            self._asked = None
-            if self.began is not None:
-                self._begin, self.path = message, message.path
+            self._news.wait_for(lambda: self.life.stage is not Stage.ASKED or self.fault, _ANSWER_S)
+            if self.life.began is not None:
                 return
-            if self._refused is not None:
-                raise self._refused.error
-            if self.fault is None:
-                self._end_reason = "cancelled"  # should it begin all the same
+            if self.life.refused is not None:
+                raise self.life.refused.error
+            if self.life.stage is Stage.ASKED:
+                self.life.on_overdue()
                 self._workers[RECORDER].post(Cancel())
-        if self.fault is None:
-            raise DeviceError(
-                f"start: the recorder has not begun within {_ANSWER_S:g} s: {self._excuse()}",
-                possible="nothing was recorded",
-                hint="start again once the disk answers",
-            )
-        raise DeviceError(f"start: {self.fault}")
+            if self.fault is not None:
+                raise DeviceError(f"start: {self.fault}")
+        raise DeviceError(
+            f"start: the recorder has not begun within {_ANSWER_S:g} s: {self._excuse()}",
+            possible="nothing was recorded",
+            hint="start again once the disk answers",
+        )
 
     def end_recording(self, reason: str, line: int) -> None:
-        """Have the recording end at ``line``; a recorder that is only starting will hear of it."""
+        """Have the recording end at ``line``; a recorder that is only starting will hear of it.
+
+        Raises StateError where nothing has been recorded; one that has ended stays as it is.
+        """
         with self._news:
-            self._end_reason = reason
-            self._stay_ended()
+            self._cancel_if(begins=self.life.end(reason))
         self._workers[RECORDER].post(End(reason, line))
+
+    def interrupt_recording(self, reason: str) -> None:
+        """Have the recording end here and now, and not go on."""
+        with self._news:
+            self._cancel_if(begins=self.life.on_fault())
+        self._workers[RECORDER].post(Interrupt(reason, ARMS, Cause.INTERRUPTED))
 
     def extend(self, line: int) -> None:
         """Let the recording not end before ``line``, unless it is ending already."""
         with self._news:
-            if self.began is not None and self.began.end_line is not None:
-                self.began = replace(self.began, end_line=max(line, self.began.end_line))
-                if self._cut_short is not None and self._begin is not None:
-                    self._begin = replace(self._begin, end_line=self.began.end_line)
+            self.life.extend(line)
         self._workers[RECORDER].post(Extend(line))
 
     def happened(self, note: Note) -> None:
@@ -360,6 +321,9 @@ class Supervisor:
             if name not in self._last_words and self._succeed(name, worker, death):
                 return
             self._dead.add(name)
+            if name == RECORDER:
+                with self._news:
+                    self.life.on_died()
             if name == WATCHER:
                 self._lose_watcher(self._last_words.get(name, death))
                 return
@@ -384,28 +348,15 @@ class Supervisor:
         for arm in self._arms_of.get(name, ()):
             self._cameras[arm].revive()
         self._loop.revive()
-        if name == RECORDER and self._begin is not None and self.began is not None and self.sealed is None:
-            successor.post(self._go_on(self._begin, self.began, death))
-        elif name == RECORDER and self._asked is not None:
-            self._orphans.append(Orphan(self._asked.path, f"its recorder was {death}"))
-            self._note(name, Refused(DeviceError(f"start: the recorder was {death}", hint="start again")))
+        if name == RECORDER:
+            with self._news:
+                following = self.life.on_killed(death, self._committed_lines, time.monotonic())
+                self._news.notify_all()
+            if following is not None:
+                successor.post(following)
         newest = max(self._counters[arm]["next_line"] for arm in ARMS)
         self.happened(replacement_note(worker.name, death, max(newest, 0)))
         return True
-
-    def _go_on(self, begin: Begin, began: Began, death: str) -> Begin:
-        """With the recording of a recorder that was killed, beside it."""
-        committed = self._committed_lines
-        if self._going_on or self._cut_short is not None:  # and the counters may be neither's
-            following, committed = once_more(begin), 0
-        else:
-            following = continuation(begin, began, committed, death)
-        self._begin = following
-        if following.path != begin.path:  # else it was killed before it had made anything
-            why = f"its recorder was {death}; it goes on in {following.path.name}"
-            self._orphans.append(Orphan(begin.path, why, committed))
-        self._going_on, self.path = True, following.path
-        return following
 
     def _note(self, name: str, message: object) -> None:
         with self._news:
@@ -413,15 +364,16 @@ class Supervisor:
                 case Ready():
                     self._succession.ready(name)
                 case Began():
-                    self.began, self._going_on, self._cut_short = message, False, None
-                    self.resumption.began(time.monotonic())
-                    self.path = self._begin.path if self._begin else self.path
-                    if self._end_reason is not None:
-                        self._workers[RECORDER].post(End(self._end_reason))
+                    reason = self.life.on_began(message, time.monotonic())
+                    if reason is not None:
+                        self._workers[RECORDER].post(End(reason))
                 case Refused(error):
-                    self._take_refusal(name, message, error)
+                    if self.life.on_refused(message, time.monotonic()):
+                        self._last_words[name] = f"the recording cannot go on: {error}"
+                        self._fail(f"{self._workers[name].name}: {self._last_words[name]}", name)
                 case Sealed():
-                    self._take_end(message)
+                    rows = {arm: self._counters[RECORDER][f"rows_{arm}"] for arm in ARMS}
+                    self.life.on_sealed(message, rows, self._committed_lines, time.monotonic())
                 case Note():
                     self.happened(message)
                 case Checked(first_line, _, text):
@@ -431,50 +383,16 @@ class Supervisor:
                     self._last_words[name] = str(error).removeprefix(f"{self._workers[name].name}: ")
             self._news.notify_all()
 
-    def _take_refusal(self, name: str, refused: Refused, error: AcquireError) -> None:
-        """Of a first recording, or of one that goes on after a disk's trouble or a recorder's death."""
-        if self._cut_short is not None:
-            self.resumption.ended(time.monotonic(), error.message)
-        elif self._begin is None:
-            self._refused = refused
-        else:
-            self._last_words[name] = f"the recording cannot go on: {error}"
-            self.fault = self.fault or f"{self._workers[name].name}: {self._last_words[name]}"
-
-    def _take_end(self, sealed: Sealed) -> None:
-        self._note_kept()
-        if not sealed.on_disk and self.path is not None:
-            self._orphans.append(Orphan(self.path, sealed.end_reason, self._committed_lines))
-        begin, began, is_over = self._begin, self.began, self._end_reason or self.fault
-        following = None
-        if self._plan.goes_on and sealed.end_line is not None and begin and began and not is_over:
-            following = resumed(begin, began, sealed.end_line, sealed.end_reason)
-        if following is None:
-            self.sealed = sealed
-            return
-        self._begin, self._cut_short = following, sealed
-        self.resumption.ended(time.monotonic(), sealed.end_reason)
-
-    def _note_kept(self) -> None:
-        if self.began is None:
-            return
-        first = self.began.first_line
-        for arm, ranges in self._kept.items():
-            ranges.append((first, first + self._counters[RECORDER][f"rows_{arm}"]))
-
     def _resume_when_due(self) -> None:
         """Have a recording that the disk ended go on in a further segment."""
         with self._news:
-            if self._begin is None or not self.resumption.is_due(time.monotonic()):
-                return
-            self._begin = once_more(self._begin)
-        self._workers[RECORDER].post(self._begin)
+            following = self.life.due(time.monotonic())
+        if following is not None:
+            self._workers[RECORDER].post(following)
 
-    def _stay_ended(self) -> None:
-        """Nobody wants the further segment any more that has not begun yet."""
-        if self._cut_short is not None:
-            self.sealed, self._cut_short = self._cut_short, None
-            self.resumption = Resumption()
+    def _cancel_if(self, *, begins: bool) -> None:
+        """Nobody wants what the recorder only begins."""
+        if begins:
             self._workers[RECORDER].post(Cancel())
             self._news.notify_all()
 
@@ -482,6 +400,6 @@ class Supervisor:
         """Keep the first fault, and have the recording sealed if the recorder lives."""
         with self._news:
             self.fault = self.fault or text
-            self._stay_ended()
+            self._cancel_if(begins=self.life.on_fault())
             self._news.notify_all()
         self._workers[RECORDER].post(Interrupt(text, self._arms_of.get(name or "", ())))

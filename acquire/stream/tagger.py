@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -93,7 +93,7 @@ class Tagger:
             return []
         wrong = (rows != expected).any(axis=1)
         right = np.flatnonzero(~wrong)
-        lines = rows[right, 0].astype(np.int64)
+        lines = rows[right, 0].astype(np.int64)  # signed, as is the line before the first
         back = np.diff(lines, prepend=self._last_line) <= 0
         ahead = lines[~np.logical_or.accumulate(back)]
         if len(ahead) and not self._restarted:
@@ -101,7 +101,7 @@ class Tagger:
             self.confirmed_end = self._last_line + 1
         self._restarted |= bool(back.any())
         suspects = np.union1d(np.flatnonzero(wrong), right[back])
-        return [_mismatch(rows[k], expected[k]) for k in suspects]
+        return [TagMismatch(LineTag(*map(int, rows[k])), LineTag(*map(int, expected[k]))) for k in suspects]
 
     def _all_right(self, rows: NDArray[np.uint64], expected: NDArray[np.uint64]) -> bool:
         """The common case, at a fraction of the cost: all tags as predicted, each ahead of the one before."""
@@ -156,7 +156,3 @@ class Tagger:
     def _expected(self, lines: NDArray[np.uint64]) -> NDArray[np.uint64]:
         code_index = lines * np.uint64(self._run.substeps)
         return np.stack([lines, code_index, code_index * np.uint64(self._run.substep_ticks)], axis=1)
-
-
-def _mismatch(row: NDArray[Any], expected: NDArray[Any]) -> TagMismatch:
-    return TagMismatch(LineTag(*map(int, row)), LineTag(*map(int, expected)))

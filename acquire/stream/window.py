@@ -48,7 +48,7 @@ class Window:
     def __post_init__(self) -> None:
         if self.pre_lines < 0 or (self.post_lines is not None and self.post_lines < 1):
             raise UsageError(
-                f"a recording of {self.pre_lines} lines before and {self.post_lines} after",
+                f"a recording cannot have {self.pre_lines} lines before an event and {self.post_lines} after",
                 possible="0 or more before, 1 or more after",
             )
 
@@ -104,7 +104,8 @@ def span(window: Window, lines: int | None, held: Held, line_rate_hz: float) -> 
     if wanted < held.from_line and window.exact:
         has = max(0, held.at - held.from_line)
         raise UsageError(
-            f"start with {window.pre_lines} lines ({window.pre_lines / line_rate_hz:.3g} s) from before",
+            f"start: the rings do not hold {window.pre_lines} lines from before "
+            f"({window.pre_lines / line_rate_hz:.3g} s)",
             possible=f"up to {has} lines ({has / line_rate_hz:.3g} s), which both rings hold now",
             hint="wait until the ring is full, or configure a longer one (stream.ring_seconds)",
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from abc import ABC, abstractmethod
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -114,12 +115,12 @@ class SolverContract:
         assert np.isfinite(result.video).all()
 
 
-class DenoiserContract:
+class DenoiserContract(ABC):
     """Needs ``make``, what gives the denoiser."""
 
+    @abstractmethod
     def make(self) -> Denoiser:
         """The denoiser to be tried."""
-        raise NotImplementedError
 
     def test_no_strength_changes_nothing_and_more_leaves_less_noise(self) -> None:
         draws = np.random.default_rng(2)

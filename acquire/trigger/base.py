@@ -41,6 +41,20 @@ class Delays:
 
 
 @dataclass(frozen=True, slots=True)
+class LightWindow:
+    """When the light of a lit sub-step is on, in ticks from the sub-step's beginning."""
+
+    open_ticks: int
+    close_ticks: int
+
+    @classmethod
+    def of(cls, config: TriggerConfig) -> LightWindow:
+        """As a rig has it."""
+        light = config.light
+        return cls(light.open_ticks, config.substep_ticks if light.close_ticks is None else light.close_ticks)
+
+
+@dataclass(frozen=True, slots=True)
 class TriggerRun:
     """What one run asks of the trigger; a trigger that cannot honour it refuses in `Trigger.prepare`."""
 
@@ -52,7 +66,8 @@ class TriggerRun:
     """Duration of a sub-step in ticks of the trigger's clock."""
     tag_every_lines: int
     delays: Delays | None = None
-    """In place of what the trigger was configured with."""
+    window: LightWindow | None = None
+    """Delays and window in place of what the trigger was configured with."""
 
     @property
     def line_period_ticks(self) -> int:

@@ -131,7 +131,9 @@ class Device:
         """Load the code memory (0 or 1 per bit) and check it on the device; its CRC-32."""
         room = self.capabilities.code_bits
         if not 0 < len(bits) <= room:
-            raise TriggerError(f"a code of {len(bits)} bits", possible=f"1 to {room}")
+            raise TriggerError(
+                f"the code memory cannot hold a code of {len(bits)} bits", possible=f"1 to {room}"
+            )
         packed = np.packbits(bits, bitorder="little").tobytes()
         packed += bytes(-len(packed) % 4)
         self.link.write_block(r.CODE_MEMORY, np.frombuffer(packed, "<u4").tolist())

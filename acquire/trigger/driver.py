@@ -118,7 +118,7 @@ class TriggerDriver:
         with self._lock:
             run = self._prepared
             if run is None:
-                raise TriggerError("start of a trigger without a run", hint="prepare one")
+                raise TriggerError("a trigger cannot start without a run", hint="prepare one")
             device = self.device()
             device.link.tags(0)  # of the run before
             compared = device.compare_clocks()
@@ -127,7 +127,7 @@ class TriggerDriver:
                 device.command(Command.START, run_number(run.run_id))
         limit_s = self._config.external_timeout_s if external else ANSWER_S
         start_tick = self._await_line_0(device, run, limit_s)
-        if external:
+        if external:  # the edge may have come long after the first comparison, and clocks drift
             compared = device.compare_clocks()
         with self._lock:
             self._tags = TagReader(run, run_number(run.run_id), start_tick)
@@ -147,7 +147,7 @@ class TriggerDriver:
             patience_s = self._show_life(device)
             return tags.take(device.link.tags(min(timeout_s, patience_s)))
         except TriggerError as error:
-            raise TriggerError(f"{error.message}; last heard of {tags}", hint=error.hint) from error
+            raise TriggerError(f"{error.message}; its tags have told of {tags}", hint=error.hint) from error
 
     def events(self) -> list[TagEvent]:
         return self._tags.events() if self._tags is not None else []

@@ -61,7 +61,9 @@ class Frame(NamedTuple):
 def encode(frame: Frame) -> bytes:
     """The frame's bytes, delimiter included. Raises FrameLengthError for too long a payload."""
     if len(frame.payload) > MAX_PAYLOAD:
-        raise FrameLengthError(f"payload of {len(frame.payload)} bytes", possible=f"at most {MAX_PAYLOAD}")
+        raise FrameLengthError(
+            f"a payload cannot have {len(frame.payload)} bytes", possible=f"at most {MAX_PAYLOAD}"
+        )
     body = _HEADER.pack(frame.version, frame.type, frame.sequence) + frame.payload
     return bytes(cobs.encode(body + _CRC.pack(zlib.crc32(body)))) + b"\0"
 
@@ -69,13 +71,15 @@ def encode(frame: Frame) -> bytes:
 def decode(encoded: bytes) -> Frame:
     """The frame between two zeros. Raises a FrameError that says what is wrong."""
     if not _OVERHEAD < len(encoded) <= MAX_ENCODED:
-        raise FrameLengthError(f"{len(encoded)} bytes", possible=f"{_OVERHEAD + 1} to {MAX_ENCODED}")
+        raise FrameLengthError(
+            f"an encoded frame cannot have {len(encoded)} bytes", possible=f"{_OVERHEAD + 1} to {MAX_ENCODED}"
+        )
     try:
         whole = cobs.decode(encoded)
     except cobs.DecodeError as error:
         raise FrameStuffingError(f"{len(encoded)} bytes are not COBS: {error}") from error
     if len(whole) < _OVERHEAD:
-        raise FrameLengthError(f"{len(whole)} bytes", possible=f"{_OVERHEAD} or more")
+        raise FrameLengthError(f"a frame cannot have {len(whole)} bytes", possible=f"{_OVERHEAD} or more")
     body, (crc,) = whole[: -_CRC.size], _CRC.unpack(whole[-_CRC.size :])
     if zlib.crc32(body) != crc:
         raise FrameChecksumError(f"CRC {crc:#010x} where the bytes have {zlib.crc32(body):#010x}")
@@ -137,7 +141,7 @@ def read_payload(address: int, count: int) -> bytes:
 def write_payload(address: int, words: Sequence[int]) -> bytes:
     """Address and words: a WRITE, and equally a DATA."""
     if not 0 < len(words) <= MAX_WORDS:
-        raise FrameLengthError(f"{len(words)} words in one frame", possible=f"1 to {MAX_WORDS}")
+        raise FrameLengthError(f"one frame cannot have {len(words)} words", possible=f"1 to {MAX_WORDS}")
     return struct.pack(f"<H{len(words)}I", address, *words)
 
 

@@ -39,7 +39,7 @@ def blink(hz: float, substep_ticks: int, device: Capabilities) -> SquareWave:
     fastest = device.clock_hz / (2 * substep_ticks)
     if not slowest <= hz <= fastest:
         raise UsageError(
-            f"a light that blinks {hz:g} times a second",
+            f"the light cannot blink {hz:g} times a second",
             possible=f"{slowest:.3g} to {fastest:.6g} Hz, with sub-steps of {substep_ticks} ticks",
         )
     half_ticks = device.clock_hz / (2 * hz)
@@ -52,5 +52,7 @@ def square(half_substeps: int, substep_ticks: int, device: Capabilities) -> Squa
     """UsageError for more than the code memory holds."""
     most = device.code_bits // 2
     if not 1 <= half_substeps <= most:
-        raise UsageError(f"light for {half_substeps} sub-steps at a time", possible=f"1 to {most}")
+        raise UsageError(
+            f"the light cannot be on for {half_substeps} sub-steps at a time", possible=f"1 to {most}"
+        )
     return SquareWave(half_substeps, substep_ticks)

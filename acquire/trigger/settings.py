@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.config.device import LightOutputConfig, LineOutputConfig, TriggerConfig
-    from acquire.trigger.base import Delays, TriggerRun
+    from acquire.trigger.base import Delays, LightWindow, TriggerRun
 
 _DEFAULT_WIDTH = 90
 _TWINS = (r.Board.NONE, r.Board.MODEL)
@@ -115,6 +115,8 @@ def register_values(
     """Every config register's value. Raises TriggerError for what the device or its link cannot do."""
     if run.delays is not None:
         config = with_delays(config, run.delays)
+    if run.window is not None:
+        config = with_window(config, run.window)
     _check_timing(run, config, device)
     distance = run.substep_ticks if config.line_start == "per-substep" else run.line_period_ticks
     _check_pulses(config, distance)
@@ -153,35 +155,43 @@ def with_delays(config: TriggerConfig, delays: Delays) -> TriggerConfig:
     )
 
 
+def with_window(config: TriggerConfig, window: LightWindow) -> TriggerConfig:
+    """The configuration with another window of the light."""
+    light = {"open_ticks": window.open_ticks, "close_ticks": window.close_ticks}
+    return config.model_copy(update={"light": config.light.model_copy(update=light)})
+
+
 def _check_timing(run: TriggerRun, config: TriggerConfig, device: Capabilities) -> None:
     if config.clock_hz != device.clock_hz:
         raise TriggerError(
-            f"a trigger clock of {config.clock_hz} Hz",
+            f"trigger.clock_hz is {config.clock_hz} Hz, which is not the clock of this device",
             possible=f"{device.clock_hz} Hz, as this device has",
             hint="set trigger.clock_hz, and substep_ticks with it",
         )
     if not device.substep_ticks_min <= run.substep_ticks <= device.substep_ticks_max:
         raise TriggerError(
-            f"sub-step of {run.substep_ticks} ticks",
+            f"the trigger cannot make a sub-step of {run.substep_ticks} ticks",
             possible=f"{device.substep_ticks_min} to {device.substep_ticks_max}",
             hint="change trigger.substep_ticks",
         )
     if run.substeps not in device.substeps:
         raise TriggerError(
-            f"{run.substeps} sub-steps per line",
+            f"the trigger cannot make {run.substeps} sub-steps per line",
             possible=", ".join(map(str, device.substeps)),
             hint="change geometry.substeps",
         )
     if config.external_start != "off" and "external_arm" not in device.inputs:
         raise TriggerError(
-            "an external start", possible="start by command", hint="trigger.external_start='off'"
+            "this device has no input for an external start",
+            possible="start by command",
+            hint="trigger.external_start='off'",
         )
 
 
 def _check_pulses(config: TriggerConfig, distance: int) -> None:
     if distance < config.camera_min_period_ticks:
         raise TriggerError(
-            f"camera pulses {distance} ticks apart",
+            f"the camera pulses are only {distance} ticks apart",
             possible=f"{config.camera_min_period_ticks} or more, as trigger.camera_min_period_ticks says",
             hint="a longer trigger.substep_ticks",
         )
@@ -189,12 +199,14 @@ def _check_pulses(config: TriggerConfig, distance: int) -> None:
 
 def _check_tags(run: TriggerRun, device: Capabilities, bytes_per_s: float) -> None:
     if run.tag_every_lines < 1:
-        raise TriggerError(f"a tag every {run.tag_every_lines} lines", possible="1 or more")
+        raise TriggerError(
+            f"the trigger cannot send a tag every {run.tag_every_lines} lines", possible="1 or more"
+        )
     line_rate = device.clock_hz / run.line_period_ticks
     fewest = int(line_rate * _TAG_FRAME_BYTES / (bytes_per_s * _TAGS_SHARE)) + 1
     if run.tag_every_lines < fewest and bytes_per_s != float("inf"):
         raise TriggerError(
-            f"a tag every {run.tag_every_lines} lines at {line_rate:g} lines/s",
+            f"the link cannot carry a tag every {run.tag_every_lines} lines at {line_rate:g} lines/s",
             possible=f"every {fewest} lines over a link of {bytes_per_s:g} bytes/s",
             hint="raise trigger.tag_every_lines or trigger.baud",
         )
@@ -204,7 +216,7 @@ def _check_watchdog(config: TriggerConfig) -> None:
     most = (1 << r.WATCHDOG.width) - 1
     if config.watchdog_ticks > most:
         raise TriggerError(
-            f"a watchdog of {config.watchdog_s:g} s",
+            f"the watchdog cannot wait for {config.watchdog_s:g} s",
             possible=f"up to {most / config.clock_hz:.4g} s at {config.clock_hz} Hz; 0: never",
             hint="change trigger.watchdog_s",
         )
@@ -235,23 +247,26 @@ def _light(light: LightOutputConfig, substep_ticks: int, device: Capabilities) -
     closes = substep_ticks if light.close_ticks is None else light.close_ticks
     if not light.open_ticks < closes <= substep_ticks:
         raise TriggerError(
-            f"light from tick {light.open_ticks} to {closes} of a sub-step",
+            f"the light cannot be on from tick {light.open_ticks} to {closes} of a sub-step",
             possible=f"within 0 to {substep_ticks}",
             hint="change trigger.light.open_ticks and close_ticks",
         )
     if device.light_active not in {"any", light.active}:
         raise TriggerError(
-            f"a light that is lit by a {light.active} level",
+            f"the light cannot be lit by a {light.active} level",
             possible=f"{device.light_active}, as this board was built: else it is lit from power-up on",
             hint=f"trigger.light.active, or firmware.build with --light-active {light.active}",
         )
     most = substep_ticks - device.lead_margin_ticks
     if light.lead_ticks > most:
         raise TriggerError(
-            f"light {light.lead_ticks} ticks ahead", possible=f"at most {most} with this sub-step"
+            f"the light cannot be {light.lead_ticks} ticks ahead",
+            possible=f"at most {most} with this sub-step",
         )
     if light.scene_gate and "scene_gate" not in device.inputs:
-        raise TriggerError("light behind the scene gate", possible="trigger.light.scene_gate = false")
+        raise TriggerError(
+            "this device has no scene gate for the light", possible="trigger.light.scene_gate = false"
+        )
     led = r.LED.pack(
         enable=light.enable,
         gate_enable=light.scene_gate,
@@ -270,13 +285,14 @@ def _output(output: LineOutputConfig, arm: str, distance: int, device: Capabilit
     width = pulse_width_ticks(output.width_ticks, distance)
     if output.enable and output.delay_ticks + width >= distance:
         raise TriggerError(
-            f"pulse {arm} {width} ticks wide, {output.delay_ticks} late",
+            f"the pulse of camera {arm} is {width} ticks wide and {output.delay_ticks} late: too much",
             possible=f"delay + width below the {distance} ticks between pulses",
             hint=f"change trigger.{arm.lower()}.delay_ticks and width_ticks",
         )
     if output.strobe and "strobes" not in device.inputs:
         raise TriggerError(
-            f"strobes of camera {arm}", possible=f"trigger.{arm.lower()}.strobe = false with this device"
+            f"this device cannot watch the strobes of camera {arm}",
+            possible=f"trigger.{arm.lower()}.strobe = false",
         )
     control = r.TRIGGER_A.pack(
         enable=output.enable,

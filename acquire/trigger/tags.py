@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
     from acquire.trigger.base import TriggerRun
-    from acquire.trigger.link import TagArrival
+    from acquire.trigger.dialogue import TagArrival
 
 _NUMBERS = 1 << 16
 _RUN_BITS = dict(TAG_FIELDS)["run"]

@@ -158,7 +158,12 @@ def _add_stream(api: APIRouter, pages: Pages) -> None:
         glimpses: Annotated[
             bool, Query(description="coarse videos of what has just passed; takes a core")
         ] = False,
-    ) -> StreamingResponse:
+        once: Annotated[
+            bool, Query(description="the state and no more, as a hidden page asks for it")
+        ] = False,
+    ) -> Response:
+        if once:
+            return Response(pages.state, media_type="application/octet-stream", headers=NO_STORE)
         stream = pages.open(pictures=pictures, glimpses=glimpses)
         return StreamingResponse(stream, media_type="application/octet-stream", headers=NO_STORE)
 

@@ -18,7 +18,7 @@ from PIL import Image
 from acquire.errors import AcquireError, PlaceError, UsageError
 from acquire.lines import ARMS, LineFlag
 from acquire.store import Recording, format_of, hold, open_recording, open_video
-from acquire.store.camera_stream import DAMAGE
+from acquire.store.layout import DAMAGE
 from acquire.store.shortfall import first_shortfall, missing_segments
 from acquire.text import shortened
 from acquire.web.messages import (
@@ -129,7 +129,7 @@ class Archive:
         facts, video = self.video(name), open_video(self.path_of(name))
         most = max(1, MOST_FRAME_BYTES // (facts.rows * facts.columns))
         if not 0 <= first < facts.frames:
-            raise UsageError(f"frame {first} of {name}", possible=f"0 to {facts.frames - 1}")
+            raise UsageError(f"{name} has no frame {first}", possible=f"0 to {facts.frames - 1}")
         values = np.asarray(video.video[first : first + min(count, most)], np.float32)
         scaled = np.nan_to_num((values - facts.low) * (255 / max(facts.high - facts.low, 1e-12)))
         content: bytes = np.clip(scaled, 0, 255).astype(np.uint8).tobytes()
@@ -140,7 +140,7 @@ class Archive:
         try:
             entries = list(self._directory.iterdir())
         except OSError as error:
-            raise PlaceError(f"{self._directory}: {error.strerror}") from error
+            raise PlaceError(f"{self._directory} cannot be listed: {error.strerror}") from error
         for path in entries:
             try:
                 mode = path.lstat()

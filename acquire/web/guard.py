@@ -37,8 +37,10 @@ API = "/api/"
 OPEN = ("/api/session", "/api/healthz")
 """Answered without a token: one takes it, the other tells a supervisor no more than that all is well."""
 SAFE = ("GET", "HEAD", "OPTIONS")
-REQUESTS = (60.0, 30.0)
-"""At once, and per second, of one address."""
+REQUESTS = (240.0, 30.0)
+"""At once, and per second, of one address without a token: ten new tabs ask for twenty files each."""
+ADMITTED = (600.0, 60.0)
+"""The same with one: strangers behind the same address cannot use it up."""
 WRONG_TOKENS = (5.0, 0.2)
 """Wrong tokens of one address at once, and per second."""
 MOST_ADDRESSES = 1024
@@ -102,6 +104,7 @@ class Guard:
         self._tokens = tokens
         self._names = names
         self._requests = Buckets(*REQUESTS)
+        self._admitted = Buckets(*ADMITTED)
         self._wrong = Buckets(*WRONG_TOKENS)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -122,7 +125,8 @@ class Guard:
         address = request.client.host if request.client else ""
         if _host_of(request.headers.get("host", "")) not in self._names:
             return _refuse(421, f"this is not {shortened(request.headers.get('host', ''))}", "web.names")
-        if not self._requests.take(address):
+        asked = self._requests if self.role_of(request) is None else self._admitted
+        if not asked.take(address):
             return _refuse(429, "too many requests", "a second")
         if not request.url.path.startswith(API):
             return None

@@ -1,4 +1,4 @@
-"""One stream per page: state, news and pictures on one connection, of which a browser has six per host.
+"""One stream per page that is seen: state, news and pictures on one connection, of which a browser has six.
 
 Nothing is queued for a page. It is woken, takes what is new from its places in the two logs, and writes it; a
 page that reads slowly takes the newest pictures, and one that does not read at all is disconnected.
@@ -36,6 +36,10 @@ class Pages:
         if self._open >= MOST_PAGES:
             raise StateError(f"{MOST_PAGES} pages are open already", hint="close one of them")
         return self._stream(pictures=pictures, glimpses=glimpses)
+
+    @property
+    def state(self) -> bytes:
+        return self._hub.state_message()
 
     async def _stream(self, *, pictures: bool, glimpses: bool) -> AsyncIterator[bytes]:
         hub = self._hub

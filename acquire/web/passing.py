@@ -11,7 +11,7 @@ from acquire.daemon.stream import news_text, status_text
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
-    from acquire.daemon.facts import Health, Rings, Setup, Version
+    from acquire.daemon.facts import Health, Reloaded, Rings, Setup, Version
     from acquire.daemon.messages import ArmRequest, CapacityStatus, MarkRequest, StartRequest
     from acquire.web.hub import Hub
 
@@ -43,6 +43,9 @@ class Passing:
 
     async def measure(self) -> CapacityStatus:
         return await self._client.measure()
+
+    async def reload(self) -> Reloaded:
+        return await self._client.reload()
 
     async def health(self) -> Health:
         return self._hub.health()

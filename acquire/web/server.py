@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import os
 import socket as sockets
 import ssl
 from typing import TYPE_CHECKING
@@ -15,6 +14,7 @@ import uvicorn
 from acquire.client import Client
 from acquire.daemon.connections import Connection, raise_descriptor_limit
 from acquire.errors import NoDaemonError, UsageError
+from acquire.processes.rank import EARLY, stand_back
 from acquire.web.app import build_page
 from acquire.web.tokens import Tokens, load_tokens
 
@@ -36,7 +36,7 @@ def serve_page(socket: Path, directory: Path, config: WebConfig) -> None:
 
     Raises UsageError for an address, certificate or token file that cannot be used.
     """
-    os.nice(NICE)
+    stand_back(NICE, EARLY)
     raise_descriptor_limit()
     tokens = load_tokens(config.token_path(socket))
     context = _tls(config)

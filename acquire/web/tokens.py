@@ -64,7 +64,9 @@ def load_tokens(path: Path) -> Tokens:
     except FileExistsError:
         return _read(path)
     except OSError as error:
-        raise UsageError(f"the file of tokens {path}: {error.strerror}", hint="web.token_file") from error
+        raise UsageError(
+            f"the file of tokens {path} cannot be opened: {error.strerror}", hint="web.token_file"
+        ) from error
     made = {role: secrets.token_urlsafe(_TOKEN_BYTES) for role in ROLES}
     with os.fdopen(file, "w") as out:
         json.dump(made, out)
@@ -76,7 +78,9 @@ def _read(path: Path) -> Tokens:
     try:
         file = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
     except OSError as error:
-        raise UsageError(f"the file of tokens {path}: {error.strerror}", hint="web.token_file") from error
+        raise UsageError(
+            f"the file of tokens {path} cannot be opened: {error.strerror}", hint="web.token_file"
+        ) from error
     with os.fdopen(file, "rb") as source:
         found = os.fstat(file)
         if not stat.S_ISREG(found.st_mode):

@@ -5,22 +5,19 @@ It gets what the processors leave, is the first to go where memory is short, and
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import os
 import signal
 import sys
-from pathlib import Path
+
+from acquire.processes.rank import FIRST, stand_back
 
 _NICE = 19
 _PR_SET_PDEATHSIG = 1
-_FIRST_TO_GO = "1000"
 
 
 def main() -> None:
-    os.nice(_NICE)
-    with contextlib.suppress(OSError):  # a kernel without it
-        Path("/proc/self/oom_score_adj").write_text(_FIRST_TO_GO, encoding="ascii")
+    stand_back(_NICE, FIRST)
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
     os.execv(sys.executable, [sys.executable, "-m", "acquire", *sys.argv[1:]])  # noqa: S606 - ours
 

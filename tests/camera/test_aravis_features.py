@@ -102,7 +102,8 @@ def test_what_only_computes_is_read_and_is_refused_with_what_it_reads(described:
     with pytest.raises(CameraError, match=r"PeriodInMs = 3: it cannot be written now, it reads 40\.0"):
         apply(described, ("remote", "PeriodInMs", 3))
     with pytest.raises(
-        CameraError, match="PlainRegister = 3: not a value for it; possible: nothing that can be"
+        CameraError,
+        match="PlainRegister = 3: the feature cannot have this value; possible: nothing that can be",
     ):
         apply(described, ("remote", "PlainRegister", 3))
 
@@ -167,10 +168,13 @@ def test_a_frame_is_waited_for_as_long_as_its_lines_take(
             "stream has no feature 'frame-retension'; possible: frame-retention",
         ),
         (("stream", "packet-timeout", -1), "out of range; possible: 0 to 4294967295"),
-        (("stream", "packet-timeout", 1.5), "not a value for it"),
-        (("stream", "packet-resend", "sometimes"), "no such entry; possible: never, always"),
+        (("stream", "packet-timeout", 1.5), "the feature cannot have this value"),
+        (("stream", "packet-resend", "sometimes"), "the feature has no such entry; possible: never, always"),
         (("stream", "packet-request-ratio", 3.0), "out of range; possible: 0 to 2"),
-        (("stream", "packet-size-adjustment", "default"), "no such entry; possible: never, .*always$"),
+        (
+            ("stream", "packet-size-adjustment", "default"),
+            "the feature has no such entry; possible: never, .*always$",
+        ),
         (("stream", "socket-buffer-size", 2**31 - 1), "out of range; possible: -1 to "),
         (("remote", "packet-timeout", 3), "no feature 'packet-timeout'.*try: module stream"),
         (("stream", "Width", 3), "no feature 'Width'.*try: module remote"),
@@ -187,7 +191,9 @@ def test_packets_are_not_asked_for_again_of_a_camera_that_keeps_none() -> None:
     with our_camera(50, Transmission(resends=False)) as (_, address):
         camera = open_in_time(AravisOpener(spec_at(address, 50)))
         assert camera.settings()["packet-resend"] == "never"
-        with pytest.raises(CameraError, match="packet-resend = 'always': no such entry; possible: never"):
+        with pytest.raises(
+            CameraError, match="packet-resend = 'always': the feature has no such entry; possible: never"
+        ):
             apply(camera, ("stream", "packet-resend", "always"))
         camera.close()
 

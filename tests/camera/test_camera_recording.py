@@ -25,6 +25,7 @@ from acquire.sim.gige.camera import Transmission
 from acquire.sim.lines import StreamingArm
 from acquire.simulate import bench_of
 from acquire.store import Recording, RunCondition, open_recording, verify
+from acquire.stream.messages import Begin
 
 needs_compiler = pytest.mark.needs_compiler
 
@@ -69,13 +70,16 @@ def record(
         try:
             run.arm()
             if stamps:
-                until(lambda: all(run.poll().lines[arm]["clock"]["stamp_ns"] for arm in "ab"), "time stamps")
-            run.start(path, lines)
+                until(
+                    lambda: all(run.capture.poll().lines[arm]["clock"]["stamp_ns"] for arm in "ab"),
+                    "time stamps",
+                )
+            run.capture.start(Begin(path, run.spec(), lines))
             happen(rig, run)
-            until(lambda: run.poll().done, "the recording's end")
+            until(lambda: run.capture.poll().done, "the recording's end")
         finally:
-            run.close()
-        return open_recording(path), run.poll()
+            run.capture.close()
+        return open_recording(path), run.capture.poll()
 
 
 def check_lines(config: RigConfig, recording: Recording, arm: str) -> np.ndarray:
@@ -137,10 +141,10 @@ def test_over_a_bad_link_every_line_is_eq1_flagged_or_lost_also_after_the_camera
         rig.simulated._gige.transmission = Transmission(link=BadLink(0.05), resends=False)
 
     def happen(rig: Rig, run: Run) -> None:
-        until(lambda: run.poll().recorded_lines > 2500, "lines")
+        until(lambda: run.capture.poll().recorded_lines > 2500, "lines")
         gige = rig.simulated._gige
         gige._servers.pop("a").end(time.monotonic() + 20)
-        until(lambda: run.poll().lines["a"]["reopened"] or _reopen(gige, rig), "the camera")
+        until(lambda: run.capture.poll().lines["a"]["reopened"] or _reopen(gige, rig), "the camera")
 
     def _reopen(gige: Any, rig: Rig) -> bool:
         gige.opener("a", rig.simulated.sensor)
@@ -210,7 +214,7 @@ def test_a_camera_that_was_away_goes_on_at_the_right_line_and_the_gap_is_recorde
     config = rig_config(**{"stream.reopen_s": 20.0, **UNHURRIED})
 
     def happen(rig: Rig, run: Run) -> None:
-        until(lambda: run.poll().recorded_lines > 2500, "lines")
+        until(lambda: run.capture.poll().recorded_lines > 2500, "lines")
         memory = rig.simulated._gentl._bench.cameras["SIM-A"]
         memory.unplug()
         until(
@@ -233,10 +237,10 @@ def test_a_camera_that_does_not_come_back_ends_the_recording_in_time(tmp_path: P
     config = rig_config(**{"stream.reopen_s": 0.5})
 
     def happen(rig: Rig, run: Run) -> None:
-        until(lambda: run.poll().recorded_lines > 1000, "lines")
+        until(lambda: run.capture.poll().recorded_lines > 1000, "lines")
         rig.simulated._gentl._bench.cameras["SIM-A"].unplug()
         begin = time.monotonic()
-        until(lambda: run.poll().done, "the end")
+        until(lambda: run.capture.poll().done, "the end")
         assert time.monotonic() - begin < 200
 
     recording, status = record(config, tmp_path / "r.zarr", 10_000_000, happen)

@@ -36,13 +36,16 @@ def apply(camera: HarvestersCamera, *settings: tuple[str, str, object]) -> None:
         (("remote", "Widht", 3), r"remote has no feature 'Widht'; possible: Width, "),
         (("remote", "BufferHeight", 3), r"no feature 'BufferHeight'; .*try: module stream"),
         (("camera", "Width", 3), r"module 'camera'; possible: remote, interface, device, stream, system"),
-        (("remote", "Width", 65), r"Width = 65: out of range; possible: 1 to 64"),
-        (("remote", "Width", 1.5), r"Width = 1.5: not a value for it; possible: 1 to 64"),
-        (("remote", "Width", True), r"not a value for it"),
-        (("remote", "Width", "wide"), r"not a value for it"),
-        (("remote", "TDIStages", "TDI96"), r"no such entry; possible: TDI64, TDI128, TDI192, TDI256"),
-        (("remote", "TDIStages", 64), r"not a value for it; possible: TDI64"),
-        (("remote", "DigitalGain", "nan"), r"not a value"),
+        (("remote", "Width", 65), r"Width = 65: the value is out of range; possible: 1 to 64"),
+        (("remote", "Width", 1.5), r"Width = 1.5: the feature cannot have this value; possible: 1 to 64"),
+        (("remote", "Width", True), r"the feature cannot have this value"),
+        (("remote", "Width", "wide"), r"the feature cannot have this value"),
+        (
+            ("remote", "TDIStages", "TDI96"),
+            r"the feature has no such entry; possible: TDI64, TDI128, TDI192, TDI256",
+        ),
+        (("remote", "TDIStages", 64), r"the feature cannot have this value; possible: TDI64"),
+        (("remote", "DigitalGain", "nan"), r"cannot have this value"),
         (("remote", "DigitalGain", 99), r"out of range; possible: 1 to 32"),
         (("remote", "SensorWidth", 64), r"cannot be written now, it reads 64"),
         (("remote", "DeviceModelName", "x"), r"cannot be written now"),
@@ -74,7 +77,7 @@ def test_values_are_coerced_by_the_feature_s_type(camera: HarvestersCamera) -> N
 
 
 def test_the_order_is_the_user_s(camera: HarvestersCamera) -> None:
-    with pytest.raises(CameraError, match="OffsetX = 32: out of range; possible: 0 to 0"):
+    with pytest.raises(CameraError, match="OffsetX = 32: the value is out of range; possible: 0 to 0"):
         apply(camera, ("remote", "OffsetX", 32), ("remote", "Width", 32))
     apply(camera, ("remote", "Width", 32), ("remote", "OffsetX", 32))
     apply(camera, ("remote", "OffsetX", 0), ("remote", "Width", 64))
@@ -88,7 +91,7 @@ def test_a_setting_that_a_later_one_undoes_is_told(camera: HarvestersCamera) -> 
         node.write(16)  # as modes of real cameras do
         yield Setting("remote", "OffsetX", 0)
 
-    with pytest.raises(CameraError, match="Width = 32: a later setting has made it 16"):
+    with pytest.raises(CameraError, match="Width = 32: the camera has 16 after a later setting"):
         apply_settings(settings(), camera.features())
     apply(camera, ("remote", "Width", 64))
 

@@ -239,7 +239,7 @@ def test_a_camera_in_use_is_listed_so_and_refused(bench: GentlBench, open_camera
     ("changes", "words"),
     [
         ({"model": "VT-4K5C-H100"}, "is a 'simulated TDI line-scan camera', not a 'VT-4K5C-H100'"),
-        ({"pixels": 32}, "lines of 48 pixels; possible: 32"),
+        ({"pixels": 32}, "delivers lines of 48 pixels; possible: 32"),
         ({"bits": 8}, "Mono12 of 12 bits; possible: 8 bits"),
         ({"serial": "NONE"}, "no camera with serial number 'NONE'; possible: SIM-64"),
         ({"cti": "/nowhere/x.cti"}, "no such file"),

@@ -63,5 +63,5 @@ def test_unpacked_lines_are_not_copied() -> None:
 
 
 def test_a_format_that_cannot_be_recorded_is_refused_with_those_that_can() -> None:
-    with pytest.raises(CameraError, match=r"'RGB8'; possible: Mono8, .*Mono16"):
+    with pytest.raises(CameraError, match=r"'RGB8' cannot be recorded; possible: Mono8, .*Mono16"):
         layout_of("RGB8")

@@ -38,7 +38,7 @@ def test_what_a_rig_lacks_is_said(cli: Cli, monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.delenv("GENICAM_GENTL64_PATH", raising=False)
     answer = cli("devices", "--config", "rig-vt-4k5c-h100")
     assert answer.code == 0
-    assert answer.out.count("no GenTL producer; possible: .cti files") == 2
+    assert answer.out.count("there is no GenTL producer; possible: .cti files") == 2
 
 
 def of_host(producers: str) -> list[dict[str, str]]:

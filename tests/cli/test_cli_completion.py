@@ -51,7 +51,7 @@ def test_commands_options_and_values(offered: Callable[..., list[str]], shell: s
     assert offered("acquire calibrate da", shell) == ["dark"]
     assert offered("acquire reconstruct take.zarr --pl", shell) == ["--plan"]
     assert offered("acquire status --wait ", shell) == list(STATES)
-    assert offered("acquire serve --config rig-f", shell) == ["rig-fast"]
+    assert offered("acquire serve --config rig-f", shell) == ["rig-fast", "rig-fibre"]
     assert "scene-leds" in offered("acquire simulate scene-", shell)
     assert offered("acquire reconstruct take.zarr --plan plan", shell) == ["plan-window"]
     assert offered("acquire config check own", shell) == ["own.toml"]

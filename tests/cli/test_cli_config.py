@@ -66,19 +66,31 @@ def test_bad_files_name_the_key(cli: Cli, rig_file: Path, before: str, after: st
             "substep_ticks = 9000\ncamera_min_period_ticks = 30_000",
             "27000 ticks apart; possible: 30000 or more",
         ),
-        ("a.delay_ticks = 2650", "pulse A 90 ticks wide, 2650 late; possible: delay + width below the 2700"),
-        ("b.width_ticks = 2700", "pulse B 2700 ticks wide, 0 late"),
-        ("light.open_ticks = 901", "light from tick 901 to 900 of a sub-step; possible: within 0 to 900"),
-        ("substep_ticks = 200\nlight.lead_ticks = 200", "light 200 ticks ahead; possible: at most 199"),
+        (
+            "a.delay_ticks = 2650",
+            "A is 90 ticks wide and 2650 late: too much; possible: delay + width below the 2700",
+        ),
+        ("b.width_ticks = 2700", "the pulse of camera B is 2700 ticks wide and 0 late"),
+        (
+            "light.open_ticks = 901",
+            "the light cannot be on from tick 901 to 900 of a sub-step; possible: within 0 to 900",
+        ),
+        (
+            "substep_ticks = 200\nlight.lead_ticks = 200",
+            "the light cannot be 200 ticks ahead; possible: at most 199",
+        ),
         (
             "light.scene_gate = true",
-            "light behind the scene gate; possible: trigger.light.scene_gate = false",
+            "this device has no scene gate for the light; possible: trigger.light.scene_gate = false",
         ),
-        ("b.strobe = true", "strobes of camera B"),
+        ("b.strobe = true", "this device cannot watch the strobes of camera B"),
         ("line_start = 'per-substep'", "trigger.line_start = 'per-substep': cannot be simulated"),
         ("external_start = 'rising'", "trigger.external_start = 'rising': cannot be simulated"),
         ("b.direction = 'reverse'", "trigger.b.direction = 'reverse': cannot be simulated"),
-        ("light.close_ticks = 450", "trigger.light.open_ticks, light.close_ticks: cannot be simulated"),
+        (
+            "light.close_ticks = 450\ndriver = 'rtl'",
+            "trigger.light.open_ticks, light.close_ticks: cannot be simulated",
+        ),
         ("driver = 'serial'\nurl = '/dev/ttyUSB0'", "trigger.driver = 'serial': cannot be simulated"),
         ("driver = 'serial'", "driver 'serial' needs a url"),
         (

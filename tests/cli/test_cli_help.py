@@ -21,6 +21,8 @@ from acquire.simulate import simulate
 Cli = Callable[..., Any]
 LATE = {"rich", "pydantic", "numpy", "zarr", "acquire.config", "acquire.store"}
 """What the help of no command needs."""
+LIBRARIES = {"awscrt", "multiprocessing", "numcodecs", "numpy", "pydantic", "rich", "scipy", "zarr"}
+"""What a list of recordings does without."""
 PROCESSOR_S = 2.0
 """Ten times what is expected, for a slow machine: what is loaded is asked exactly."""
 
@@ -67,10 +69,10 @@ def test_no_words_are_answered_with_the_overview_and_exit_2(cli: Cli) -> None:
 @pytest.mark.parametrize(
     ("words", "meant"),
     [
-        (("stauts",), "no such command 'stauts'; did you mean 'status'?"),
-        (("--versoin",), "no such option: --versoin; did you mean '--version'?"),
-        (("start", "--line", "5"), "start: no such option: --line; did you mean '--lines'?"),
-        (("calibrate", "drak"), "calibrate: no such command 'drak'; did you mean 'dark'?"),
+        (("stauts",), "there is no command 'stauts'; did you mean 'status'?"),
+        (("--versoin",), "there is no option --versoin; did you mean '--version'?"),
+        (("start", "--line", "5"), "start: there is no option --line; did you mean '--lines'?"),
+        (("calibrate", "drak"), "calibrate: there is no command 'drak'; did you mean 'dark'?"),
         (("config", "check", "rig-dmeo"), "'rig-dmeo' does not exist; did you mean 'rig-demo'?"),
         (("status", "--wait", "armd"), "no state 'armd'; did you mean 'armed'?"),
     ],
@@ -89,19 +91,39 @@ def test_help_names_the_environment_s_variables(cli: Cli) -> None:
     assert "[env var: ACQUIRE_SOCKET]" in cli("arm", "--help").out
 
 
-@pytest.mark.parametrize("words", [["ls", "."], ["info", "run.zarr"]], ids=" ".join)
-def test_recordings_are_listed_without_zarr_python(tmp_path: Path, words: list[str]) -> None:
-    """The metadata is read by our own reader: the library takes half a second to import."""
-    simulate(
-        load_rig("rig-demo", {"geometry.stages": 8}), load_scene("scene-leds"), tmp_path / "run.zarr", 100
-    )
+@pytest.mark.parametrize(
+    "words", [["ls", "."], ["info", "run.zarr"], ["info", "run.zarr", "--json"]], ids=" ".join
+)
+@pytest.mark.parametrize("state", ["sealed", "growing", "among odd entries"])
+def test_recordings_are_listed_without_libraries_of_arrays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], state: str
+) -> None:
+    """Metadata and small tables need the standard library alone; the others take longer than the answer."""
+    monkeypatch.setenv("COLUMNS", "200")
+    path, rig = tmp_path / "run.zarr", load_rig("rig-demo", {"geometry.stages": 8})
+    simulate(rig, load_scene("scene-leds"), path, 100)
+    root = path / "zarr.json"
+    if state == "growing":
+        root.write_text(root.read_text().replace('"state":"sealed"', '"state":"recording"'))
+    if state == "among odd entries":
+        (tmp_path / "empty.zarr").mkdir()
+        (tmp_path / "link.zarr").symlink_to(path)
+        (tmp_path / "nothing.zarr").symlink_to(tmp_path / "gone")
+        (tmp_path / "file.zarr").write_text("no directory")
+        (tmp_path / "torn.zarr").mkdir()
+        (tmp_path / "torn.zarr" / "zarr.json").write_bytes(root.read_bytes()[:500])
     code = (
         "import sys\nfrom acquire.cli import main\n"
         f"sys.argv = ['acquire', *{words!r}]\n"
-        f"assert main() == 0\nprint('loaded:', sorted({{'zarr', 'rich', 'scipy'}} & set(sys.modules)))"
+        f"assert main() == 0\nprint('loaded:', sorted({LIBRARIES!r} & set(sys.modules)))"
     )
     ended = subprocess.run(
         [sys.executable, "-c", code], cwd=tmp_path, check=True, capture_output=True, text=True, timeout=300
     )
     assert "run.zarr" in ended.stdout
+    if state == "among odd entries" and words[0] == "ls":
+        told = {line.split()[0]: line for line in ended.stdout.splitlines()[1:-1]}
+        assert set(told) == {"empty.zarr", "link.zarr", "run.zarr", "torn.zarr"}
+        assert "is not a recording: it holds no zarr.json" in told["empty.zarr"]
+        assert "zarr.json is damaged" in told["torn.zarr"]
     assert ended.stdout.splitlines()[-1] == "loaded: []"

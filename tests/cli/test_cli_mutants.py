@@ -21,7 +21,7 @@ from acquire.clock import ClockFit
 from acquire.errors import DataError
 from acquire.lines import ARMS, LineBlock
 from acquire.store import RecordingWriter, RunCondition, verify
-from acquire.store.opening import open_source
+from acquire.store.reader import open_source
 from acquire.store.source import LocalSource
 from acquire.stream.tagger import Tagger
 

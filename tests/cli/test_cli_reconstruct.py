@@ -71,6 +71,15 @@ def test_several_voxels_side_by_side(cli: Cli, recording: Path, tmp_path: Path) 
     assert answer.code == 0, answer.err
     with Image.open(tmp_path / "both.png") as sheet:
         assert sheet.width > 6 * 190
+    answer = cli("render", slow, fast, "--out", tmp_path / "both.html", "--json")
+    assert answer.code == 0, answer.err
+    page = (tmp_path / "both.html").read_text(encoding="utf-8")
+    assert answer.json["bytes"] == len(page.encode()) < 700_000
+    facts = open_video(fast).attrs["provenance"]
+    part = facts["segments"][0]
+    assert part["processor_s"] > 0
+    assert f"<td>{part['seconds']:.1f}</td><td>{part['processor_s']:.1f}</td>" in page
+    assert f"{facts['lines']} lines from {facts['first_line']} on" in page
 
 
 def test_a_plan_on_the_command_line(cli: Cli, recording: Path, tmp_path: Path) -> None:
@@ -201,7 +210,10 @@ def test_fig_9_from_scene_to_page(cli: Cli, tmp_path: Path) -> None:
     assert rows["video"] == "64 × 64 × 598, 51.99 to 57.96 ms"
     assert figure["numbers"]["psnr_db"] > 12
     page = (tmp_path / "p" / "index.html").read_text()
-    assert page.count("data:image/png") == 3
+    assert page.count("<picture>") == 3
+    assert page.count("data:image/svg+xml") == 2 * 3  # for wide pages and for narrow ones
+    assert figure["rows"][0]["verdict"] == "equal"
+    assert 1 <= figure["host"]["least_share_percent"] <= figure["host"]["share_percent"] <= 100
     assert "data:image/webp" in page
     assert json.loads((tmp_path / "p" / "summary.json").read_text())["figures"][0]["rows"] == figure["rows"]
 

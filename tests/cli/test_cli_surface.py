@@ -71,11 +71,11 @@ def test_help_fits_a_narrow_terminal_and_cuts_no_name(
 @pytest.mark.parametrize(
     ("words", "command", "message"),
     [
-        (("stauts",), "acquire", "no such command 'stauts'"),
-        (("start", "--line", "5"), "acquire start", "start: no such option: --line"),
-        (("cut",), "acquire cut", "cut: missing argument 'RECORDING'"),
+        (("stauts",), "acquire", "there is no command 'stauts'"),
+        (("start", "--line", "5"), "acquire start", "start: there is no option --line"),
+        (("cut",), "acquire cut", "cut: the argument 'RECORDING' is missing"),
         (("start", "--lines", "x"), "acquire start", "start: invalid value for '--lines'"),
-        (("trigger", "lod"), "acquire trigger", "trigger: no such command 'lod'"),
+        (("trigger", "lod"), "acquire trigger", "trigger: there is no command 'lod'"),
     ],
 )
 def test_wrong_words_are_told_in_the_voice_of_all_errors(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from collections import Counter
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,13 @@ def test_rule(rule: str) -> None:
         [sys.executable, *TOOLS[rule]], cwd=ROOT, capture_output=True, text=True, timeout=800, check=False
     )
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_modules_of_tests_have_names_of_their_own() -> None:
+    """Of two with one name the second is not collected, and a run of one room does not notice."""
+    names = Counter(path.name for path in (ROOT / "tests").rglob("*.py"))
+    shared = {name for name, count in names.items() if count > 1}
+    assert shared <= {"conftest.py", "__init__.py"}
 
 
 def test_types_and_the_front_door_are_shipped() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from tools import results
-from tools.results import Machine, Run, choose, commit, read, recorded, table
+from tools.results import DOCUMENTS, Machine, Run, choose, commit, read, recorded, table, with_tables
 
 
 def test_a_run_is_kept_with_its_origin_and_shown_as_a_table(
@@ -122,3 +122,33 @@ def test_what_is_kept_here_can_be_read() -> None:
     for run in read():
         assert table(run).startswith("(`python ")
         assert "/" not in run.command.replace("tools/", "")
+
+
+def test_tables_in_documents_are_the_newest_whole_run_of_their_command() -> None:
+    machine = Machine("a cpu", 2, 8.0, 0.5, "6.1", "3.11.7", "2.4.6")
+
+    def run(command: str, s: float, *, whole: bool = True) -> Run:
+        return Run("b", command, "2026-01-01T00:00:00Z", "abc", "1", machine, [{"case": "x", "s": s}], whole)
+
+    runs = [
+        run("python tools/b.py --long --record", 1.0),
+        run("python tools/b.py --long --record", 2.0),
+        run("python tools/b.py --long --record", 3.0, whole=False),
+        run("python tools/b.py --record", 4.0),
+    ]
+    place = "Before.\n<!-- results of python tools/b.py --long -->\n{}<!-- end of results -->\nAfter.\n"
+    made = with_tables(place.format("| old |\n"), runs)
+    assert made == place.format(f"{table(runs[1])}\n")
+    assert "| x | 2.00 |" in made
+    assert with_tables(made, runs) == made
+    with pytest.raises(ValueError, match=r"no whole run of 'python tools/b\.py --long' is kept"):
+        with_tables(made, runs[2:])
+
+
+def test_the_tables_of_the_documents_are_those_that_were_kept() -> None:
+    texts = [path.read_text(encoding="utf-8") for path in DOCUMENTS]
+    assert sum(text.count("<!-- results of ") for text in texts) >= 2
+    for path, text in zip(DOCUMENTS, texts, strict=True):
+        assert with_tables(text, read()) == text, (
+            f"{path.name}: python tools/results.py --write makes it anew"
+        )

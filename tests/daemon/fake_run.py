@@ -6,17 +6,21 @@ import threading
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from acquire.capacity.load import Load, recording_spec
+from acquire.clock import ClockFit
 from acquire.config import load_rig
 from acquire.lines import ARMS
 from acquire.store import RunCondition
-from acquire.stream import CaptureStatus, Window
-from acquire.stream.messages import Note
+from acquire.stream import CaptureStatus, Note, Window
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
     from acquire.config import RigConfig
+    from acquire.config.recording import RecordingConfig
+    from acquire.store import RecordingSpec
+    from acquire.stream import Begin
     from acquire.stream.ring import RingShape
 
 CALM = CaptureStatus(
@@ -75,23 +79,26 @@ class FakeRun:
         self._call("arm")
         self.seen = CALM
 
-    def start(self, path: Path, lines: int | None, window: Window, *, resume: bool = False) -> Path:
-        self._call("start", path, lines)
-        self.window = window
+    @property
+    def capture(self) -> FakeRun:
+        return self
+
+    def spec(self) -> RecordingSpec:
+        return recording_spec(Load(8, "uint8", 33_333.0), ClockFit(90_000_000, 0, 0))
+
+    def start(self, begin: Begin) -> None:
+        self._call("start", begin.path, begin.lines)
+        self.window = begin.window
         self.see(recording=True, first_line=40)
-        return path.with_name("segment.zarr") if resume else path
 
-    def mark(self, text: str) -> Note:
-        self._call("mark", text)
-        return Note(77, "mark", text)
-
-    def note(self, kind: str, text: str) -> None:
+    def note(self, kind: str, text: str) -> int:
         self._call("note", kind, text)
+        return 77
 
     def extend(self, line: int) -> None:
         self._call("extend", line)
 
-    def events(self) -> list[Note]:
+    def take_events(self) -> list[Note]:
         happened, self.happened = self.happened, []
         return happened
 
@@ -107,6 +114,9 @@ class FakeRun:
         if "poll" in self.refuse and "close" not in self.names:
             raise self.refuse["poll"]
         return self.seen
+
+    def adopt(self, recording: RecordingConfig) -> None:
+        self._call("adopt", recording)
 
     def close(self) -> None:
         self._call("close")

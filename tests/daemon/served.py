@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from acquire.daemon.connections import ApiServer
 from acquire.daemon.control import build_app
 from acquire.daemon.endpoint import Endpoint
+from acquire.daemon.local import Local
 from acquire.daemon.service import Service
 
 
@@ -22,7 +23,7 @@ def api(service: Service, endpoint: Endpoint) -> Iterator[None]:
         async def run(work: Callable[[], None]) -> None:
             await asyncio.get_running_loop().run_in_executor(devices, work)
 
-        server = ApiServer(build_app(service, run), endpoint.socket)
+        server = ApiServer(build_app(Local(service, run)), endpoint.socket)
         thread = threading.Thread(target=asyncio.run, args=(server.answer(),))
         thread.start()
         try:

@@ -68,7 +68,7 @@ def test_who_gave_a_command_is_in_the_log_and_in_the_recording(
         assert raw.post("/mark", json={}, headers={"Acquire-By": "x" * 200}).status_code == 422
         daemon.mark("nobody says who")
     assert "arm by operator at 10.0.0.7" in caplog.text
-    assert [call for call in run.calls if call[0] == "note"] == [
+    assert [call for call in run.calls if call[:2] == ("note", "operator")] == [
         ("note", "operator", "start by operator at 10.0.0.7")
     ]
 

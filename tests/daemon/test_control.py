@@ -91,7 +91,8 @@ def test_requests_that_no_route_takes_are_answered_alike(
         answer = raw.request(method, url, content=b"\xff", headers={"content-type": "application/json"})
     assert answer.status_code == code
     message = ErrorMessage.model_validate_json(answer.content)
-    assert (message.error, message.message.split(":")[0]) == ("UsageError", f"{method} {url}")
+    assert message.error == "UsageError"
+    assert message.message.startswith(f"the daemon cannot answer {method} {url}: ")
 
 
 def test_long_requests_are_not_read(path: Path, daemon: Client, run: FakeRun) -> None:
@@ -142,7 +143,7 @@ def test_status_is_answered_while_arming(daemon: Client, run: FakeRun) -> None:
 
 def test_wait(daemon: Client, run: FakeRun) -> None:
     assert daemon.wait({State.IDLE}, 0.0).state is State.IDLE
-    with pytest.raises(StateError, match=r"still idle after waiting 0\.2 s for recording"):
+    with pytest.raises(StateError, match=r"still idle after 0\.2 s of waiting for recording"):
         daemon.wait({State.RECORDING}, 0.2)
 
 
@@ -268,7 +269,7 @@ def test_marks_are_bounded_and_text(daemon: Client, run: FakeRun) -> None:
     with pytest.raises(UsageError, match=r"mark: text .*unicode"):
         daemon.mark("caf\udce9")
     daemon.mark("a\nb")
-    assert run.calls[-1] == ("mark", "a\nb")
+    assert run.calls[-1] == ("note", "mark", "a\nb")
 
 
 def test_every_answer_is_documented(path: Path, daemon: Client) -> None:

@@ -21,6 +21,7 @@ from acquire.config import builtin_directory, load_rig
 from acquire.config.service import HooksConfig
 from acquire.daemon.facts import Health
 from acquire.daemon.hooks import Hooks
+from acquire.daemon.host import memory_bytes, needed_bytes
 from acquire.daemon.messages import ArmRequest
 from acquire.daemon.metrics import metrics_text
 from acquire.daemon.news import NewsLog
@@ -108,8 +109,12 @@ def test_the_unit_says_when_it_is_ready_and_what_it_may_not(tmp_path: Path) -> N
     unit = unit_of(tmp_path, user=False)
     assert (unit["Type"], unit["WatchdogSec"], unit["Restart"]) == ("notify", str(WATCHDOG_S), "on-failure")
     assert unit["ExecStart"].endswith(f'-m acquire serve --config "{tmp_path}/my rig%%.toml"')
+    assert unit["ExecReload"].endswith("-m acquire reload")  # its words and exit code are systemctl's
     assert str(tmp_path) in unit["ReadWritePaths"]
     assert float(unit["TimeoutStopSec"]) > rig_config(tmp_path).recording.seal_timeout_s
+    assert (unit["OOMPolicy"], unit["OOMScoreAdjust"]) == ("continue", "-500")
+    rings, scene = needed_bytes(rig_config(tmp_path))
+    assert rings + scene < int(unit["MemoryLow"].removesuffix("M")) * 1e6 < memory_bytes()
     assert unit["NoNewPrivileges"] == "yes"
     assert "User" not in unit_of(tmp_path, user=True)
 

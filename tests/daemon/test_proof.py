@@ -21,6 +21,7 @@ from acquire.daemon.states import State
 from acquire.errors import UsageError
 from acquire.rig import Rig
 from acquire.store import open_recording
+from acquire.stream.messages import Begin
 
 
 @pytest.fixture
@@ -147,9 +148,9 @@ def test_the_codec_that_is_chosen_is_the_one_that_is_measured(tmp_path: Path) ->
         run = Run(config, rig, prove.choose)
         try:
             run.arm()
-            run.start(tmp_path / "r.zarr", 1000)
+            run.capture.start(Begin(tmp_path / "r.zarr", run.spec(), 1000))
         finally:
-            run.close()
+            run.capture.close()
     attributes = open_recording(tmp_path / "r.zarr").attrs
     assert attributes["codec_choice"] == json.loads(json.dumps(choice.to_attrs()))
 

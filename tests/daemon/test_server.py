@@ -195,9 +195,25 @@ def test_a_mark_is_taken_while_a_stop_is_waited_for(path: Path) -> None:
             finally:
                 run.seal()
             assert stopping.result().state is State.ARMED
-        assert ("mark", "meanwhile") in run.calls
+        assert ("note", "mark", "meanwhile") in run.calls
 
     assert live(path, run, script) == 0
+
+
+def test_a_daemon_that_is_starting_opens_and_closes_files(path: Path) -> None:
+    """One that is gone when it is looked at does not mean that the daemon has ended."""
+    code = (
+        "print(flush=True)\nwhile True:\n    for file in [open('/dev/null') for _ in range(20)]: file.close()"
+    )
+    command = [sys.executable, "-c", code, "acquire", "serve"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as starting:
+        try:
+            assert starting.stdout is not None
+            starting.stdout.readline()
+            process = Path(f"/proc/{starting.pid}")
+            assert all(may_listen(process, path) for _ in range(300))
+        finally:
+            starting.kill()
 
 
 def test_a_client_waits_for_a_daemon_that_is_starting(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -249,7 +249,7 @@ def test_marks_are_taken_while_a_recording_drains(bed: Bed) -> None:
     bed.record()
     bed.service.stop()
     bed.service.mark("meanwhile")
-    assert (bed.state, bed.run.calls[-1]) == (State.DRAINING, ("mark", "meanwhile"))
+    assert (bed.state, bed.run.calls[-1]) == (State.DRAINING, ("note", "mark", "meanwhile"))
 
 
 def test_hurry_ends_the_wait_and_the_run(bed: Bed) -> None:
@@ -394,11 +394,11 @@ def test_a_mark_is_only_noted_where_nobody_asked_for_more(bed: Bed) -> None:
         bed.service.mark("too early")
     bed.service.arm()
     bed.service.mark("hello")
-    assert (bed.state, bed.run.calls[-1]) == (State.ARMED, ("mark", "hello"))
+    assert (bed.state, bed.run.calls[-1]) == (State.ARMED, ("note", "mark", "hello"))
     bed.service.start(StartRequest(pre_s=0.01, post_s=0.01))
     assert bed.run.window == Window(None, 334, 334, kind="mark", text="acquire start")
     bed.service.mark("hello")
-    assert bed.run.calls[-1] == ("mark", "hello")  # nothing is prolonged
+    assert bed.run.calls[-1] == ("note", "mark", "hello")  # nothing is prolonged
 
 
 def test_a_defect_beside_the_capture_does_not_keep_it_from_being_watched(

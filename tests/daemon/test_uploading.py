@@ -22,7 +22,7 @@ from acquire.daemon.uploads import Uploads, check_upload
 from acquire.errors import ConfigError, UsageError
 from acquire.lines import ARMS, LineBlock
 from acquire.store import Continuation, RecordingWriter, RunCondition, mirror, open_recording, recover
-from acquire.store.mirror import only_copy
+from acquire.store.mirroring import only_copy
 from acquire.stream.tagger import Tagger
 
 CLOCK = ClockFit(90_000_000, 0, 0)

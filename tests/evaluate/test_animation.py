@@ -52,7 +52,7 @@ def test_a_file_too_large_is_thinned_out(short: DemoResult, tmp_path) -> None:
 
 def test_an_impossible_limit_is_refused_and_leaves_no_file(short: DemoResult, tmp_path) -> None:
     path = tmp_path / "a.webp"
-    with pytest.raises(UsageError, match="20 frames in 100 bytes"):
+    with pytest.raises(UsageError, match="20 frames does not fit into 100 bytes"):
         save_animation(short, path, max_bytes=100)
     assert not path.exists()
 

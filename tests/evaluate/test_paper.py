@@ -1,11 +1,12 @@
-"""Contrast of the bars of a target, as Fig. 6c plots it."""
+"""Contrast of the bars of a target, as Fig. 6c plots it, and what stands against the paper."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from acquire.evaluate.paper.bars import contrasts, last_resolved
+from acquire.evaluate.paper.against import Row, captured, finer, frequency, same, sooner
+from acquire.evaluate.paper.bars import contrasts, last_resolved, place_of
 from acquire.sim.targets import usaf_picture
 
 GROUPS, FIELD_MM = (2, 3), 6.4
@@ -19,3 +20,38 @@ def test_a_sharp_target_is_resolved_and_a_blurred_one_is_not():
     assert contrast["2/1"] > 0.3
     assert contrast["3/4"] < 0.1
     assert contrasts(np.ones((192, 192)), FIELD_MM, GROUPS)["2/1"] == pytest.approx(0, abs=1e-6)
+
+
+def test_reached_is_equal_and_only_beyond_is_better() -> None:
+    paper = "group 3, element 5"
+    rows = [
+        finer("", paper, "", place_of(element) - place_of("3/5")) for element in ("3/6", "3/5", "2/6", "–")
+    ]
+    assert [(row.verdict, row.by) for row in rows] == [
+        ("better", "1 element finer, × 1.12"),
+        ("equal", ""),
+        ("worse", "5 elements coarser, × 1.78"),
+        ("worse", "11 elements coarser, × 3.56"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("r", "expected", "verdict"),
+    [
+        (0.98, True, "holds"),
+        (0.35, True, "does not hold"),
+        (0.35, False, "holds"),
+        (0.98, False, "does not hold"),
+    ],
+)
+def test_words_hold_or_do_not_and_are_never_better(r: float, expected: bool, verdict: str) -> None:
+    assert captured("pulses", "captured", r, expected=expected).verdict == verdict
+
+
+def test_times_and_frequencies_say_by_how_much() -> None:
+    assert sooner("time", "", "", 60.0, 600.0, "elsewhere").by == "× 10 faster, elsewhere"
+    assert sooner("time", "", "", 900.0, 600.0, "elsewhere").verdict == "worse"
+    assert frequency("x", "", "", 4999.5, 5000.0).by == "0.5 Hz off, 0.01%"
+    assert frequency("x", "", "", 4900.0, 5000.0).verdict == "does not hold"
+    assert same("video", "", "", equal=False).verdict == "worse"
+    assert Row("accuracy", "–", "40 dB").verdict == "no number"

@@ -13,19 +13,12 @@ import pytest
 from PIL import Image
 
 from acquire.errors import UsageError
-from acquire.evaluate import figures
-from acquire.evaluate.report import (
-    NARROW_SPACE,
-    DemoResult,
-    evaluate_solver,
-    hertz,
-    number,
-    render_page,
-    write_report,
-)
+from acquire.evaluate import figures, themed
+from acquire.evaluate.page import NARROW_SPACE, hertz, number
+from acquire.evaluate.report import DemoResult, evaluate_solver, render_page, write_report
 from acquire.evaluate.summary import summarise
 
-VOID = {"meta", "link", "img", "br", "input"}
+VOID = {"meta", "link", "img", "br", "input", "source"}
 HIDDEN = {"style", "title", "script"}
 
 
@@ -108,6 +101,11 @@ def test_losses_stand_with_their_causes(page: Page) -> None:
     assert "discarded while armed 7 11" in page.text
 
 
+def test_how_busy_the_machine_was_is_told(page: Page) -> None:
+    assert "a thread that wanted a whole core got 63 % of it, 41 % at the least" in page.text
+    assert "The machine was busy: alone on it, this takes less time." in page.text
+
+
 def test_a_solver_that_its_budget_stopped_is_not_shown_as_if_it_had_finished(page: Page) -> None:
     assert "207 of 451 (stopped by its budget of 31.5 s)" in page.text
     assert re.search(r"TwIST [\d.]+ dB, stopped by its budget", page.text)
@@ -119,7 +117,7 @@ def test_the_page_refers_to_nothing_outside_itself(source: str, page: Page) -> N
     references = [
         value for _, name, value in page.attributes if name in {"src", "href", "srcset", "action", "data"}
     ]
-    assert len(references) == 6
+    assert len(references) == 10  # the icon, the player's first frame, and each drawing for two widths
     assert all(value.startswith("data:") for value in references)
 
 
@@ -131,7 +129,7 @@ def test_pictures_have_a_text_and_are_those_beside_the_page(directory, page: Pag
     names = {path.name for path in directory.iterdir()}
     assert names == {
         "index.html", "summary.json", "animation.webp",
-        "lines.png", "frames.png", "curves.png", "psnr.png", "curves.svg", "psnr.svg",
+        *(f"{name}.{kind}" for name in ("lines", "frames", "curves", "psnr") for kind in ("png", "svg")),
     }  # fmt: skip
 
 
@@ -151,7 +149,7 @@ def test_the_three_lines_open_this_recording(result: DemoResult, page: Page) -> 
 def test_figures_are_pictures_of_the_page_width(directory, name: str) -> None:
     with Image.open(directory / f"{name}.png") as image:
         pixels = np.asarray(image.convert("L"))
-    assert pixels.shape[1] == figures.DPI * figures.WIDTH_IN
+    assert pixels.shape[1] == themed.DPI * themed.WIDTH_IN
     assert pixels.std() > 10, "an empty figure"
 
 
@@ -177,9 +175,9 @@ def test_extremes_one_perfect_solver_nothing_to_follow_no_stage_time(result: Dem
 def test_a_run_without_losses_says_so(result: DemoResult, directory) -> None:
     arms = dict.fromkeys("ab", result.capture.arms["a"])
     calm = replace(result, capture=replace(result.capture, arms=arms, condition="GOOD"))
-    pictures = {name: directory / f"{name}.png" for name in ("lines", "frames", "curves", "psnr")}
+    drawings = dict.fromkeys(("lines", "frames", "curves", "psnr"), themed.Drawing("<svg/>", "<svg/>"))
     summary = json.loads((directory / "summary.json").read_text()) | summarise(calm)
-    text = render_page(summary, pictures | {"animation": directory / "animation.webp"})
+    text = render_page(summary, drawings, directory / "animation.webp")
     assert 'class="badge good">GOOD' in text
     assert 'class="warn"' not in text
     assert "Lines lost 0 GOOD" in Page(text).text

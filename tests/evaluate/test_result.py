@@ -83,7 +83,7 @@ class TestRefusals:
             replace(result, frame_time_ns=result.frame_time_ns[1:])
 
     def test_no_solver(self, result: DemoResult) -> None:
-        with pytest.raises(UsageError, match="without a reconstruction"):
+        with pytest.raises(UsageError, match="needs a reconstruction"):
             replace(result, solvers=())
 
     def test_a_video_of_another_size(self, result: DemoResult) -> None:

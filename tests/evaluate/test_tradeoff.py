@@ -15,6 +15,7 @@ from acquire.config import load_rig
 from acquire.config.scene import SineDrive
 from acquire.errors import UsageError
 from acquire.evaluate.cases import full_wells, procedural
+from acquire.evaluate.host import Busyness
 from acquire.evaluate.tradeoff import Judge, Point, Run, amplitude_error, measure, pareto, table
 from acquire.evaluate.tradeoff_page import write_page
 from acquire.recon.segments import Voxels
@@ -23,7 +24,12 @@ from acquire.simulate import simulate
 from acquire.store import open_recording
 
 VOXELS = Voxels(2, 1)
-HEADING = {"title": "one LED", "command": "acquire tradeoff", "notes": ["Two repeats."]}
+HEADING = {
+    "title": "one LED",
+    "command": "acquire tradeoff",
+    "notes": ["Two repeats."],
+    "host": Busyness(cores=2, load=0.2, share=1.0, least_share=0.97).facts(),
+}
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +120,9 @@ def test_page_and_table_say_the_same(judge, run, tmp_path):
     page = write_page([run, cut, exact], {("", VOXELS): true}, None, tmp_path, HEADING, datetime.now(UTC))
     text = page.read_text()
     assert text.count("<picture>") == 2 * 6  # PSNR by two clocks, frames, SSIM, amplitude, frequency
-    assert text.count('prefers-color-scheme: dark)"><img') == 2 * 6
+    assert text.count('<figure class="player') == 2
+    assert "a thread that wanted a whole core got 100 % of it, 97 % at the least" in text
+    assert "The machine was busy" not in text
     assert "cut, 1 of 2" in text
     assert f"The truth&#39;s own time mean, shown as a still, has {run.mean_db:.0f} dB" in text
     assert "cut by its budget after" in text

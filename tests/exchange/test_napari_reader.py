@@ -70,9 +70,16 @@ def test_a_recording_is_pages_of_both_arms(recording: Path, monkeypatch: pytest.
     assert read is not None
     layers = read(str(recording))
     opened = open_recording(recording)
-    assert [options["name"] for _, options, _ in layers] == ["run, arm a", "run, arm b"]
-    assert [options["translate"] for _, options, _ in layers] == [[0, 0, 0], [0, 0, 14]]
-    for (data, _, _), arm in zip(layers, "ab", strict=True):
+    arms = layers[2:]
+    assert [options["name"] for _, options, _ in arms] == ["run, arm a", "run, arm b"]
+    assert [options["translate"] for _, options, _ in arms] == [[0, 0, 0], [0, 0, 14]]
+    for (data, options, _), arm in zip(layers[:2], "ab", strict=True):
+        overview = opened.overview(arm)
+        assert overview is not None
+        np.testing.assert_array_equal(data, overview.rows)
+        assert options["name"] == f"run, arm {arm}, overview (64 lines a row)"
+        assert (options["translate"], options["visible"]) == ([0, 0 if arm == "a" else 14], False)
+    for (data, _, _), arm in zip(arms, "ab", strict=True):
         lines = opened.camera(arm).lines[:]
         assert data.shape == (3, 40, 6)
         np.testing.assert_array_equal(data[1], lines[40:80])

@@ -28,8 +28,7 @@ EXAMPLES = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
 def test_its_examples_run(
     recording: Path, video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if "acquire" not in xarray.backends.list_engines():
-        pytest.skip("the package is not installed as it stands: pip install -e .")
+    assert "acquire" in xarray.backends.list_engines(), "install the package as it stands: pip install -e ."
     shutil.copytree(recording, tmp_path / "run.zarr")
     shutil.copytree(video, tmp_path / "video.zarr")
     monkeypatch.chdir(tmp_path)
@@ -39,6 +38,7 @@ def test_its_examples_run(
     assert names["some"].sizes == {"line": 11, "pixel": 6}
     assert set(names["video"]["0"].coords) == {"t", "y", "x", "time", "trusted"}
     assert names["arm"]["line"].values[[0, -1]].tolist() == [100, 189]
+    assert names["whole"].shape == (2, 6)
     names["video"].close()
     names["arm"].close()
 

@@ -64,7 +64,9 @@ def test_a_board_is_pulled_and_asked_for_the_level_it_was_built_for(built_low: b
 def test_the_watchdog_is_on_unless_it_is_turned_off() -> None:
     assert register_values(RUN, TriggerConfig(), GATEWARE, 3e5)[r.WATCHDOG] == 900_000_000 == r.WATCHDOG.reset
     assert register_values(RUN, TriggerConfig(watchdog_s=0), GATEWARE, 3e5)[r.WATCHDOG] == 0
-    with pytest.raises(TriggerError, match=r"a watchdog of 60 s; possible: up to 47\.72 s at 90000000 Hz"):
+    with pytest.raises(
+        TriggerError, match=r"the watchdog cannot wait for 60 s; possible: up to 47\.72 s at 90000000 Hz"
+    ):
         register_values(RUN, TriggerConfig(watchdog_s=60), GATEWARE, 3e5)
 
 

@@ -200,6 +200,6 @@ def test_devices_that_are_not_there(monkeypatch: pytest.MonkeyPatch, segment: Se
     with pytest.raises(UsageError, match="device 'tpu'"):
         reconstruct(segment, 3, 1, device="tpu")
     monkeypatch.setitem(sys.modules, "cupy", None)
-    with pytest.raises(UsageError, match="without CuPy") as refused:
+    with pytest.raises(UsageError, match="needs CuPy") as refused:
         reconstruct(segment, 3, 1, device="gpu")
     assert "tdi-acquire[gpu]" in str(refused.value.hint)

@@ -42,7 +42,7 @@ def test_the_coarse_grid_samples_the_same_function() -> None:
 def test_basis_refuses_more_cosines_than_instants() -> None:
     with pytest.raises(UsageError, match="1 to 5"):
         TemporalBasis(5, 6)
-    with pytest.raises(UsageError, match="3 instants for 4"):
+    with pytest.raises(UsageError, match="3 instants are too few for 4"):
         TemporalBasis(5, 4).matrix(3)
 
 

@@ -85,7 +85,7 @@ def test_the_document_is_carried_out(tmp_path: Path) -> None:
     for told in ("self test passed", "turn 90", "DN per electron", "250 ms lit, 250 ms dark"):
         assert told in done.stdout, told
     known = open_calibration(tmp_path / "cal.zarr")
-    assert list(known.steps) == ["delay", "dark", "flat", "transfer", "orientation", "align"]
+    assert list(known.steps) == ["delay", "dark", "linearity", "transfer", "flat", "orientation", "align"]
     late = known.quantities["light_late_ticks"]
     assert late.value == pytest.approx([each * 90e6 for each in DELAYS], abs=5 * late.uncertainty.max())
     recording = open_recording(tmp_path / "lamps.zarr")

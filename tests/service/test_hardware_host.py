@@ -46,7 +46,7 @@ def test_the_daemon_of_real_devices_imports_no_laboratory(tmp_path: Path) -> Non
 
 def _refusal(client: Client) -> str:
     try:
-        client.arm()
+        client.arm(force=True)  # however busy this host is: what is asked is what the devices lack
     except AcquireError as error:
         return str(error)
     raise AssertionError("a rig without cameras was armed")

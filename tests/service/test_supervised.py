@@ -1,7 +1,8 @@
-"""Under a supervisor that does what systemd does with our unit: killed or hung, the service comes back.
+"""Under a supervisor that does what systemd does with our unit: killed, hung or out of memory, the service
+comes back.
 
 The supervisor here knows what the unit says: ready by a datagram, a word within the watchdog's time,
-restarted when it ends otherwise than by itself.
+restarted when it ends otherwise than by itself, and what was left of it ended before.
 """
 
 from __future__ import annotations
@@ -13,10 +14,12 @@ import socket
 import subprocess
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 from live_daemon import COMMAND, write_rig
+from memory_group import MemoryGroup
 
 from acquire.client import Client, State
 from acquire.daemon.messages import Status
@@ -30,8 +33,10 @@ WATCHDOG_S = 8.0
 class Supervisor:
     """Runs one service; `turn` is called again and again."""
 
-    def __init__(self, home: Path, *settings: str) -> None:
-        self._words = [*COMMAND, "serve", "--config", str(write_rig(home))]
+    def __init__(self, home: Path, *settings: str, group: MemoryGroup | None = None) -> None:
+        self._group = group
+        enter = [] if group is None else ["sh", "-c", f'echo $$ > {group.path}/cgroup.procs; exec "$@"', "sh"]
+        self._words = [*enter, *COMMAND, "serve", "--config", str(write_rig(home))]
         self._words += [word for setting in settings for word in ("--set", setting)]
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind(str(home / "notify"))
@@ -57,6 +62,9 @@ class Supervisor:
             os.killpg(self.process.pid, signal.SIGKILL)  # systemd ends what is left of the group, too
             self.process.wait()
         if self.process.poll() is not None:
+            for pid in [] if self._group is None else self._group.pids:
+                with contextlib.suppress(ProcessLookupError):  # it ended with its owner
+                    os.kill(pid, signal.SIGKILL)  # as systemd does, where the recorder might still seal
             self._start()
 
     def close(self) -> None:
@@ -111,3 +119,57 @@ def test_killed_and_hung_it_comes_back_recovers_and_goes_on_recording(
     client.disarm()  # the operator's word is the last: nothing begins by itself any more
     time.sleep(1.0)
     assert client.status().state is State.IDLE
+
+
+@pytest.mark.needs_memory_group
+@pytest.mark.parametrize("victim", ["the kernel's choice", "daemon", "recorder", "a"])
+def test_out_of_memory_it_goes_on_recording(tmp_path: Path, victim: str) -> None:
+    """The kernel kills one of its processes: the daemon replaces a worker, the supervisor the daemon."""
+    settings = ('service.begin="recording"', "service.retry_s=0.5")
+    client = Client(tmp_path / "c.sock")
+    with (
+        MemoryGroup() as group,
+        contextlib.closing(Supervisor(tmp_path, *settings, group=group)) as supervisor,
+    ):
+        first = until_recording(supervisor, client, 1)
+        assert first.recording is not None
+        pids = {"daemon": supervisor.process.pid, **first.processes}
+        assert set(pids.values()) <= set(group.pids)
+        with ThreadPoolExecutor(1) as threads:
+            running_out = threads.submit(group.run_out, pids.get(victim))
+            while not running_out.done():
+                supervisor.turn()
+            gone = running_out.result()
+        deadline = time.monotonic() + LIMIT_S
+        while not goes_on(client, first, without=gone):
+            supervisor.turn()
+            assert time.monotonic() < deadline
+        assert supervisor.lives == (2 if pids["daemon"] in gone else 1)
+        after = until_recording(supervisor, client, supervisor.lives)
+        assert after.recording is not None
+        again = client.stop()
+        assert again.last is not None
+        assert again.last.lines > 0
+        before = client.open(first.recording.path)
+        assert before.lines >= first.recording.committed_lines  # nothing that was committed is lost
+        while client.open(first.recording.path).state != "sealed":
+            supervisor.turn()
+            assert time.monotonic() < deadline
+        client.disarm()
+
+
+def goes_on(client: Client, first: Status, without: set[int]) -> bool:
+    """More is recorded than at ``first``, and those who are gone are replaced."""
+    try:
+        now = client.status()
+    except AcquireError:
+        return False
+    if (
+        now.state is not State.RECORDING
+        or now.recording is None
+        or {now.pid, *now.processes.values()} & without
+    ):
+        return False
+    assert first.recording is not None
+    known = first.recording.committed_lines if now.recording.path == first.recording.path else 0
+    return now.recording.committed_lines > known

@@ -21,6 +21,8 @@ PARAMETERS = {
     "vignetting": {"loss": 0.3},
     "psf": {"sigma_pixels": 1.2},
     "stray_light": {"veil": 0.05, "ambient": 0.02},
+    "fibre_bands": {"shift_pixels": 0.5},
+    "fibre_gain": {"columns": 0.05, "fibres": 0.1},
     "beam_splitter": {"part_a": 0.45},
     "cti": {"inefficiency": 1e-3},
     "prnu": {"prnu": 0.02},

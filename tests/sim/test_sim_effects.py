@@ -12,6 +12,7 @@ from effect_cases import FLAT, PARAMETERS, effects, electrons, setting, through
 from sim_helpers import CODE
 from small_bench import DT, LIT, K, N, S, bench, blinking, flat, read
 
+from acquire.errors import UsageError
 from acquire.sim.effects import in_order, kinds
 from acquire.sim.effects.light import jitter
 from acquire.sim.effects.signal import tail
@@ -248,6 +249,25 @@ def test_a_late_light_is_shared_with_the_sub_steps_after_and_the_trigger_takes_i
     settled = replace(bench(late), settled_s={"a": 1.4 * DT, "b": 1.1 * DT})
     for arm in "ab":
         np.testing.assert_array_equal(settled.camera(arm, CODE).read(512, 2048).pixels, plain.pixels)
+
+
+def test_light_in_part_of_a_sub_step():
+    """On from 0.25 to 0.65 of it: so much of the light, shared as a pulse lies that comes late."""
+    pulsed = replace(bench(flat()), lit_part=(0.25, 0.65))
+    late = flat(listed=effects("delays", light_s=1.5 * DT, a_s=0.0, b_s=0.6 * DT))
+    bits = CODE.bits(0, 8192).astype(float)
+    index = S * np.arange(512, 1024)[:, None, None] + np.arange(N)[:, None] + np.arange(S)
+    for arm, part in (("a", 0.15 / 0.4), ("b", 0.0)):  # late by 1.5 and by 0.9 sub-steps
+        seen = pulsed.camera(arm, CODE).read(512, 512).pixels.astype(float)
+        expected = 300.0 + 0.4 * S * bits[index].sum(axis=(1, 2))
+        np.testing.assert_allclose(seen, np.broadcast_to(expected[:, None], seen.shape), atol=0.51)
+        seen = replace(bench(late), lit_part=(0.25, 0.65)).camera(arm, CODE).read(512, 512).pixels
+        shared = (1 - part) * bits[index - 1] + part * bits[index - 2]
+        expected = 300.0 + 0.4 * S * shared.sum(axis=(1, 2))
+        np.testing.assert_allclose(seen, np.broadcast_to(expected[:, None], seen.shape), atol=0.51)
+    for kind in ("led_rise_fall", "trigger_jitter"):
+        with pytest.raises(UsageError, match=f"{kind} cannot be simulated with a light"):
+            replace(bench(flat(listed=effects(kind))), lit_part=(0.0, 0.5)).camera("a", CODE)
 
 
 def test_jitter_of_the_arms_differs_and_wrong_bits_are_common():

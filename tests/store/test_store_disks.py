@@ -28,9 +28,9 @@ from acquire.store import (
     recover,
     verify,
 )
-from acquire.store.codecs import CODECS
 from acquire.store.files import Disk, ShardFile
 from acquire.store.pages import PAGE, aligned_bytes, is_aligned, open_direct
+from acquire.store.shape import CODECS
 
 BIG = make_spec(pixels=1024, chunk_lines=64, shard_chunks=4, codec="none")
 """Chunks of 128 KiB: large enough for direct I/O."""
@@ -271,13 +271,30 @@ def test_a_slow_disk_asks_for_packing():
 
 @pytest.mark.parametrize("wrong", [(0, 1.0), (1.0, 0)])
 def test_rates_that_cannot_be_are_refused(wrong):
-    with pytest.raises(UsageError, match="choosing a codec"):
+    with pytest.raises(UsageError, match="no codec can be chosen"):
         choose_codec(lines(1), *wrong)
 
 
 def test_the_disk_is_measured_and_nothing_is_left(tmp_path):
     assert measure_disk(tmp_path, size=2**23) > 1e5
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("named", [False, True])
+def test_the_disk_is_measured_the_way_lines_are_written(tmp_path, monkeypatch, named):
+    if named:
+        monkeypatch.setattr(os, "O_TMPFILE", os.O_TMPFILE & ~os.O_DIRECTORY)  # is refused: EISDIR
+    ways = []
+
+    class Watched(files.ShardFile):
+        def write_pages(self, parts, offset):
+            super().write_pages(parts, offset)
+            ways.append(self.direct)
+
+    monkeypatch.setattr(files, "ShardFile", Watched)
+    measure_disk(tmp_path, size=2**23)
+    with contextlib.closing(ShardFile(tmp_path / "lines", direct=True)) as lines_file:
+        assert ways == [lines_file.direct] * 2
 
 
 @pytest.mark.parametrize("named", [False, True])

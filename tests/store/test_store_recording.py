@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import errno
+import importlib
 import json
 import os
 import shutil
 from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -16,6 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from store_helpers import CLOCK, Truth, check_rows, fill, make_spec
 
+from acquire import store
 from acquire.errors import DataError, PlaceError, StoreError, UsageError
 from acquire.lines import ARMS, LineFlag
 from acquire.store import FORMAT, Event, Gap, RecordingWriter, RunCondition, open_recording, verify
@@ -159,7 +163,8 @@ def test_unconsolidated_listing_finds_nothing_foreign(path):
     lines = {f"{arm}/{name}" for arm in ARMS for name in Truth(make_spec()).arrays(arm, 0, 1)}
     tables = {f"gaps/{c}" for c in ("first_line", "count", "cause", "arm")}
     tables |= {f"events/{c}" for c in ("tick", "line", "kind", "text")}
-    assert names == {"a", "b", "gaps", "events"} | lines | tables
+    overview = {f"overview/{name}" for name in (*ARMS, "line")}
+    assert names == {"a", "b", "gaps", "events", "overview"} | lines | tables | overview
     assert [file.name for file in path.rglob(".*")] == [".attributes"]
 
 
@@ -470,3 +475,12 @@ def test_a_recording_of_format_1_opens_and_has_the_same_code(path):
     assert recording.attrs["format"] == "acquire-recording/1"
     np.testing.assert_array_equal(recording.cut(1000, 100).code, code)
     assert (verify(path).damage, verify(path).contradictions) == ((), ())
+
+
+def test_what_the_package_offers_is_what_is_asked_for():
+    """Each name leads to what it says, whichever module was imported before."""
+    for name in sorted({path.stem for path in Path(store.__path__[0]).glob("[a-z]*.py")}):
+        importlib.import_module(f"acquire.store.{name}")
+        assert name not in store.__all__, f"module {name} would take the place of what has its name"
+    for name in store.__all__:
+        assert not isinstance(getattr(store, name), ModuleType), name

@@ -27,7 +27,7 @@ from acquire.store import (
     recover,
     verify,
 )
-from acquire.store.mirror import Mirror, only_copy
+from acquire.store.mirroring import Mirror, only_copy
 from acquire.store.remote import PATIENCE, PROOF, RemoteSource, be_patient
 
 SPEC = make_spec()

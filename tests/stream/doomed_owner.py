@@ -9,14 +9,14 @@ from pathlib import Path
 
 from wired_devices import make_bench, make_spec
 
-from acquire.stream import Capture
+from acquire.stream import Begin, Capture
 
 
 def main(path: Path) -> None:
     bench = make_bench()
     capture = Capture(bench.plan, bench.trigger)
     capture.arm()
-    capture.start(path, make_spec())
+    capture.start(Begin(path, make_spec()))
     while capture.poll().committed_lines < 2000:
         time.sleep(0.005)
     sys.stdout.write(json.dumps(capture.pids) + "\n")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -36,7 +37,7 @@ from wired_devices import (
 from acquire.errors import AcquireError, CameraError, DeviceError, StateError, TriggerError, UsageError
 from acquire.lines import ARMS, LineFlag
 from acquire.store import Recording, RunCondition, open_recording
-from acquire.stream import Capture, CaptureStatus
+from acquire.stream import Begin, Capture, CaptureStatus
 from acquire.trigger.base import TriggerRun
 
 UNCONFIRMED = LineFlag.TIME_ESTIMATED | LineFlag.CODE_UNVERIFIED
@@ -57,7 +58,7 @@ def armed(bench: Bench) -> Iterator[Capture]:
 
 def record_until(capture: Capture, path: Path, rows: int) -> None:
     """Start without a budget and let ``rows`` rows be written."""
-    capture.start(path, make_spec())
+    capture.start(Begin(path, make_spec()))
     until(lambda: capture.poll().recorded_lines > rows, f"{rows} rows")
 
 
@@ -131,17 +132,17 @@ def test_records_every_line_of_both_arms_as_it_was(tmp_path: Path) -> None:
             capture.stop()
         until(lambda: capture.poll().lines["a"]["delivered"] > 2000, "lines while armed")
         with pytest.raises(UsageError, match="does not exist"):
-            capture.start(tmp_path / "no" / "r.zarr", make_spec())
-        with pytest.raises(UsageError, match="budget of 0"):
-            capture.start(tmp_path / "r.zarr", make_spec(), 0)
+            capture.start(Begin(tmp_path / "no" / "r.zarr", make_spec()))
+        with pytest.raises(UsageError, match="cannot have 0 lines"):
+            capture.start(Begin(tmp_path / "r.zarr", make_spec(), 0))
         for name in ("x" * 300, "nul\0.zarr"):
             with pytest.raises(UsageError, match="cannot be a path"):
-                capture.start(tmp_path / name, make_spec())
+                capture.start(Begin(tmp_path / name, make_spec()))
         assert not any(tmp_path.iterdir())
 
-        capture.start(tmp_path / "budget.zarr", make_spec(), 5000)
+        capture.start(Begin(tmp_path / "budget.zarr", make_spec(), 5000))
         with pytest.raises(StateError, match="being written"):
-            capture.start(tmp_path / "second.zarr", make_spec())
+            capture.start(Begin(tmp_path / "second.zarr", make_spec()))
         budget = sealed(capture)
         capture.stop()  # of what has ended by itself: nothing to do
 
@@ -195,7 +196,8 @@ def test_losses_are_located_to_the_line_and_a_full_ring_ends_the_recording(tmp_p
     check_balance(capture.poll())
     recording, missing = check_rows(tmp_path / "r.zarr")
     assert status.condition is RunCondition.INTERRUPTED
-    assert "was full at line" in str(status.end_reason)
+    # which of the two is seen first depends on how busy the host is
+    assert re.search(r"was full at line|ring slots of arm [ab] wait", str(status.end_reason))
     assert (
         recording.lines == status.committed_lines >= rows + 60 * 128
     )  # a block of 256 lines takes two of 64 slots
@@ -253,7 +255,7 @@ def test_a_dead_grabber_is_a_fault_and_what_was_written_is_sealed(
         until(lambda: capture.poll().fault, "the fault")
         status = sealed(capture)
         with pytest.raises(StateError, match="has failed"):
-            capture.start(tmp_path / "next.zarr", make_spec())
+            capture.start(Begin(tmp_path / "next.zarr", make_spec()))
     recording, missing = check_rows(tmp_path / "r.zarr")
     assert status.fault == status.end_reason == text
     assert status.condition is RunCondition.INTERRUPTED
@@ -272,7 +274,7 @@ def test_recording_begins_now_however_fast_the_lines_before_it_came(tmp_path: Pa
         for arm in ARMS:
             bench.wire[f"stall_{arm}"] = 0
         until(lambda: capture.poll().lines["a"]["delivered"] > 256, "lines")
-        capture.start(tmp_path / "r.zarr", make_spec(), 1000)
+        capture.start(Begin(tmp_path / "r.zarr", make_spec(), 1000))
         assert capture.poll().first_line <= issued(bench.wire, bench.trigger.rate_hz)
         status = sealed(capture)
     # A machine with other work may let a ring run over, which is told; it may not wait for lines to come.
@@ -291,7 +293,7 @@ def test_silence_while_armed_is_a_fault(tmp_path: Path, stalled: str, fault: str
         until(lambda: capture.poll().fault, "the fault")
         assert capture.poll().fault == fault
         with pytest.raises(StateError, match="no line for 1 s"):
-            capture.start(tmp_path / "r.zarr", make_spec())
+            capture.start(Begin(tmp_path / "r.zarr", make_spec()))
     assert not any(tmp_path.iterdir())
 
 
@@ -307,7 +309,7 @@ def test_a_camera_that_does_not_wait_for_the_trigger_is_a_fault() -> None:
 def test_a_killed_recorder_leaves_what_was_committed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("acquire.stream.succession.MOST", 0)  # nobody takes its place
     with armed(make_bench()) as capture:
-        capture.start(tmp_path / "r.zarr", make_spec())
+        capture.start(Begin(tmp_path / "r.zarr", make_spec()))
         until(lambda: capture.poll().committed_lines > 1000, "commits")
         recorder = capture.pids["recorder"]
         assert recorder is not None
@@ -349,7 +351,7 @@ def test_close_seals_what_is_being_recorded(tmp_path: Path) -> None:
         capture.close()
         status = capture.poll()
         with pytest.raises(StateError, match="not armed"):
-            capture.start(tmp_path / "next.zarr", make_spec())
+            capture.start(Begin(tmp_path / "next.zarr", make_spec()))
         with pytest.raises(StateError, match="been used"):
             capture.arm()
     check_rows(tmp_path / "r.zarr")
@@ -366,7 +368,7 @@ def test_a_write_error_aborts_and_the_rings_are_emptied_all_the_same(tmp_path: P
         assert status.end_reason is not None
         assert status.end_reason.startswith("write error: ")
         assert "possible" not in status.end_reason  # what was possible then
-        capture.start(tmp_path / "next.zarr", make_spec(), 1000)
+        capture.start(Begin(tmp_path / "next.zarr", make_spec(), 1000))
         assert sealed(capture).condition is RunCondition.GOOD
     check_rows(tmp_path / "next.zarr")
 
@@ -375,7 +377,7 @@ def test_lines_without_tags_are_flagged_not_lost(tmp_path: Path) -> None:
     bench = make_bench(tag_wait_s=0.05)
     bench.trigger.mute = True
     with armed(bench) as capture:
-        capture.start(tmp_path / "r.zarr", make_spec(), 3000)
+        capture.start(Begin(tmp_path / "r.zarr", make_spec(), 3000))
         status = sealed(capture)
     assert status.condition is RunCondition.TAINTED
     assert status.ledger["a"]["unverified"] == status.ledger["b"]["unverified"] == 3000
@@ -423,7 +425,7 @@ def test_a_trigger_that_fails_is_a_fault(tmp_path: Path, error: Exception, fault
         ("refuse", CameraError, "camera b is in use; possible: another; try: unplug it"),
         ("bug", AcquireError, "grabber b: ZeroDivisionError: a bug"),
         ("die", DeviceError, "grabber b: killed by SIGKILL"),
-        ("hang", DeviceError, "grabber b: no answer in time"),
+        ("hang", DeviceError, "grabber b: it did not answer in time"),
         ("trigger", TriggerError, "the run is too fast"),
     ],
 )
@@ -450,7 +452,7 @@ def test_arm_undoes_everything_when_something_fails(
         ({"openers": {"a": None}}, "cameras a"),
         ({"dtype": "float32"}, "float32"),
         ({"ring_slots": 0}, "0 slots"),
-        ({"ring_slots": 1, "block_lines": 100}, "a tag every 100 lines"),
+        ({"ring_slots": 1, "block_lines": 100}, "cannot have a tag every 100 lines"),
         ({"run": TriggerRun("r", CODE, 9, 900, 100)}, "S = 9"),
     ],
 )

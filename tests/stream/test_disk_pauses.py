@@ -27,8 +27,8 @@ from acquire.errors import DataError, DeviceError, StateError
 from acquire.lines import ARMS
 from acquire.store import Recording, RecordingSpec, open_recording, verify
 from acquire.store.files import DISK, Disk
-from acquire.store.recover import recover
-from acquire.stream import Capture, CaptureStatus
+from acquire.store.recovery import recover
+from acquire.stream import Begin, Capture, CaptureStatus
 
 LOAD = Load(64, "uint16", 8000.0, substeps=2, stages=8, block_lines=64, ring_slots=4000, chunk_lines=512)
 """A ring of 32 s: a busy host takes its time to come back after a pause."""
@@ -44,7 +44,7 @@ def recording(
     """A capture whose recording has some committed lines, or has only been asked for where it is held up."""
     with capturing(disk, LOAD, **changes) as capture:
         spec = replace(recording_spec(LOAD, capture.clock), fsync=fsync)
-        capture.start(path, spec, lines)
+        capture.start(Begin(path, spec, lines))
         until(lambda: capture.poll().committed_lines > 500, "committed lines")
         yield capture
 
@@ -191,7 +191,7 @@ def test_a_pause_while_a_recording_is_created_or_sealed_costs_nothing(tmp_path: 
         disk.gate.touch()
         if at == "make":
             threading.Timer(1.5, disk.gate.unlink).start()
-        capture.start(tmp_path / "r.zarr", recording_spec(LOAD, capture.clock), 2000)
+        capture.start(Begin(tmp_path / "r.zarr", recording_spec(LOAD, capture.clock), 2000))
         if at == "seal":
             until(disk.held.exists, "a seal that is held up")
             until(lambda: "the disk has been at work for " in capture.poll().waiting, "the words")
@@ -210,7 +210,7 @@ def test_a_recording_that_the_disk_does_not_create_is_refused_and_leaves_nothing
         spec = recording_spec(LOAD, capture.clock)
         disk.gate.touch()
         with pytest.raises(DeviceError, match=r"it waits for the disk.*nothing was recorded"):
-            capture.start(tmp_path / "r.zarr", spec)
+            capture.start(Begin(tmp_path / "r.zarr", spec))
         assert capture.poll().fault is None
         disk.gate.unlink()
         monkeypatch.undo()
@@ -223,7 +223,7 @@ def test_a_recording_that_the_disk_does_not_create_is_refused_and_leaves_nothing
 def can_start(capture: Capture, path: Path, spec: RecordingSpec) -> bool:
     """It has begun; refused as long as the recorder clears away the one before."""
     try:
-        capture.start(path, spec, 1000)
+        capture.start(Begin(path, spec, 1000))
     except StateError:
         return False
     return True

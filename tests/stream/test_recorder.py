@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
@@ -13,16 +14,18 @@ import pytest
 from wired_devices import CODE, PIXELS, STAGES, SUBSTEP_TICKS, SUBSTEPS, make_spec
 
 from acquire.clock import ClockFit
-from acquire.errors import StoreError
+from acquire.errors import StateError, StoreError
 from acquire.lines import ARMS
 from acquire.processes.shared import Counters
 from acquire.store import RunCondition, Suspect, open_recording, suspect_lines
 from acquire.store.suspect import DOUBTFUL, VERIFIED
+from acquire.stream import recorder_states
 from acquire.stream.external_counts import ExternalCounts
 from acquire.stream.losses import Cause, Loss, LossLog
-from acquire.stream.messages import Began, Begin, End, Note, Refused, RunStarted, Sealed
+from acquire.stream.messages import Began, Begin, Cancel, End, Extend, Note, Refused, RunStarted, Sealed
 from acquire.stream.recorder import Recorder
 from acquire.stream.recorder_plan import COUNTERS, RecorderPlan
+from acquire.stream.recorder_states import RecorderEvent, RecorderState
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.window import NOW, Window
 from acquire.trigger.base import TriggerRun
@@ -140,6 +143,88 @@ def bed() -> Iterator[Bed]:
     made = Bed()
     yield made
     made.close()
+
+
+COMMANDS = ("start", "cancel", "stop", "extend")
+STATES = {
+    # state → how the recorder comes there, and where each of the owner's commands leads; "": it is refused
+    RecorderState.WAITING: ((), {"start": "", "cancel": "waiting", "stop": "waiting", "extend": "waiting"}),
+    RecorderState.DISCARDING: (
+        ("run",),
+        {"start": "opening", "cancel": "discarding", "stop": "discarding", "extend": "discarding"},
+    ),
+    RecorderState.OPENING: (
+        ("run", "start"),
+        {"start": "", "cancel": "cancelled", "stop": "opening", "extend": "opening"},
+    ),
+    RecorderState.CANCELLED: (
+        ("run", "start", "cancel"),
+        {"start": "", "cancel": "cancelled", "stop": "cancelled", "extend": "cancelled"},
+    ),
+    RecorderState.RECORDING: (
+        ("run", "start", "disk"),
+        {"start": "", "cancel": "sealing", "stop": "sealing", "extend": "recording"},
+    ),
+    RecorderState.SEALING: (
+        ("run", "start", "disk", "stop"),
+        {"start": "", "cancel": "sealing", "stop": "sealing", "extend": "sealing"},
+    ),
+}
+
+
+@pytest.mark.parametrize(("state", "command"), [*itertools.product(STATES, COMMANDS)])
+def test_every_command_in_every_state(bed: Bed, tmp_path: Path, state: RecorderState, command: str) -> None:
+    """A command that makes no sense is refused in words, one that crossed with an end changes nothing."""
+    bed.post.waiting.clear()
+    messages = {
+        "run": RunStarted(ClockFit(90_000_000, 0, 0)),
+        "start": Begin(tmp_path / "r.zarr", make_spec(), None),
+        "cancel": Cancel(),
+        "stop": End("stopped", 0),
+        "extend": Extend(10),
+    }
+
+    def happen(what: str) -> str:
+        if what == "disk":
+            bed.disk.finish()
+        else:
+            bed.post.waiting.append(messages[what])
+        bed.recorder.turn()
+        return recorder_states.STATES[bed.counters["state"]]
+
+    way, leads = STATES[state]
+    for what in way:
+        happen(what)
+    assert recorder_states.STATES[bed.counters["state"]] is state
+    bed.post.said.clear()
+    found = happen(command)
+    if leads[command]:
+        assert found == leads[command]
+        assert bed.post.said == []
+    else:
+        assert found is state
+        (refused,) = bed.post.said
+        assert isinstance(refused, Refused)
+        assert recorder_states.MEANINGS[state] in refused.error.message
+    for _ in range(2):  # whatever it was, it can be brought to its end
+        if bed.disk.work:
+            happen("disk")
+        happen("stop")
+    assert recorder_states.STATES[bed.counters["state"]] in ("waiting", "discarding", "sealing")
+    if bed.disk.work:
+        assert happen("disk") == "discarding"
+
+
+@pytest.mark.parametrize(("state", "event"), [*itertools.product(RecorderState, RecorderEvent)])
+def test_the_table_refuses_what_has_no_row_in_the_words_of_the_state(
+    state: RecorderState, event: RecorderEvent
+) -> None:
+    if (state, event) in recorder_states.TABLE:
+        assert recorder_states.after(state, event) is recorder_states.TABLE[state, event]
+        return
+    with pytest.raises(StateError) as caught:
+        recorder_states.after(state, event)
+    assert caught.value.message == f"{event}: {recorder_states.MEANINGS[state]}"
 
 
 def test_lines_are_discarded_until_the_recording_can_take_them(bed: Bed, tmp_path: Path) -> None:

@@ -29,14 +29,15 @@ from waiting import until
 from acquire.capacity.load import CLOCK_HZ, Load, recording_spec
 from acquire.capacity.run import capture_plan
 from acquire.config.device import TriggerConfig
-from acquire.lines import ARMS
+from acquire.flags import ARMS, LineFlag
 from acquire.pattern import Pattern
 from acquire.sim.clock import Wire
 from acquire.sim.trigger_model import TriggerModel
 from acquire.sim.twin_links import TwinTransport
 from acquire.store import open_recording, verify
 from acquire.store.files import DISK, Disk
-from acquire.stream import Capture, CaptureStatus
+from acquire.stream import Begin, Capture, CaptureStatus
+from acquire.stream.lifecycle import MEANINGS, Stage
 from acquire.stream.stalls import NEARLY_FULL, Backlog
 from acquire.trigger.driver import TriggerDriver
 
@@ -80,7 +81,7 @@ def check_lines(path: Path, load: Load = LOAD) -> None:
     for arm in ARMS:
         expected = Pattern(arm, load.pixels, load.dtype, 4095).lines(recording.first_line, recording.lines)
         np.testing.assert_array_equal(recording.camera(arm).lines[:], expected)
-        assert not recording.camera(arm).flags[:].any() & 1
+        assert not (recording.camera(arm).flags[:] & LineFlag.MISSING).any()
 
 
 def check_graceful_end(capture: Capture, path: Path) -> None:
@@ -112,8 +113,26 @@ def test_a_slow_disk_ends_the_recording_before_a_line_is_lost(
         LOAD, block_lines=block_lines, ring_slots=LOAD.ring_slots * LOAD.block_lines // block_lines
     )
     with capturing(SlowDisk(share * LOAD.bytes_per_s), load) as capture:
-        capture.start(path, recording_spec(load, capture.clock))
+        capture.start(Begin(path, recording_spec(load, capture.clock)))
         check_graceful_end(capture, path)
+
+
+def test_what_is_closed_between_two_segments_is_sealed_already(tmp_path: Path) -> None:
+    with capturing(SlowDisk(0.2 * LOAD.bytes_per_s), goes_on=True) as capture:
+        capture.start(Begin(tmp_path / "r.zarr", recording_spec(LOAD, capture.clock)))
+        life = capture._supervisor.life
+
+        def pauses() -> bool:
+            due_s = life.resumption._due_s
+            return life.stage is Stage.PAUSED and due_s is not None and due_s > time.monotonic() + 1.0
+
+        until(pauses, "a pause that lasts")
+        assert capture.poll().waiting.startswith(MEANINGS[Stage.PAUSED])
+        capture.close()  # nothing is left to be sealed: it must not wait for it, and fail
+        seen = capture.poll()
+    assert (seen.recording, seen.done, seen.orphans) == (False, True, ())
+    assert str(seen.end_reason).startswith("too slow to write")
+    assert open_recording(Path(str(seen.path))).state == "sealed"
 
 
 @pytest.mark.needs_throttle
@@ -121,7 +140,7 @@ def test_a_disk_that_the_kernel_slows_down(tmp_path: Path) -> None:
     """From some moment on it takes a fifth of what comes; direct writes feel that at once."""
     path = tmp_path / "r.zarr"
     with capturing(DISK) as capture:
-        capture.start(path, recording_spec(LOAD, capture.clock))
+        capture.start(Begin(path, recording_spec(LOAD, capture.clock)))
         until(lambda: capture.poll().committed_lines > 0)
         pid = capture.pids["recorder"]
         assert pid is not None
@@ -146,7 +165,7 @@ def test_a_disk_that_fails_acknowledges_nothing_more(
     path = tmp_path / "r.zarr"
     disk = FailingDisk(number, 4 * 2**20, tmp_path / "failed", wholly, share * LOAD.bytes_per_s)
     with capturing(disk) as capture:
-        capture.start(path, recording_spec(LOAD, capture.clock))
+        capture.start(Begin(path, recording_spec(LOAD, capture.clock)))
         seen, acknowledged = until_done(capture, path)
         assert seen.condition == "ABORTED"
         assert os.strerror(number) in str(seen.end_reason)

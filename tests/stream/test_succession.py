@@ -21,8 +21,10 @@ from acquire.pattern import Pattern
 from acquire.processes.nursery import nursery
 from acquire.rig import Rig
 from acquire.store import open_recording
-from acquire.store.recover import recover
+from acquire.store.recovery import recover
 from acquire.stream import Orphan
+from acquire.stream.lifecycle import Stage
+from acquire.stream.messages import Begin
 
 WAIT_S = 300.0
 RIG = """
@@ -65,11 +67,11 @@ def run(config: RigConfig) -> Iterator[Run]:
             run.arm()
             yield run
         finally:
-            run.close()
+            run.capture.close()
 
 
 def kill(run: Run, name: str) -> int:
-    pid = run._capture.pids[name]
+    pid = run.capture.pids[name]
     assert pid is not None
     os.kill(pid, signal.SIGKILL)
     return pid
@@ -93,23 +95,23 @@ def check(path: Path) -> set[str]:
 
 
 def check_books(run: Run) -> None:
-    for arm in run.poll().lines.values():
+    for arm in run.capture.poll().lines.values():
         told = arm["preroll"] + arm["lost"]["ring_full"] + arm["discarded"] + arm["recorded"] - arm["missing"]
         assert arm["delivered"] == told
 
 
 def test_a_grabber_that_is_killed_is_replaced_and_the_gap_is_recorded(run, tmp_path):
-    run.start(tmp_path / "r.zarr", None)
-    until(lambda: run.poll().recorded_lines > 2000)
+    run.capture.start(Begin(tmp_path / "r.zarr", run.spec()))
+    until(lambda: run.capture.poll().recorded_lines > 2000)
     kill(run, "b")
-    until(lambda: run.poll().lines["b"]["reopened"] == 1)
-    goal = run.poll().recorded_lines + 3000
-    until(lambda: run.poll().recorded_lines > goal)
-    assert run.poll().fault is None
-    run.stop("stopped")
-    until(lambda: run.poll().done)
-    run.close()
-    assert run.poll().condition == "INCOMPLETE"
+    until(lambda: run.capture.poll().lines["b"]["reopened"] == 1)
+    goal = run.capture.poll().recorded_lines + 3000
+    until(lambda: run.capture.poll().recorded_lines > goal)
+    assert run.capture.poll().fault is None
+    run.capture.stop("stopped")
+    until(lambda: run.capture.poll().done)
+    run.capture.close()
+    assert run.capture.poll().condition == "INCOMPLETE"
     assert check(tmp_path / "r.zarr") == {"grabber_lost"}
     check_books(run)
     assert any("another took its place" in event.text for event in open_recording(tmp_path / "r.zarr").events)
@@ -117,12 +119,12 @@ def test_a_grabber_that_is_killed_is_replaced_and_the_gap_is_recorded(run, tmp_p
 
 def test_a_recorder_that_is_killed_is_replaced_and_no_line_is_lost(run, tmp_path):
     lines = 30_000
-    run.start(tmp_path / "r.zarr", lines)
-    until(lambda: run.poll().committed_lines > 2000)
-    first = run.poll().first_line
+    run.capture.start(Begin(tmp_path / "r.zarr", run.spec(), lines))
+    until(lambda: run.capture.poll().committed_lines > 2000)
+    first = run.capture.poll().first_line
     kill(run, "recorder")
-    until(lambda: run.poll().done)
-    seen = run.poll()
+    until(lambda: run.capture.poll().done)
+    seen = run.capture.poll()
     assert seen.fault is None
     assert seen.path == str(tmp_path / "r-2.zarr")
     (orphan,) = seen.orphans
@@ -144,16 +146,16 @@ def test_a_recorder_that_is_killed_is_replaced_and_no_line_is_lost(run, tmp_path
 @pytest.mark.parametrize("begun", [True, False], ids=["once it has begun", "before it begins"])
 def test_a_successor_that_is_killed_as_well_is_replaced_and_the_budget_stays(run, tmp_path, begun):
     lines = 40_000
-    run.start(tmp_path / "r.zarr", lines)
-    until(lambda: run.poll().committed_lines > 2000)
-    first = run.poll().first_line
+    run.capture.start(Begin(tmp_path / "r.zarr", run.spec(), lines))
+    until(lambda: run.capture.poll().committed_lines > 2000)
+    first = run.capture.poll().first_line
     killed = kill(run, "recorder")
-    until(lambda: run._capture.pids["recorder"] not in (None, killed))
+    until(lambda: run.capture.pids["recorder"] not in (None, killed))
     if begun:
-        until(lambda: run.poll().first_line != first and run.poll().committed_lines > 0)
+        until(lambda: run.capture.poll().first_line != first and run.capture.poll().committed_lines > 0)
     kill(run, "recorder")
-    until(lambda: run.poll().done)
-    seen = run.poll()
+    until(lambda: run.capture.poll().done)
+    seen = run.capture.poll()
     assert seen.fault is None
     assert len({orphan.path for orphan in seen.orphans} - {Path(seen.path)}) == (2 if begun else 1)
     recover(tmp_path / "r.zarr")
@@ -177,53 +179,53 @@ def test_what_the_ring_could_not_hold_meanwhile_is_a_gap(config, tmp_path):
         run = Run(short, rig)
         try:
             run.arm()
-            run.start(tmp_path / "r.zarr", 30_000)
-            until(lambda: run.poll().committed_lines > 2000)
+            run.capture.start(Begin(tmp_path / "r.zarr", run.spec(), 30_000))
+            until(lambda: run.capture.poll().committed_lines > 2000)
             os.kill(nursery().pid, signal.SIGSTOP)  # nobody can take its place for a while
             try:
-                os.kill(run.poll().pids["recorder"], signal.SIGKILL)
-                until(lambda: all(ring["drops"] for ring in run.poll().ring.values()))
+                os.kill(run.capture.poll().pids["recorder"], signal.SIGKILL)
+                until(lambda: all(ring["drops"] for ring in run.capture.poll().ring.values()))
             finally:
                 os.kill(nursery().pid, signal.SIGCONT)
-            until(lambda: run.poll().done)
+            until(lambda: run.capture.poll().done)
         finally:
-            run.close()
+            run.capture.close()
     recover(tmp_path / "r.zarr")
     one, two = (open_recording(tmp_path / name) for name in ("r.zarr", "r-2.zarr"))
     assert two.first_line <= one.first_line + one.lines
     assert two.first_line + two.lines == one.first_line + 30_000
     assert set() < check(tmp_path / "r-2.zarr") <= {"recorder_lost", "ring_full"}
     assert check(tmp_path / "r.zarr") == set()
-    assert run.poll().condition == "INCOMPLETE"
+    assert run.capture.poll().condition == "INCOMPLETE"
 
 
 def test_what_is_killed_again_and_again_is_given_up(run, tmp_path, monkeypatch):
     monkeypatch.setattr("acquire.stream.succession.MOST", 1)
-    run.start(tmp_path / "r.zarr", None)
+    run.capture.start(Begin(tmp_path / "r.zarr", run.spec()))
     first = kill(run, "a")
-    until(lambda: run.poll().lines["a"]["reopened"] == 1)
-    assert run._capture.pids["a"] != first
+    until(lambda: run.capture.poll().lines["a"]["reopened"] == 1)
+    assert run.capture.pids["a"] != first
     kill(run, "a")
-    until(lambda: run.poll().fault is not None)
-    assert "killed by SIGKILL" in run.poll().fault
-    until(lambda: run.poll().done)
-    run.close()
-    assert run.poll().condition == "INTERRUPTED"
+    until(lambda: run.capture.poll().fault is not None)
+    assert "killed by SIGKILL" in run.capture.poll().fault
+    until(lambda: run.capture.poll().done)
+    run.capture.close()
+    assert run.capture.poll().condition == "INTERRUPTED"
     check(tmp_path / "r.zarr")
     check_books(run)
 
 
 def test_a_recorder_that_is_killed_while_it_begins_refuses_at_once(run, tmp_path):
     """Another takes its place, and the next start finds it; what was left is named."""
-    pid = run._capture.pids["recorder"]
+    pid = run.capture.pids["recorder"]
     os.kill(pid, signal.SIGSTOP)
     with ThreadPoolExecutor(1) as user:
-        started = user.submit(run.start, tmp_path / "r.zarr", None)
-        until(lambda: run._capture._supervisor._asked is not None)
+        started = user.submit(run.capture.start, Begin(tmp_path / "r.zarr", run.spec()))
+        until(lambda: run.capture._supervisor.life.stage is Stage.ASKED)
         os.kill(pid, signal.SIGKILL)
         with pytest.raises(DeviceError, match="start: the recorder was killed by SIGKILL"):
             started.result(WAIT_S)
-    assert [orphan.path for orphan in run.poll().orphans] == [tmp_path / "r.zarr"]
-    run.start(tmp_path / "s.zarr", 1000)
-    until(lambda: run.poll().done)
+    assert [orphan.path for orphan in run.capture.poll().orphans] == [tmp_path / "r.zarr"]
+    run.capture.start(Begin(tmp_path / "s.zarr", run.spec(), 1000))
+    until(lambda: run.capture.poll().done)
     assert check(tmp_path / "s.zarr") <= {"ring_full"}

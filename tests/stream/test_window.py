@@ -62,7 +62,7 @@ def test_the_shorter_history_counts(make_ring: Callable[..., Ring]) -> None:
     window = Window(at=390, pre_lines=375)
     held = hold(window, rings)
     assert held.from_line == 280  # of arm a; b has everything since line 0, and nothing after 50
-    with pytest.raises(UsageError, match=r"375 lines \(0.375 s\).*up to 110 lines \(0.11 s\)"):
+    with pytest.raises(UsageError, match=r"375 lines from before \(0.375 s\).*up to 110 lines \(0.11 s\)"):
         span(window, None, held, 1000.0)
 
 
@@ -120,7 +120,7 @@ def test_a_recording_begins_before_it_was_asked_for(tmp_path: Path) -> None:
         until(lambda: capture.poll().lines["b"]["delivered"] > 5000, "history")
         before = capture.poll()
         line = capture.note("mark", "something happened")
-        capture.start(tmp_path / "r.zarr", make_spec(), None, Window(line, 3000, 1000))
+        capture.start(Begin(tmp_path / "r.zarr", make_spec(), None, Window(line, 3000, 1000)))
         status = sealed(capture)
     assert before.lines["a"]["discarded"] > 0
     assert (status.first_line, status.recorded_lines) == (line - 3000, 4000)
@@ -140,10 +140,10 @@ def test_a_recording_begins_before_it_was_asked_for(tmp_path: Path) -> None:
 def test_what_the_ring_does_not_hold_is_refused_with_what_it_does(tmp_path: Path) -> None:
     with armed(make_bench(ring_slots=1024)) as capture:
         until(lambda: capture.poll().lines["b"]["delivered"] > 2000, "history")
-        with pytest.raises(UsageError, match=r"50000 lines \(.* s\) from before.*which both rings hold now"):
-            capture.start(tmp_path / "r.zarr", make_spec(), 60_000, Window(pre_lines=50_000))
+        with pytest.raises(UsageError, match=r"50000 lines from before \(.* s\).*which both rings hold now"):
+            capture.start(Begin(tmp_path / "r.zarr", make_spec(), 60_000, Window(pre_lines=50_000)))
         assert not any(tmp_path.iterdir())
-        capture.start(tmp_path / "r.zarr", make_spec(), 6000, Window(pre_lines=50_000, exact=False))
+        capture.start(Begin(tmp_path / "r.zarr", make_spec(), 6000, Window(pre_lines=50_000, exact=False)))
         status = sealed(capture)
     assert status.condition is RunCondition.GOOD
     assert status.recorded_lines == 6000
@@ -159,7 +159,7 @@ def test_takes_of_one_run_overlap_and_every_line_counts_once(tmp_path: Path) -> 
         for name, lines in (("0.zarr", 1500), ("1.zarr", 20_000), ("2.zarr", 40_000)):
             line = takes[0].first_line if takes else None
             window = Window(pre_lines=1000) if line is None else Window(line + 700, 0)
-            capture.start(tmp_path / name, make_spec(), lines, window)
+            capture.start(Begin(tmp_path / name, make_spec(), lines, window))
             if name == "2.zarr":
                 until(lambda: capture.poll().committed_lines > 0, "a commit")
                 recorder = capture.pids["recorder"]
@@ -188,7 +188,7 @@ def test_what_a_take_was_to_begin_with_stays_in_the_one_before(
     monkeypatch.setattr("acquire.stream.capture._LEAST_END_S", 2.0)
     disk = PausingDisk(tmp_path / "gate", "make")
     with armed(make_bench(ring_slots=1024, disk=disk)) as capture:
-        capture.start(tmp_path / "1.zarr", make_spec(), 3000)
+        capture.start(Begin(tmp_path / "1.zarr", make_spec(), 3000))
         first = sealed(capture).first_line
         assert first is not None
         disk.gate.touch()
@@ -216,7 +216,7 @@ def test_what_the_trigger_tells_is_in_the_recording_that_begins_before_it(tmp_pa
         notes: list[Note] = []
         until(lambda: notes.extend(capture.take_events()) or notes, "the event")
         assert notes == [Note(2500, "input", "tick 6750000")]
-        capture.start(tmp_path / "r.zarr", make_spec(), 20_000, Window(2500, 1000, exact=False))
+        capture.start(Begin(tmp_path / "r.zarr", make_spec(), 20_000, Window(2500, 1000, exact=False)))
         bench.trigger.told = [TagEvent(2600, 2600 * 2700, "missed_trigger_b")]
         status = sealed(capture)
     recording, _ = check_rows(tmp_path / "r.zarr")
@@ -229,7 +229,7 @@ def test_what_the_trigger_tells_is_in_the_recording_that_begins_before_it(tmp_pa
 
 def test_an_event_in_a_recording_lets_it_go_on(tmp_path: Path) -> None:
     with armed(make_bench(ring_slots=1024)) as capture:
-        capture.start(tmp_path / "r.zarr", make_spec(), 4000)
+        capture.start(Begin(tmp_path / "r.zarr", make_spec(), 4000))
         until(lambda: capture.poll().recorded_lines > 100, "rows")
         line = capture.note("mark", "again")
         capture.extend(line + 6000)
@@ -247,7 +247,7 @@ def test_a_watcher_that_dies_or_stops_costs_no_line(tmp_path: Path, number: sign
         notes: list[Note] = []
         until(lambda: notes.extend(capture.take_events()) or len(notes) > 2, "crossings")
         assert {note.kind for note in notes} == {"threshold"}
-        capture.start(tmp_path / "r.zarr", make_spec(), 20_000, Window(pre_lines=1000, exact=False))
+        capture.start(Begin(tmp_path / "r.zarr", make_spec(), 20_000, Window(pre_lines=1000, exact=False)))
         watcher = capture.pids["watcher"]
         assert watcher is not None
         os.kill(watcher, number)

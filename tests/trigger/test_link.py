@@ -10,8 +10,9 @@ from trigger_twins import DEVICES, wired_model
 
 from acquire.errors import TriggerError
 from acquire.trigger import registers as r
+from acquire.trigger.dialogue import RefusedError
 from acquire.trigger.frames import Decoder, Frame, encode, nak_payload, read_payload, write_payload
-from acquire.trigger.link import Link, RefusedError
+from acquire.trigger.link import Link
 from acquire.trigger.registers import ErrorCode, FrameType
 
 
@@ -41,7 +42,7 @@ def test_a_link_that_only_makes_noise_fails_in_time() -> None:
     with (
         wired_model() as model,
         linked(NoisyTransport(model, 0.9, 5), reply_s=0.02, attempts=3) as link,
-        pytest.raises(TriggerError, match=r"no answer to READ in 3 attempts of 0\.02 s"),
+        pytest.raises(TriggerError, match=r"no answer to READ came in 3 attempts of 0\.02 s"),
     ):
         link.read(0)
 

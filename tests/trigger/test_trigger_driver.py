@@ -16,8 +16,8 @@ from acquire.sim.clock import Wire
 from acquire.sim.trigger_model import TriggerModel
 from acquire.sim.twin_links import TwinTransport
 from acquire.trigger import registers as r
+from acquire.trigger.dialogue import TagArrival
 from acquire.trigger.driver import TriggerDriver, run_number
-from acquire.trigger.link import TagArrival
 from acquire.trigger.registers import State, TagFlag
 from acquire.trigger.settings import register_values
 from acquire.trigger.tags import TagReader

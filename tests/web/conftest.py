@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 sys.path[:0] = [
-    str(Path(__file__).parents[1] / name) for name in ("daemon", "service")
-]  # their fake and real daemons
+    str(Path(__file__).parents[1] / name) for name in ("daemon", "service", "evaluate")
+]  # their fake and real daemons, and the demo's result
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser

@@ -20,9 +20,12 @@ from acquire.web.places import shape_of
 BLOCK = 50
 
 
-@pytest.fixture(scope="module")
-def rig() -> RigConfig:
-    return load_rig("rig-demo", {"geometry.stages": 16})
+FIBRE = {"geometry.stages": 16, "fibre.rows": 32, "fibre.columns": 48, "fibre.sensor_pixels": 100}
+
+
+@pytest.fixture(scope="module", params=["rig-demo", "rig-fibre"])
+def rig(request: pytest.FixtureRequest) -> RigConfig:
+    return load_rig(request.param, FIBRE if request.param == "rig-fibre" else {"geometry.stages": 16})
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +38,8 @@ def recording(rig: RigConfig, tmp_path_factory: pytest.TempPathFactory) -> Recor
 @pytest.fixture
 def rings(recording: Recording) -> Iterator[dict[str, Ring]]:
     """The lines of the recording, in blocks, of which the oldest are gone."""
-    made = {arm: Ring(arm, RingShape(8, BLOCK, 16, "uint16")) for arm in "ab"}
+    width = recording.camera("a").pixels
+    made = {arm: Ring(arm, RingShape(8, BLOCK, width, "uint16")) for arm in "ab"}
     for arm, ring in made.items():
         pixels = recording.camera(arm).read("lines", 0, 500)
         for start in range(0, 500, BLOCK):
@@ -70,7 +74,7 @@ def test_it_is_the_segment_that_the_recording_gives(
         found = glimpses.segment()
         assert found is not None
         lines = Sizes.of(rig).lines
-        cut = recording.cut(recording.first_line + 500 - lines, lines)
+        cut = recording.cut(recording.first_line + 500 - lines, lines, glimpses.tile)
         np.testing.assert_array_equal(found.lines, cut.lines)
         np.testing.assert_array_equal(found.mask, cut.mask)
         np.testing.assert_array_equal(found.code, cut.code)

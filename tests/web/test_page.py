@@ -131,3 +131,18 @@ def until_restarted(daemon: Daemon, before: int) -> None:
     while log().count("the operator's page: http") < 2 or page_process(daemon).pid == before:
         assert time.monotonic() < deadline
         time.sleep(0.05)
+
+
+def test_a_setup_that_changes_is_shown_and_who_changed_it_among_the_events(
+    page: Page, daemon: Daemon
+) -> None:
+    page.keyboard.press("5")
+    page.locator("#setup", has_text="small").wait_for(timeout=SEEN_MS)
+    assert "recording.reserve_gb" not in page.locator("#setup table").first.inner_text()
+    text = daemon.config.read_text().replace("[recording]", "[recording]\nreserve_gb = 0.5")
+    daemon.config.write_text(text)
+    assert daemon("reload").code == 0
+    page.locator("#setup table", has_text="recording.reserve_gb").first.wait_for(timeout=SEEN_MS)
+    page.keyboard.press("1")
+    told = "reload by the control socket: recording.reserve_gb = 0.5, it was 0.25"
+    page.locator("#events", has_text=told).wait_for(timeout=SEEN_MS)

@@ -15,6 +15,7 @@ import pytest
 from fake_run import FakeRun, rig_config
 from page_server import PageServer
 from served import api
+from waiting import until
 
 from acquire.client import Client
 from acquire.daemon.endpoint import Endpoint
@@ -304,3 +305,38 @@ def test_nothing_is_loaded_from_elsewhere(browser: Browser, instrument: Instrume
             page.keyboard.press(key)
     assert len(asked) > 10
     assert [url for url in asked if not url.startswith((instrument.server.address, "data:"))] == []
+
+
+HIDDEN = """
+let state = "hidden";
+Object.defineProperty(document, "visibilityState", { get: () => state });
+window.show = () => { state = "visible"; document.dispatchEvent(new Event("visibilitychange")); };
+"""
+"""A browser without a window shows all its tabs: what it would say of those that are behind others."""
+TABS = 10
+
+
+def test_ten_tabs_are_served_and_each_is_live_once_it_is_seen(
+    browser: Browser, instrument: Instrument
+) -> None:
+    context = browser.new_context()
+    first = context.new_page()
+    first.goto(instrument.server.link)
+    first.wait_for_selector("#arm:enabled", timeout=SEEN_MS)
+    tabs = [context.new_page() for _ in range(TABS - 1)]
+    refused: list[str] = []
+    for tab in tabs:
+        tab.add_init_script(HIDDEN)
+        tab.on("response", lambda one: one.status == 429 and refused.append(one.url))
+        tab.goto(instrument.server.address, wait_until="commit")  # all at once, as a session is restored
+    for tab in tabs:
+        tab.wait_for_selector("#arm:enabled", timeout=SEEN_MS)
+    arm(instrument)
+    for tab in [first, *tabs]:
+        until(lambda tab=tab: tab.title().startswith("ARMED"))
+    with tabs[-1].expect_request(lambda one: "pictures=true" in one.url, timeout=SEEN_MS):
+        tabs[-1].evaluate("window.show()")
+    tabs[-1].click("#disarm")
+    until(lambda: first.title().startswith("IDLE"))
+    context.close()
+    assert refused == []

@@ -153,6 +153,7 @@ class AravisCamera:
             return 1
         with errors(f"arm camera {self._spec.serial}") as error:
             size = self._library.arv_camera_gv_get_packet_size(self._camera, error)
+        # Two more packets have no lines in them: the leader and the trailer.
         return 2 + math.ceil(self._payload / max(1, int(size) - _HEADERS_BYTES))
 
     def _give(self, stream: int, buffer: int) -> None:
@@ -258,7 +259,7 @@ class AravisCamera:
         self._armed = False
         self._held.clear()
         self._ready.clear()
-        while self._taken:
+        while self._taken:  # ours since the stream gave them; it frees the others itself
             self._library.g_object_unref(self._taken.pop())
         try:
             with errors("stop") as error:

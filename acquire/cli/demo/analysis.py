@@ -12,6 +12,7 @@ from acquire.cli.demo.plan import N_M, SEGMENT_LINES, T_M, segment_row
 from acquire.cli.progress import stage_progress
 from acquire.config.scene import SineDrive
 from acquire.cores import idle_cores, limit_blas
+from acquire.evaluate.host import HostWatch
 from acquire.evaluate.report import (
     ArmLedger,
     CaptureFacts,
@@ -65,7 +66,12 @@ def analyse(plan: DemoPlan, captured: Captured, rig: RigConfig, journal: Journal
         Method("admm", "ADMM (default)", "video.zarr", plan.budget_s),
         Method("twist", "TwIST (the paper's)", "video-twist.zarr", plan.twist_budget_s),
     )
-    videos = [_solve(method, segment, journal) for method in methods]
+    host = HostWatch()
+    host.look()
+    videos = []
+    for method in methods:
+        videos.append(_solve(method, segment, journal))
+        host.look()
     for method, video in zip(methods, videos, strict=True):
         save_reconstruction(plan.out / method.file, video, recording, segment, N_M)
     trusted = videos[0].trusted
@@ -88,6 +94,7 @@ def analyse(plan: DemoPlan, captured: Captured, rig: RigConfig, journal: Journal
         solvers=solvers,
         regions=regions,
         stages=tuple(journal.stages),
+        host=host.busyness(),
     )
 
 
@@ -110,7 +117,7 @@ def _solve(method: Method, segment: Segment, journal: Journal) -> Reconstruction
             solver=method.solver,
             refuse=False,  # the recording is made: something is shown of it
         )
-        note["detail"] = f"{result.iterations} of {result.iterations_asked} iterations"
+        note["detail"] = f"{result.iterations} iterations"
     return result
 
 

@@ -13,7 +13,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from acquire.evaluate.paper.studio import PaperFigure, Picture, Row, Studio
+from acquire.evaluate.paper.against import Row
+from acquire.evaluate.paper.studio import PaperFigure, Picture, Studio
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -29,7 +30,7 @@ def make(name: str, studio: Studio) -> PaperFigure:
 
     import matplotlib as mpl
 
-    from acquire.evaluate.figures import STYLE
+    from acquire.evaluate.themed import STYLE
 
     figure: Callable[[Studio], PaperFigure] = import_module(f"acquire.evaluate.paper.{name}").figure
     with mpl.rc_context(STYLE):

@@ -44,6 +44,12 @@ def last_resolved(contrast: dict[str, float]) -> str:
     return last
 
 
+def place_of(element: str) -> int:
+    """Elements up to this one, counted through the groups; one before the first of group 2 for ``–``."""
+    group, _, number = element.partition("/")
+    return 6 * int(group) + int(number) if number else 6 * 2
+
+
 def _contrast(picture: NDArray[Any], bars: list[Bar], field_mm: float) -> float:
     size = len(picture)
     lying = bars[0].width > bars[0].height

@@ -5,40 +5,64 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from acquire.evaluate.figures import HIGHLIGHT, WIDTH_IN, bare, stamp
+from acquire.evaluate.figures import bare, stamp
+from acquire.evaluate.paper.studio import Picture
+from acquire.evaluate.themed import HIGHLIGHT, NARROW_IN, WIDTH_IN, canvas
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-FRAME_IN = 1.55
+    Rows = Sequence[tuple[str, NDArray[Any]]]
 
-
-def canvas(height_in: float) -> Figure:
-    return Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
+NARROW_ACROSS = 4
+LABEL_IN, STAMP_IN = 0.3, 0.2
 
 
 def show(ax: Axes, frame: NDArray[Any], peak: float = 1.0, title: str = "") -> None:
     """A frame in grey, 0 black and ``peak`` white, its pixels sharp."""
-    ax.imshow(frame, cmap="gray", vmin=0, vmax=peak, interpolation="nearest")
+    ax.imshow(frame, cmap="gray", vmin=0, vmax=peak)
     bare(ax)
     if title:
         ax.set_title(title, fontsize=9, loc="left")
 
 
-def strips(rows: Sequence[tuple[str, NDArray[Any]]], stamps: Sequence[str], peak: float = 1.0) -> Figure:
-    """Rows of frames at the same instants, one instant per column."""
-    figure = canvas(0.2 + FRAME_IN * len(rows) * 6 / len(stamps))
-    axes = figure.subplots(len(rows), len(stamps), squeeze=False)
-    for (label, frames), line in zip(rows, axes, strict=True):
-        for ax, frame, text in zip(line, frames, stamps, strict=True):
-            show(ax, frame, peak)
-            stamp(ax, text)
-        line[0].set_ylabel(label, fontweight="bold")
+def strip(name: str, caption: str, rows: Rows, stamps: Sequence[str], peak: float = 1.0) -> Picture:
+    """Rows of frames at the same instants, one instant per column; on narrow pages some below the others."""
+    narrow = strips(rows, stamps, peak, across=NARROW_ACROSS, width_in=NARROW_IN)
+    return Picture(name, strips(rows, stamps, peak), caption, narrow=narrow)
+
+
+def strips(
+    rows: Rows,
+    stamps: Sequence[str],
+    peak: float = 1.0,
+    *,
+    across: int | None = None,
+    width_in: float = WIDTH_IN,
+) -> Figure:
+    """The same as one figure, at most ``across`` instants side by side."""
+    blocks = -(-len(stamps) // (across or len(stamps)))
+    across = -(-len(stamps) // blocks)  # as many in each as can be
+    side_in = (width_in - LABEL_IN) / across
+    shape = rows[0][1].shape
+    figure = canvas(blocks * (STAMP_IN + side_in * shape[1] / shape[2] * len(rows)), width_in)
+    axes = figure.subplots(blocks * len(rows), across, squeeze=False)
+    for ax in axes.ravel():
+        bare(ax)
+    for number, text in enumerate(stamps):
+        block, column = divmod(number, across)
+        for row, (label, frames) in enumerate(rows):
+            ax = axes[block * len(rows) + row, column]
+            show(ax, frames[number], peak)
+            if row == 0:
+                stamp(ax, text)
+            if column == 0:
+                ax.set_ylabel(label, fontweight="bold")
     return figure
 
 

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.evaluate.curves import region_mean
-from acquire.evaluate.figures import SOLVER_COLOURS, THEORY
-from acquire.evaluate.paper.drawing import box, canvas, correlation, show, strips
-from acquire.evaluate.paper.studio import PaperFigure, Picture, Row
+from acquire.evaluate.paper.against import Row, captured, words
+from acquire.evaluate.paper.drawing import box, correlation, show, strip
+from acquire.evaluate.paper.studio import PaperFigure, Picture
+from acquire.evaluate.themed import SOLVER_COLOURS, THEORY, canvas
 from acquire.sim.digits import SEGMENTS, DigitScene
 
 if TYPE_CHECKING:
@@ -54,30 +55,36 @@ def figure(studio: Studio) -> PaperFigure:
         text="2-4-6-8 on the left, 1-3-5-7 on the right; each digit rises and falls within 1.28 ms, the "
         "displays half a period apart. 598 frames of 64 × 64 voxels from 263 lines.",
         pictures=(
-            Picture(
+            strip(
                 "frames",
-                strips(
-                    (("ours", video[picks]), ("truth", truth[picks])), [f"{times[p]:.2f} ms" for p in picks]
-                ),
                 "(b) frames at the peaks of the digits.",
+                (("ours", video[picks]), ("truth", truth[picks])),
+                [f"{times[p]:.2f} ms" for p in picks],
             ),
             Picture(
                 "curves", _curves(times, curves, truth, masks), "(c) mean light of three segments over time."
             ),
         ),
         rows=(
-            Row("left display reads", "identified", f"{digits['left'][0]} (shown {digits['left'][1]})"),
-            Row("right display reads", "identified", f"{digits['right'][0]} (shown {digits['right'][1]})"),
-            *(
-                Row(f"{name}: light over time", _statement(name), f"r = {r:.3f}")
-                for name, r in agreement.items()
-            ),
+            *(_reading(side, *digits[side]) for side in ("left", "right")),
+            *(captured(f"{name}: light over time", _statement(name), r) for name, r in agreement.items()),
             shot.accuracy(),
         ),
         seconds=dict(studio.seconds),
         numbers=shot.numbers(),
-        movie=video[::4],
+        movie={"ours": video[::4], "truth": truth[::4]},
         movie_ms=0.04,
+    )
+
+
+def _reading(side: str, read: str, shown: str) -> Row:
+    right = sum(one == other for one, other in zip(read, shown, strict=True))
+    return words(
+        f"{side} display reads",
+        "identified",
+        f"{read} (shown {shown})",
+        f"{right} of {len(shown)} digits",
+        hold=right == len(shown),
     )
 
 

@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.ndimage import map_coordinates
 
-from acquire.evaluate.figures import SOLVER_COLOURS, THEORY, stamp
 from acquire.evaluate.metrics import psnr, ssim
-from acquire.evaluate.paper.drawing import canvas, show
-from acquire.evaluate.paper.studio import PaperFigure, Picture, Row, true_voxels
+from acquire.evaluate.paper.against import Row, same, words
+from acquire.evaluate.paper.drawing import show, strip
+from acquire.evaluate.paper.studio import PaperFigure, Picture, true_voxels
+from acquire.evaluate.themed import SOLVER_COLOURS, THEORY, canvas
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from acquire.evaluate.paper.studio import Studio
 
 LINES = 1313
+NARROW_TRAJECTORY_IN = 2.6
 DETAIL, MOTION = (1, 820), (3, 4)
 PROFILE = 0.2
 """Half length of the line across the stripes, of the scene's side."""
@@ -51,34 +53,54 @@ def figure(studio: Studio) -> PaperFigure:
                 "trajectory",
                 _trajectory(true_motion, motion),
                 "(a) all positions at once: the truth, and ours.",
+                narrow_in=NARROW_TRAJECTORY_IN,
             ),
-            Picture(
+            _frames(
                 "detail",
-                _frames("162 × 162, 5 frames", detail, true_detail, range(5), frame_ms[0]),
                 "(b) N_m = 1, T_m = 820: stripes are clear, the fast fish is blurred along its way.",
+                detail,
+                true_detail,
+                range(5),
+                frame_ms[0],
             ),
-            Picture(
+            _frames(
                 "motion",
-                _frames("54 × 54, 1025 frames", motion, true_motion, range(102, 1025, 205), frame_ms[1]),
                 "(d) N_m = 3, T_m = 4: the fast fish is caught, the stripes have lost contrast.",
+                motion,
+                true_motion,
+                range(102, 1025, 205),
+                frame_ms[1],
             ),
             Picture(
                 "stripes", _stripes(profiles), "(c) light along a line across the stripes, over its mean."
             ),
         ),
         rows=(
-            Row("N_m = 1, T_m = 820", "stripes clearly discerned", _quality(numbers, "detail", studio)),
+            words(
+                "N_m = 1, T_m = 820",
+                "stripes clearly discerned",
+                _quality(numbers, "detail", studio),
+                f"{depth['N_m = 1'] / depth['truth']:.0%} of the stripes' true swing; half is asked",
+                hold=depth["N_m = 1"] >= depth["truth"] / 2,
+            ),
             Row("N_m = 3, T_m = 4", "fast fish clearly captured", _quality(numbers, "motion", studio)),
-            Row(
+            words(
                 "swing across the stripes, of their mean",
                 "higher with N_m = 1",
                 ", ".join(f"{value:.2f} ({name})" for name, value in depth.items()),
+                f"× {depth['N_m = 1'] / depth['N_m = 3']:.2f}",
+                hold=depth["N_m = 1"] > depth["N_m = 3"],
             ),
-            Row("voxels", "162×162×5 and 54×54×1025", f"{_shape(detail)} and {_shape(motion)}"),
+            same(
+                "voxels",
+                "162×162×5 and 54×54×1025",
+                f"{_shape(detail)} and {_shape(motion)}",
+                equal=(detail.shape, motion.shape) == ((5, 162, 162), (1025, 54, 54)),
+            ),
         ),
         seconds=dict(studio.seconds),
         numbers=numbers,
-        movie=motion[::10],
+        movie={"ours": motion[::10], "truth": true_motion[::10]},
         movie_ms=10 * frame_ms[1],
     )
 
@@ -117,15 +139,11 @@ def _trajectory(truth: NDArray[Any], video: NDArray[Any]) -> Figure:
     return drawing
 
 
-def _frames(label: str, video: NDArray[Any], truth: NDArray[Any], picks: range, frame_ms: float) -> Figure:
-    drawing = canvas(4.1)
-    axes = drawing.subplots(2, len(picks))
-    for row, (name, source) in zip(axes, ((f"ours\n{label}", video), ("truth", truth)), strict=True):
-        for ax, frame in zip(row, picks, strict=True):
-            show(ax, source[frame])
-            stamp(ax, f"{frame * frame_ms:.2f} ms")
-        row[0].set_ylabel(name, fontweight="bold")
-    return drawing
+def _frames(
+    name: str, caption: str, video: NDArray[Any], truth: NDArray[Any], picks: range, frame_ms: float
+) -> Picture:
+    stamps = [f"{frame * frame_ms:.2f} ms" for frame in picks]
+    return strip(name, caption, (("ours", video[picks]), ("truth", truth[picks])), stamps)
 
 
 def _stripes(profiles: dict[str, NDArray[np.float64]]) -> Figure:
@@ -136,5 +154,5 @@ def _stripes(profiles: dict[str, NDArray[np.float64]]) -> Figure:
     for name, values in profiles.items():
         ax.plot(place, values, color=colours[name], lw=3 if name == "truth" else 1.4, label=name)
     ax.set(xlabel="place along the line (side of the scene = 1)", ylabel="light over mean")
-    ax.legend(ncols=3, loc="upper right")
+    drawing.legend(ncols=3, loc="outside upper right")
     return drawing

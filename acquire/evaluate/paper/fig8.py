@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.evaluate.metrics import psnr
-from acquire.evaluate.paper.bars import contrasts, last_resolved
-from acquire.evaluate.paper.drawing import box, canvas, show, strips
-from acquire.evaluate.paper.studio import PaperFigure, Picture, Row, read, true_voxels
+from acquire.evaluate.paper.against import Row, in_elements, same, words
+from acquire.evaluate.paper.bars import contrasts, last_resolved, place_of
+from acquire.evaluate.paper.drawing import box, show, strip
+from acquire.evaluate.paper.studio import PaperFigure, Picture, read, true_voxels
+from acquire.evaluate.themed import canvas
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -20,6 +22,8 @@ if TYPE_CHECKING:
 
 LINES = 2140
 T_OUT = 4
+KEPT = "2136 + 1972 + 2136"
+NARROW_CLOSE_IN = 1.5
 FIELD_MM, GROUPS = 6.4, (2, 3)
 CLOSE = (slice(20, 104), slice(18, 66))
 """Rows and columns of the close-up: group 2, elements 2 to 6."""
@@ -56,31 +60,37 @@ def figure(studio: Studio) -> PaperFigure:
         "N_m = 3, T_m = 4; #B, at rest, of N_m = 1, T_m = 220 (230 evened out, so that nine fill it), from "
         "the lines that see nothing but it. One video holds them all.",
         pictures=(
-            Picture("a", _strip(video, fine, picks_a, frame_ms), "(a), (b) #A: the window slides up."),
-            Picture("b", _strip(video, fine, picks_b, frame_ms), "(d) #B: open, in fine pixels."),
-            Picture(
-                "c", _strip(video, fine, picks_c, frame_ms), "(e), (f) #C: the window slides to the left."
-            ),
+            _strip("a", "(a), (b) #A: the window slides up.", video, fine, picks_a, frame_ms),
+            _strip("b", "(d) #B: open, in fine pixels.", video, fine, picks_b, frame_ms),
+            _strip("c", "(e), (f) #C: the window slides to the left.", video, fine, picks_c, frame_ms),
             Picture(
                 "close",
                 _close(video, fine, picks_a[-2], picks_b[2], picks_c[-2]),
                 "(c) the same bars close up.",
+                narrow_in=NARROW_CLOSE_IN,
             ),
         ),
         rows=(
-            Row("sub-steps kept", "2136 + 1972 + 2136", " + ".join(_kept(outcome.provenance))),
+            same(
+                "sub-steps kept",
+                KEPT,
+                " + ".join(_kept(outcome.provenance)),
+                equal=" + ".join(_kept(outcome.provenance)) == KEPT,
+            ),
             Row("#A, 54 × 54, 534 frames", "sliding clearly captured", f"{numbers['a_psnr_db']:.1f} dB"),
             Row("#B, 162 × 162", "target details explored", f"{numbers['b_psnr_db']:.1f} dB"),
             Row("#C, 54 × 54, 534 frames", "sliding clearly captured", f"{numbers['c_psnr_db']:.1f} dB"),
-            Row(
+            words(
                 "bars resolved",
                 "#B significantly better",
                 f"#B {_named(resolved)}; pixels of #A and #C, without any error, {_named(open_coarse)}",
+                f"#B {in_elements(place_of(resolved) - place_of(open_coarse))}",
+                hold=place_of(resolved) > place_of(open_coarse),
             ),
         ),
         seconds=dict(studio.seconds),
         numbers=numbers,
-        movie=video[::16],
+        movie={"ours": video[::16], "truth": fine[::16]},
         movie_ms=16 * frame_ms,
     )
 
@@ -94,9 +104,16 @@ def _kept(facts: dict[str, Any]) -> list[str]:
     return [str(part["end_substep"] - part["begin_substep"]) for part in facts["segments"]]
 
 
-def _strip(video: NDArray[Any], truth: NDArray[Any], picks: NDArray[np.int64], frame_ms: float) -> Figure:
+def _strip(
+    name: str,
+    caption: str,
+    video: NDArray[Any],
+    truth: NDArray[Any],
+    picks: NDArray[np.int64],
+    frame_ms: float,
+) -> Picture:
     stamps = [f"{frame * frame_ms:.2f} ms" for frame in picks]
-    return strips((("ours", video[picks]), ("truth", truth[picks])), stamps)
+    return strip(name, caption, (("ours", video[picks]), ("truth", truth[picks])), stamps)
 
 
 def _close(video: NDArray[Any], truth: NDArray[Any], a: int, b: int, c: int) -> Figure:

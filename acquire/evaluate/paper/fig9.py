@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.evaluate.curves import CurveComparison, compare_curve, region_mean
-from acquire.evaluate.figures import SOLVER_COLOURS, THEORY
-from acquire.evaluate.paper.drawing import canvas, strips
-from acquire.evaluate.paper.studio import PaperFigure, Picture, Row
+from acquire.evaluate.paper.against import Row, frequency, same, words
+from acquire.evaluate.paper.drawing import strip
+from acquire.evaluate.paper.studio import PaperFigure, Picture
+from acquire.evaluate.themed import SOLVER_COLOURS, THEORY, canvas
 from acquire.sim.leds import LedScene
 
 if TYPE_CHECKING:
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
 FIRST_LINE, LINES = 1733, 263
 INNER = 0.9
 DETAIL_MS = 1.2
+FRAMES = 598
+STEADY = 0.05
+"""Ripple of what is constant, of its level."""
 
 
 def figure(studio: Studio) -> PaperFigure:
@@ -45,47 +49,58 @@ def figure(studio: Studio) -> PaperFigure:
         "10 µs apart, 52 ms to 57.98 ms.",
         pictures=(
             Picture("lines", _lines(segment, times[0]), "(a) what the two cameras recorded."),
-            Picture(
+            strip(
                 "frames",
-                strips(
-                    (("ours", video[picks]), ("truth", truth[picks])),
-                    [f"#{frame}  {times[frame]:.2f} ms" for frame in picks],
-                    float(truth.max()),
-                ),
                 "(b) frames over one period of the circle.",
+                (("ours", video[picks]), ("truth", truth[picks])),
+                [f"#{frame}  {times[frame]:.2f} ms" for frame in picks],
+                float(truth.max()),
             ),
             Picture(
                 "curves", _curves(times, light, measured, curves), "(c) mean light of each shape over time."
             ),
         ),
         rows=(
-            Row(
+            same(
                 "video",
                 "64 × 64 × 598, 52 to 57.98 ms",
                 f"64 × 64 × {len(video)}, {times[0]:.2f} to {times[-1]:.2f} ms",
+                equal=len(video) == FRAMES,
             ),
             *(_row(curve) for curve in curves),
-            Row(
+            words(
                 "distortion of the circle",
                 "slight, from saturation",
                 f"{curves[2].measured.distortion:.1%} (true {curves[2].theory.distortion:.1%})",
+                f"{abs(curves[2].measured.distortion - curves[2].theory.distortion):.1%} off the truth; "
+                "half of it is allowed",
+                hold=abs(curves[2].measured.distortion / curves[2].theory.distortion - 1) <= 0.5,
             ),
             shot.accuracy(),
         ),
         seconds=dict(studio.seconds),
         numbers=shot.numbers(),
-        movie=video[100:400:2],
+        movie={"ours": video[100:400:2], "truth": truth[100:400:2]},
         movie_ms=0.02,
     )
 
 
 def _row(curve: CurveComparison) -> Row:
     if curve.constant:
-        return Row(f"{curve.name}: constant", "constant", f"level × {curve.level_ratio or 0:.3f}")
-    return Row(
+        ripple = curve.measured.residual_rms / curve.measured.offset
+        return words(
+            f"{curve.name}: constant",
+            "constant",
+            f"level × {curve.level_ratio or 0:.3f}",
+            f"ripple {ripple:.1%}; {STEADY:.0%} is allowed",
+            hold=ripple <= STEADY,
+        )
+    return frequency(
         f"{curve.name}: {curve.theory.frequency_hz:.0f} Hz",
         "same frequency as theory",
         f"{curve.measured.frequency_hz:.1f} Hz, amplitude × {curve.amplitude_ratio or 0:.2f}",
+        curve.measured.frequency_hz,
+        curve.theory.frequency_hz,
     )
 
 

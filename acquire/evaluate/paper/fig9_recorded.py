@@ -14,9 +14,10 @@ from acquire.calibrate.apply import calibrated
 from acquire.calibrate.choose import choose, corrected
 from acquire.errors import UsageError
 from acquire.evaluate.curves import HARMONICS, SineFit, fit_constant, fit_sine, region_mean
-from acquire.evaluate.figures import SOLVER_COLOURS, THEORY
-from acquire.evaluate.paper.drawing import canvas, strips
-from acquire.evaluate.paper.studio import PaperFigure, Picture, Row
+from acquire.evaluate.paper.against import Row, frequency, same, words
+from acquire.evaluate.paper.drawing import strip
+from acquire.evaluate.paper.studio import PaperFigure, Picture
+from acquire.evaluate.themed import SOLVER_COLOURS, THEORY, canvas
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -76,7 +77,8 @@ def figure_of(recording: Recording, studio: Studio, first_line: int | None = Non
     times_ms = np.arange(len(video), dtype=np.float64) * (interval_s * 1e3)
     picks = np.linspace(0, len(video) - 1, 6).astype(int)
     stamps = [f"{times_ms[k]:.2f} ms" for k in picks]
-    frames = strips((("frames", video[picks]),), stamps, float(np.percentile(video, 99.9)))
+    white = float(np.percentile(video, 99.9))
+    frames = strip("frames", "(b) frames over the whole time.", (("frames", video[picks]),), stamps, white)
     what = "none" if chosen is None else ", ".join(corrected(chosen.calibration)) or "nothing"
     return PaperFigure(
         name="fig9",
@@ -84,18 +86,25 @@ def figure_of(recording: Recording, studio: Studio, first_line: int | None = Non
         text=f"{LINES} lines of both cameras from line {first} on; {len(video)} frames of "
         f"{video.shape[1]} × {video.shape[2]} voxels. Corrected: {what}.",
         pictures=(
-            Picture("frames", frames, "(b) frames over the whole time."),
+            frames,
             Picture(
                 "curves", _curves(times_ms, interval_s, lamps), "(c) mean light of each lamp, and its fit."
             ),
         ),
         rows=(
-            Row("video", "64 × 64 × 598", f"{video.shape[1]} × {video.shape[2]} × {len(video)}"),
+            same(
+                "video",
+                "64 × 64 × 598",
+                f"{video.shape[1]} × {video.shape[2]} × {len(video)}",
+                equal=video.shape == (598, 64, 64),
+            ),
             *_rows(lamps),
             *(Row("warning", "–", text) for text in result.warnings),
         ),
         seconds=dict(studio.seconds),
         numbers={f"{lamp.place}_hz": lamp.fit.frequency_hz for lamp in lamps},
+        movie={"reconstructed": video[::4] / white},
+        movie_ms=4 * interval_s * 1e3,
     )
 
 
@@ -126,9 +135,16 @@ def _rows(lamps: list[Lamp]) -> list[Row]:
     for name, hz in LAMPS.items():
         found = next((lamp for lamp in lamps if lamp.name == name), None)
         expected = f"{hz:.0f} Hz" if hz else "constant"
-        rows.append(Row(f"{name}: {expected}", "same frequency as theory", _told(found)))
+        rows.append(_row(f"{name}: {expected}", found, hz))
     strange = [lamp for lamp in lamps if lamp.name is None]
     return rows + [Row(f"{lamp.place}: none of these", "–", _told(lamp)) for lamp in strange]
+
+
+def _row(what: str, lamp: Lamp | None, hz: float) -> Row:
+    paper = "same frequency as theory" if hz else "constant"
+    if lamp is None or not hz:
+        return words(what, paper, _told(lamp), hold=lamp is not None)
+    return frequency(what, paper, _told(lamp), lamp.fit.frequency_hz, hz)
 
 
 def _told(lamp: Lamp | None) -> str:

@@ -10,7 +10,9 @@ import numpy as np
 
 from acquire.config import load_plan, load_recorded, load_rig, load_scene
 from acquire.config.scene import OpticsConfig
+from acquire.evaluate.host import HostWatch
 from acquire.evaluate.metrics import psnr, ssim
+from acquire.evaluate.paper.against import Row
 from acquire.recon import reconstruct
 from acquire.recon.segments import Voxels
 from acquire.reconstruct import Options, Watcher, along_plan, combine, in_voxels, open_pool
@@ -39,30 +41,23 @@ TRUE_PEAK = 1.0
 """Light of the scenes at their brightest."""
 
 
-@dataclass(frozen=True, slots=True)
-class Row:
-    """A line of a figure's table."""
-
-    what: str
-    paper: str
-    ours: str
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Picture:
-    """A drawing, with what it shows in words."""
+    """A drawing, with what it shows in words; on narrow pages ``narrow``, or the same ``narrow_in`` high."""
 
     name: str
     drawing: Figure
     caption: str
+    narrow: Figure | None = None
+    narrow_in: float | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PaperFigure:
     """A figure of the paper as we have it.
 
-    ``movie`` (t, row, column) is shown as an animation, ``movie_ms`` the time from one of its frames to the
-    next.
+    ``movie`` maps what is shown side by side to its frames (t, row, column); ``movie_ms`` is the time from
+    one to the next.
     """
 
     name: str
@@ -72,7 +67,7 @@ class PaperFigure:
     rows: tuple[Row, ...]
     seconds: dict[str, float]
     numbers: dict[str, float] = field(default_factory=dict)
-    movie: NDArray[Any] | None = None
+    movie: dict[str, NDArray[Any]] = field(default_factory=dict)
     movie_ms: float = 1.0
 
 
@@ -114,6 +109,7 @@ class Studio:
     seed: int = 1
     say: Callable[[str], object] = lambda _: None
     seconds: dict[str, float] = field(default_factory=dict)
+    host: HostWatch = field(default_factory=HostWatch)
 
     def record(
         self, scene_name: str, lines: int, *, interline: bool = False, gain_dn_per_e: float | None = None
@@ -146,7 +142,7 @@ class Studio:
 
     def solve(self, segment: Segment, spatial_merge: int, temporal_merge: int, what: str) -> Reconstruction:
         """Reconstruct a segment by the studio's options; the time it takes is noted under ``what``."""
-        self.say(f"reconstructing {what}")
+        self._begin(what)
         options = self.options
         result = reconstruct(
             segment,
@@ -158,7 +154,7 @@ class Studio:
             iterations=options.iterations,
             refuse=False,
         )
-        self.seconds[what] = result.seconds
+        self._end(what, result.seconds)
         return result
 
     def shoot(self, scene_name: str, first_line: int, lines: int, what: str) -> Shot:
@@ -180,7 +176,7 @@ class Studio:
 
     def stitch(self, recording: Recording, plan_name: str, first_line: int, what: str) -> Outcome:
         """Reconstruct along a built-in plan from a line on, sub-segments side by side."""
-        self.say(f"reconstructing {what}")
+        self._begin(what)
         plan = load_plan(plan_name)
         request = along_plan(by_lines(recording, first_line), plan)
         began = time.perf_counter()
@@ -189,14 +185,14 @@ class Studio:
             outcome = combine(
                 recording, request, self.directory / f"{plan_name}.zarr", self.options, pool, watcher
             )
-        self.seconds[what] = time.perf_counter() - began
+        self._end(what, time.perf_counter() - began)
         return outcome
 
     def stitch_evenly(
         self, recording: Recording, selection: Selection, voxels: Voxels, pieces: int, what: str
     ) -> Outcome:
         """Reconstruct a selection in ``pieces`` equal sub-segments."""
-        self.say(f"reconstructing {what}")
+        self._begin(what)
         begin, end = selection.extent(voxels, voxels, whole=False)
         request = in_voxels(selection, voxels, longest=-(-(end - begin) // pieces))
         began = time.perf_counter()
@@ -210,8 +206,16 @@ class Studio:
                 pool,
                 watcher,
             )
-        self.seconds[what] = time.perf_counter() - began
+        self._end(what, time.perf_counter() - began)
         return outcome
+
+    def _begin(self, what: str) -> None:
+        self.host.look()
+        self.say(f"reconstructing {what}")
+
+    def _end(self, what: str, seconds: float) -> None:
+        self.seconds[what] = seconds
+        self.host.look()
 
 
 def scene_of(recording: Recording) -> Scene:

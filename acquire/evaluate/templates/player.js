@@ -1,14 +1,16 @@
 /* Shows the frames of a figure.player one by one. Keys within it: space, arrows, Home, End. */
 for (const figure of document.querySelectorAll("figure.player")) {
   const frames = JSON.parse(figure.querySelector("script[type='application/json']").textContent);
-  const [image, slider] = [figure.querySelector("img"), figure.querySelector("input")];
+  const labels = JSON.parse(figure.dataset.labels ?? "[]");
+  const [image, slider, label] = ["img", "input", "output"].map((name) => figure.querySelector(name));
   const [first, back, play, on] = figure.querySelectorAll("button");
   let [at, timer] = [0, 0];
   const show = (number) => {
     at = (number + frames.length) % frames.length;
     image.src = frames[at];
     slider.value = at;
-    slider.setAttribute("aria-valuetext", `${at + 1} of ${frames.length}`);
+    slider.setAttribute("aria-valuetext", `${at + 1} of ${frames.length}${labels[at] ? `: ${labels[at]}` : ""}`);
+    if (label) label.textContent = labels[at];
   };
   const running = (wanted) => {
     clearInterval(timer);
@@ -29,6 +31,7 @@ for (const figure of document.querySelectorAll("figure.player")) {
     event.preventDefault();
   });
   slider.max = frames.length - 1;
+  show(Number(figure.dataset.start ?? 0));
   figure.querySelector(".controls").hidden = false;
   running(!matchMedia("(prefers-reduced-motion: reduce)").matches);
 }

@@ -3,7 +3,8 @@
 Stages run in the order of the physics, whatever the order of the list; ours::
 
     light    code_errors ▸ pwm ▸ led_nonlinearity ▸ led_rise_fall ▸ delays ▸ trigger_jitter   sub-steps' light
-    image    misregistration ▸ lens_distortion ▸ vignetting ▸ psf ▸ stray_light (veil)   frames, or masks once
+    image    misregistration ▸ lens_distortion ▸ vignetting ▸ psf ▸ stray_light (veil) ▸ fibre_bands ▸
+             fibre_gain                                                             frames, or masks once
     signal   beam_splitter ▸ stray_light (ambient) ▸ cti                              expected lines, Eq. (1)
     charge   prnu ▸ shot_noise ▸ dark_current ▸ dsnu ▸ column_defects ▸ full_well ▸ read_noise     electrons
     readout  drift ▸ column_offsets ▸ adc_nonlinearity ▸ adc                          DN

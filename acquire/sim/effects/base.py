@@ -13,6 +13,7 @@ import numpy as np
 from acquire.config.effect import EffectConfig
 
 if TYPE_CHECKING:
+    from acquire.fibre import Fibre
     from acquire.sim.scene import Scene
 
 Place = Literal["light", "image", "signal", "charge", "readout", "stream"]
@@ -37,6 +38,8 @@ class Setting:
     scene : what it looks at
     white_dn, black_level_dn, responsivity_dn, gain_dn_per_e : of its camera
     settled_s : by which the trigger starts the charge's moves after the light's, on purpose
+    lit_part : from where to where of a lit sub-step the trigger lets the light on
+    fibre : what stands before the sensor and lays a larger scene out in bands; None: nothing does
     """
 
     arm: str
@@ -52,6 +55,8 @@ class Setting:
     responsivity_dn: float
     gain_dn_per_e: float
     settled_s: float = 0.0
+    lit_part: tuple[float, float] = (0.0, 1.0)
+    fibre: Fibre | None = None
 
     @property
     def exposure_s(self) -> float:

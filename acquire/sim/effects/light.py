@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from acquire.config.base import Part, Positive
+from acquire.errors import UsageError
 from acquire.sim.effects.base import Effect, Place, Setting, Stage, draws
 from acquire.sim.light import Illumination, Tiled
 from acquire.sim.scene import SeparableScene
@@ -119,6 +120,7 @@ class LedRiseFall(Effect):
 
     def stages(self, setting: Setting) -> list[Stage]:
         """dL/dt = (d − L)/τ with τ = rise where L < d, else fall; a sub-step gets the mean of L, exactly."""
+        _refuse_pulses(self.kind, setting)
         from acquire.sim.kernels import follow  # compiled code, which reading a scene file does without
 
         rise, fall = self.rise_s / setting.substep_s, self.fall_s / setting.substep_s
@@ -150,12 +152,14 @@ class Delays(Effect):
         """The light of a sub-step comes δ sub-steps after the charge: g(t) ← g(t − δ), of two neighbours'.
 
         δ = (light's delay − camera's − what the trigger leads the light by and delays the line start by) /
-        sub-step; below 0 the light is early. Of one sensor with both images camera A's delays count.
+        sub-step; below 0 the light is early. Of one sensor with both images camera A's delays count. A light
+        that is on for a part of a sub-step, from o to c, is shared as [o + δ, c + δ] lies in the two.
         """
         camera_s = self.b_s if setting.arm == "b" else self.a_s
         late = (self.light_s - camera_s - setting.settled_s) / setting.substep_s
-        whole = floor(late)
-        part = late - whole
+        begin, end = (late + edge for edge in setting.lit_part)
+        whole = floor(begin)
+        part = max(0.0, end - whole - 1) / (end - begin)
 
         def moved(light: Illumination) -> Callable[[int, int], NDArray[Any]]:
             def compute(first: int, count: int) -> NDArray[Any]:
@@ -184,6 +188,7 @@ class TriggerJitter(Effect):
 
             g(t) ← max(0, −δ_t)·g(t−1) + (1 − max(0, δ_t) − max(0, −δ_{t+1}))·g(t) + max(0, δ_{t+1})·g(t+1)
         """
+        _refuse_pulses(self.kind, setting)
         delay = jitter(self, setting)
 
         def moved(light: Illumination) -> Callable[[int, int], NDArray[Any]]:
@@ -209,6 +214,15 @@ def jitter(effect: TriggerJitter, setting: Setting) -> Tiled:
         return np.clip(sigma * drawn, -0.5, 0.5)
 
     return Tiled(compute, _TILE)
+
+
+def _refuse_pulses(effect: str, setting: Setting) -> None:
+    """UsageError for light in part of a sub-step, of which the effect's formula knows nothing."""
+    if setting.lit_part != (0.0, 1.0):
+        raise UsageError(
+            f"effect {effect} cannot be simulated with a light that is on for a part of each sub-step",
+            possible="trigger.light.open_ticks and close_ticks absent; or a scene without the effect",
+        )
 
 
 def _shaped(effect: str, shape: Callable[[Illumination], Callable[[int, int], NDArray[Any]]]) -> Stage:

@@ -58,4 +58,4 @@ def model_of(config: RigConfig, arm: str) -> CameraModel:
 
 def sensor_width(config: RigConfig) -> int:
     """Pixels of the camera's lines: an arm's, or as many as both arms take."""
-    return max((end for _, end in config.columns.values()), default=config.geometry.stages)
+    return max((end for _, end in config.columns.values()), default=config.pixels)

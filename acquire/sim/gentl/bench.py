@@ -46,7 +46,10 @@ class GentlBench:
         producer = build()
         serials = [model.serial for model in cameras]
         if len(set(serials)) < len(serials):
-            raise UsageError(f"simulated cameras with serials {', '.join(serials)}", possible="each its own")
+            raise UsageError(
+                f"simulated cameras cannot have the serials {', '.join(serials)}",
+                possible="one of its own for each",
+            )
         self._directory = Path(tempfile.mkdtemp(prefix="acquire-gentl-"))
         self.cameras: dict[str, CameraMemory] = {}
         self._feeders: list[Worker] = []

@@ -74,14 +74,16 @@ class Module:
                 free += feature.size * self._copies(feature)
             self.features[feature.name] = placed
         if free > URL_AT:
-            raise ValueError(f"module {name}: registers up to {free:#x}, room until {URL_AT:#x}")
+            raise ValueError(f"module {name} has registers up to {free:#x}, and room until {URL_AT:#x}")
 
     def space(self, base: int = 0) -> bytes:
         """The module's whole register space, at address ``base``: values, URL and XML."""
         text = self.xml(base).encode()
         url = f"local:{self.name}.xml;{XML_AT:X};{len(text):X}".encode()
         if XML_AT + len(text) > PORT_BYTES:
-            raise ValueError(f"module {self.name}: {len(text)} bytes of XML, room for {PORT_BYTES - XML_AT}")
+            raise ValueError(
+                f"module {self.name} has {len(text)} bytes of XML, and room for {PORT_BYTES - XML_AT}"
+            )
         space = bytearray(PORT_BYTES)
         for feature in self.features.values():
             for copy in range(self._copies(feature)):

@@ -115,7 +115,7 @@ class CameraMemory:
         ``count`` trigger pulses from line ``at`` on.
         """
         if kind not in layout.FAULT_KINDS[1:]:
-            raise UsageError(f"fault {kind!r}", possible=", ".join(layout.FAULT_KINDS[1:]))
+            raise UsageError(f"there is no fault {kind!r}", possible=", ".join(layout.FAULT_KINDS[1:]))
         for slot in range(layout.FAULTS):
             first = layout.FAULTS_AT + slot * layout.FAULT_WORDS
             if not self._words[first] or self._words[first + 3]:

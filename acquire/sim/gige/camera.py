@@ -200,7 +200,7 @@ def _bound(host: str, *, shared: bool) -> socket.socket:
         made.bind((host, protocol.PORT))
     except OSError as error:
         made.close()
-        raise DeviceError(f"GigE Vision camera on {host}: {error.strerror}") from error
+        raise DeviceError(f"the GigE Vision camera cannot be opened on {host}: {error.strerror}") from error
     return made
 
 

@@ -47,7 +47,10 @@ link.addEventListener("begun", () => { if (!setup || $("enter").open) admitted()
 link.addEventListener("locked", () => { if (!$("enter").open) $("enter").showModal(); });
 link.addEventListener("silent", ({ detail }) => stale(`No word from the page's server for ${Math.round(detail)} s.`));
 link.addEventListener("link", ({ detail }) => stale(`The page's server has no daemon: ${detail.header.why}`));
-link.addEventListener("news", ({ detail }) => watch.news(detail.header.news));
+link.addEventListener("news", ({ detail }) => {
+  watch.news(detail.header.news);
+  if (detail.header.news.kind === "reload" && !$("setup").hidden) screen();
+});
 link.addEventListener("rows", ({ detail }) => { watch.rows(detail.header, detail.body); aim.rows(detail.header, detail.body); });
 link.addEventListener("state", ({ detail }) => {
   latest = detail.header.state;

@@ -25,7 +25,7 @@ export class Glimpse {
     this.#header = header; this.#body = body.slice(); this.#frame = 0;
     const now = performance.now();
     this.#rate = [...this.#rate, now].filter((at) => at > now - 5000);
-    $("glimpse-text").textContent = `${header.columns} × ${header.rows} voxels, ${header.frames} frames, ${header.age_s.toFixed(1)} s old, ${(this.#rate.length / 5).toFixed(1)} per second`;
+    $("glimpse-text").textContent = `${header.tile ? `tile ${header.tile}, ` : ""}${header.columns} × ${header.rows} voxels, ${header.frames} frames, ${header.age_s.toFixed(1)} s old, ${(this.#rate.length / 5).toFixed(1)} per second`;
   }
 
   #draw() {

@@ -2,6 +2,8 @@
 
 const decoder = new TextDecoder();
 export const SILENT_MS = 2000;
+/** A hidden page asks so often, and browsers let it ask once a minute: its title may be as old. */
+const HIDDEN_MS = 1500, HIDDEN_SILENT_MS = 65000;
 
 /** Split a stream of bytes into messages: see acquire/web/frames.py. */
 export class Messages {
@@ -29,14 +31,15 @@ export class Link extends EventTarget {
   #abort = null;
   glimpses = false;
 
-  /** Follow for ever. Hidden pages get no pictures; one that is shown again gets them at once. */
+  /** Follow for ever. A hidden page asks now and then, since browsers have six connections for all their tabs. */
   async run() {
-    document.addEventListener("visibilitychange", () => this.#abort?.abort());
+    let shown = () => {};
+    document.addEventListener("visibilitychange", () => { this.#abort?.abort(); shown(); });
     setInterval(() => this.#watch(), 250);
     for (;;) {
       try { await this.#follow(); }
       catch (error) { if (error.name !== "AbortError") console.info(`stream: ${error.message}`); }
-      await new Promise((done) => setTimeout(done, 300));
+      await new Promise((done) => { shown = done; setTimeout(done, document.visibilityState === "visible" ? 300 : HIDDEN_MS); });
     }
   }
 
@@ -45,10 +48,10 @@ export class Link extends EventTarget {
 
   async #follow() {
     this.#abort = new AbortController();
-    const pictures = document.visibilityState === "visible";
-    const answer = await fetch(`/api/live?pictures=${pictures}&glimpses=${pictures && this.glimpses}`, { signal: this.#abort.signal });
+    const followed = document.visibilityState === "visible" ? `pictures=true&glimpses=${this.glimpses}` : "once=true";
+    const answer = await fetch(`/api/live?${followed}`, { signal: this.#abort.signal });
     if (answer.status === 401) { this.dispatchEvent(new Event("locked")); return; }
-    if (!answer.ok) throw new Error(`HTTP ${answer.status}`);
+    if (!answer.ok) throw new Error(`The page's server answered with HTTP ${answer.status}.`);
     this.dispatchEvent(new Event("begun"));
     const messages = new Messages(), reader = answer.body.getReader();
     for (;;) {
@@ -63,7 +66,7 @@ export class Link extends EventTarget {
 
   #watch() {
     const silent = performance.now() - this.#heard;
-    if (silent > SILENT_MS) this.dispatchEvent(new CustomEvent("silent", { detail: silent / 1000 }));
+    if (silent > (document.visibilityState === "visible" ? SILENT_MS : HIDDEN_SILENT_MS)) this.dispatchEvent(new CustomEvent("silent", { detail: silent / 1000 }));
   }
 }
 
@@ -76,6 +79,6 @@ export async function ask(method, path, body) {
   catch { throw new Error("The page's server does not answer."); }
   const facts = (answer.headers.get("content-type") ?? "").includes("json") ? await answer.json() : null;
   if (answer.ok) return facts;
-  const words = [facts?.message ?? `HTTP ${answer.status}`, facts?.possible && `possible: ${facts.possible}`, facts?.hint && `try: ${facts.hint}`];
+  const words = [facts?.message ?? `The page's server answered with HTTP ${answer.status}.`, facts?.possible && `possible: ${facts.possible}`, facts?.hint && `try: ${facts.hint}`];
   throw new Error(words.filter(Boolean).join("; "));
 }

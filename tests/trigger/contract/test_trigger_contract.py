@@ -18,8 +18,8 @@ from acquire.sim.trigger_model import prbs_state
 from acquire.testing.triggers import TriggerContract, collect
 from acquire.trigger import registers as r
 from acquire.trigger.base import LineTag
+from acquire.trigger.dialogue import RefusedError
 from acquire.trigger.driver import TriggerDriver, run_number
-from acquire.trigger.link import RefusedError
 from acquire.trigger.registers import Command, EndReason, ErrorCode, State
 
 MASK = sum(1 << tap - 1 for tap in (64, 63, 61, 60))
@@ -172,13 +172,21 @@ def test_the_device_itself_rejects_what_it_cannot_do(bench: Bench, register, val
 @pytest.mark.parametrize(
     ("changes", "config", "words"),
     [
-        ({"substep_ticks": 3}, {}, "sub-step of 3 ticks; possible: "),
-        ({"substeps": 4}, {}, "4 sub-steps per line; possible: 1, 2, 3, 6"),
-        ({"tag_every_lines": 0}, {}, "a tag every 0 lines"),
-        ({}, {"clock_hz": 50_000_000}, "clock of 50000000 Hz; possible: 90000000"),
+        ({"substep_ticks": 3}, {}, "cannot make a sub-step of 3 ticks; possible: "),
+        ({"substeps": 4}, {}, "cannot make 4 sub-steps per line; possible: 1, 2, 3, 6"),
+        ({"tag_every_lines": 0}, {}, "cannot send a tag every 0 lines"),
+        (
+            {},
+            {"clock_hz": 50_000_000},
+            "trigger.clock_hz is 50000000 Hz, which is not the clock of this device; possible: 90000000",
+        ),
         ({}, {"camera_min_period_ticks": 3000}, "2700 ticks apart; possible: 3000"),
-        ({}, {"a": {"delay_ticks": 2650}}, "pulse A 90 ticks wide, 2650 late; possible: "),
-        ({}, {"light": {"open_ticks": 950}}, "light from tick 950 to 900"),
+        (
+            {},
+            {"a": {"delay_ticks": 2650}},
+            "the pulse of camera A is 90 ticks wide and 2650 late: too much; possible: ",
+        ),
+        ({}, {"light": {"open_ticks": 950}}, "the light cannot be on from tick 950 to 900"),
     ],
 )
 def test_the_driver_refuses_in_words_before_it_writes(bench: Bench, changes, config, words) -> None:

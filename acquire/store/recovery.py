@@ -25,19 +25,18 @@ import numpy as np
 from acquire.errors import AcquireError, StateError
 from acquire.lines import ARMS, LineFlag
 from acquire.store import layout
+from acquire.store.array_files import COLUMNS
 from acquire.store.files import DISK, SCRATCH, Publisher, locked
 from acquire.store.links import refuse_links
 from acquire.store.mend import mend_index, rewrite_chunk
-from acquire.store.opening import open_recording
+from acquire.store.reader import open_recording
 from acquire.store.rebuild import rebuild_root, root_is_lost, write_copy
 from acquire.store.refusals import refused
 from acquire.store.removal import RESERVE, Dropped, remove, shard_numbers, shards_on_disk
 from acquire.store.resume import list_segments
 from acquire.store.retention import release
 from acquire.store.scan import (
-    COLUMNS,
     ArmScan,
-    Damage,
     chunks_of,
     covered,
     grown_rows,
@@ -46,6 +45,7 @@ from acquire.store.scan import (
     scan,
     tag_rows,
 )
+from acquire.store.shortfall import Damage
 from acquire.store.spec import RunCondition
 from acquire.store.table import event_table, gap_table
 
@@ -227,7 +227,7 @@ class _Recoverer:
         nodes |= self._tables(publisher, new_gaps)
         self._resize(publisher, nodes)
         document["attributes"] = self._attributes(new_gaps)
-        self.disk.sync_tree(self.path)
+        self.disk.sync_tree(self.path)  # all that the root is going to tell of
         write_copy(publisher, self.path, document["attributes"], durable=True)
         publisher.replace(self.path / "zarr.json", layout.to_json(document), durable=True)
         for leftover in (SCRATCH, RESERVE):

@@ -11,11 +11,12 @@ import numpy as np
 from acquire.errors import DataError
 from acquire.lines import ARMS
 from acquire.reading import parse_object
-from acquire.store.camera_stream import DAMAGE
+from acquire.store import overview
+from acquire.store.layout import DAMAGE
 from acquire.store.links import refuse_links
-from acquire.store.opening import open_source
-from acquire.store.scan import Damage, chunks_of, missing_rows, scan
-from acquire.store.shortfall import missing_segments
+from acquire.store.reader import open_source
+from acquire.store.scan import chunks_of, missing_rows, scan
+from acquire.store.shortfall import Damage, missing_segments
 from acquire.store.source import LocalSource, source_of
 from acquire.store.suspect import suspect_lines
 
@@ -115,6 +116,7 @@ def _contradictions(recording: Recording, scans: dict[str, ArmScan]) -> Iterator
         if complete and flagged is not None and flagged != kept:
             yield f"{arm}: {flagged} lines are flagged as missing, {kept} are listed in gaps"
         yield from _unbalanced(recording, arm, every if complete else None)
+        yield from overview.contradictions(recording, arm)
 
 
 def _listed(recording: Recording, arm: str) -> tuple[int, int]:

@@ -21,17 +21,18 @@ from typing import TYPE_CHECKING, Any
 
 from acquire.errors import DataError, StateError, UsageError
 from acquire.lines import ARMS
-from acquire.reading import parse_object
+from acquire.reading import parse_object, read_regular
+from acquire.store import overview
+from acquire.store.array_files import COLUMNS
 from acquire.store.attributes import segment_of
 from acquire.store.files import DISK, SCRATCH, locked
 from acquire.store.layout import PARSE_ERRORS, group_document, to_json
 from acquire.store.links import refuse_link, refuse_links
-from acquire.store.opening import open_recording
+from acquire.store.reader import open_recording
 from acquire.store.refusals import refusal
 from acquire.store.remote import RemoteSource
 from acquire.store.removal import ROOT, shard_files
 from acquire.store.retention import keep_from, release
-from acquire.store.scan import COLUMNS
 from acquire.store.shortfall import first_shortfall
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ LOOK_S = 0.5
 """How often a growing recording is looked at."""
 MARK = "a/lines/.copy-of"
 """Says at the target whose copy it is, as long as no root does."""
-_OURS = (*ARMS, "gaps", "events", ROOT, SCRATCH)
+_OURS = (*ARMS, "gaps", "events", overview.NAME, ROOT, SCRATCH)
 """What the keys of a recording begin with."""
 _ELSEWHERE = "another name there: acquire upload RECORDING URL"
 _HINT = "what is there already stays: the same command goes on with it"
@@ -139,6 +140,7 @@ def only_copy(path: Path) -> Iterator[None]:
     """Keep other processes from copying the recording at ``path``; StateError while one does."""
     with ExitStack() as held:
         try:
+            # An arm's directory: the lock of the recording's own is its writer's.
             held.enter_context(locked(path / ARMS[0], "copying"))
         except StateError as error:
             raise StateError(f"{path} is being copied by another process", hint="acquire status") from error
@@ -331,11 +333,14 @@ class Mirror:
         for table in ("gaps", "events"):
             for file in sorted((self.path / table).glob("*/c/0")):
                 self._put(file.relative_to(self.path).as_posix(), file.read_bytes())
+        if overview.NAME in nodes:
+            for key in overview.CHUNKS:
+                self._put(key, read_regular(self.path / key, follow=False))
         for key, node in nodes.items():
             inner = {name.partition("/")[2]: n for name, n in nodes.items() if name.startswith(f"{key}/")}
             own = group_document(node["attributes"], inner) if node["node_type"] == "group" else node
             self._put(f"{key}/zarr.json", to_json(own))
-        self._put("zarr.json", root)
+        self._put("zarr.json", root)  # last: readers there begin with it
         self._root = root
 
     def _dropped(self, recording: Recording, lines: int) -> list[list[int]]:

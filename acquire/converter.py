@@ -1,0 +1,57 @@
+"""A camera whose numbers are not quite in proportion to the light: by how much they are too high."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.errors import UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ConverterCurve:
+    """What a sample reads, and what it would read if the camera were linear: a rising curve for either arm.
+
+    Attributes
+    ----------
+    dn : (arm, knot) readings, rising
+    excess_dn : (arm, knot) how much too high they are; linear between knots, beyond them as at the last
+    """
+
+    dn: NDArray[np.float64]
+    excess_dn: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        if self.dn.shape != self.excess_dn.shape or not np.isfinite(self.excess_dn).all():
+            raise UsageError(
+                f"the curve has {self.excess_dn.shape} excesses for {self.dn.shape} readings",
+                possible="one finite number for each",
+            )
+        if (np.diff(self.dn) <= 0).any() or (np.diff(self.dn - self.excess_dn) <= 0).any():
+            raise UsageError(
+                "the curve of the camera does not rise: two amounts of light would read alike",
+                possible="a curve that rises from black to white",
+            )
+
+    def straight(self, dn: NDArray[Any]) -> NDArray[Any]:
+        """What a linear camera would have said; ``dn`` (arm, …) of floats keep their type."""
+        arms = zip(dn, self.dn, self.excess_dn, strict=True)
+        return np.stack([each - np.interp(each, *knots).astype(dn.dtype) for each, *knots in arms])
+
+    def slope(self, dn: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Of `straight` at ``dn`` (arm, …): what it makes of a small difference."""
+        found = []
+        for each, knots, excess in zip(dn, self.dn, self.excess_dn, strict=True):
+            at = np.clip(np.searchsorted(knots, each) - 1, 0, len(knots) - 2)
+            inside = (each > knots[0]) & (each < knots[-1])
+            found.append(1 - np.where(inside, (np.diff(excess) / np.diff(knots))[at], 0.0))
+        return np.stack(found)
+
+    def swapped(self) -> ConverterCurve:
+        """Of an instrument whose arms have changed places."""
+        return ConverterCurve(self.dn[::-1], self.excess_dn[::-1])

@@ -1,0 +1,25 @@
+"""Names of the arms, and what is known about a line: words that every part of the program says alike."""
+
+from __future__ import annotations
+
+from enum import IntFlag
+
+ARMS = ("a", "b")
+"""Names of the two arms, in the order of the ``arm`` axis."""
+
+
+class LineFlag(IntFlag):
+    """What is known about one line beyond its pixels (CF ``flag_masks`` of the recording)."""
+
+    MISSING = 1
+    """Never arrived; the row is filled with 0."""
+    INCOMPLETE = 2
+    """The camera reported that part of the line is not valid."""
+    SATURATED = 4
+    """At least one pixel stands at the top of the range."""
+    TIME_ESTIMATED = 8
+    """No tag of the trigger confirmed tick and time; they are extrapolated."""
+    CODE_UNVERIFIED = 16
+    """No tag of the trigger confirmed the code index; it is extrapolated."""
+    CODE_CONTRADICTED = 32
+    """The arm's lines did not follow the code that they are tagged with (`acquire.stream.lightcheck`)."""

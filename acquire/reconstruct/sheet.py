@@ -1,0 +1,112 @@
+"""Where the frames of a video go: one after the other, or behind a fibre tile by tile onto a large sheet."""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from acquire.store import MosaicWriter, VideoGrid, VideoWriter
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from acquire.fibre import Tile
+    from acquire.reconstruct.select import VideoRequest
+    from acquire.reconstruct.times import Times
+
+
+class Sheet(Protocol):
+    """Takes finished frames in the order of tiles and, of each, of time."""
+
+    shape: tuple[int, int]
+
+    @property
+    def frames(self) -> int: ...
+
+    def take(
+        self, tile: Tile | None, first: int, video: NDArray[np.float32], error: NDArray[np.float32]
+    ) -> None:
+        """Frames (t, y, x) of a tile from frame ``first`` on, with their errors (t,)."""
+        ...
+
+    def finish(self, provenance: Mapping[str, Any]) -> None:
+        """The video appears under its name."""
+        ...
+
+
+@contextmanager
+def open_sheet(
+    out: Path | str, request: VideoRequest, times: Times, anchor: tuple[int, int]
+) -> Iterator[Sheet]:
+    """For the video of a request; without `Sheet.finish` nothing is left of it. ``anchor``: see `Times`."""
+    grid = request.grid
+
+    def utc_ns(first: int, stop: int) -> NDArray[np.int64]:
+        return times.utc_ns(grid.edges(slice(first, stop))[:-1], anchor)
+
+    if not request.tiles:
+        with VideoWriter(
+            out, (grid.side, grid.side), np.dtype(np.float32), _place(request, times), quality=True
+        ) as writer:
+            yield _Strip(writer, (grid.side, grid.side), utc_ns)
+        return
+    first, last = request.tiles[0], request.tiles[-1]
+    tiles = (last.row - first.row + 1, last.column - first.column + 1)
+    with MosaicWriter(out, tiles, grid.side, _place(request, times), utc_ns(0, grid.frames)) as mosaic:
+        yield _Mosaic(mosaic, grid.side, first, tiles)
+
+
+class _Strip:
+    """Without a fibre: frames of one scene."""
+
+    def __init__(self, writer: VideoWriter, shape: tuple[int, int], utc_ns: Any) -> None:
+        self.shape, self._writer, self._utc_ns = shape, writer, utc_ns
+        self.finish = writer.finish
+
+    @property
+    def frames(self) -> int:
+        return self._writer.frames
+
+    def take(
+        self,
+        tile: Tile | None,  # noqa: ARG002  # a sheet
+        first: int,
+        video: NDArray[np.float32],
+        error: NDArray[np.float32],
+    ) -> None:
+        self._writer.append(video, self._utc_ns(first, first + len(video)), error)
+
+
+class _Mosaic:
+    """Frames of several tiles, of which ``corner`` is the topmost and leftmost."""
+
+    def __init__(self, writer: MosaicWriter, side: int, corner: Tile, tiles: tuple[int, int]) -> None:
+        self.shape = (tiles[0] * side, tiles[1] * side)
+        self._writer, self._side, self._corner = writer, side, corner
+        self.finish = writer.finish
+
+    @property
+    def frames(self) -> int:
+        return self._writer.frames
+
+    def take(
+        self, tile: Tile | None, first: int, video: NDArray[np.float32], error: NDArray[np.float32]
+    ) -> None:
+        assert tile is not None
+        row, column = tile.row - self._corner.row, tile.column - self._corner.column
+        self._writer.put(first, (row * self._side, column * self._side), video, error)
+
+
+def _place(request: VideoRequest, times: Times) -> VideoGrid:
+    """Where the voxels lie: in pixels of the scene at full resolution, and seconds after the first line."""
+    grid = request.grid
+    side, begin_s = grid.voxels.spatial_merge, (grid.begin - times.first_substep) * times.substep_ns * 1e-9
+    step = (times.substep_ns * grid.voxels.temporal_merge * 1e-9, float(side), float(side))
+    row, column = (request.tiles[0].row, request.tiles[0].column) if request.tiles else (0, 0)
+    middle = (side - 1) / 2
+    return VideoGrid(step, (begin_s, row * grid.size + middle, column * grid.size + middle), None)

@@ -1,0 +1,88 @@
+"""Writes a video that comes in tiles, each in the order of its frames: no more than one is in memory."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.errors import UsageError
+from acquire.store import video_layout as layout
+from acquire.store.refusals import refused
+from acquire.store.video_writer import VideoWriter, check_provenance
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+NOT_THERE = float("nan")
+"""Voxels of tiles that nobody wrote."""
+
+
+class MosaicWriter(VideoWriter):
+    """A video of ``tiles`` (rows, columns of them) of ``side`` × ``side`` voxels and as many frames as times.
+
+    Chunks are of one tile. Voxels that are never put are `NOT_THERE`. One thread at a time.
+    """
+
+    def __init__(
+        self,
+        place: Path | str,
+        tiles: tuple[int, int],
+        side: int,
+        grid: layout.VideoGrid,
+        time_ns: NDArray[np.int64],
+    ) -> None:
+        shape = (tiles[0] * side, tiles[1] * side)
+        super().__init__(
+            place, shape, np.dtype(np.float32), grid, quality=True, tile_side=side, fill_value=NOT_THERE
+        )
+        self._time_ns, self.frames = time_ns, len(time_ns)
+        self._squares = np.zeros((2, self.frames))
+        with refused(place, "written"):
+            self._levels[0].resize((self.frames, *shape))
+
+    def put(
+        self, first: int, corner: tuple[int, int], video: NDArray[np.float32], quality: NDArray[np.float32]
+    ) -> None:
+        """Frames (t, side, side) of one tile from frame ``first`` on; ``corner``: its first row and column.
+
+        StoreError when the disk refuses.
+        """
+        row, column = corner
+        end = first + len(video)
+        with refused(self._place, "written"):
+            image: Any = self._levels[0]
+            image[first:end, row : row + video.shape[1], column : column + video.shape[2]] = video
+        self._window.add(video)
+        known = np.isfinite(quality)
+        self._squares[:, first:end] += np.where(known, np.square(quality, dtype=np.float64), 0), known
+
+    def finish(self, provenance: Mapping[str, Any]) -> None:
+        """The video appears under its name; a frame's quality is the RMS of its tiles'."""
+        if not self.frames:
+            raise UsageError(f"{self._place}: a video without a frame cannot be written")
+        check_provenance(provenance)
+        squares, count = self._squares
+        self._begin_ns = int(self._time_ns[0])
+        since_s = self._grid.origin[0] + (self._time_ns - self._begin_ns) * 1e-9
+        with np.errstate(invalid="ignore", divide="ignore"):
+            quality = np.sqrt(squares / count).astype(np.float32)
+        with refused(self._place, "written"):
+            values: Any
+            for array, values in zip(self._columns.values(), (self._time_ns, since_s, quality), strict=True):
+                array.resize((self.frames,))
+                array[:] = values
+            self._halve()
+        self._end(provenance)
+
+    def _halve(self) -> None:
+        """The smaller copies, some whole frames at a time."""
+        step = self._levels[0].chunks[0]
+        for larger, smaller in zip(self._levels, self._levels[1:], strict=False):
+            smaller.resize((self.frames, *smaller.shape[1:]))
+            for first in range(0, self.frames, step):
+                frames = np.asarray(larger[first : first + step])
+                smaller[first : first + step] = layout.halved(frames)

@@ -1,0 +1,221 @@
+"""What a recording says of itself, from its metadata and its small tables: no line is read.
+
+This is all that lists and summaries need, so it needs no library beyond the standard one and a checksum:
+`acquire ls` answers at once. `acquire.store.reader.Recording` is the same, with the lines.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Self
+
+from acquire.clock import NS_PER_S, ClockFit
+from acquire.errors import DataError, UsageError
+from acquire.fibre import Fibre
+from acquire.flags import ARMS
+from acquire.geometry import Geometry
+from acquire.store.array_files import COLUMNS, ArmFiles, ArrayFiles
+from acquire.store.files import DISK
+from acquire.store.opening import opened
+from acquire.store.source import LocalSource, source_of
+from acquire.store.table_reader import read_events, read_gaps
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from acquire.store.layout import Document
+    from acquire.store.source import Source
+    from acquire.store.table_reader import Event, Gap
+
+
+def open_outline(place: Path | str) -> Outline:
+    """What `acquire.store.open_recording` opens, without its lines; raises as it does."""
+    return opened(source_of(place), Outline)
+
+
+class Outline:
+    """One recording, as far as its metadata tell; `open_outline` makes it.
+
+    A snapshot: of one that is still growing it shows what was committed when it was opened; `refreshed` shows
+    more.
+    """
+
+    arms: Mapping[str, ArmFiles]
+
+    def __init__(self, source: Source, document: Document) -> None:
+        """``document`` is the root's zarr.json. Raises one of `layout.DAMAGE` where it is damaged."""
+        self.source = source
+        self.document = document
+        self.attrs: dict[str, Any] = document["attributes"]
+        self._nodes = nodes = document["consolidated_metadata"]["metadata"]
+        self.arms = {arm: self._arm(arm, {name: nodes[f"{arm}/{name}"] for name in COLUMNS}) for arm in ARMS}
+
+    def _arm(self, arm: str, documents: dict[str, Document]) -> ArmFiles:
+        files = {name: ArrayFiles(self.source, f"{arm}/{name}", found) for name, found in documents.items()}
+        return ArmFiles(self.source, arm, files, self.first_line)
+
+    def __str__(self) -> str:
+        return str(self.source)
+
+    @property
+    def is_here(self) -> bool:
+        """It lies on a disk of this machine."""
+        return isinstance(self.source, LocalSource)
+
+    def refreshed(self) -> Self:
+        """The recording as it is now: of one that is growing, what was committed since."""
+        return opened(self.source, type(self))
+
+    @property
+    def state(self) -> str:
+        """``recording`` until it is sealed."""
+        return str(self.attrs["state"])
+
+    @property
+    def first_line(self) -> int:
+        """The trigger's number of the line in row 0."""
+        return int(self.attrs["first_line"])
+
+    @property
+    def lines(self) -> int:
+        """Rows of each arm."""
+        return min(len(stream) for stream in self.arms.values())
+
+    @property
+    def clock(self) -> ClockFit:
+        return ClockFit.from_attrs(self.attrs["clock"])
+
+    @property
+    def line_period_ns(self) -> float:
+        return int(self.attrs["trigger"]["line_period_ticks"]) * NS_PER_S / self.clock.clock_hz
+
+    @property
+    def substeps(self) -> int:
+        """S."""
+        return int(self.attrs["geometry"]["substeps"])
+
+    @cached_property
+    def fibre(self) -> Fibre | None:
+        """Which column sees what; None where a line's pixels see one scene, in order.
+
+        Raises DataError for a table that contradicts itself.
+        """
+        try:
+            return Fibre.of(self.attrs["geometry"])
+        except UsageError as error:
+            raise DataError(f"{self}: {error}") from error
+
+    @property
+    def dropped(self) -> tuple[tuple[int, int], ...]:
+        """Lines that retention has deleted: first line and count of every stretch."""
+        return tuple((int(first), int(count)) for first, count in self.attrs.get("dropped", ()))
+
+    @property
+    def first_available_line(self) -> int:
+        """The first line that retention has left."""
+        line = self.first_line
+        for first, count in sorted(self.dropped):
+            line = first + count if first == line else line
+        return line
+
+    def dropped_rows(self) -> list[range]:
+        """The same, in rows."""
+        return [range(first - self.first_line, first - self.first_line + n) for first, n in self.dropped]
+
+    @cached_property
+    def segments(self) -> tuple[Self, ...]:
+        """Recordings that continue this one after an outage, in order. Raises DataError for a damaged one."""
+        return tuple(self.beside(name) for name in self.attrs.get("segments", ()))
+
+    def beside(self, name: str) -> Self:
+        """The recording of this name in the same place. Raises DataError."""
+        return opened(self.source.beside(name), type(self))
+
+    def kept_rows(self) -> list[range]:
+        """Rows that have not been deleted; retention deletes whole files."""
+        kept, start = [], 0
+        for dropped in sorted(self.dropped_rows(), key=lambda rows: rows.start):
+            kept.append(range(start, dropped.start))
+            start = dropped.stop
+        return [rows for rows in [*kept, range(start, self.lines)] if rows]
+
+    def lost_rows(self, arm: str, lines: int | None = None) -> list[range]:
+        """Rows of one arm that are listed in gaps; of the first ``lines`` rows, or of all that there are."""
+        start, end = self.first_line, self.lines if lines is None else lines
+        gaps = [
+            range(gap.first_line - start, min(end, gap.first_line - start + gap.count))
+            for gap in self.gaps
+            if gap.arm == arm
+        ]
+        return [rows for rows in gaps if rows]
+
+    @cached_property
+    def gaps_not_listed(self) -> int:
+        """Gaps for which the table had no room."""
+        return int(self._nodes["gaps"]["attributes"]["not_listed"])
+
+    def geometry_for(self, lines: int) -> Geometry:
+        """Geometry of a segment of ``lines`` lines."""
+        sizes = self.attrs["geometry"]
+        return Geometry(int(sizes["stages"]), int(sizes["substeps"]), lines)
+
+    @cached_property
+    def gaps(self) -> tuple[Gap, ...]:
+        """Lost lines in the order in which they were noticed."""
+        return read_gaps(self.source, self._nodes)
+
+    @cached_property
+    def events(self) -> tuple[Event, ...]:
+        """What happened, in the order in which it was noted."""
+        return read_events(self.source, self._nodes)
+
+    def info(self) -> dict[str, Any]:
+        """What one wants to know of a recording at a glance; everything is JSON."""
+        period_ns, lines = self.line_period_ns, self.lines
+        keys = ("run_id", "state", "run_condition", "end_reason", "layout", "geometry", "code", "clock")
+        return {
+            "path": str(self),
+            **{key: self.attrs[key] for key in keys},
+            "first_line": self.first_line,
+            "lines": lines,
+            "first_available_line": self.first_available_line,
+            "dropped": [list(stretch) for stretch in self.dropped],
+            "holds": self.attrs.get("holds", []),
+            "duration_s": lines * period_ns / NS_PER_S,
+            "line_rate_hz": NS_PER_S / period_ns,
+            "start_ns": self._start_ns(),
+            "dtype": self.arms["a"].data_type,
+            "bytes": self.source.total_bytes(),
+            "segment": self.attrs.get("segment"),
+            "segments": self.attrs.get("segments", []),
+            "gaps": len(self.gaps),
+            "lost_lines": {arm: sum(gap.count for gap in self.gaps if gap.arm == arm) for arm in ARMS},
+            "events": len(self.events),
+            "simulated": bool(self.attrs.get("simulated", False)),
+            "cameras": self.attrs["cameras"],
+            "imported": self.attrs.get("imported"),
+            "calibration": self.attrs.get("calibration"),
+            "calibration_missing": self.attrs.get("calibration_missing"),
+            "disk": self._disk_facts(),
+            "ledger": self.attrs["ledger"],
+            "durability": self.attrs.get("durability", {}),
+            "versions": self.attrs["versions"],
+        }
+
+    def _disk_facts(self) -> dict[str, float] | None:
+        """While it grows here: bytes free, bytes per second that it takes, seconds until the disk is full."""
+        if self.state == "sealed" or not isinstance(self.source, LocalSource) or not self.lines:
+            return None
+        free = DISK.free_bytes(self.source.path)
+        rate = self.source.total_bytes() * NS_PER_S / (self.lines * self.line_period_ns)
+        return {"free_bytes": free, "bytes_per_s": rate, "seconds_to_full": free / rate}
+
+    def _start_ns(self) -> int | None:
+        """When the first line that there is was read out: its number and the clock tell."""
+        line = self.first_available_line
+        if line >= self.first_line + self.lines:
+            return None
+        period, substeps = int(self.attrs["trigger"]["line_period_ticks"]), self.substeps
+        readout = self.geometry_for(1).readout_substep
+        return self.clock.instant_ns((line * substeps + readout) * period // substeps)

@@ -1,0 +1,226 @@
+"""A coarse picture of a whole recording, beside its lines: hours at a glance, in any viewer of Zarr.
+
+::
+
+    overview/  a  b   (line, pixel)   row i: the mean of rows T·i … T·i + 7 of the arm that are not missing
+               line   (line)          the trigger's number of the line in row T·i
+
+The first lines of every T are added up while they pass; T doubles, and every second row goes, whenever there
+are too many rows: memory and time are bounded, however long a recording gets. It is written when the
+recording is sealed, and never a reason for a recording to fail.
+"""
+
+from __future__ import annotations
+
+import errno
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.errors import DataError
+from acquire.lines import ARMS, LineFlag
+from acquire.store import layout
+from acquire.store.codecs import check_size, crc32c, decode, encode
+from acquire.store.shape import CRC_BYTES, ArrayShape, codec_of
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from acquire.lines import TaggedBlock
+    from acquire.store.files import Disk, Publisher
+    from acquire.store.reader import Recording
+    from acquire.store.spec import RecordingSpec
+
+NAME = "overview"
+KEYS = (NAME, *(f"{NAME}/{name}" for name in (*ARMS, "line")))
+CHUNKS = (*(f"{NAME}/{arm}/c/0/0" for arm in ARMS), f"{NAME}/line/c/0")
+"""The files that hold it; everything else is metadata."""
+AVERAGED = 8
+"""Lines that become one row."""
+FIRST_STEP = 64
+"""T of a short recording."""
+MOST_ROWS = 1024
+MOST_SAMPLES = 2**22
+"""Of an arm: lines of very many pixels have fewer rows."""
+SPARE_BYTES = 2**22
+"""Of the disk, that are left to whatever else ends a recording."""
+MISSING = np.uint16(LineFlag.MISSING)
+ROWS = {"long_name": "mean of some lines", "units": "DN"}
+NUMBERS = {"long_name": "the trigger's number of the row's first line", "units": "1"}
+
+
+class Passing:
+    """What becomes of one arm's overview while its lines pass; rows are counted from ``first_line``."""
+
+    def __init__(self, pixels: int) -> None:
+        self.step = FIRST_STEP
+        rows = max(2, min(MOST_ROWS, MOST_SAMPLES // pixels) // 2 * 2)
+        # Sums of AVERAGED samples of 16 bits fit; the system gives the memory page by page.
+        self._sums = np.zeros((rows, pixels), np.uint32)
+        self._counts = np.zeros(rows, np.uint32)
+
+    def add(self, block: TaggedBlock, first_line: int) -> None:
+        """Take note of the next lines; a missing one is filled with 0."""
+        start, count = block.first_line - first_line, len(block.flags)
+        while (start + count - 1) // self.step >= len(self._counts):
+            self.widen(2 * self.step)
+        for offset in range(AVERAGED):
+            skipped = (offset - start) % self.step
+            lines = block.pixels[skipped :: self.step]
+            row = (start + skipped) // self.step
+            rows = slice(row, row + len(lines))
+            self._sums[rows] += lines
+            self._counts[rows] += (block.flags[skipped :: self.step] & MISSING) == 0
+
+    def widen(self, step: int) -> None:
+        """Keep the rows for a larger T."""
+        while self.step < step:
+            for values in (self._sums, self._counts):
+                half = len(values) // 2
+                for row in range(half):  # in its place: no memory that could be refused
+                    values[row] = values[2 * row]
+                values[half:] = 0
+            self.step *= 2
+
+    def rows(self, lines: int, data_type: str) -> NDArray[Any]:
+        """Rows of so many lines, without one whose lines were not all due; 0 where none of them is there."""
+        count = max(0, (lines - AVERAGED) // self.step + 1)
+        means = self._sums[:count] / np.maximum(self._counts[:count], 1)[:, None]
+        return np.rint(means).astype(np.dtype(data_type).newbyteorder("<"))
+
+
+def write_overview(
+    publisher: Publisher, path: Path, passing: Mapping[str, Passing], spec: RecordingSpec, lines: int
+) -> dict[str, layout.Document]:
+    """Write it for a recording of so many lines; metadata by path below the recording. Raises OSError."""
+    step = max(arm.step for arm in passing.values())
+    for arm in passing.values():
+        arm.widen(step)
+    arrays = {name: arm.rows(lines, spec.dtype) for name, arm in passing.items()}
+    count = len(next(iter(arrays.values())))
+    if not count:
+        return {}
+    documents = {name: _document(rows, ("line", "pixel"), ROWS) for name, rows in arrays.items()}
+    arrays["line"] = (spec.first_line + step * np.arange(count)).astype("<u8")
+    documents["line"] = _document(arrays["line"], ("line",), NUMBERS)
+    spare = publisher.disk.free_bytes(path) - 2 * sum(rows.nbytes for rows in arrays.values())
+    if spare < SPARE_BYTES:
+        raise OSError(errno.ENOSPC, "the disk has room for the recording's end alone")
+    for name, rows in arrays.items():
+        chunk = path / NAME / name / "c" / "/".join("0" * rows.ndim)
+        publisher.disk.make_directory(chunk.parent, parents=True)
+        payload = encode(np.ascontiguousarray(rows), "lz4")
+        publisher.replace(chunk, payload.tobytes() + crc32c(payload.data))
+        publisher.replace(path / NAME / name / "zarr.json", layout.to_json(documents[name]))
+    about = {
+        "description": f"means of the first {AVERAGED} of every {step} lines, as far as they are there",
+        "lines_per_row": step,
+        "lines_averaged": AVERAGED,
+    }
+    group = layout.group_document(about, documents)
+    publisher.replace(path / NAME / "zarr.json", layout.to_json(group))
+    return {NAME: group, **{f"{NAME}/{name}": document for name, document in documents.items()}}
+
+
+def withdraw_overview(disk: Disk, path: Path) -> None:
+    """Give back the room of one that could not be written; a recording's end needs it."""
+    for key in (*CHUNKS, *(f"{key}/zarr.json" for key in KEYS)):
+        with suppress(OSError):
+            disk.remove(path / key)
+
+
+def _document(rows: NDArray[Any], dimensions: tuple[str, ...], attributes: dict[str, Any]) -> layout.Document:
+    shape = ArrayShape(rows.dtype.name, rows.shape[1:], len(rows), 1, "lz4")
+    return layout.array_document(
+        shape=rows.shape,
+        data_type=shape.data_type,
+        dimensions=dimensions,
+        chunk_shape=rows.shape,
+        codecs=[layout.BYTES, *layout.packing(shape), layout.CRC32C],
+        attributes=attributes,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Overview:
+    """One arm at a glance: ``rows`` (row, pixel) in DN, one for every ``lines_per_row`` lines."""
+
+    first_line: int
+    lines_per_row: int
+    rows: NDArray[Any]
+
+
+def read_overview(recording: Recording, arm: str) -> Overview | None:
+    """The one that was written; None where there is none. Raises DataError for a damaged one."""
+    nodes = recording.document["consolidated_metadata"]["metadata"]
+    if NAME not in nodes:
+        return None
+    key = f"{NAME}/{arm}"
+    try:
+        document = nodes[key]
+        rows, pixels = map(int, document["shape"])
+        shape = ArrayShape(document["data_type"], (pixels,), rows, 1, codec_of(document["codecs"]))
+        if not (0 < rows <= MOST_ROWS and pixels == recording.arms[arm].pixels):
+            raise ValueError(f"it has {rows} rows of {pixels} pixels")
+        data = recording.source.read(f"{key}/c/0/0")
+        payload = memoryview(data)[:-CRC_BYTES]
+        if crc32c(payload) != data[-CRC_BYTES:]:
+            raise ValueError("the checksum is wrong")
+        check_size(payload, shape.chunk_bytes, shape.codec)
+        values = decode(payload, shape.codec).view(shape.dtype).reshape(shape.chunk_shape)
+        step = int(nodes[NAME]["attributes"]["lines_per_row"])
+        if step < AVERAGED:
+            raise ValueError(f"it has a row for every {step} lines")
+        return Overview(recording.first_line, step, values)
+    except layout.DAMAGE as error:
+        raise DataError(
+            f"{recording}: its overview cannot be read: {error}",
+            hint="the lines themselves, which it is made of",
+        ) from error
+
+
+def contradictions(recording: Recording, arm: str) -> Iterator[str]:
+    """Where an arm's overview is not what its lines are, as far as these are there and intact."""
+    try:
+        found = read_overview(recording, arm)
+    except DataError as error:
+        yield error.message
+        return
+    if found is None:
+        return
+    if wrong := sum(_differ(recording, arm, found, rows) for rows in _groups(recording, found)):
+        yield f"{arm}: {wrong} rows of the overview are not the mean of their lines"
+
+
+def _groups(recording: Recording, found: Overview) -> Iterator[range]:
+    """Rows of lines that are read at once: a chunk at a time, without what retention has dropped."""
+    step, size = found.lines_per_row, recording.arms[ARMS[0]].reader("lines").shape.chunk_rows
+    together = max(1, size // step)
+    there = min(len(found.rows), max(0, recording.lines - AVERAGED) // step + 1)
+    for first in range(0, there, together):
+        rows = range(first, min(there, first + together))
+        lines = range(rows.start * step, rows[-1] * step + AVERAGED)
+        if not any(lines.start < gone.stop and gone.start < lines.stop for gone in recording.dropped_rows()):
+            yield rows
+
+
+def _differ(recording: Recording, arm: str, found: Overview, rows: range) -> int:
+    """How many of the rows are not the mean of their lines; those that miss a line are not compared."""
+    step, stream = found.lines_per_row, recording.arms[arm]
+    start, stop = rows.start * step, rows[-1] * step + AVERAGED
+    try:
+        missing = (stream.read("flags", start, stop) & MISSING) != 0
+        lines = stream.read("lines", start, stop)
+    except DataError:  # which is told as damage
+        return 0
+    wrong = 0
+    for number in rows:
+        some = slice(number * step - start, number * step - start + AVERAGED)
+        if not missing[some].any():
+            wrong += not np.array_equal(found.rows[number], np.rint(lines[some].mean(axis=0)))
+    return wrong

@@ -1,0 +1,106 @@
+"""How an array is cut into chunks and files, how its bytes are packed, and where a file says that they lie.
+
+Plain numbers: nothing here needs a library of arrays or codecs, which take half a second to load. Who only
+asks what a recording holds (`acquire.store.outline`) does not wait for them.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+from itertools import chain
+from typing import TYPE_CHECKING, Any, Literal
+
+import google_crc32c
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    import numpy as np
+
+Codec = Literal["none", "lz4", "zstd"]
+CODECS: tuple[Codec, ...] = ("none", "lz4", "zstd")
+CRC_BYTES = 4
+
+ITEM_BYTES = {"uint8": 1, "uint16": 2, "uint64": 8, "int64": 8}
+"""Of a sample, by the Zarr data types that there are."""
+
+ABSENT = 2**64 - 1
+"""Offset and size of a chunk that is not there."""
+
+
+@dataclass(frozen=True, slots=True)
+class ArrayShape:
+    """How an array is cut into pieces: rows of ``row_shape`` samples, rows per chunk, chunks per file."""
+
+    data_type: str
+    row_shape: tuple[int, ...]
+    chunk_rows: int
+    shard_chunks: int
+    codec: Codec
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Of a sample, as it lies on disk."""
+        import numpy as np
+
+        return np.dtype(self.data_type).newbyteorder("<")
+
+    @property
+    def chunk_shape(self) -> tuple[int, ...]:
+        return (self.chunk_rows, *self.row_shape)
+
+    @property
+    def chunk_bytes(self) -> int:
+        """Bytes of a chunk's samples."""
+        return math.prod(self.chunk_shape) * ITEM_BYTES[self.data_type]
+
+    @property
+    def shard_rows(self) -> int:
+        return self.chunk_rows * self.shard_chunks
+
+    @property
+    def shard_shape(self) -> tuple[int, ...]:
+        return (self.shard_rows, *self.row_shape)
+
+
+def shard_key(shard: int, dimensions: int) -> str:
+    """Where shard number ``shard`` lies below an array with ``dimensions`` axes, cut along the first only."""
+    return "/".join(["c", str(shard), *["0"] * (dimensions - 1)])
+
+
+def index_bytes(chunks: int) -> int:
+    """Size of the index of ``chunks`` chunks."""
+    return 16 * chunks + CRC_BYTES
+
+
+def small_crc32c(data: bytes) -> bytes:
+    """Checksum of an index or a table as Zarr stores it; of chunks, `codecs.crc32c` is the faster one."""
+    value: int = google_crc32c.value(data)
+    return value.to_bytes(CRC_BYTES, "little")
+
+
+def pack_index(entries: Sequence[tuple[int, int]]) -> bytes:
+    """Offset and size of every chunk as they stand in the file."""
+    data = struct.pack(f"<{2 * len(entries)}Q", *chain.from_iterable(entries))
+    return data + small_crc32c(data)
+
+
+def unpack_index(data: bytes, chunks: int) -> tuple[list[tuple[int, int]], bool]:
+    """Offset and size of every chunk, and whether their checksum agrees; what is not there is ABSENT."""
+    page = data[: index_bytes(chunks)].ljust(index_bytes(chunks), b"\xff")
+    entries, checksum = page[:-CRC_BYTES], page[-CRC_BYTES:]
+    return list(struct.iter_unpack("<QQ", entries)), small_crc32c(entries) == checksum
+
+
+def codec_of(codecs: Sequence[dict[str, Any]]) -> Codec:
+    """The codec of a Zarr codec chain of ours: `bytes`, perhaps `blosc`, `crc32c`. ValueError for others."""
+    names = [codec["name"] for codec in codecs]
+    if names == ["bytes", "crc32c"]:
+        return "none"
+    if names == ["bytes", "blosc", "crc32c"]:
+        for codec in CODECS:
+            if codec == codecs[1]["configuration"]["cname"]:
+                return codec
+    raise ValueError(f"the codecs {', '.join(names)} are not known")

@@ -1,0 +1,318 @@
+"""What became of the latest recording, as its recorder's owner knows: a table of (stage, event) → stage.
+
+::
+
+              BEGIN            BEGAN              SEALED
+      none ─────────▶ asked ───────────▶ recording ─────▶ sealed ── BEGIN ─▶ asked
+       ▲ REFUSED │      │ OVERDUE          │  ▲  │ DIED         ▲
+       └─────────┘      ▼         KILLED   │  │  ▼              │ END, FAULT
+                    cancelled     DISK_END ▼  │ lost            │
+                                  replaced, paused ─────────────┘ (paused only)
+
+It has no thread and no clock, and speaks to no process: times are passed in, and what the recorder is to be
+told is returned. An event that cannot happen, or a command that makes no sense, has no row.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+from enum import StrEnum
+from typing import TYPE_CHECKING
+
+from acquire.errors import DeviceError, StateError
+from acquire.lines import ARMS
+from acquire.stream.messages import Refused
+from acquire.stream.succession import Orphan, Resumption, continuation, once_more, resumed
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+    from pathlib import Path
+
+    from acquire.stream.messages import Began, Begin, Sealed
+
+_MOST_KEPT = 256
+"""Recordings whose lines are remembered; those that a ring still holds lines of are fewer."""
+
+
+class Stage(StrEnum):
+    """Where the latest recording is in its life."""
+
+    NONE = "none"
+    ASKED = "asked"
+    CANCELLED = "cancelled"
+    RECORDING = "recording"
+    REPLACED = "replaced"
+    PAUSED = "paused"
+    SEALED = "sealed"
+    LOST = "lost"
+
+
+MEANINGS = {
+    Stage.NONE: "nothing has been recorded",
+    Stage.ASKED: "a recording is being created",
+    Stage.CANCELLED: "the disk took too long to create the recording, and nobody wants it any more",
+    Stage.RECORDING: "a recording is being written",
+    Stage.REPLACED: "the recorder was killed; another one goes on with the recording beside it",
+    Stage.PAUSED: "the recording goes on in a further segment when the disk lets it",
+    Stage.SEALED: "the recording is closed",
+    Stage.LOST: "the recorder ended without sealing the recording, which can be recovered",
+}
+"""For refusals and for the status."""
+
+UNDER_WAY = frozenset({Stage.RECORDING, Stage.REPLACED, Stage.PAUSED})
+"""A recording is open, as far as the living can tell."""
+
+
+class Event(StrEnum):
+    """What can happen to a recording. BEGIN and END are commands."""
+
+    BEGIN = "start"
+    END = "stop"
+    BEGAN = "began"
+    REFUSED = "refused"
+    OVERDUE = "overdue"
+    """The recorder has not answered in time."""
+    KILLED = "killed"
+    """The recorder was, and another process took its place."""
+    DIED = "died"
+    """The recorder did, and nobody takes its place."""
+    DISK_END = "ended by the disk"
+    """The recorder sealed what it had, and goes on as soon as the disk allows."""
+    SEALED = "sealed"
+    FAULT = "fault"
+    """The capture has failed, or is closed: what has not begun is not wanted any more."""
+
+
+TABLE: dict[tuple[Stage, Event], Stage] = {
+    (Stage.NONE, Event.BEGIN): Stage.ASKED,
+    (Stage.NONE, Event.KILLED): Stage.NONE,
+    (Stage.NONE, Event.DIED): Stage.NONE,
+    (Stage.NONE, Event.FAULT): Stage.NONE,
+    (Stage.ASKED, Event.BEGAN): Stage.RECORDING,
+    (Stage.ASKED, Event.REFUSED): Stage.NONE,
+    (Stage.ASKED, Event.OVERDUE): Stage.CANCELLED,
+    (Stage.ASKED, Event.KILLED): Stage.NONE,
+    (Stage.ASKED, Event.DIED): Stage.NONE,
+    (Stage.ASKED, Event.FAULT): Stage.CANCELLED,
+    # The recorder is silent about what was cancelled, unless its answer was on the way already.
+    (Stage.CANCELLED, Event.BEGIN): Stage.ASKED,
+    (Stage.CANCELLED, Event.BEGAN): Stage.RECORDING,
+    (Stage.CANCELLED, Event.REFUSED): Stage.NONE,
+    (Stage.CANCELLED, Event.KILLED): Stage.NONE,
+    (Stage.CANCELLED, Event.DIED): Stage.NONE,
+    (Stage.CANCELLED, Event.FAULT): Stage.CANCELLED,
+    (Stage.RECORDING, Event.END): Stage.RECORDING,
+    (Stage.RECORDING, Event.REFUSED): Stage.RECORDING,  # the answer to a start that was given up
+    (Stage.RECORDING, Event.KILLED): Stage.REPLACED,
+    (Stage.RECORDING, Event.DIED): Stage.LOST,
+    (Stage.RECORDING, Event.DISK_END): Stage.PAUSED,
+    (Stage.RECORDING, Event.SEALED): Stage.SEALED,
+    (Stage.RECORDING, Event.FAULT): Stage.RECORDING,
+    (Stage.REPLACED, Event.END): Stage.REPLACED,
+    (Stage.REPLACED, Event.BEGAN): Stage.RECORDING,
+    (Stage.REPLACED, Event.REFUSED): Stage.LOST,
+    (Stage.REPLACED, Event.KILLED): Stage.REPLACED,
+    (Stage.REPLACED, Event.DIED): Stage.LOST,
+    (Stage.REPLACED, Event.FAULT): Stage.REPLACED,
+    (Stage.PAUSED, Event.END): Stage.SEALED,
+    (Stage.PAUSED, Event.BEGAN): Stage.RECORDING,
+    (Stage.PAUSED, Event.REFUSED): Stage.PAUSED,
+    (Stage.PAUSED, Event.KILLED): Stage.PAUSED,
+    (Stage.PAUSED, Event.DIED): Stage.SEALED,
+    (Stage.PAUSED, Event.FAULT): Stage.SEALED,
+    # A further segment that was cancelled may have begun, or been refused, before the recorder heard of it.
+    (Stage.SEALED, Event.BEGIN): Stage.ASKED,
+    (Stage.SEALED, Event.END): Stage.SEALED,
+    (Stage.SEALED, Event.BEGAN): Stage.RECORDING,
+    (Stage.SEALED, Event.REFUSED): Stage.SEALED,
+    (Stage.SEALED, Event.KILLED): Stage.SEALED,
+    (Stage.SEALED, Event.DIED): Stage.SEALED,
+    (Stage.SEALED, Event.FAULT): Stage.SEALED,
+    (Stage.LOST, Event.END): Stage.LOST,
+    (Stage.LOST, Event.KILLED): Stage.LOST,
+    (Stage.LOST, Event.DIED): Stage.LOST,
+    (Stage.LOST, Event.FAULT): Stage.LOST,
+}
+
+
+def after(stage: Stage, event: Event) -> Stage:
+    """The stage that ``event`` leads to; StateError where the table has no row for it."""
+    try:
+        return TABLE[stage, event]
+    except KeyError:
+        others = ", ".join(other for other in (Event.BEGIN, Event.END) if (stage, other) in TABLE)
+        hint = "stop it first" if event is Event.BEGIN and stage in UNDER_WAY else ""
+        raise StateError(f"{event}: {MEANINGS[stage]}", possible=others, hint=hint) from None
+
+
+class Lifecycle:
+    """The latest recording of an armed run. Not thread-safe: its owner guards it.
+
+    Attributes
+    ----------
+    stage : where it is in its life
+    began : the recorder's answer to the latest beginning, unless that was refused
+    sealed : how it ended
+    refused : why it was not begun
+    path : where ``began`` is: not where it was first begun, if it goes on in another segment
+    resumption : when a recording that the disk has ended goes on, and why it has not yet
+    """
+
+    def __init__(self, *, goes_on: bool) -> None:
+        self.stage = Stage.NONE
+        self.began: Began | None = None
+        self.sealed: Sealed | None = None
+        self.refused: Refused | None = None
+        self.path: Path | None = None
+        self.resumption = Resumption()
+        self._goes_on = goes_on
+        self._begin: Begin | None = None
+        self._end_reason: str | None = None
+        self._failed = False
+        self._cut_short: Sealed | None = None
+        self._orphans: list[Orphan] = []
+        self._kept: dict[str, deque[tuple[int, int]]] = {arm: deque(maxlen=_MOST_KEPT) for arm in ARMS}
+
+    @property
+    def orphans(self) -> tuple[Orphan, ...]:
+        """Recordings that were not sealed; not while another recorder only begins, which has more to do."""
+        return () if self.stage is Stage.REPLACED else tuple(self._orphans)
+
+    def kept(self, arm: str, released_line: int) -> list[tuple[int, int]]:
+        """Ranges of the arm's lines that recordings hold, the one under way up to ``released_line``."""
+        ranges = list(self._kept[arm])
+        if self.began is not None and self.stage in (Stage.RECORDING, Stage.REPLACED, Stage.LOST):
+            ranges.append((self.began.first_line, max(self.began.first_line, released_line)))
+        return ranges
+
+    # ---- commands
+
+    def begin(self, begin: Begin) -> None:
+        """The recorder is asked for another recording. Raises StateError while there is one."""
+        self._go(Event.BEGIN)
+        self.began = self.sealed = self.refused = self._cut_short = self._end_reason = None
+        self.resumption = Resumption()
+        self._begin = begin
+
+    def end(self, reason: str) -> bool:
+        """Nobody wants more of it. True: what the recorder only begins is to be cancelled."""
+        was = self._go(Event.END)
+        self._end_reason = reason
+        return self._close_pause(was)
+
+    def extend(self, line: int) -> None:
+        """It does not end before ``line``, in whatever segment."""
+        if self.began is None or self.began.end_line is None:
+            return
+        self.began = replace(self.began, end_line=max(line, self.began.end_line))
+        if self.stage is Stage.PAUSED and self._begin is not None:
+            self._begin = replace(self._begin, end_line=self.began.end_line)
+
+    # ---- what the recorder says
+
+    def on_began(self, began: Began, now_s: float) -> str | None:
+        """It exists; for what reason it is to end at once all the same, if it is."""
+        self._go(Event.BEGAN)
+        assert self._begin is not None
+        self.began, self.sealed, self._cut_short = began, None, None
+        self.path = self._begin.path
+        self.resumption.began(now_s)
+        return self._end_reason
+
+    def on_refused(self, refused: Refused, now_s: float) -> bool:
+        """It, or its further segment, cannot be begun. True: and so it cannot go on at all."""
+        was = self._go(Event.REFUSED)
+        if was is Stage.ASKED:
+            self.refused = refused
+        elif was is Stage.PAUSED:
+            self.resumption.ended(now_s, refused.error.message)
+        elif was is Stage.REPLACED:
+            self._begin = None  # nothing of it was made
+        return self.stage is Stage.LOST
+
+    def on_sealed(self, sealed: Sealed, rows: Mapping[str, int], committed_lines: int, now_s: float) -> None:
+        """It is closed, with so many ``rows`` of each arm; ``committed_lines`` of them are on the disk."""
+        began, begin, path = self.began, self._begin, self.path
+        if began is None or begin is None or path is None:
+            raise StateError(f"{Event.SEALED}: {MEANINGS[self.stage]}")
+        following = None
+        if self._goes_on and sealed.end_line is not None and self._end_reason is None and not self._failed:
+            following = resumed(begin, began, sealed.end_line, sealed.end_reason)
+        self._go(Event.SEALED if following is None else Event.DISK_END)
+        for arm, ranges in self._kept.items():
+            ranges.append((began.first_line, began.first_line + rows[arm]))
+        if not sealed.on_disk:
+            self._orphans.append(Orphan(path, sealed.end_reason, committed_lines))
+        if following is None:
+            self.sealed = sealed
+        else:
+            self._begin, self._cut_short = following, sealed
+            self.resumption.ended(now_s, sealed.end_reason)
+
+    # ---- what becomes of the recorder, and of time
+
+    def on_overdue(self) -> None:
+        """The recorder has not answered in time: what it begins is to be cancelled."""
+        self._go(Event.OVERDUE)
+        self._end_reason = "cancelled"  # should it begin all the same
+
+    def on_killed(self, death: str, committed_lines: int, now_s: float) -> Begin | None:
+        """Another process is in the recorder's place: what it is to begin, if it is to begin anything now."""
+        was, begin = self._go(Event.KILLED), self._begin
+        if begin is None or was in (Stage.NONE, Stage.SEALED, Stage.LOST):
+            return None
+        if was in (Stage.ASKED, Stage.CANCELLED):
+            self._orphans.append(Orphan(begin.path, f"its recorder was {death}"))
+            if was is Stage.ASKED:
+                self.refused = Refused(DeviceError(f"start: the recorder was {death}", hint="start again"))
+            return None
+        if was is Stage.RECORDING and self.began is not None:
+            self._begin = continuation(begin, self.began, committed_lines, death)
+        else:
+            self._begin, committed_lines = once_more(begin), 0  # the counters may be neither's
+        if self._begin.path != begin.path:  # else it was killed before it had made anything
+            why = f"its recorder was {death}; it goes on in {self._begin.path.name}"
+            self._orphans.append(Orphan(begin.path, why, committed_lines))
+        if was is Stage.PAUSED:
+            self.resumption.ended(now_s, f"its recorder was {death}")
+            return None
+        return self._begin
+
+    def on_died(self) -> None:
+        """The recorder did, and nobody takes its place."""
+        self._close_pause(self._go(Event.DIED))
+
+    def on_fault(self) -> bool:
+        """The capture has failed, or is closed. True: what the recorder only begins is to be cancelled."""
+        was = self._go(Event.FAULT)
+        self._failed = True
+        return self._close_pause(was) or was is Stage.ASKED
+
+    def due(self, now_s: float) -> Begin | None:
+        """The further segment that is to be tried now."""
+        if self.stage is not Stage.PAUSED or self._begin is None or not self.resumption.is_due(now_s):
+            return None
+        self._begin = once_more(self._begin)
+        return self._begin
+
+    def mark_unsealed(self, why: str, committed_lines: int) -> None:
+        """Every process has ended: a recording that is not sealed now will not be."""
+        self.on_died()
+        known = {orphan.path for orphan in self._orphans}
+        if self.stage is Stage.LOST and self._begin is not None and self._begin.path not in known:
+            lines = committed_lines if self._begin.path == self.path else 0  # else those of the one before
+            self._orphans.append(Orphan(self._begin.path, why, lines))
+
+    def _go(self, event: Event) -> Stage:
+        """Gives the stage before."""
+        before, self.stage = self.stage, after(self.stage, event)
+        return before
+
+    def _close_pause(self, was: Stage) -> bool:
+        """Nobody wants the further segment any more that has not begun yet; says whether there was one."""
+        if was is not Stage.PAUSED:
+            return False
+        self.sealed, self._cut_short = self._cut_short, None
+        self.resumption = Resumption()
+        return True

@@ -1,0 +1,87 @@
+"""Behind a fibre a column's gain is also that of what ends on it: a flat tells both, and tiles get theirs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from acquire.calibrate import Calibration, calibrated
+from acquire.calibrate.columns import dark, flat
+from acquire.calibrate.exposure import open_exposure
+from acquire.config import load_rig
+from acquire.config.rig import ConstantCodeConfig
+from acquire.errors import UsageError
+from acquire.sim.leds import LedSceneConfig
+from acquire.simulate import simulate
+from acquire.store import Recording, open_recording
+
+SETTINGS = {"geometry.stages": 16, "geometry.substeps": 1, "cameras.layout": "fibre"}
+SETTINGS |= {"fibre.rows": 32, "fibre.columns": 48, "fibre.sensor_pixels": 103}
+SETTINGS |= {
+    f"cameras.{arm}.{key}": value
+    for arm in "ab"
+    for key, value in (("black_level_dn", 100.0), ("responsivity_dn", 150.0))
+}
+UNEVEN = [
+    {"kind": "fibre_gain", "columns": 0.05},
+    {"kind": "prnu", "prnu": 0.03},
+    {"kind": "dsnu", "dsnu_e": 60.0},
+]
+LED = {"name": "x", "row": 0.5, "column": 0.5, "drive": {"waveform": "constant", "level": 1.0}}
+
+
+def recorded(path: Path, shape: str, effects: list[dict[str, Any]], steady: int | None = None) -> Recording:
+    """``steady``: the light's code, where it is constant."""
+    scene = {"kind": "leds", "leds": [{**LED, "shape": shape, "size": 1.0}], "effects": effects}
+    rig = load_rig("rig-demo", SETTINGS)
+    if steady is not None:
+        rig = rig.model_copy(update={"code": ConstantCodeConfig(kind="constant", value=steady)})
+    simulate(rig, LedSceneConfig.model_validate(scene), path, 600)
+    return open_recording(path)
+
+
+@pytest.fixture(scope="module")
+def known(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
+    home = tmp_path_factory.mktemp("flat")
+    noisy = [*UNEVEN, {"kind": "shot_noise"}, {"kind": "read_noise", "sigma_e": 10.0}]
+    found = {}
+    for name, value in (("dark", 0), ("flat", 1)):
+        recorded(home / f"{name}.zarr", "square", noisy, value)
+        found[name] = open_exposure(home / f"{name}.zarr", 64, 500)
+    begun = Calibration(found["dark"].instrument).with_step(dark(found["dark"]))
+    return begun.with_step(flat(found["flat"], begun))
+
+
+def test_a_flat_tells_the_gains_of_what_ends_on_each_column(known: Calibration, tmp_path: Path) -> None:
+    assert known.instrument.columns == 103
+    uneven = recorded(tmp_path / "uneven.zarr", "x", UNEVEN)
+    even = recorded(tmp_path / "even.zarr", "x", [])
+    levels = []
+    for tile in even.fibre.tiles:
+        found = calibrated(uneven.cut(100, 200, tile), known).samples(np.float64)
+        bare = even.cut(100, 200, tile).samples(np.float64)
+        raw = uneven.cut(100, 200, tile).samples(np.float64)
+        ratio = (found * bare).sum(axis=1) / (bare**2).sum(axis=1).clip(1e-9)
+        worst = np.abs((raw * bare).sum(axis=1) / (bare**2).sum(axis=1).clip(1e-9) - 1).max()
+        lit = bare.mean(axis=1) > 0.5
+        assert np.ptp(ratio[lit]) < 0.02 < worst
+        levels.append(np.median(ratio[lit]))
+    assert np.ptp(levels) < 0.01
+
+
+def test_columns_that_no_band_ends_on_are_masked_and_not_complained_of(known: Calibration) -> None:
+    assert known.usable is not None
+    fibre = load_rig("rig-demo", SETTINGS).laid_out
+    for arm, usable in zip("ab", known.usable, strict=True):
+        np.testing.assert_array_equal(usable, fibre.table(arm)[:, 0] >= 0)
+    assert not known.steps["flat"]["warnings"]
+
+
+def test_a_calibration_without_these_columns_is_refused(known: Calibration, tmp_path: Path) -> None:
+    narrow = Calibration(known.instrument.model_copy(update={"pixels": None}))
+    uneven = recorded(tmp_path / "uneven.zarr", "x", [])
+    with pytest.raises(UsageError, match="16 columns does not reach those of the lines"):
+        calibrated(uneven.cut(100, 200, uneven.fibre.tiles[-1]), narrow)

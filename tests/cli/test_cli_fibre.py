@@ -1,0 +1,112 @@
+"""A scene behind a fibre from the command line: simulated, reconstructed, in whole and in part."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from acquire.store import open_video
+
+Cli = Callable[..., Any]
+
+RIG = """
+name = "small-fibre"
+[geometry]
+stages = 16
+substeps = 1
+[cameras]
+layout = "fibre"
+[cameras.a]
+serial = "A"
+responsivity_dn = 200.0
+[cameras.b]
+serial = "B"
+responsivity_dn = 200.0
+[fibre]
+rows = 32
+columns = 48
+sensor_pixels = 96
+bands_a = [48, 0]
+bands_b = [64, 0, 32]
+[simulation]
+scene = "scene.toml"
+"""
+SCENE = """
+kind = "leds"
+rig = "rig.toml"
+lines = 110
+[[leds]]
+name = "disc"
+shape = "circle"
+row = 0.5
+column = 0.4
+size = 0.5
+drive = { waveform = "constant", level = 0.8 }
+"""
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    home = tmp_path_factory.mktemp("fibre")
+    (home / "rig.toml").write_text(RIG)
+    (home / "scene.toml").write_text(SCENE)
+    words = ("simulate", home / "scene.toml", "--config", home / "rig.toml", "--out", home / "run.zarr")
+    subprocess.run([Path(sys.executable).with_name("acquire"), *words], check=True, timeout=300)
+    return home / "run.zarr"
+
+
+def test_the_whole_scene_becomes_one_video_whatever_the_order_of_the_bands(
+    cli: Cli, recording: Path, tmp_path: Path
+) -> None:
+    words = ("--nm", 2, "--tm", 5, "--iterations", 12, "--workers", 1)
+    answer = cli("reconstruct", recording, "--out", tmp_path / "v.zarr", *words)
+    assert answer.code == 0, answer.err
+    assert "0,0 to 1,2, 6 of 6" in answer.out
+    video = np.asarray(open_video(tmp_path / "v.zarr").video[:])
+    assert video.shape[1:] == (16, 24)
+    row, column = np.mgrid[:16, :24]
+    disc = np.hypot(row + 0.5 - 8, column + 0.5 - 0.4 * 24)
+    image = video.mean(axis=0)
+    assert image[disc < 4].min() > 0.6
+    assert image[disc > 8].max() < 0.2
+    answer = cli("render", tmp_path / "v.zarr", "--out", tmp_path / "v.png", "--frames", 2)
+    assert answer.code == 0, answer.err
+
+
+def test_a_part_and_a_preview(cli: Cli, recording: Path, tmp_path: Path) -> None:
+    words = ("--tiles", "0-1,1", "--nm", 4, "--tm", 10, "--iterations", 5, "--workers", 1, "--json")
+    answer = cli("reconstruct", recording, "--out", tmp_path / "part.zarr", *words)
+    assert answer.code == 0, answer.err
+    assert answer.json["shape"][1:] == [8, 4]
+    assert answer.json["tiles"] == ["0,1", "1,1"]
+    answer = cli("reconstruct", recording, "--out", tmp_path / "look.zarr", "--preview", "--json")
+    assert answer.code == 0, answer.err
+    assert answer.json["shape"][1:] == [32, 48]
+
+
+@pytest.mark.parametrize(
+    ("words", "reason"),
+    [
+        (("--tiles", "2,0"), "the fibre has no tile 2,0"),
+        (("--tiles", "1-0,0"), "backwards"),
+        (("--tiles", "all"), "tiles 'all' cannot be read"),
+        (
+            ("--nm", 3),
+            "voxels of N_m = 3 do not fill the tiles behind the fibre, which are 16 fine pixels wide",
+        ),
+        (("--auto",), "--auto needs lines that see one scene, and these see tiles behind a fibre"),
+        (("--try-orientations",), "--try-orientations needs lines that see one scene"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_is_made(
+    cli: Cli, recording: Path, tmp_path: Path, words: tuple[object, ...], reason: str
+) -> None:
+    answer = cli("reconstruct", recording, "--out", tmp_path / "v.zarr", *words)
+    assert (answer.code, reason in " ".join(answer.err.split())) == (2, True), answer.err
+    assert not (tmp_path / "v.zarr").exists()

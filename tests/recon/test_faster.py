@@ -1,0 +1,45 @@
+"""Light beyond the band is told by its frequency, and nothing is told of motion, slower lamps and noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from acquire.forward import DualArm
+from acquire.recon import Reconstruction, reconstruct
+from acquire.recon.clock import IterationClock
+from acquire.recon.faster import tell_faster_light
+from acquire.recon.problem import build_problem
+from acquire.sim.procedural import Recorded, record
+
+SIZES = {"stages": 32, "lines": 150}
+
+
+def told(warnings: tuple[str, ...]) -> list[str]:
+    return [each for each in warnings if each.startswith("light changes at about")]
+
+
+def test_a_lamp_of_20_khz_is_told_by_its_frequency() -> None:
+    result = reconstruct(record("fastled", 22, **SIZES).segment, 3, 1)
+    (words,) = told(result.warnings)
+    found_hz = float(words.removeprefix("light changes at about ").split()[0])
+    assert found_hz == pytest.approx(20e3, rel=0.01)
+    assert result.parameters["resolved_hz"] < 10e3
+    assert f"the {result.parameters['resolved_hz']:.5g} Hz that" in words
+
+
+def held_against(recorded: Recorded, result: Reconstruction, clock: IterationClock) -> tuple[str, ...]:
+    """What is told of a video, also where no noise makes `reconstruct` ask."""
+    segment = recorded.segment
+    problem = build_problem(segment, 3, 1, hold_out=0.0)
+    lines = DualArm(segment.geometry, segment.code, 3, 1).forward(result.video.astype(np.float32))
+    predicted = lines / (problem.norm * problem.scale)
+    resolved_hz = result.parameters["resolved_hz"]
+    return tell_faster_light(segment, problem, predicted, result.video, resolved_hz, clock)
+
+
+@pytest.mark.parametrize("scene", ["still", "leds", "splash", "flame", "spark", "disc", "bullet"])
+def test_none_is_told_of_scenes_without_any(scene: str) -> None:
+    recorded = record(scene, 22, **SIZES)
+    result = reconstruct(recorded.segment, 3, 1, "fast", iterations=20, check=False)
+    assert not held_against(recorded, result, IterationClock(1))

@@ -1,0 +1,128 @@
+"""Tiles of a scene behind a fibre: each is solved as a scene of its own, and one video holds them all."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from acquire.config import RigConfig, load_rig
+from acquire.config.scene import ConstantDrive, SineDrive
+from acquire.errors import UsageError
+from acquire.fibre import Tile
+from acquire.recon import reconstruct
+from acquire.recon.segments import Voxels
+from acquire.reconstruct import Options, Outcome, Watcher, by_lines, combine, in_tiles, in_voxels, open_pool
+from acquire.sim.leds import LedConfig, LedSceneConfig
+from acquire.sim.scenes import build_scene
+from acquire.simulate import simulate
+from acquire.store import Recording, open_recording, open_video
+
+SETTINGS = {"geometry.stages": 24, "geometry.substeps": 1, "cameras.layout": "fibre"}
+SETTINGS |= {"fibre.rows": 48, "fibre.columns": 72, "fibre.sensor_pixels": 150}
+LINES = 130
+OPTIONS = Options(iterations=20, check=False)
+
+
+@pytest.fixture(scope="module")
+def rig() -> RigConfig:
+    return load_rig("rig-demo", SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def scene() -> LedSceneConfig:
+    """Shapes that cross the borders of tiles; one flickers."""
+    steady, sine = (
+        ConstantDrive(waveform="constant", level=0.7),
+        SineDrive(waveform="sine", frequency_hz=900.0, low=0.2),
+    )
+    leds = (
+        LedConfig(name="disc", shape="circle", row=0.5, column=0.35, size=0.5, drive=steady),
+        LedConfig(name="x", shape="x", row=0.45, column=0.8, size=0.35, drive=sine),
+    )
+    return LedSceneConfig(kind="leds", title="across tiles", leds=leds)
+
+
+@pytest.fixture(scope="module")
+def recording(rig: RigConfig, scene: LedSceneConfig, tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    path = tmp_path_factory.mktemp("fibre") / "run.zarr"
+    simulate(rig, scene, path, LINES)
+    return open_recording(path)
+
+
+def combined(
+    recording: Recording, out: Path, voxels: Voxels, tiles: tuple[Tile, ...], watcher: Watcher | None = None
+) -> Outcome:
+    request = in_tiles(in_voxels(by_lines(recording), voxels, longest=60), tiles)
+    watcher = watcher or Watcher(len(request.stretches) * len(tiles))
+    with open_pool(1, watch=watcher) as pool:
+        return combine(recording, request, out, OPTIONS, pool, watcher)
+
+
+def truth(rig: RigConfig, scene: LedSceneConfig, substeps: np.ndarray) -> np.ndarray:
+    fibre = rig.laid_out
+    rows, columns = fibre.field()
+    shown = build_scene(scene, fibre.side, rig.trigger.substep_ticks / rig.trigger.clock_hz)
+    return shown.frames_at(substeps)[:, rows, columns]
+
+
+def test_a_video_of_all_tiles_shows_the_whole_scene(
+    rig: RigConfig, scene: LedSceneConfig, recording: Recording, tmp_path: Path
+) -> None:
+    outcome = combined(recording, tmp_path / "v.zarr", Voxels(2, 4), recording.fibre.tiles)
+    video = open_video(tmp_path / "v.zarr")
+    assert outcome.shape == video.video.shape == (26, 24, 36)
+    first = outcome.provenance["first_substep"]
+    fine = truth(rig, scene, np.arange(first, first + 4 * 26))
+    expected = fine.reshape(26, 4, 24, 2, 36, 2).mean(axis=(1, 3, 5))
+    found = np.asarray(video.video[:])
+    kept = video.trusted
+    assert len(kept) == 26
+    assert 10 * np.log10(1 / np.mean((found[kept] - expected[kept]) ** 2)) > 25
+    assert np.isfinite(video.quality).all()
+    assert video.time_ns[1] - video.time_ns[0] == round(4 * recording.line_period_ns)
+    assert len(outcome.provenance["segments"]) == outcome.provenance["segments_asked"] == 6 * 2
+    assert [part["tile"] for part in outcome.provenance["segments"][::2]] == list(
+        map(str, recording.fibre.tiles)
+    )
+
+
+def test_a_part_is_what_the_whole_has_there_and_says_where_it_lies(
+    recording: Recording, tmp_path: Path
+) -> None:
+    tiles = (Tile(1, 1), Tile(1, 2))
+    combined(recording, tmp_path / "part.zarr", Voxels(3, 153), tiles)
+    part = open_video(tmp_path / "part.zarr")
+    assert part.video.shape == (1, 8, 16)
+    assert part.origin[1:] == (24 + 1, 24 + 1)
+    for number, tile in enumerate(tiles):
+        segment = recording.cut(0, LINES, tile)
+        alone = reconstruct(segment, 3, 153, iterations=20, check=False)
+        image = np.asarray(part.video[0])[:, 8 * number : 8 * number + 8]
+        assert np.corrcoef(image.ravel(), alone.video[0].ravel())[0, 1] > 0.9
+
+
+def test_an_interrupted_video_has_holes_and_trusts_nothing(recording: Recording, tmp_path: Path) -> None:
+    begun: list[float] = []
+    watcher = Watcher(12, stop=lambda: bool(begun) and begun[-1] > 4.5)
+    watcher._progress = lambda done, _: begun.append(done)
+    outcome = combined(recording, tmp_path / "v.zarr", Voxels(2, 4), recording.fibre.tiles, watcher)
+    assert outcome.interrupted
+    video = open_video(tmp_path / "v.zarr")
+    image = np.asarray(video.video[:])
+    assert image.shape == (26, 24, 36)
+    there = np.isfinite(image).all(axis=0).reshape(2, 12, 3, 12).all(axis=(1, 3))
+    assert there[0, :2].all()
+    assert not there[1].any()
+    assert not video.trusted
+    assert outcome.provenance["state"] == "interrupted"
+
+
+def test_voxels_that_cross_the_borders_of_tiles_are_refused(recording: Recording) -> None:
+    request = in_voxels(by_lines(recording), Voxels(5, 4))
+    with pytest.raises(
+        UsageError, match=r"N_m = 5 do not fill the tiles .* possible: N_m of 1, 2, 3, 4, 6, 8"
+    ):
+        in_tiles(request, recording.fibre.tiles)
+    assert in_tiles(request, ()) == request

@@ -1,0 +1,159 @@
+"""A scene of 768 x 1536 through a fibre with an ordinary camera's noise, reconstructed: dB by tile.
+
+    python tools/bench_fibre.py still                          # N_m = 1, a minute of a core for a tile
+    python tools/bench_fibre.py video --tiles 1,3 --nm 8       # T_m = 16, 64 frames and more
+
+Stills are binary textures at two scales, in tiles of their own: features in proportion to the whole scene on
+the left, as fine as those of a scene of one tile on the right, which is unfavourable. Videos are of
+`scene-fibre`, of which some tiles hold little but darkness: those are easy, and told apart by their contrast.
+The brightest sample has 10 000 electrons, and 10 are read noise. PSNR has a peak of 1, full light. The line
+of JSON that is printed has dB and contrast (standard deviation of the truth) of each tile.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from acquire.cli.tiles import tiles_of
+from acquire.config import load_rig, load_scene
+from acquire.config.scene import SceneFile
+from acquire.recon.segments import Voxels
+from acquire.reconstruct import Options, Watcher, by_lines, combine, in_tiles, in_voxels, open_pool
+from acquire.sim.procedural import Stage, still
+from acquire.sim.scene import frames_at
+from acquire.sim.scenes import build_scene
+from acquire.simulate import bench_of, simulate
+from acquire.store import open_recording, open_video
+
+FULL_WELL_E, TOP_DN, READ_E = 1e4, 3600.0, 10.0
+K = TOP_DN / FULL_WELL_E
+NOISE = [{"kind": "shot_noise"}, {"kind": "read_noise", "sigma_e": READ_E}]
+EFFECTS = {"effects": NOISE, "system_gain_dn_per_e": K}
+BLOCK = 16
+
+
+def still_scene(home: Path, seed: int) -> dict[str, object]:
+    """A picture twice as wide as high: coarse texture on the left, fine on the right."""
+    coarse = still(Stage(1536, 2, seed))(0, 0.0)[:768, :768]
+    fine = np.empty((768, 768), np.float32)
+    for number in range(9):
+        i, j = divmod(number, 3)
+        fine[256 * i : 256 * i + 256, 256 * j : 256 * j + 256] = still(Stage(256, 2, 100 * seed + number))(
+            0, 0.0
+        )
+    picture = np.rint(255 * np.clip(np.hstack([coarse, fine]), 0, 1)).astype(np.uint8)
+    Image.fromarray(picture).save(home / "still.png")
+    return {"kind": "video", "path": str(home / "still.png"), "fit": "pad"}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("what", choices=("still", "video"))
+    parser.add_argument("--seed", type=int, default=1, help="of texture, code and noise")
+    parser.add_argument("--lines", type=int, help="absent: 600 of a still, 1344 of a video")
+    parser.add_argument("--tiles", help="as acquire reconstruct takes them; absent: all")
+    parser.add_argument("--nm", type=int, help="absent: 1 of a still, 4 of a video")
+    parser.add_argument("--tm", type=int, help="absent: all sub-steps, or 16")
+    parser.add_argument("--preset", default="fast")
+    parser.add_argument("--workers", type=int)
+    parser.add_argument("--keep", type=Path, help="directory for the recording and the video; absent: none")
+    asked = parser.parse_args()
+    with tempfile.TemporaryDirectory() as scratch:
+        home = asked.keep or Path(scratch)
+        home.mkdir(exist_ok=True, parents=True)
+        measure(asked, home)
+
+
+def measure(asked: argparse.Namespace, home: Path) -> None:
+    """Simulate, reconstruct, compare; prints a line of JSON."""
+    resting = asked.what == "still"
+    table = still_scene(home, asked.seed) if resting else load_scene("scene-fibre").model_dump(mode="json")
+    scene = SceneFile.model_validate({**table, **EFFECTS, "seed": asked.seed}).root
+    lines = asked.lines or (600 if resting else 1344)
+    rig = load_rig("rig-fibre", {"code.seed": asked.seed})
+    bare = bench_of(rig, scene).without("shot_noise", "read_noise")
+    black = rig.cameras.a.black_level_dn
+    brightest = max(
+        int(bare.camera(arm, rig.code.build()).read(256, 64 if not resting else lines - 256).pixels.max())
+        for arm in "ab"
+    )
+    responsivity = rig.cameras.a.responsivity_dn * TOP_DN / (brightest - black)
+    cameras = {"responsivity_dn": responsivity, "dn_per_electron": K, "read_noise_e": READ_E}
+    changes = {f"cameras.{arm}.{key}": value for arm in "ab" for key, value in cameras.items()}
+    rig = load_rig("rig-fibre", {"code.seed": asked.seed, **changes})
+    recording = home / f"{asked.what}-{asked.seed}.zarr"
+    began = time.monotonic()
+    simulate(rig, scene, recording, lines)
+    simulated_s = time.monotonic() - began
+    opened = open_recording(recording)
+    tiles = tiles_of(opened, asked.tiles)
+    span = opened.geometry_for(lines).span
+    voxels = Voxels(asked.nm or (1 if resting else 4), asked.tm or (span if resting else 16))
+    request = in_tiles(in_voxels(by_lines(opened), voxels), tiles)
+    tasks = len(request.stretches) * len(tiles)
+    watcher = Watcher(tasks, lambda done, of: print(f"{done:.1f} of {of}", end="\r", flush=True))
+    out = home / f"{asked.what}-{asked.seed}-video.zarr"
+    began = time.monotonic()
+    with open_pool(tasks, asked.workers, None, watcher) as pool:
+        outcome = combine(opened, request, out, Options(asked.preset), pool, watcher)
+    seconds = time.monotonic() - began
+    video, side = open_video(out), request.grid.side
+    found = np.asarray(video.video[:])
+    kept = range(len(found)) if resting else video.trusted
+    truth = truth_of(rig, scene, request, kept)
+    fibre = opened.fibre
+    top, left = tiles[0].row * side, tiles[0].column * side
+    truth = truth[:, top : top + found.shape[1], left : left + found.shape[2]]
+    error, by_tile = np.square(found[kept.start : kept.stop] - truth), {}
+    for tile in tiles:
+        row, column = (tile.row - tiles[0].row) * side, (tile.column - tiles[0].column) * side
+        part = np.s_[:, row : row + side, column : column + side]
+        by_tile[str(tile)] = [decibels(error[part].mean()), round(float(truth[part].std()), 3)]
+    facts = {
+        "what": asked.what,
+        "seed": asked.seed,
+        "lines": lines,
+        "voxels": str(voxels),
+        "frames": [len(kept), *found.shape[1:]],
+        "scene": [fibre.rows, fibre.columns],
+        "psnr_db": decibels(error.mean()),
+        "tiles_db_contrast": by_tile,
+        "simulated_s": round(simulated_s, 1),
+        "seconds": round(seconds, 1),
+        "processor_s": round(sum(part["processor_s"] for part in outcome.provenance["segments"]), 1),
+        "warnings": outcome.provenance["warnings"],
+    }
+    print(json.dumps(facts))
+
+
+def truth_of(rig, scene, request, kept: range) -> np.ndarray:  # type: ignore[no-untyped-def]
+    """The voxels of the whole scene in the frames that are kept."""
+    fibre, grid = rig.laid_out, request.grid
+    rows, columns = fibre.field()
+    shown = build_scene(scene, fibre.side, rig.trigger.substep_ticks / rig.trigger.clock_hz)
+    N_m = grid.voxels.spatial_merge
+    frames = np.empty((len(kept), fibre.rows // N_m, fibre.columns // N_m), np.float32)
+    for number, (begin, end) in enumerate(
+        zip(*(edges := grid.edges(slice(kept.start, kept.stop)), edges[1:]), strict=False)
+    ):
+        at = np.array([begin]) if N_m == 1 else np.arange(begin, end, max(1, (end - begin) // BLOCK))
+        mean = frames_at(shown, at)[:, rows, columns].mean(axis=0)
+        frames[number] = mean.reshape(len(mean) // N_m, N_m, -1, N_m).mean(axis=(1, 3))
+    return frames
+
+
+def decibels(mse: float) -> float:
+    return round(float(-10 * np.log10(mse)), 2)
+
+
+if __name__ == "__main__":
+    main()
