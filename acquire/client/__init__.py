@@ -17,11 +17,21 @@
 `acquire web` at /api/openapi.json.
 """
 
-from acquire.client.asynchronous import AsyncClient
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from acquire.client.blocking import Client
 from acquire.client.core import EventReader
 from acquire.daemon.facts import Health, News, Setup
 from acquire.daemon.messages import Status
 from acquire.daemon.states import SEALED, State
+from acquire.lazy import lazily
+
+if TYPE_CHECKING:
+    from acquire.client.asynchronous import AsyncClient
 
 __all__ = ["SEALED", "AsyncClient", "Client", "EventReader", "Health", "News", "Setup", "State", "Status"]
+
+# The command line, which asks once and leaves, is not to wait for asyncio.
+__getattr__, __dir__ = lazily(__name__, {"AsyncClient": "asynchronous"}, __all__)
