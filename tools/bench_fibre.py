@@ -64,6 +64,9 @@ def main() -> None:
     parser.add_argument("--nm", type=int, help="absent: 1 of a still, 4 of a video")
     parser.add_argument("--tm", type=int, help="absent: all sub-steps, or 16")
     parser.add_argument("--preset", default="fast")
+    parser.add_argument(
+        "--search", choices=("shared", "each"), default="shared", help="as acquire reconstruct"
+    )
     parser.add_argument("--workers", type=int)
     parser.add_argument("--keep", type=Path, help="directory for the recording and the video; absent: none")
     asked = parser.parse_args()
@@ -92,7 +95,8 @@ def measure(asked: argparse.Namespace, home: Path) -> None:
     rig = load_rig("rig-fibre", {"code.seed": asked.seed, **changes})
     recording = home / f"{asked.what}-{asked.seed}.zarr"
     began = time.monotonic()
-    simulate(rig, scene, recording, lines)
+    if not recording.exists():
+        simulate(rig, scene, recording, lines)
     simulated_s = time.monotonic() - began
     opened = open_recording(recording)
     tiles = tiles_of(opened, asked.tiles)
@@ -101,10 +105,12 @@ def measure(asked: argparse.Namespace, home: Path) -> None:
     request = in_tiles(in_voxels(by_lines(opened), voxels), tiles)
     tasks = len(request.stretches) * len(tiles)
     watcher = Watcher(tasks, lambda done, of: print(f"{done:.1f} of {of}", end="\r", flush=True))
-    out = home / f"{asked.what}-{asked.seed}-video.zarr"
+    out = home / f"{asked.what}-{asked.seed}-{time.time_ns()}-video.zarr"
     began = time.monotonic()
     with open_pool(tasks, asked.workers, None, watcher) as pool:
-        outcome = combine(opened, request, out, Options(asked.preset), pool, watcher)
+        outcome = combine(
+            opened, request, out, Options(asked.preset, shared=asked.search == "shared"), pool, watcher
+        )
     seconds = time.monotonic() - began
     video, side = open_video(out), request.grid.side
     found = np.asarray(video.video[:])
@@ -130,6 +136,10 @@ def measure(asked: argparse.Namespace, home: Path) -> None:
         "simulated_s": round(simulated_s, 1),
         "seconds": round(seconds, 1),
         "processor_s": round(sum(part["processor_s"] for part in outcome.provenance["segments"]), 1),
+        "processor_s_by_tile": {
+            part["tile"]: round(part["processor_s"], 1) for part in outcome.provenance["segments"]
+        },
+        "choice": outcome.provenance["choice"],
         "warnings": outcome.provenance["warnings"],
     }
     print(json.dumps(facts))

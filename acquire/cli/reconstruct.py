@@ -132,6 +132,13 @@ def reconstruct(
         ),
     ] = False,
     tiles: TilesOption = None,
+    search: Annotated[
+        str | None,
+        typer.Option(
+            help="Who looks for prior and weight: each tile or sub-segment, or one for all (shared); absent: "
+            "shared among tiles."
+        ),
+    ] = None,
     preview: Annotated[
         bool, typer.Option("--preview", help="Make a coarse video in a second or two.")
     ] = False,
@@ -194,6 +201,7 @@ def reconstruct(
             None if chosen is None else chosen.calibration,
             solver_options=solver_options,
             denoiser=denoiser,
+            shared=_shared(search),
         ),
         tiles=asked_tiles,
     )
@@ -228,6 +236,12 @@ def _check_something_asked(*wanted: object) -> None:
             "reconstruct needs --out, where the video goes",
             possible="--out NAME.zarr; --auto alone shows a plan, --explain what a calibration gives",
         )
+
+
+def _shared(search: str | None) -> bool | None:
+    if search not in {None, "each", "shared"}:
+        raise UsageError(f"--search {search} is not known", possible="each, shared")
+    return None if search is None else search == "shared"
 
 
 def _tiles_asked(recording: Recording, text: str | None, looks: dict[str, bool]) -> tuple[Tile, ...]:
@@ -338,6 +352,7 @@ def _readable(outcome: Outcome) -> dict[str, Any]:
         if outcome.cut
         else None,
         "tiles": _tiles(facts),
+        "search": _searched(facts["choice"]),
         "trusted": f"frames {first} to {end - 1}" if end > first else f"none: {nothing}",
         "solver": f"{facts['solver']}, {_iterations(facts)}, {facts['seconds']:.1f} s",
         "corrected": ", ".join(facts["calibration"]["corrected"]) if facts["calibration"] else None,
@@ -358,6 +373,16 @@ def _tiles(facts: dict[str, Any]) -> str | None:
     there = len(facts["segments"]) * len(tiles) // facts["segments_asked"]
     which = tiles[0] if len(tiles) == 1 else f"{tiles[0]} to {tiles[-1]}"
     return f"{which}, {there} of {len(tiles)}"
+
+
+def _searched(choice: dict[str, list[str]] | None) -> str | None:
+    """Who looked for prior and weight, of those that one choice was handed to."""
+    if choice is None or not choice["kept"] + choice["changed"]:
+        return None
+    others = f"kept by {len(choice['kept'])}"
+    if choice["changed"]:
+        others += f", changed by {len(choice['changed'])} ({', '.join(choice['changed'])})"
+    return f"by {', '.join(choice['searched'])} for all; {others}"
 
 
 def _beside_noise(quality: dict[str, Any]) -> str:

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from acquire.lines import Segment
     from acquire.recon.denoisers import Denoiser
     from acquire.recon.estimates import Estimate
+    from acquire.recon.handed import Choice
     from acquire.recon.problem import Problem
 
 HOLD_OUT = 0.08
@@ -54,6 +55,7 @@ def reconstruct(
     initial: NDArray[Any] | None = None,
     static_image: NDArray[Any] | None = None,
     denoiser: Denoiser | str | None = None,
+    choice: Choice | None = None,
     dtype: Dtype = "float32",
     device: str = "cpu",
     stop: Stop | None = None,
@@ -81,6 +83,8 @@ def reconstruct(
     static_image : (n, n), the scene at rest: only its light s(t) is solved for, in any units
     denoiser : in place of total variation (ADMM), itself or the name of an installed one; see
         `acquire.recon.denoisers`
+    choice : of prior, weight and band that another part of the scene led to, to be tried before all is
+        searched (ADMM); see `acquire.recon.handed`
     dtype : of the video and all that leads to it; sums that need it are float64 anyway
     device : ``"cpu"`` or ``"gpu"``, where iterations are made; see `acquire.arrays`
     stop : asked after every iteration; once set, the best so far is returned
@@ -110,6 +114,7 @@ def reconstruct(
         initial,
         static_image,
         open_denoiser(denoiser) if isinstance(denoiser, str) else denoiser,
+        choice,
     )
     arrays = open_arrays(device, dtype)
     options.check_shapes(segment.geometry.size, segment.geometry.video_shape(spatial_merge, temporal_merge))

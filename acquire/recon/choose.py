@@ -14,10 +14,12 @@ begin.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 from acquire.arrays import host
 from acquire.recon.blinking import EXPLAINED, go_on, look_in_cosines, solve_blinking
+from acquire.recon.estimates import Preferred
+from acquire.recon.handed import follow
 from acquire.recon.holdout import HeldOut
 from acquire.recon.patterns import find_patterns
 from acquire.recon.solver import Preset, Solver
@@ -51,7 +53,7 @@ class AdmmSolver(Solver):
     """Ridge ADMM with whichever prior predicts best; ends sooner when the held-out samples say so."""
 
     iterations: ClassVar[Mapping[Preset, int]] = {"fast": 40, "balanced": 150, "best": 300}
-    takes: ClassVar[frozenset[str]] = frozenset({"initial", "denoiser"})
+    takes: ClassVar[frozenset[str]] = frozenset({"initial", "denoiser", "choice"})
 
     def solve(
         self, segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock
@@ -67,6 +69,10 @@ def solve_admm(segment: Segment, problem: Problem, options: SolveOptions, clock:
         return solve_blinking(segment, problem, options, clock)
     bench = Workbench(segment, problem, options, clock, held_out)
     trials = max(4, options.iterations // ITERATIONS_PER_TRIAL)
+    if options.choice is not None:
+        followed = follow(bench, segment, problem, options, clock, trials)
+        if followed is not None:
+            return followed
     if bench.frames == 1:
         return bench.finish(bench.climb(bench.attempt(STILL, FIRST_ITERATIONS), trials))
     volume = bench.attempt(bench.fitting(VOLUME), FIRST_ITERATIONS)
@@ -82,24 +88,12 @@ def solve_admm(segment: Segment, problem: Problem, options: SolveOptions, clock:
         best = _search(bench, still, volume, first, trials)
     elif not clock.spent(SEARCH_SHARE) and not _in_patterns(first):
         best = _challenge(bench, still, first, trials) or best
-    if not _worth_going_on(bench, first, still, best):
-        return bench.finish(best)
-    blinking = go_on(segment, problem, options, clock, first)
-    errors = bench.note({"prior": "patterns"} | blinking.facts(), blinking.predict())
-    if held_out.clearly_less(errors, best.errors):
-        return Preferred(blinking, bench.record)
+    if _worth_going_on(bench, first, still, best):
+        blinking = go_on(segment, problem, options, clock, first)
+        errors = bench.note({"prior": "patterns"} | blinking.facts(), blinking.predict())
+        if held_out.clearly_less(errors, best.errors):
+            return Preferred(blinking, bench.record)
     return bench.finish(best)
-
-
-class Preferred:
-    """An estimate with the candidates that it was preferred to."""
-
-    def __init__(self, estimate: Estimate, record: list[dict[str, Any]]) -> None:
-        self._estimate, self._record, self.held_out_error = estimate, record, estimate.held_out_error
-        self.predict, self.video = estimate.predict, estimate.video
-
-    def facts(self) -> dict[str, Any]:
-        return self._estimate.facts() | {"prior": "cosines", "candidates": self._record}
 
 
 def _better(moving: Trial, still: Trial) -> Trial:

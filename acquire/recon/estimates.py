@@ -73,3 +73,14 @@ class Refined:
     def facts(self) -> dict[str, Any]:
         found = {"temporal_coefficients": self._coefficients, "patterns": self._refinement.rank}
         return found | asdict(self._refinement.parameters)
+
+
+class Preferred:
+    """An estimate with the candidates that it was preferred to."""
+
+    def __init__(self, estimate: Estimate, record: list[dict[str, Any]]) -> None:
+        self._estimate, self._record, self.held_out_error = estimate, record, estimate.held_out_error
+        self.predict, self.video = estimate.predict, estimate.video
+
+    def facts(self) -> dict[str, Any]:
+        return self._estimate.facts() | {"prior": "cosines", "candidates": self._record}

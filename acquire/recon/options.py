@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.recon.denoisers import Denoiser
+    from acquire.recon.handed import Choice
 
 NEGATIVE_SHARE = 0.01
 """Of the largest value: what solvers without a sign leave below zero is no mistake."""
@@ -40,6 +41,7 @@ class SolveOptions:
     initial: NDArray[Any] | None = None
     static_image: NDArray[Any] | None = None
     denoiser: Denoiser | None = None
+    choice: Choice | None = None
 
     def __post_init__(self) -> None:
         if self.bandwidth is not None and not 0 < self.bandwidth <= 1:
@@ -57,7 +59,11 @@ class SolveOptions:
             raise UsageError(
                 f"{self.iterations!r} iterations are not possible", possible="an integer of at least 1"
             )
-        for option, given in (("initial", self.initial), ("denoiser", self.denoiser)):
+        for option, given in (
+            ("initial", self.initial),
+            ("denoiser", self.denoiser),
+            ("choice", self.choice),
+        ):
             if given is not None and option not in SOLVERS.load(self.solver).takes:
                 able = [repr(name) for name, each in SOLVERS.working().items() if option in each.takes]
                 raise UsageError(

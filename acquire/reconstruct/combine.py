@@ -20,6 +20,7 @@ from acquire.recon.diagnosis import TURNED
 from acquire.recon.segments import Stitcher
 from acquire.reconstruct.arms import balance_of_recording
 from acquire.reconstruct.budget import Budget
+from acquire.reconstruct.handing import Handing, handed_on, liveliest_first
 from acquire.reconstruct.sheet import open_sheet
 from acquire.reconstruct.times import Times
 from acquire.reconstruct.work import Task
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from concurrent.futures import Future
     from pathlib import Path
 
+    from acquire.fibre import Tile
     from acquire.recon.segments import SubSegment
     from acquire.reconstruct.pools import Pool
     from acquire.reconstruct.select import VideoRequest
@@ -96,14 +98,17 @@ def combine(
     place = str(recording) if is_url(str(recording)) else str(recording.path.resolve())
     balance, balance_facts, warnings = balance_of_recording(recording, options)
     options = replace(options, balance=balance)
-    tiles = request.tiles or (None,)
+    handing = options.chooses and (bool(request.tiles) if options.shared is None else options.shared)
+    tiles: Sequence[Tile | None] = request.tiles or (None,)
+    if handing and len(tiles) > 1:
+        tiles = liveliest_first(recording, request, options)
     tasks = [Task(place, each, grid, options, tile=tile) for tile in tiles for each in segments]
     budget = Budget(options.budget_s, called if began is None else began, pool.workers)
     budget.check(tasks, request.stream.geometry(1))
     times, anchor = Times.of(recording), _anchor(recording, request)
     done: list[dict[str, Any]] = []
     with open_sheet(out, request, times, anchor) as sheet:
-        for part, task, following in _solved(tasks, pool, watcher, budget):
+        for part, task, following in _solved(tasks, pool, watcher, budget, Handing(handing)):
             if len(done) % len(segments) == 0:
                 stitcher = Stitcher(grid)
             arrived, first = time.monotonic(), stitcher.frames
@@ -118,6 +123,7 @@ def combine(
         cut = len(done) < len(tasks) and not watcher.stopped
         told = [*warnings, *(text for part in done for text in part["warnings"])]
         facts |= {"balance": balance_facts, "warnings": list(dict.fromkeys(told))}
+        facts["choice"] = handed_on(done) if handing else None
         facts["state"] = "interrupted" if cut or watcher.stopped else "complete"
         facts["seconds"] = round(time.monotonic() - called, 3)
         facts["trusted"] = _trusted_frames(request, sheet.frames, _common_stretch(request, segments, done))
@@ -126,21 +132,25 @@ def combine(
 
 
 def _solved(
-    tasks: Sequence[Task], pool: Pool, watcher: Watcher, budget: Budget
+    tasks: Sequence[Task], pool: Pool, watcher: Watcher, budget: Budget, handing: Handing
 ) -> Iterator[tuple[Part, Task, SubSegment | None]]:
-    """Solved tasks in order, each with its tile's next sub-segment, until watcher or budget ends it."""
+    """Solved tasks in order, each with its tile's next sub-segment, until watcher or budget ends it.
+
+    What a choice is handed to waits for it, so that the video does not depend on who is done first.
+    """
     submitted = 0
     waiting: deque[Future[Part]] = deque()
     for index, task in enumerate(tasks):
         while submitted < len(tasks) and len(waiting) <= pool.workers and not watcher.stopped:
-            if submitted and budget.gone:
+            if (submitted and budget.gone) or (waiting and handing.awaits(tasks[submitted])):
                 break
             after = len(tasks) - submitted - 1
             undone = after + 1 + sum(not each.done() for each in waiting)
-            waiting.append(pool.submit(budget.limit(tasks[submitted], undone, after)))
+            waiting.append(pool.submit(budget.limit(handing.told(tasks[submitted]), undone, after)))
             submitted += 1
         if not waiting or (part := _result(waiting, pool, watcher)) is None:
             return
+        handing.found(task, part)
         following = tasks[index + 1 : index + 2]
         yield part, task, following[0].segment if following and following[0].tile == task.tile else None
 

@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from acquire.calibrate import calibrated
+from acquire.plugins import SOLVERS
 from acquire.recon import reconstruct
 from acquire.recon.balance import divided
 from acquire.recon.diagnosis import put_right
+from acquire.recon.handed import Choice
 from acquire.recon.hypotheses import AS_BUILT
 from acquire.recon.judge import POOR_MISFIT
 from acquire.store import open_recording
@@ -41,7 +43,8 @@ class Options:
     ``calibration`` is what lines are read with; None: as the cameras' configuration says. ``turn`` is how the
     arms are to be put right beyond that, ``balance`` what arm B's light is then divided by, and ``check``
     whether what is not explained is looked into. The options of the solver and the denoiser's name are those
-    of whoever's solver that is.
+    of whoever's solver that is. ``shared``: whether one tile's choice of prior and weight is handed to the
+    others, and one sub-segment's to those after it; None: among the tiles behind a fibre.
     """
 
     preset: Preset = "balanced"
@@ -57,13 +60,21 @@ class Options:
     solver_options: Mapping[str, Any] = field(default_factory=dict)
     denoiser: str | None = None
     balance: Balance | None = None
+    shared: bool | None = None
+
+    @property
+    def chooses(self) -> bool:
+        """Whether the solver is one that chooses, and is left to."""
+        given = (self.bandwidth, self.denoiser)
+        return "choice" in SOLVERS.load(self.solver).takes and all(each is None for each in given)
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
     """A sub-segment of a recording, and the grid on which its frames are wanted. Picklable.
 
-    ``tile`` is what of the scene is solved behind a fibre; None: there is none.
+    ``tile`` is what of the scene is solved behind a fibre; None: there is none. ``choice`` is another's of
+    the same voxels, to be tried first.
     ``due`` (`time.monotonic` of this machine) is when it is to be done; where that is not known, the options'
     budget is for it.
     """
@@ -74,15 +85,18 @@ class Task:
     options: Options
     due: float | None = None
     tile: Tile | None = None
+    choice: Choice | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """A solved sub-segment: ``video`` (t, y, x) and ``error`` (t,) on the grid, and how it went."""
+    """A solved sub-segment: ``video`` (t, y, x) and ``error`` (t,) on the grid, how it went, and the choice
+    that it led to, where there was one."""
 
     video: NDArray[np.float32]
     error: NDArray[np.float32]
     facts: dict[str, Any] = field(default_factory=dict)
+    choice: Choice | None = None
 
 
 MOST_SHARE = 0.95
@@ -129,6 +143,7 @@ def solve(task: Task, watch: Watch) -> Part:
         solver=options.solver,
         solver_options=options.solver_options,
         denoiser=options.denoiser,
+        choice=task.choice,
         iterations=options.iterations,
         bandwidth=options.bandwidth,
         dtype=options.dtype,
@@ -160,10 +175,12 @@ def solve(task: Task, watch: Watch) -> Part:
             "masked": result.masked,
             "trusted": why is None,
             "tile": None if task.tile is None else str(task.tile),
+            "kept_choice": None if task.choice is None else task.choice.kept(result.parameters),
             "warnings": [whose + text for text in (*([] if why is None else [why]), *result.warnings)],
             "parameters": result.parameters,
             "quality": {name: _json(value) for name, value in asdict(result.quality).items()},
         },
+        choice=Choice.of(result) if result.believed and result.ended != "stopped" else None,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +13,10 @@ from acquire.config.scene import ConstantDrive, SineDrive
 from acquire.errors import UsageError
 from acquire.fibre import Tile
 from acquire.recon import reconstruct
+from acquire.recon.handed import Choice
 from acquire.recon.segments import Voxels
 from acquire.reconstruct import Options, Outcome, Watcher, by_lines, combine, in_tiles, in_voxels, open_pool
+from acquire.reconstruct.handing import energies
 from acquire.sim.leds import LedConfig, LedSceneConfig
 from acquire.sim.scenes import build_scene
 from acquire.simulate import simulate
@@ -83,9 +86,41 @@ def test_a_video_of_all_tiles_shows_the_whole_scene(
     assert np.isfinite(video.quality).all()
     assert video.time_ns[1] - video.time_ns[0] == round(4 * recording.line_period_ns)
     assert len(outcome.provenance["segments"]) == outcome.provenance["segments_asked"] == 6 * 2
-    assert [part["tile"] for part in outcome.provenance["segments"][::2]] == list(
-        map(str, recording.fibre.tiles)
-    )
+    solved = [part["tile"] for part in outcome.provenance["segments"][::2]]
+    assert sorted(solved) == list(map(str, recording.fibre.tiles))
+    choice = outcome.provenance["choice"]
+    assert choice["searched"] == ["0,2"]  # where the x flickers
+    assert {*choice["kept"], *choice["changed"]} >= {*solved} - {"0,2"}
+
+
+def test_each_tile_searches_by_itself_where_that_is_asked_for(recording: Recording, tmp_path: Path) -> None:
+    request = in_tiles(in_voxels(by_lines(recording), Voxels(6, 153)), recording.fibre.tiles[:2])
+    watcher = Watcher(2)
+    with open_pool(1, watch=watcher) as pool:
+        outcome = combine(
+            recording, request, tmp_path / "v.zarr", replace(OPTIONS, shared=False), pool, watcher
+        )
+    assert outcome.provenance["choice"] is None
+    assert [part["kept_choice"] for part in outcome.provenance["segments"]] == [None, None]
+
+
+def test_what_changes_is_told_from_what_rests_by_the_lines(recording: Recording) -> None:
+    change = {str(tile): energies(recording.cut(0, LINES, tile))[1] for tile in recording.fibre.tiles}
+    assert max(change, key=lambda tile: change[tile]) == "0,2"
+    assert max(change["0,0"], change["1,0"]) < 0.1 * change["0,2"]
+
+
+def test_a_choice_that_does_not_fit_is_searched_anew(recording: Recording) -> None:
+    segment = recording.cut(0, LINES, Tile(0, 2))
+    still = Choice("still", 1, 2e-3, 0.0, error=0.001, noise=float("nan"))
+    handed = reconstruct(segment, 2, 4, iterations=20, check=False, choice=still)
+    alone = reconstruct(segment, 2, 4, iterations=20, check=False)
+    assert not still.kept(handed.parameters)
+    assert Choice.of(alone).kept(handed.parameters)
+    np.testing.assert_array_equal(handed.video, alone.video)
+    again = reconstruct(segment, 2, 4, iterations=20, check=False, choice=Choice.of(alone))
+    assert len(again.parameters["candidates"]) < len(alone.parameters["candidates"])
+    assert again.quality.prediction <= 1.05 * alone.quality.prediction
 
 
 def test_a_part_is_what_the_whole_has_there_and_says_where_it_lies(
@@ -113,7 +148,8 @@ def test_an_interrupted_video_has_holes_and_trusts_nothing(recording: Recording,
     image = np.asarray(video.video[:])
     assert image.shape == (26, 24, 36)
     there = np.isfinite(image).all(axis=0).reshape(2, 12, 3, 12).all(axis=(1, 3))
-    assert there[0, :2].all()
+    assert there[0].sum() == 2  # the one where most changes, which all others wait for, and the first
+    assert there[0, 2]
     assert not there[1].any()
     assert not video.trusted
     assert outcome.provenance["state"] == "interrupted"
