@@ -160,7 +160,7 @@ def test_records_every_line_of_both_arms_as_it_was(tmp_path: Path) -> None:
         after.lines[arm]["recorded"] += 5000
     check_balance(after)
     assert after.ring["a"]["dropped_lines"] == 0
-    assert after.ring["a"]["peak"] <= after.ring["a"]["slots"] == 64
+    assert after.ring["a"]["peak"] <= after.ring["a"]["slots"] == bench.plan.ring_slots
     assert bench.trigger.stops == 1
     for status, name, reason in (
         (budget, "budget", "line budget reached"),
@@ -180,7 +180,7 @@ def test_records_every_line_of_both_arms_as_it_was(tmp_path: Path) -> None:
 
 def test_losses_are_located_to_the_line_and_a_full_ring_ends_the_recording(tmp_path: Path) -> None:
     """A camera loses a block; then the recorder is held up until both rings overflow."""
-    bench = make_bench(stall_timeout_s=20.0)
+    bench = make_bench(stall_timeout_s=20.0, ring_slots=256)
     with armed(bench) as capture:
         record_until(capture, tmp_path / "r.zarr", 1000)
         bench.wire["drop_b"] = 1
@@ -198,9 +198,8 @@ def test_losses_are_located_to_the_line_and_a_full_ring_ends_the_recording(tmp_p
     assert status.condition is RunCondition.INTERRUPTED
     # which of the two is seen first depends on how busy the host is
     assert re.search(r"was full at line|ring slots of arm [ab] wait", str(status.end_reason))
-    assert (
-        recording.lines == status.committed_lines >= rows + 60 * 128
-    )  # a block of 256 lines takes two of 64 slots
+    # a block of 256 lines takes two of 256 slots
+    assert recording.lines == status.committed_lines >= rows + 250 * 128
     assert causes(recording) == {("b", "camera")}
     assert missing["b"].sum() == lost_by_camera == 256
     assert {arm: status.lines[arm]["lost"]["ring_full"] for arm in ARMS} == {"a": 0, "b": 0}
@@ -211,7 +210,7 @@ def test_losses_are_located_to_the_line_and_a_full_ring_ends_the_recording(tmp_p
 
 
 def test_a_stalled_arm_ends_the_recording_in_bounded_time(tmp_path: Path) -> None:
-    bench = make_bench(stall_timeout_s=1.0)
+    bench = make_bench(stall_timeout_s=2.0)
     with armed(bench) as capture:
         record_until(capture, tmp_path / "r.zarr", 1000)
         bench.wire["stall_b"] = 1
@@ -220,21 +219,21 @@ def test_a_stalled_arm_ends_the_recording_in_bounded_time(tmp_path: Path) -> Non
         assert time.monotonic() - begun < 60
     recording, missing = check_rows(tmp_path / "r.zarr")
     assert (status.condition, status.fault) == (RunCondition.INCOMPLETE, None)
-    assert status.end_reason == "arm b stalled: no line for 1 s"
+    assert status.end_reason == "arm b stalled: no line for 2 s"
     assert causes(recording) == {("b", "stalled")}
     assert 0 < missing["b"].sum() < recording.lines
     assert np.flatnonzero(missing["b"])[-1] == recording.lines - 1
 
 
 def test_a_stopped_trigger_ends_the_recording_without_missing_lines_in_doubt(tmp_path: Path) -> None:
-    bench = make_bench(stall_timeout_s=1.0)
+    bench = make_bench(stall_timeout_s=2.0)
     with armed(bench) as capture:
         record_until(capture, tmp_path / "r.zarr", 1000)
         bench.wire["stop_ns"] = time.monotonic_ns()
         status = sealed(capture)
     check_rows(tmp_path / "r.zarr")
     assert status.condition is RunCondition.INTERRUPTED
-    assert status.end_reason == "both arms stalled: no line for 1 s"
+    assert status.end_reason == "both arms stalled: no line for 2 s"
 
 
 @pytest.mark.parametrize(
@@ -283,16 +282,16 @@ def test_recording_begins_now_however_fast_the_lines_before_it_came(tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("stalled", "fault"), [("stall_b", "arm b: no line for 1 s"), ("stop_ns", "arm a and b: no line for 1 s")]
+    ("stalled", "fault"), [("stall_b", "arm b: no line for 2 s"), ("stop_ns", "arm a and b: no line for 2 s")]
 )
 def test_silence_while_armed_is_a_fault(tmp_path: Path, stalled: str, fault: str) -> None:
-    bench = make_bench(stall_timeout_s=1.0)
+    bench = make_bench(stall_timeout_s=2.0)
     with armed(bench) as capture:
         until(lambda: capture.poll().lines["b"]["delivered"] > 1000, "lines")
         bench.wire[stalled] = time.monotonic_ns()
         until(lambda: capture.poll().fault, "the fault")
         assert capture.poll().fault == fault
-        with pytest.raises(StateError, match="no line for 1 s"):
+        with pytest.raises(StateError, match="no line for 2 s"):
             capture.start(Begin(tmp_path / "r.zarr", make_spec()))
     assert not any(tmp_path.iterdir())
 

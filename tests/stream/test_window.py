@@ -116,7 +116,7 @@ def test_impossible_windows_are_refused(pre: int, post: int) -> None:
 
 
 def test_a_recording_begins_before_it_was_asked_for(tmp_path: Path) -> None:
-    with armed(make_bench(ring_slots=1024)) as capture:
+    with armed(make_bench()) as capture:
         until(lambda: capture.poll().lines["b"]["delivered"] > 5000, "history")
         before = capture.poll()
         line = capture.note("mark", "something happened")
@@ -138,7 +138,7 @@ def test_a_recording_begins_before_it_was_asked_for(tmp_path: Path) -> None:
 
 
 def test_what_the_ring_does_not_hold_is_refused_with_what_it_does(tmp_path: Path) -> None:
-    with armed(make_bench(ring_slots=1024)) as capture:
+    with armed(make_bench()) as capture:
         until(lambda: capture.poll().lines["b"]["delivered"] > 2000, "history")
         with pytest.raises(UsageError, match=r"50000 lines from before \(.* s\).*which both rings hold now"):
             capture.start(Begin(tmp_path / "r.zarr", make_spec(), 60_000, Window(pre_lines=50_000)))
@@ -187,7 +187,7 @@ def test_what_a_take_was_to_begin_with_stays_in_the_one_before(
     """The recorder is ended with stored lines in its hands, and nobody takes them from the rings again."""
     monkeypatch.setattr("acquire.stream.capture._LEAST_END_S", 2.0)
     disk = PausingDisk(tmp_path / "gate", "make")
-    with armed(make_bench(ring_slots=1024, disk=disk)) as capture:
+    with armed(make_bench(disk=disk)) as capture:
         capture.start(Begin(tmp_path / "1.zarr", make_spec(), 3000))
         first = sealed(capture).first_line
         assert first is not None
@@ -209,7 +209,7 @@ def test_what_a_take_was_to_begin_with_stays_in_the_one_before(
 
 def test_what_the_trigger_tells_is_in_the_recording_that_begins_before_it(tmp_path: Path) -> None:
     """An edge at its input is an event; a camera that missed a pulse makes what follows doubtful."""
-    bench = make_bench(ring_slots=1024)
+    bench = make_bench()
     with armed(bench) as capture:
         until(lambda: capture.poll().lines["b"]["delivered"] > 3000, "history")
         bench.trigger.told = [TagEvent(2500, 2500 * 2700, "input")]
@@ -228,7 +228,7 @@ def test_what_the_trigger_tells_is_in_the_recording_that_begins_before_it(tmp_pa
 
 
 def test_an_event_in_a_recording_lets_it_go_on(tmp_path: Path) -> None:
-    with armed(make_bench(ring_slots=1024)) as capture:
+    with armed(make_bench()) as capture:
         capture.start(Begin(tmp_path / "r.zarr", make_spec(), 4000))
         until(lambda: capture.poll().recorded_lines > 100, "rows")
         line = capture.note("mark", "again")
@@ -243,7 +243,7 @@ def test_an_event_in_a_recording_lets_it_go_on(tmp_path: Path) -> None:
 def test_a_watcher_that_dies_or_stops_costs_no_line(tmp_path: Path, number: signal.Signals) -> None:
     threshold = ThresholdPlan("a", 2000.0, 100.0, rising=True, average_lines=1)
     watch = WatchPlan(None, 512, {"a": 0.0, "b": 0.0}, threshold)
-    with armed(make_bench(ring_slots=1024, watch=watch)) as capture:
+    with armed(make_bench(watch=watch)) as capture:
         notes: list[Note] = []
         until(lambda: notes.extend(capture.take_events()) or len(notes) > 2, "crossings")
         assert {note.kind for note in notes} == {"threshold"}

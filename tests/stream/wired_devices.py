@@ -207,10 +207,10 @@ def make_bench(
         pixels=PIXELS,
         dtype="uint16",
         block_lines=200,
-        ring_slots=64,
+        ring_slots=1024,  # ten seconds: a busy host's recorder may have to wait for its turn
         white_dn=WHITE,
         openers=openers,
-        stall_timeout_s=1.0,
+        stall_timeout_s=10.0,
     )
     return Bench(wire, WireTrigger(wire, rate_hz), replace(plan, **changes))
 
