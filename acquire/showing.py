@@ -65,3 +65,11 @@ def as_picture(image: NDArray[Any], words: str) -> str:
 
 def _safe(value: object) -> str:
     return html.escape(shortened(value, 400))
+
+
+def error_in_words(facts: Mapping[str, Any]) -> str:
+    """The estimated error of a video, of the facts that its provenance has."""
+    if "unknown" in facts:
+        return f"cannot be told: {facts['unknown']}"
+    rms, low, high = (f"{100 * facts[key] / facts['full_scale']:.2g}" for key in ("rms", "low", "high"))
+    return f"about {rms} % of full scale ({low} to {high} % in nine of ten)"

@@ -20,6 +20,7 @@ from acquire.cli.recordings import PlaceArgument
 from acquire.cli.stretch import FirstLineOption, FromOption, LinesOption, ToOption
 from acquire.cli.tiles import TilesOption, tiles_of
 from acquire.errors import EXIT_INTERRUPTED, UsageError
+from acquire.showing import error_in_words
 
 if TYPE_CHECKING:
     from acquire.cli.reconstruct_request import Asked, Prepared
@@ -361,6 +362,7 @@ def _readable(outcome: Outcome) -> dict[str, Any]:
         else None,
         "misfit": f"{quality['misfit']:.2%} of the samples' RMS",
         "prediction": None if prediction is None else f"{prediction:.2%} at samples kept from the solver",
+        "error": error_in_words(facts["error"]),
         "noise": None if quality.get("noise") is None else _beside_noise(quality),
         "coverage": f"{quality['coverage']:.2%} of the samples usable",
     }

@@ -111,7 +111,11 @@ def _requests(recording: Recording, asked: Asked) -> Prepared:
     selection, whole = _select(recording, asked), ENDS[asked.ends]
     if asked.preview:
         options = replace(
-            asked.options, iterations=PREVIEW_ITERATIONS, bandwidth=PREVIEW_BANDWIDTH, check=False
+            asked.options,
+            iterations=PREVIEW_ITERATIONS,
+            bandwidth=PREVIEW_BANDWIDTH,
+            check=False,
+            error=False,
         )
         return Prepared({"": _preview(selection, len(asked.tiles), whole=whole)}, options)
     plan = _plan(recording, selection, asked)

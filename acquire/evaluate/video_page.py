@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Any
 import matplotlib as mpl
 import numpy as np
 
+from acquire.evaluate.error_map import draw_error
 from acquire.evaluate.page import fill_template
 from acquire.evaluate.player import beside, clip_of
 from acquire.evaluate.themed import GRID, SOLVER_COLOURS, STYLE, Drawing, canvas, drawing_of
+from acquire.showing import error_in_words
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -60,6 +62,7 @@ def write_page(
         "videos": [_account(panel) for panel in panels],
     }
     drawn = {f"misfit-{number}": _misfit(panel.file) for number, panel in enumerate(panels)}
+    drawn |= {f"error-{number}": draw_error(panel.file) for number, panel in enumerate(panels)}
     drawings = {name: drawing for name, drawing in drawn.items() if drawing is not None}
     path.write_text(fill_template("video.html.j2", facts, drawings), encoding="utf-8")
     return len(clip.frames)
@@ -87,6 +90,7 @@ def _account(panel: Panel) -> dict[str, Any]:
         "size": f"{count} frames of {rows} × {columns}, {file.interval_ns / 1e3:.6g} µs each",
         "trusted": None if file.trusted is None else [file.trusted.start, file.trusted.stop - 1],
         "known": {key: known.get(key) for key in KNOWN},
+        "error": error_in_words(known["error"]) if known.get("error") else None,
         "calibration": (known.get("calibration") or {}).get("corrected"),
         "parts": [_part(number, part) for number, part in enumerate(parts[:MOST_PARTS], 1)],
         "more_parts": max(0, len(parts) - MOST_PARTS),

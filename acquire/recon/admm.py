@@ -17,6 +17,7 @@ Over-relaxed by 1.7 (Eckstein and Bertsekas, Math. Program. 55, 293 (1992)).
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -113,6 +114,17 @@ class Admm:
         self._tv_multiplier = other._tv_multiplier * (old.tv_penalty / new.tv_penalty)
         self._sign = self._xp.asarray(other._sign, copy=True)
         self._sign_multiplier = other._sign_multiplier * (old.sign_penalty / new.sign_penalty)
+
+    def on(self, operator: MaskedOperator, samples: Array) -> Admm:
+        """A solver that goes on from here with other samples, or others of them masked; this one stays as it
+        is, but for the dual field of the denoiser, which they share."""
+        other = copy(self)
+        other._samples, other._operator = samples, operator
+        other._tv_multiplier = self._xp.asarray(self._tv_multiplier, copy=True)
+        other._w = self._xp.asarray(self._w, copy=True)
+        other._lifted = operator.adjoint(other._w)
+        other._prepare()
+        return other
 
     def _prepare(self) -> None:
         """The preconditioner of the operator and penalties that are now in use."""

@@ -14,6 +14,7 @@ from acquire.cores import idle_cores, limit_threads
 from acquire.recon.balance import balance_of, divided
 from acquire.recon.clock import IterationClock
 from acquire.recon.denoisers import open_denoiser
+from acquire.recon.error import estimate_error
 from acquire.recon.faster import tell_faster_light
 from acquire.recon.judge import frame_error, judge
 from acquire.recon.least import check_budget, least_seconds
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
     from acquire.lines import Segment
     from acquire.recon.denoisers import Denoiser
+    from acquire.recon.error import VideoError
     from acquire.recon.estimates import Estimate
     from acquire.recon.handed import Choice
     from acquire.recon.problem import Problem
@@ -62,6 +64,7 @@ def reconstruct(
     refuse: bool = True,
     look: Callable[[Look], object] | None = None,
     check: bool = True,
+    error: bool = True,
 ) -> Reconstruction:
     """Reconstruct the voxels X′ of a segment at N_m = ``spatial_merge``, T_m = ``temporal_merge`` (Eq. 5).
 
@@ -90,6 +93,8 @@ def reconstruct(
     stop : asked after every iteration; once set, the best so far is returned
     refuse : a budget that cannot be kept here; else as little as possible is done
     check : where the lines are not explained, ask what would explain them (a second); see `recon.told`
+    error : estimate how far the video is from the truth, which takes a tenth of the time and is left out
+        where a budget has none; see `recon.error`
     look : called after iterations, with what the answer would be if it ended there; its time does not count
 
     Raises
@@ -130,7 +135,7 @@ def reconstruct(
         if look is not None:
             clock.looks = _looking(look, problem, chosen)
         estimate = _solve(segment, problem, options, chosen, clock)
-        result = _finish(segment, problem, options, chosen, estimate, clock, check=check)
+        result = _finish(segment, problem, options, chosen, estimate, clock, check=check, error=error)
     return replace(
         result,
         warnings=(*warnings, *result.warnings),
@@ -167,6 +172,28 @@ def _scaled(video: NDArray[Any], problem: Problem, solver: Solver) -> NDArray[An
     return video if solver.signed else np.maximum(video, 0, out=video)
 
 
+def _error(
+    segment: Segment,
+    problem: Problem,
+    options: SolveOptions,
+    estimate: Estimate,
+    video: NDArray[Any],
+    prediction: float,
+    clock: IterationClock,
+    told: Told,
+    faster: tuple[str, ...],
+) -> VideoError | str:
+    """Not of what the lines contradict: what it is estimated from shows nothing of either."""
+    if not told.believed:
+        return "the lines are not what is said of them"
+    if faster:
+        return "light changes faster than the video resolves"
+    if clock.ended == "stopped":
+        return "the reconstruction was stopped"
+    merges = (options.spatial_merge, options.temporal_merge)
+    return estimate_error(segment, problem, estimate, video, prediction, merges, clock)
+
+
 def _finish(
     segment: Segment,
     problem: Problem,
@@ -176,6 +203,7 @@ def _finish(
     clock: IterationClock,
     *,
     check: bool,
+    error: bool,
 ) -> Reconstruction:
     T_m = options.temporal_merge
     predicted = estimate.predict()
@@ -193,6 +221,9 @@ def _finish(
     faster: tuple[str, ...] = ()
     if asked and told.believed:
         faster = tell_faster_light(segment, problem, predicted, video, resolved_hz, clock)
+    off: VideoError | str = "it was not asked for"
+    if error:
+        off = _error(segment, problem, options, estimate, video, prediction, clock, told, faster)
     return Reconstruction(
         video=video,
         time_ns=segment.frame_time_ns(T_m),
@@ -205,6 +236,7 @@ def _finish(
         solver=options.solver,
         quality=quality,
         frame_error=frame_error(problem, predicted, segment.geometry, T_m),
+        error=off,
         ended=clock.ended,
         believed=told.believed,
         masked=problem.masked_by,

@@ -71,6 +71,11 @@ class IterationClock:
         return time.process_time() - self._processor_began_s
 
     @property
+    def asked(self) -> bool:
+        """Whether who looks on wants the answer now."""
+        return self._stop is not None and self._stop.is_set()
+
+    @property
     def compiled_s(self) -> float:
         """What compiling took meanwhile: once after an installation, and no part of a budget."""
         return compiled_s() - self._compiled_before
@@ -164,7 +169,7 @@ class IterationClock:
         return False
 
     def _stopped(self) -> bool:
-        if self._stop is None or not self._stop.is_set():
+        if not self.asked:
             return False
         self.ended = "stopped"
         return True

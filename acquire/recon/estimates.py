@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 from acquire.arrays import host
+from acquire.recon.admm import Admm
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from numpy.typing import NDArray
 
-    from acquire.recon.admm import Admm, AdmmParameters
+    from acquire.recon.admm import AdmmParameters
     from acquire.recon.basis import Basis
     from acquire.recon.patterns import Refinement
     from acquire.recon.problem import Operator, Problem
@@ -28,6 +31,16 @@ class Estimate(Protocol):
     def video(self) -> NDArray[Any]: ...
 
     def facts(self) -> dict[str, Any]: ...
+
+
+@runtime_checkable
+class GoesOn(Protocol):
+    """An estimate that can be gone on with, which is how the error of a video is estimated (`error`)."""
+
+    def gone_on(self, problem: Problem, steps: Iterable[object]) -> NDArray[Any] | None:
+        """The dimensionless video after an iteration for each of ``steps`` on another problem's samples; None
+        where this one cannot. The estimate stays as it is."""
+        ...
 
 
 class InBand:
@@ -55,6 +68,14 @@ class InBand:
     def facts(self) -> dict[str, Any]:
         return {"temporal_coefficients": self.basis.count} | asdict(self._parameters)
 
+    def gone_on(self, problem: Problem, steps: Iterable[object]) -> NDArray[Any] | None:
+        if not isinstance(self.solver, Admm):
+            return None
+        solver = self.solver.on(problem.masked(self._operator), problem.used_samples)
+        for _ in steps:
+            solver.step()
+        return host(self.basis.synthesize(solver.theta))
+
 
 class Refined:
     """A refinement as an estimate."""
@@ -74,6 +95,12 @@ class Refined:
         found = {"temporal_coefficients": self._coefficients, "patterns": self._refinement.rank}
         return found | asdict(self._refinement.parameters)
 
+    def gone_on(self, problem: Problem, steps: Iterable[object]) -> NDArray[Any]:
+        refinement = self._refinement.on(problem)
+        for _ in steps:
+            refinement.step()
+        return refinement.video()
+
 
 class Preferred:
     """An estimate with the candidates that it was preferred to."""
@@ -84,3 +111,7 @@ class Preferred:
 
     def facts(self) -> dict[str, Any]:
         return self._estimate.facts() | {"prior": "cosines", "candidates": self._record}
+
+    def gone_on(self, problem: Problem, steps: Iterable[object]) -> NDArray[Any] | None:
+        estimate = self._estimate
+        return estimate.gone_on(problem, steps) if isinstance(estimate, GoesOn) else None

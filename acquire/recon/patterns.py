@@ -16,6 +16,7 @@ N_m = 1 it is gone; voxels are averaged afterwards.
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -149,6 +150,16 @@ class Refinement:
         """Take ``found``, of an earlier round, as the estimate."""
         self.found = found
         self._operators()
+
+    def on(self, problem: Problem) -> Refinement:
+        """A refinement that goes on from here with another problem's samples; this one stays as it is."""
+        other = copy(self)
+        other._problem, other._steps = problem, 0
+        other._fit = CurveFit(self._segment, problem, self._cosines, self._temporal_merge, RIDGE)
+        operator, basis = other._operators()
+        other._admm = self._admm.on(operator, problem.used_samples)
+        other._admm.rebase(operator, basis, self.found.patterns)
+        return other
 
     def predict(self) -> NDArray[Any]:
         """The lines of the estimate, as `Problem.samples`."""

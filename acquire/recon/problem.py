@@ -61,6 +61,11 @@ class Problem:
     arrays: Arrays = HOST
 
     @property
+    def usable(self) -> NDArray[np.bool_]:
+        """Samples that count, those held out among them."""
+        return (self.weight > 0) | self.held_out
+
+    @property
     def used_samples(self) -> Array:
         """``weight·samples``: what the solvers are given."""
         return self.arrays.asarray(self.samples * self.weight)
@@ -73,6 +78,11 @@ class Problem:
         """The same with all usable samples in use."""
         everything = np.maximum(self.weight, self.held_out.astype(self.weight.dtype))
         return replace(self, weight=everything, held_out=np.zeros_like(self.held_out))
+
+    def keeping(self, samples: NDArray[np.bool_]) -> Problem:
+        """The same with these samples, and no others, kept from the solver, as far as they are usable."""
+        kept = self.usable & samples
+        return replace(self, weight=(self.usable & ~kept).astype(self.weight.dtype), held_out=kept)
 
     def on_host(self) -> Problem:
         """The same, for what is solved on the host."""

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from acquire.recon.error import VideoError
+
 
 EXPLAINED, NEARLY = 1.25, 2.0
 """Residuals, in units of the noise, up to which the video's own error is below 0.75 and 1.7 σ of a sample."""
@@ -98,6 +100,8 @@ class Reconstruction:
         the budget, ``stop`` or the data ended it (``ended``)
     frame_error : (time,) relative RMS residual of the samples that saw each frame; NaN where none did. It is
         no error of the frame, which may be many times larger; see `acquire.recon.judge.frame_error`
+    error : an estimate of how far the video is from the truth, of every frame and of 8 × 8 regions, in the
+        video's own unit, or a sentence on why it cannot be told; see `acquire.recon.error`
     believed : False where the lines say that code, geometry or orientation are not the segment's: then no
         frame is to be trusted, and ``warnings`` says what is wrong
     masked : samples left out, by cause
@@ -113,6 +117,7 @@ class Reconstruction:
     solver: str
     quality: Quality
     frame_error: NDArray[np.float32]
+    error: VideoError | str = "it was not asked for"
     ended: str = "done"
     believed: bool = True
     masked: dict[str, int] = field(default_factory=dict)
@@ -140,4 +145,5 @@ class Reconstruction:
             "trusted": f"frames {trusted.start} to {trusted.stop - 1}" if trusted else "none",
             "solver": f"{self.solver}, {self.iterations} iterations, {self.seconds:.3g} s ({self.ended})",
             "misfit": f"{self.quality.misfit:.2%}",
+            "error": f"cannot be told: {self.error}" if isinstance(self.error, str) else self.error.sentence,
         }

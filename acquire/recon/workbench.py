@@ -21,7 +21,7 @@ from acquire.recon.tv import FrameTv
 from acquire.recon.volume import Smooth, VolumeTv
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -291,6 +291,12 @@ class Chosen:
         chosen = asdict(self._trial.candidate)
         chosen["temporal_coefficients"] = chosen.pop("coefficients")
         return chosen | {"candidates": self._bench.record}
+
+    def gone_on(self, problem: Problem, steps: Iterable[object]) -> NDArray[Any]:
+        solver = self._trial.admm.on(problem.masked(self._trial.operator), problem.used_samples)
+        for _ in steps:
+            solver.step()
+        return self._bench.video(replace(self._trial, admm=solver))
 
 
 def _denoiser(candidate: Candidate) -> Denoiser:

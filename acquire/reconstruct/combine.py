@@ -17,6 +17,7 @@ from acquire import __version__
 from acquire.calibrate.choose import provenance
 from acquire.errors import AcquireError
 from acquire.recon.diagnosis import TURNED
+from acquire.recon.error import together
 from acquire.recon.segments import Stitcher
 from acquire.reconstruct.arms import balance_of_recording
 from acquire.reconstruct.budget import Budget
@@ -112,9 +113,11 @@ def combine(
             if len(done) % len(segments) == 0:
                 stitcher = Stitcher(grid)
             arrived, first = time.monotonic(), stitcher.frames
-            video, error = stitcher.add(task.segment, (part.video, part.error), following)
+            video, quality, error = stitcher.add(
+                task.segment, (part.video, part.quality, part.error), following
+            )
             if len(video):
-                sheet.take(task.tile, first, video, error)
+                sheet.take(task.tile, first, video, quality, error)
             budget.written(video.size, time.monotonic() - arrived, part.facts["compiled_s"])
             done.append(part.facts)  # not the part: memory must not grow with the stream
         if not done:
@@ -214,6 +217,9 @@ def describe_parts(
         "iterations_asked": sum(part["iterations_asked"] for part in parts),
         "compiled_s": round(max(part["compiled_s"] for part in parts), 3),
         "quality": {key: _rms([part["quality"][key] for part in parts]) for key in QUALITY_KEYS},
+        "error": together(
+            [part["error"] for part in parts], [part["end_substep"] - part["begin_substep"] for part in parts]
+        ),
         "segments": segments,
         "segments_asked": len(request.stretches) * tiles,
         "tiles": [str(tile) for tile in request.tiles],

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from acquire.recon.error import REGIONS
 from acquire.store import MosaicWriter, VideoGrid, VideoWriter
 
 if TYPE_CHECKING:
@@ -29,9 +30,14 @@ class Sheet(Protocol):
     def frames(self) -> int: ...
 
     def take(
-        self, tile: Tile | None, first: int, video: NDArray[np.float32], error: NDArray[np.float32]
+        self,
+        tile: Tile | None,
+        first: int,
+        video: NDArray[np.float32],
+        quality: NDArray[np.float32],
+        error: NDArray[np.float32],
     ) -> None:
-        """Frames (t, y, x) of a tile from frame ``first`` on, with their errors (t,)."""
+        """Frames (t, y, x) of a tile from frame ``first`` on, with their quality (t,) and error (t, 8, 8)."""
         ...
 
     def finish(self, provenance: Mapping[str, Any]) -> None:
@@ -51,13 +57,20 @@ def open_sheet(
 
     if not request.tiles:
         with VideoWriter(
-            out, (grid.side, grid.side), np.dtype(np.float32), _place(request, times), quality=True
+            out,
+            (grid.side, grid.side),
+            np.dtype(np.float32),
+            _place(request, times),
+            quality=True,
+            regions=(REGIONS, REGIONS),
         ) as writer:
             yield _Strip(writer, (grid.side, grid.side), utc_ns)
         return
     first, last = request.tiles[0], request.tiles[-1]
     tiles = (last.row - first.row + 1, last.column - first.column + 1)
-    with MosaicWriter(out, tiles, grid.side, _place(request, times), utc_ns(0, grid.frames)) as mosaic:
+    with MosaicWriter(
+        out, tiles, grid.side, _place(request, times), utc_ns(0, grid.frames), regions=REGIONS
+    ) as mosaic:
         yield _Mosaic(mosaic, grid.side, first, tiles)
 
 
@@ -77,9 +90,10 @@ class _Strip:
         tile: Tile | None,  # noqa: ARG002  # a sheet
         first: int,
         video: NDArray[np.float32],
+        quality: NDArray[np.float32],
         error: NDArray[np.float32],
     ) -> None:
-        self._writer.append(video, self._utc_ns(first, first + len(video)), error)
+        self._writer.append(video, self._utc_ns(first, first + len(video)), quality, error)
 
 
 class _Mosaic:
@@ -95,11 +109,16 @@ class _Mosaic:
         return self._writer.frames
 
     def take(
-        self, tile: Tile | None, first: int, video: NDArray[np.float32], error: NDArray[np.float32]
+        self,
+        tile: Tile | None,
+        first: int,
+        video: NDArray[np.float32],
+        quality: NDArray[np.float32],
+        error: NDArray[np.float32],
     ) -> None:
         assert tile is not None
         row, column = tile.row - self._corner.row, tile.column - self._corner.column
-        self._writer.put(first, (row * self._side, column * self._side), video, error)
+        self._writer.put(first, (row, column), video, quality, error)
 
 
 def _place(request: VideoRequest, times: Times) -> VideoGrid:

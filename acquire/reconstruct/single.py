@@ -7,6 +7,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from acquire import __version__
+from acquire.recon.error import error_facts
 from acquire.store import write_video
 
 if TYPE_CHECKING:
@@ -58,6 +59,7 @@ def describe(result: Reconstruction, recording: Recording, segment: Segment) -> 
         "seconds": round(result.seconds, 3),
         "parameters": result.parameters,
         "quality": quality,
+        "error": error_facts(result.error),
         "trusted": [result.trusted.start, result.trusted.stop],
         "warnings": list(result.warnings),
         "versions": {"acquire": __version__},

@@ -13,6 +13,7 @@ from acquire.plugins import SOLVERS
 from acquire.recon import reconstruct
 from acquire.recon.balance import divided
 from acquire.recon.diagnosis import put_right
+from acquire.recon.error import error_facts, in_frames
 from acquire.recon.handed import Choice
 from acquire.recon.hypotheses import AS_BUILT
 from acquire.recon.judge import POOR_MISFIT
@@ -41,10 +42,11 @@ class Options:
     """How to solve; see `acquire.recon.reconstruct`. ``budget_s`` is for all that is asked for.
 
     ``calibration`` is what lines are read with; None: as the cameras' configuration says. ``turn`` is how the
-    arms are to be put right beyond that, ``balance`` what arm B's light is then divided by, and ``check``
-    whether what is not explained is looked into. The options of the solver and the denoiser's name are those
-    of whoever's solver that is. ``shared``: whether one tile's choice of prior and weight is handed to the
-    others, and one sub-segment's to those after it; None: among the tiles behind a fibre.
+    arms are to be put right beyond that, ``balance`` what arm B's light is then divided by, ``check`` whether
+    what is not explained is looked into, and ``error`` whether the video's is estimated. The options of the
+    solver and the denoiser's name are those of whoever's solver that is. ``shared``: whether one tile's
+    choice of prior and weight is handed to the others, and one sub-segment's to those after it; None: among
+    the tiles behind a fibre.
     """
 
     preset: Preset = "balanced"
@@ -57,6 +59,7 @@ class Options:
     calibration: Calibration | None = None
     turn: Turn = AS_BUILT
     check: bool = True
+    error: bool = True
     solver_options: Mapping[str, Any] = field(default_factory=dict)
     denoiser: str | None = None
     balance: Balance | None = None
@@ -90,10 +93,12 @@ class Task:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """A solved sub-segment: ``video`` (t, y, x) and ``error`` (t,) on the grid, how it went, and the choice
-    that it led to, where there was one."""
+    """A solved sub-segment on the grid: ``video`` (t, y, x), the lines' residual ``quality`` (t,) and the
+    estimated ``error`` (t, 8, 8) of regions, NaN where it cannot be told; how it went, and the choice that it
+    led to, where there was one."""
 
     video: NDArray[np.float32]
+    quality: NDArray[np.float32]
     error: NDArray[np.float32]
     facts: dict[str, Any] = field(default_factory=dict)
     choice: Choice | None = None
@@ -151,6 +156,7 @@ def solve(task: Task, watch: Watch) -> Part:
         stop=watch,
         refuse=False,  # what is begun is ended in order
         check=options.check,
+        error=options.error,
     )
     watch.advance(1 - done)
     substeps = lines.geometry.substeps
@@ -158,7 +164,8 @@ def solve(task: Task, watch: Watch) -> Part:
     whose = "" if task.tile is None else f"tile {task.tile}: "
     return Part(
         video=task.grid.resample(result.video, segment, substeps),
-        error=task.grid.resample_time(result.frame_error, segment, substeps),
+        quality=task.grid.resample_time(result.frame_error, segment, substeps),
+        error=task.grid.resample_time(in_frames(result.error, len(result.video)), segment, substeps),
         facts={
             "first_line": segment.first_line,
             "lines": segment.lines,
@@ -178,6 +185,7 @@ def solve(task: Task, watch: Watch) -> Part:
             "kept_choice": None if task.choice is None else task.choice.kept(result.parameters),
             "warnings": [whose + text for text in (*([] if why is None else [why]), *result.warnings)],
             "parameters": result.parameters,
+            "error": error_facts(result.error),
             "quality": {name: _json(value) for name, value in asdict(result.quality).items()},
         },
         choice=Choice.of(result) if result.believed and result.ended != "stopped" else None,

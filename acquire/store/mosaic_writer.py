@@ -34,25 +34,44 @@ class MosaicWriter(VideoWriter):
         side: int,
         grid: layout.VideoGrid,
         time_ns: NDArray[np.int64],
+        *,
+        regions: int = 1,
     ) -> None:
+        """``regions``: along rows and columns of a tile, that the error is given of."""
         shape = (tiles[0] * side, tiles[1] * side)
         super().__init__(
-            place, shape, np.dtype(np.float32), grid, quality=True, tile_side=side, fill_value=NOT_THERE
+            place,
+            shape,
+            np.dtype(np.float32),
+            grid,
+            quality=True,
+            regions=(tiles[0] * regions, tiles[1] * regions),
+            tile_side=side,
+            fill_value=NOT_THERE,
         )
-        self._time_ns, self.frames = time_ns, len(time_ns)
+        self._time_ns, self.frames, self._side = time_ns, len(time_ns), side
+        self._error = np.full((self.frames, tiles[0] * regions, tiles[1] * regions), NOT_THERE, np.float32)
         self._squares = np.zeros((2, self.frames))
         with refused(place, "written"):
             self._levels[0].resize((self.frames, *shape))
 
     def put(
-        self, first: int, corner: tuple[int, int], video: NDArray[np.float32], quality: NDArray[np.float32]
+        self,
+        first: int,
+        tile: tuple[int, int],
+        video: NDArray[np.float32],
+        quality: NDArray[np.float32],
+        error: NDArray[np.float32],
     ) -> None:
-        """Frames (t, side, side) of one tile from frame ``first`` on; ``corner``: its first row and column.
+        """Frames (t, side, side) of one tile from frame ``first`` on; ``tile``: its row and column of tiles.
+        ``quality`` (t,) and ``error`` (t, regions, regions) are of these.
 
         StoreError when the disk refuses.
         """
-        row, column = corner
+        row, column = (each * self._side for each in tile)
         end = first + len(video)
+        high, wide = (each * count for each, count in zip(tile, error.shape[1:], strict=True))
+        self._error[first:end, high : high + error.shape[1], wide : wide + error.shape[2]] = error
         with refused(self._place, "written"):
             image: Any = self._levels[0]
             image[first:end, row : row + video.shape[1], column : column + video.shape[2]] = video
@@ -72,8 +91,9 @@ class MosaicWriter(VideoWriter):
             quality = np.sqrt(squares / count).astype(np.float32)
         with refused(self._place, "written"):
             values: Any
-            for array, values in zip(self._columns.values(), (self._time_ns, since_s, quality), strict=True):
-                array.resize((self.frames,))
+            columns = (self._time_ns, since_s, quality, self._error)
+            for array, values in zip(self._columns.values(), columns, strict=True):
+                array.resize((self.frames, *array.shape[1:]))
                 array[:] = values
             self._halve()
         self._end(provenance)

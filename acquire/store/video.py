@@ -8,6 +8,7 @@
       t, y, x    their coordinates: seconds after the recording's first line, centres of pixels
       time       (t) int64, UTC of each frame
       quality    (t) float32, where it is known: relative residual of each frame's lines
+      error      (t, region_y, region_x) float32, where it is known: estimated RMS error of parts of the frame
       trusted    (t) bool, where it is known: sampled in full, and solved to its end
 
 The consolidated metadata, which viewers follow, lists the image alone: ``xarray.open_zarr(…,
@@ -49,13 +50,15 @@ DTYPES = ("uint8", "uint16", "float32")
 class VideoFile:
     """A video on disk: ``video`` (t, y, x) is read when it is sliced, ``time_ns`` (t,) int64 UTC.
 
-    ``quality`` (t,) float32 where it was written; 0 is best.
+    ``quality`` (t,) float32 where it was written; 0 is best. ``error`` (t, region_y, region_x) likewise, the
+    estimated RMS error in the video's unit, read when it is sliced.
     """
 
     video: zarr.Array[Any]
     time_ns: NDArray[np.int64]
     attrs: dict[str, Any]
     quality: NDArray[np.float32] | None = None
+    error: zarr.Array[Any] | None = None
 
     def __repr__(self) -> str:
         return in_words("VideoFile", **self._holds())
@@ -173,7 +176,8 @@ def open_video(place: Path | str) -> VideoFile:
             )
         time_ns = np.asarray(child_array(group, "time")[:], np.int64)
         quality = np.asarray(child_array(group, "quality")[:]) if "quality" in group else None
-        return VideoFile(child_array(group, "0"), time_ns, attributes, quality)
+        error = child_array(group, "error") if "error" in group else None
+        return VideoFile(child_array(group, "0"), time_ns, attributes, quality, error)
     except (GroupNotFoundError, NotADirectoryError) as error:
         raise PlaceError(f"{source} is not a video: it is no Zarr group", hint=_VIDEO) from error
     except DAMAGE as error:

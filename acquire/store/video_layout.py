@@ -38,6 +38,12 @@ QUALITY_ATTRIBUTES: dict[str, Any] = {
     "units": "1",
 }
 
+ERROR_ATTRIBUTES: dict[str, Any] = {
+    "long_name": "estimated RMS error of the voxels of a region of the frame",
+    "comment": "in the unit of the video; NaN where it cannot be told; rows and columns in equal parts; "
+    "provenance, error, says how sure it is; frames that are not trusted are worse than it says",
+}
+
 TRUSTED_ATTRIBUTES: dict[str, Any] = {
     "long_name": "the lines sample the frame in full, and it was solved to its end",
 }
@@ -156,4 +162,4 @@ def along(axis: str, grid: VideoGrid, count: int) -> NDArray[np.float64]:
 
 def coordinates_of(columns: Sequence[str]) -> str:
     """What xarray takes as coordinates of the image, beside those of its axes."""
-    return " ".join(name for name in columns if name not in {"t", "y", "x"})
+    return " ".join(name for name in columns if name not in {"t", "y", "x", "error"})

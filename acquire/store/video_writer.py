@@ -42,11 +42,13 @@ class VideoWriter:
         grid: layout.VideoGrid,
         *,
         quality: bool = False,
+        regions: tuple[int, int] | None = None,
         tile_side: int | None = None,
         fill_value: float = 0,
     ) -> None:
-        """``tile_side``: rows and columns of a chunk; absent: those of a frame. ``fill_value``: of voxels
-        that are not written."""
+        """``regions``: along rows and columns, whose estimated error comes with ``quality``. ``tile_side``:
+        rows and columns of a chunk; absent: those of a frame. ``fill_value``: of voxels that are not written.
+        """
         import zarr
 
         self._place, self._delivery, self._grid = place, delivery_to(place), grid
@@ -75,19 +77,28 @@ class VideoWriter:
                 self._columns["quality"] = _column(
                     self._group, "quality", "float32", layout.QUALITY_ATTRIBUTES
                 )
+            if regions is not None:
+                self._columns["error"] = _of_regions(self._group, regions)
             for axis, count in zip("yx", shape, strict=True):
                 _whole(self._group, axis, layout.along(axis, grid, count), axis, grid)
         self._chunk: list[tuple[NDArray[Any], ...]] = []
         self.frames = 0
 
     def append(
-        self, video: NDArray[Any], time_ns: NDArray[np.int64], quality: NDArray[np.float32] | None = None
+        self,
+        video: NDArray[Any],
+        time_ns: NDArray[np.int64],
+        quality: NDArray[np.float32] | None = None,
+        error: NDArray[np.float32] | None = None,
     ) -> None:
-        """The next frames (t, y, x). Whole chunks go to the disk; StoreError when it refuses."""
+        """The next frames (t, y, x), with quality (t,) and error (t, region_y, region_x) where it has these.
+
+        Whole chunks go to the disk; StoreError when it refuses.
+        """
         if not self.frames and len(time_ns):
             self._begin_ns = int(time_ns[0])
         since_s = self._grid.origin[0] + (time_ns - self._begin_ns) * 1e-9
-        columns = (time_ns, since_s) if quality is None else (time_ns, since_s, quality)
+        columns = (time_ns, since_s, *(each for each in (quality, error) if each is not None))
         self._chunk.append((video, *columns))
         self._window.add(video)
         self.frames += len(video)
@@ -210,6 +221,19 @@ def _column(group: zarr.Group, name: str, dtype: str, attributes: dict[str, Any]
         compressors=_checked(),
         dimension_names=("t",),
         attributes=attributes,
+    )
+
+
+def _of_regions(group: zarr.Group, regions: tuple[int, int]) -> zarr.Array[Any]:
+    return group.create_array(
+        "error",
+        shape=(0, *regions),
+        dtype="float32",
+        chunks=(max(1, COLUMN_CHUNK // (regions[0] * regions[1])), *regions),
+        fill_value=float("nan"),
+        compressors=_packed(),
+        dimension_names=("t", "region_y", "region_x"),
+        attributes=layout.ERROR_ATTRIBUTES,
     )
 
 

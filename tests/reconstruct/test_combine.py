@@ -61,10 +61,15 @@ def test_a_long_stretch_is_stitched_from_pieces(recording_path, request_of_three
     # the first frame that 300 lines sample in full carries the read-out time of the first of them
     assert video.time_ns[0] == recording.camera("a").time_ns[20]
     assert np.isfinite(video.quality).all()
+    assert video.error.shape == (end - begin, 8, 8)
+    assert np.isfinite(video.error[:]).all()
+    told = outcome.provenance["error"]
+    assert 0 < told["low"] < told["rms"] < told["high"] < told["full_scale"]
     scene = build_scene(LedSceneConfig.model_validate(recording.attrs["scene"]), 24, 1e-5)
     expected = truth(scene, begin, end - begin, 2)
     error = video.video[:] - expected
     assert np.sqrt(np.mean(error**2)) < 0.1 * expected.max()
+    assert told["rms"] / 3 < np.sqrt(np.mean(error**2)) < 3 * told["rms"]
     # across a seam, frames change as they do elsewhere
     steps = np.sqrt(np.mean(np.diff(video.video[:], axis=0) ** 2, axis=(1, 2)))
     seams = [stretch.begin - begin for stretch in request_of_three.stretches[1:]]

@@ -84,6 +84,8 @@ def test_a_video_of_all_tiles_shows_the_whole_scene(
     assert len(kept) == 26
     assert 10 * np.log10(1 / np.mean((found[kept] - expected[kept]) ** 2)) > 25
     assert np.isfinite(video.quality).all()
+    assert video.error.shape == (26, 2 * 8, 3 * 8)
+    assert np.isfinite(video.error[:]).all()
     assert video.time_ns[1] - video.time_ns[0] == round(4 * recording.line_period_ns)
     assert len(outcome.provenance["segments"]) == outcome.provenance["segments_asked"] == 6 * 2
     solved = [part["tile"] for part in outcome.provenance["segments"][::2]]

@@ -1,0 +1,56 @@
+"""Where a video is likely to be wrong: its estimated error by regions, beside a frame."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import matplotlib as mpl
+import numpy as np
+
+from acquire.evaluate.themed import STYLE, Drawing, canvas, drawing_of
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.store import VideoFile
+
+MOST_FRAMES = 500
+"""That a map is made of; a video may have any number."""
+HEIGHT_IN = 2.35
+
+
+def draw_error(file: VideoFile) -> Drawing | None:
+    """The frame in the middle of the trusted ones, and the error of its regions over all of these; None where
+    nothing is known of it."""
+    shown = range(len(file.time_ns)) if file.trusted is None else file.trusted
+    full_scale = ((file.attrs.get("provenance") or {}).get("error") or {}).get("full_scale")
+    if file.error is None or not shown or not full_scale:
+        return None
+    percent = 100 / full_scale * error_of_regions(file, shown)
+    if not np.isfinite(percent).any():
+        return None
+    frame = np.asarray(file.video[shown[len(shown) // 2]], np.float64)
+    with mpl.rc_context(STYLE | {"axes.grid": False}):
+        figure = canvas(HEIGHT_IN)
+        left, right = figure.subplots(1, 2)
+        rows, columns = frame.shape
+        left.imshow(frame, cmap="gray", vmin=0, vmax=full_scale)
+        left.set_title("a frame")
+        seen = right.imshow(percent, cmap="viridis", vmin=0, extent=(0, columns, rows, 0))
+        right.set_title("error (%)")
+        for ax in (left, right):
+            ax.set(xticks=[], yticks=[])
+            ax.spines[:].set_visible(False)
+        figure.colorbar(seen, ax=right, shrink=0.8)
+        return drawing_of(figure, narrow_in=HEIGHT_IN)
+
+
+def error_of_regions(file: VideoFile, frames: range) -> NDArray[np.float64]:
+    """RMS over frames (region_y, region_x); NaN where it is not known."""
+    assert file.error is not None
+    every = max(1, len(frames) // MOST_FRAMES)
+    found = np.asarray(file.error[frames.start : frames.stop : every], np.float64)
+    known = np.isfinite(found)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        squares = np.where(known, found, 0) ** 2
+        return np.asarray(np.sqrt(squares.sum(0) / known.sum(0)))

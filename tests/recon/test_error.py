@@ -1,0 +1,115 @@
+"""The estimated error of a video, beside the truth, and where nothing is claimed."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.stats import spearmanr
+
+from acquire.recon import Reconstruction, reconstruct
+from acquire.recon.error import (
+    REGIONS,
+    Clues,
+    VideoError,
+    from_clues,
+    in_frames,
+    in_regions,
+    together,
+)
+from acquire.showing import error_in_words
+from acquire.sim.procedural import Recorded, record
+
+EVERY = slice(None)
+
+
+@cache
+def recorded(scene: str) -> Recorded:
+    return record(scene, 71, stages=24, lines=120)
+
+
+@cache
+def solved(scene: str) -> Reconstruction:
+    return reconstruct(recorded(scene).segment, 3, 1, "fast")
+
+
+@pytest.mark.parametrize("scene", ["splash", "leds", "runner"])
+def test_it_is_about_the_error_and_knows_where_it_is_large(scene: str) -> None:
+    result = solved(scene)
+    assert isinstance(result.error, VideoError)
+    off = result.video[result.trusted] - recorded(scene).truth(3, 1)
+    true = np.sqrt(np.square(off).mean())
+    assert result.error.rms / 3 < true < 3 * result.error.rms
+    assert result.error.low < result.error.rms < result.error.high < result.error.full_scale
+    regions = np.sqrt(np.square(result.error.regions[result.trusted]).mean(0))
+    assert spearmanr(regions.ravel(), np.sqrt(in_regions(np.square(off)).mean(0)).ravel())[0] > 0.5
+    assert result.error.frames.shape == (len(result.video),)
+    assert np.sqrt(np.square(result.error.frames[result.trusted]).mean()) == pytest.approx(result.error.rms)
+
+
+def test_estimating_it_does_not_change_the_video() -> None:
+    for scene in ("splash", "leds"):
+        without = reconstruct(recorded(scene).segment, 3, 1, "fast", error=False)
+        assert np.array_equal(without.video, solved(scene).video)
+        assert without.error == "it was not asked for"
+        assert without.iterations == solved(scene).iterations
+
+
+def test_it_has_the_unit_of_the_video() -> None:
+    segment = recorded("splash").segment
+    brighter = reconstruct(replace(segment, responsivity_dn=segment.responsivity_dn / 7), 3, 1, "fast")
+    error = solved("splash").error
+    assert isinstance(error, VideoError)
+    assert isinstance(brighter.error, VideoError)
+    assert brighter.error.rms == pytest.approx(7 * error.rms, rel=0.02)
+
+
+def test_nothing_is_claimed_where_nothing_can_be_known() -> None:
+    segment = recorded("splash").segment
+    paper = reconstruct(segment, 3, 1, solver="twist", iterations=3)
+    assert paper.error == "its solver gives nothing to tell it by"
+    stop = threading.Event()
+    stop.set()
+    stopped = reconstruct(segment, 3, 1, "fast", stop=stop)
+    assert stopped.error == "the reconstruction was stopped"
+    one_frame = reconstruct(segment, 3, segment.geometry.span, "fast")
+    assert one_frame.error == "no frame is sampled in full"
+    swapped = replace(segment, lines=segment.lines[::-1].copy(), mask=segment.mask[::-1].copy())
+    wrong = reconstruct(swapped, 3, 1, "fast")
+    assert not wrong.believed
+    assert wrong.error == "the lines are not what is said of them"
+    assert np.isnan(in_frames(wrong.error, 5)).all()
+
+
+@pytest.mark.parametrize("side", [1, 5, 8, 20, 33])
+def test_regions_hold_all_voxels_alike(side: int) -> None:
+    frames = np.random.default_rng(side).random((3, side, side))
+    means = in_regions(frames)
+    assert means.shape == (3, REGIONS, REGIONS)
+    assert np.allclose(means.mean((1, 2)), frames.mean((1, 2)))
+
+
+def test_an_error_has_degree_one_in_its_clues() -> None:
+    rng = np.random.default_rng(3)
+    moved, change, edge = rng.uniform(0.1, 1, (20, 8, 8)), rng.uniform(0.1, 1, (8, 8)), rng.random((8, 8))
+    once = from_clues(Clues(0.1, 2.0, moved, change, edge), EVERY)
+    twice = from_clues(Clues(0.2, 4.0, 2 * moved, 2 * change, 2 * edge), EVERY)
+    assert twice.rms == pytest.approx(2 * once.rms)
+    assert np.allclose(twice.regions, 2 * once.regions)
+    unsure = from_clues(Clues(0.2, 2.0, 2 * moved, change, edge), EVERY)
+    assert unsure.rms > once.rms
+
+
+def test_sub_segments_are_told_together() -> None:
+    parts = [
+        {"rms": 0.03, "low": 0.02, "high": 0.05, "full_scale": 1.0},
+        {"rms": 0.04, "low": 0.03, "high": 0.08, "full_scale": 2.0},
+    ]
+    whole = together(parts, [1, 1])
+    assert whole["rms"] == pytest.approx(np.sqrt((0.03**2 + 0.04**2) / 2))
+    assert error_in_words(whole) == "about 1.8 % of full scale (1.3 to 3.3 % in nine of ten)"
+    unknown = together([*parts, {"unknown": "the video is dark"}], [1, 1, 1])
+    assert error_in_words(unknown) == "cannot be told: the video is dark"

@@ -1,0 +1,253 @@
+"""Is the estimated error of a video the error? Against the truth, on scenes it was not calibrated on.
+
+    OMP_NUM_THREADS=1 python tools/bench_error.py [--scenes pan rain …] [--seeds 41] [--record]
+    OMP_NUM_THREADS=1 python tools/bench_error.py --fit [--seeds 311]
+
+Scenes of `tools.error_scenes` (the paper's, photographs that move, rain), with an ordinary camera's noise
+(full well 10⁴ e, 10 e read), with less light (10³ e) and clean, in voxels of 3 × 1 and 2 × 8, preset fast,
+32 stages, 160 lines. Per scene: the true RMS error and its estimate in percent of full scale, whether the
+claimed interval holds it, the rank correlation of estimated and true error over 8 × 8 regions and over
+frames, and what the estimate took of the processor time. At the end, how often nine of ten was nine of ten.
+
+--fit calibrates: on the scenes of `acquire.sim.procedural`, prints the powers for `acquire/recon/error.py`
+and, each scene estimated by powers fitted to the others, how far estimates were off. Scenes of which nothing
+is claimed (light beyond the band) have no part in it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import spearmanr
+
+from acquire.cores import limit_threads
+from acquire.recon import error as estimation
+from acquire.recon import reconstruct
+from acquire.recon.error import Clues, Powers, VideoError, from_clues, in_regions
+from acquire.sim import procedural
+from acquire.sim.procedural import Camera, Recorded
+from tools import error_scenes
+from tools.results import Run, add_option, recorded
+
+STAGES, SUBSTEPS, LINES = 32, 3, 160
+CAMERAS = {"1e4": Camera(), "1e3": Camera(1e3), "clean": procedural.CLEAN}
+VOXELS = ((3, 1), (2, 8))
+Make = Callable[..., Recorded]
+RIDGE = 0.02
+"""Of the number of cases, which holds powers towards 0 that hardly matter."""
+NINE_OF_TEN = (0.05, 0.95)
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """``true`` are RMS errors (time, 8, 8) of the trusted frames, as the clues are in ``shown``."""
+
+    name: str
+    scene: str
+    true: np.ndarray
+    error: VideoError | str
+    shown: slice
+    share: float
+
+    @property
+    def rms(self) -> float:
+        return float(np.sqrt(np.square(self.true).mean()))
+
+    @property
+    def regions(self) -> np.ndarray:
+        return np.sqrt(np.square(self.true).mean(0)).ravel()
+
+    @property
+    def frames(self) -> np.ndarray:
+        return np.sqrt(np.square(self.true).mean((1, 2)))
+
+
+def measure(scene: str, seed: int, camera: str, voxels: tuple[int, int], make: Make) -> Case:
+    made = make(scene, seed, stages=STAGES, substeps=SUBSTEPS, lines=LINES, camera=CAMERAS[camera])
+    result = reconstruct(made.segment, *voxels, "fast")
+    off = result.video[result.trusted] - made.truth(*voxels)
+    took = 0.0 if isinstance(result.error, str) else result.error.processor_s / result.processor_s
+    name = f"{scene}, {camera}, {voxels[0]} × {voxels[1]}"
+    return Case(name, scene, np.sqrt(in_regions(np.square(off))), result.error, result.trusted, took)
+
+
+def show(case: Case, run: Run) -> tuple[bool, np.ndarray, np.ndarray] | None:
+    """Print a row; whether the whole is held, and which regions and frames are."""
+    error = case.error
+    if isinstance(error, str):
+        print(f"{case.name:30} cannot be told: {error}", flush=True)
+        run.add(case.name, true_rms=case.rms, told=error)
+        return None
+    regions = np.sqrt(np.square(error.regions[case.shown]).mean(0)).ravel()
+    frames = error.frames[case.shown]
+    held = error.low <= case.rms <= error.high
+    alike = [correlation(*pair) for pair in ((regions, case.regions), (frames, case.frames))]
+    percent = 100 / error.full_scale
+    print(
+        f"{case.name:30} {percent * case.rms:6.2f} %  {percent * error.rms:6.2f}"
+        f" ({percent * error.low:.2g} to {percent * error.high:.2g})  {'held' if held else 'MISSED':6}"
+        f"  {alike[0]:5.2f}  {alike[1]:5.2f}  {case.share:5.1%}",
+        flush=True,
+    )
+    run.add(
+        case.name,
+        true_percent=percent * case.rms,
+        estimated_percent=percent * error.rms,
+        low_percent=percent * error.low,
+        high_percent=percent * error.high,
+        held=int(held),
+        rank_of_regions=alike[0],
+        rank_of_frames=alike[1],
+        share_of_processor_percent=100 * case.share,
+    )
+    within = [
+        (low * each <= true) & (true <= high * each)
+        for each, true, (low, high) in (
+            (regions, case.regions, error.region_factors),
+            (frames, case.frames, error.frame_factors),
+        )
+    ]
+    return held, within[0], within[1]
+
+
+def correlation(estimated: np.ndarray, true: np.ndarray) -> float:
+    """Of ranks; NaN where all are alike, as frames of a still are."""
+    if np.ptp(estimated) == 0 or np.ptp(true) == 0:
+        return math.nan
+    return float(spearmanr(estimated, true)[0])
+
+
+def judge(cases: Iterable[Case], run: Run) -> None:
+    print(f"{'':30}  true     estimate (nine of ten)          regions frames  of the time")
+    shown = [found for found in (show(case, run) for case in cases) if found is not None]
+    if not shown:
+        return
+    held, regions, frames = (
+        float(np.mean(np.concatenate([np.ravel(each[k]) for each in shown]))) for k in range(3)
+    )
+    print(f"{len(shown)} estimated: held {held:.0%}, regions {regions:.0%}, frames {frames:.0%}")
+    run.add(
+        "all that are estimated",
+        held_percent=100 * held,
+        regions_held_percent=100 * regions,
+        frames_held_percent=100 * frames,
+    )
+
+
+def signs(clues: Clues, shown: slice) -> np.ndarray:
+    """Of the whole: logarithms beside what blocks say, whose powers are constant, moved and scale."""
+    moved = np.sqrt(np.square(clues.moved[shown]).mean())
+    return np.array([1.0, *np.log([moved / clues.blocks, clues.scale / clues.blocks])])
+
+
+def signs_here(clues: Clues, shown: slice) -> np.ndarray:
+    """Of regions beside the whole: logarithms (64, 3)."""
+    maps = (np.sqrt(np.square(clues.moved[shown]).mean(0)), clues.change, clues.edge)
+    return np.stack([np.log(each / np.sqrt(np.square(each).mean())).ravel() for each in maps], 1)
+
+
+def least_squares(rows: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Held towards 0, but for the first where it is constant."""
+    ridge = RIDGE * len(rows) * np.eye(rows.shape[1])
+    if np.all(rows[:, 0] == 1):
+        ridge[0, 0] = 0
+    return np.asarray(np.linalg.solve(rows.T @ rows + ridge, rows.T @ wanted))
+
+
+def fit(cases: list[Case]) -> Powers:
+    """Without factors: those are what it misses by on scenes that it was not fitted to."""
+    told = [(case, case.error.clues) for case in cases if isinstance(case.error, VideoError)]
+    whole = least_squares(
+        np.stack([signs(clues, case.shown) for case, clues in told]),
+        np.array([math.log(case.rms / clues.blocks) for case, clues in told]),
+    )
+    faint = estimation.FAINT
+    true = [np.maximum(case.regions, faint * clues.scale) for case, clues in told]
+    here = least_squares(
+        np.concatenate([signs_here(clues, case.shown) for case, clues in told]),
+        np.concatenate([np.log(each / np.sqrt(np.square(each).mean())) for each in true]),
+    )
+    moved = [np.sqrt(np.square(clues.moved[case.shown]).mean((1, 2))) for case, clues in told]
+    now = least_squares(
+        np.concatenate([np.log(each / np.sqrt(np.square(each).mean())) for each in moved])[:, None],
+        np.concatenate([np.log(case.frames / case.rms) for case, _ in told]),
+    )
+    return Powers(*whole, *here, *now, (1, 1), (1, 1), (1, 1))
+
+
+def _over_scenes(off: list[np.ndarray]) -> tuple[float, float]:
+    """Below and above which a tenth of the scenes have their smallest and largest twentieth of cases: new
+    scenes differ from one another far more than cases of one do."""
+    low, high = (np.array([np.quantile(each, share) for each in off]) for share in NINE_OF_TEN)
+    return float(np.quantile(low, 0.1)), float(np.quantile(high, 0.9))
+
+
+def calibrate(cases: list[Case]) -> None:
+    """Print the powers, and by which factors estimates are off on scenes that these were not fitted to."""
+    told = [case for case in cases if isinstance(case.error, VideoError)]
+    off: list[list[np.ndarray]] = [[], [], []]
+    alike = []
+    for scene in sorted({case.scene for case in told}):
+        powers = fit([case for case in told if case.scene != scene])
+        ratios, here, now = [], [], []
+        for case in (each for each in told if each.scene == scene):
+            assert isinstance(case.error, VideoError)
+            found = from_clues(case.error.clues, case.shown, powers)
+            regions = np.sqrt(np.square(found.regions[case.shown]).mean(0)).ravel()
+            faint = estimation.FAINT * case.error.full_scale
+            ratios.append(case.rms / found.rms)
+            here.append(np.maximum(case.regions, faint) / regions)
+            now.append(case.frames / found.frames[case.shown])
+            alike.append(correlation(regions, case.regions))
+        for kind, each in zip(off, (ratios, np.concatenate(here), np.concatenate(now)), strict=True):
+            kind.append(np.asarray(each))
+        print(
+            f"{scene:10} {len(ratios):3} cases, true over estimated: {min(ratios):.2f} to {max(ratios):.2f}"
+        )
+    factors = [_over_scenes(each) for each in off]
+    print(
+        f"rank correlation over regions: median {np.nanmedian(alike):.2f},"
+        f" a tenth below {np.nanquantile(alike, 0.1):.2f}"
+    )
+    powers = fit(told)
+    print(
+        "POWERS =", replace(powers, factors=factors[0], region_factors=factors[1], frame_factors=factors[2])
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--fit", action="store_true", help="calibrate instead")
+    parser.add_argument("--scenes", nargs="+", metavar="SCENE")
+    parser.add_argument("--seeds", nargs="+", type=int, default=[41])
+    parser.add_argument("--cameras", nargs="+", default=list(CAMERAS), choices=list(CAMERAS))
+    add_option(parser)
+    asked = parser.parse_args()
+    known, make = (
+        (tuple(procedural.SCENES), procedural.record)
+        if asked.fit
+        else (error_scenes.SCENES, error_scenes.record)
+    )
+    scenes = asked.scenes or known
+    with limit_threads(1), recorded("bench_error", keep=asked.record and not asked.fit) as run:
+        cases = (
+            measure(scene, seed, camera, voxels, make)
+            for scene in scenes
+            for seed in asked.seeds
+            for camera in asked.cameras
+            for voxels in VOXELS
+        )
+        if asked.fit:
+            calibrate(list(cases))
+        else:
+            judge(cases, run)
+
+
+if __name__ == "__main__":
+    main()
