@@ -9,6 +9,7 @@ import typer
 from acquire.cli.output import JsonFlag, print_facts, print_json, print_table, say
 from acquire.cli.recordings import PlaceArgument
 from acquire.cli.stretch import FromOption, ToOption, lines_between
+from acquire.cli.tiles import TileOption, tile_of
 
 if TYPE_CHECKING:
     from acquire.recon.diagnosis import Diagnosis
@@ -30,6 +31,7 @@ def diagnose(
     lines: Annotated[int | None, typer.Option(help="Number of lines; absent: some hundreds.")] = None,
     begin: FromOption = None,
     end: ToOption = None,
+    tile: TileOption = None,
     calibration: Annotated[
         str | None,
         typer.Option(metavar="CAL", help="Calibration NAME.zarr, or none; absent: the recording's own."),
@@ -42,27 +44,37 @@ def diagnose(
     mirrored; other sub-steps per line; a stuck arm, black level, ambient light, gains, too little light.
     The table says how much likelier each is than what the recording says (log likelihood), in standard
     errors, and how many times better the arms agree than under wrong codes. Exit 1 where something is wrong.
+    Behind a fibre one tile speaks: the one that is named, or whose lines show most contrast.
 
     Example: [bold]acquire diagnose run.zarr[/]
     """
     from acquire.calibrate.choose import choose
     from acquire.reconstruct.diagnose import diagnose_recording, stretch
+    from acquire.reconstruct.liveliest import speaker
     from acquire.store import open_recording
 
     opened = open_recording(recording)
     chosen = choose(opened, calibration)
     first, count = stretch(opened, *lines_between(opened, first_line, lines, begin, end))
-    found = diagnose_recording(opened, first, count, None if chosen is None else chosen.calibration)
+    known, named = None if chosen is None else chosen.calibration, tile_of(opened, tile)
+    seen = speaker(opened, () if named is None else (named,), (first, count), known, moving=False)
+    found = diagnose_recording(opened, first, count, known, seen)
+    whose = {} if seen is None else {"tile": str(seen)}
     if json:
-        print_json({"recording": str(opened), "first_line": first, "lines": count, **found.to_dict()})
+        facts = {"recording": str(opened), "first_line": first, "lines": count, **whose}
+        print_json(facts | found.to_dict())
     else:
-        _print(found, first, count)
+        _print(found, first, count, whose)
     if found.wrong:
         raise typer.Exit(WRONG)
 
 
-def _print(found: Diagnosis, first: int, count: int) -> None:
-    facts = {"lines": f"{first} to {first + count - 1}", "verdict": f"{found.standing}: {found.sentence}"}
+def _print(found: Diagnosis, first: int, count: int, whose: dict[str, str]) -> None:
+    facts = {
+        "lines": f"{first} to {first + count - 1}",
+        **whose,
+        "verdict": f"{found.standing}: {found.sentence}",
+    }
     print_facts(facts | {f"also ({each.kind})": each.words for each in found.suspicions})
     if not found.rows:
         return

@@ -194,6 +194,11 @@ def _instrument(
         found = _of_options(stages, substeps, line_rate, light)
     else:
         known = _of_rig(config)
+        if known.fibre is not None and (stages, substeps) != (None, None):
+            raise UsageError(
+                "--stages and --substeps cannot change a rig whose [fibre] lays out bands of M·S rows",
+                possible="a rig file that says geometry and fibre together",
+            )
         found = replace(
             known,
             stages=stages or known.stages,
@@ -248,4 +253,6 @@ def _of_rig(name: str) -> Instrument:
         rig.trigger.substep_ticks,
         {arm: {key: getattr(rig.cameras.arm(arm), key) for key in keys} for arm in ("a", "b")},
         config=rig.model_dump(mode="json"),
+        layout="dual" if rig.laid_out is None else "fibre",
+        fibre=rig.laid_out,
     )

@@ -175,8 +175,7 @@ def reconstruct(
         open_denoiser(denoiser)
     open_arrays(device if dask is None else "cpu", dtype)  # a cluster's devices are not here
     opened = open_recording(recording)
-    looks = {"--auto": auto, "--explain": explain, "--try-orientations": try_orientations}
-    asked_tiles = _tiles_asked(opened, tiles, looks)
+    asked_tiles = _tiles_asked(opened, tiles, turned=try_orientations)
     chosen = choose(opened, calibration)
     asked = Asked(
         first_line=first_line,
@@ -245,13 +244,15 @@ def _shared(search: str | None) -> bool | None:
     return None if search is None else search == "shared"
 
 
-def _tiles_asked(recording: Recording, text: str | None, looks: dict[str, bool]) -> tuple[Tile, ...]:
-    """Those of a scene behind a fibre, which the options ``looks`` could not look at as a whole."""
+def _tiles_asked(recording: Recording, text: str | None, *, turned: bool) -> tuple[Tile, ...]:
+    """Those of a scene behind a fibre, whose arms cannot be turned tile by tile."""
     tiles = tiles_of(recording, text)
-    if wanted := [option for option, asked in looks.items() if asked and tiles]:
+    if tiles and turned:
         raise UsageError(
-            f"{wanted[0]} needs lines that see one scene, and these see tiles behind a fibre",
-            possible="--nm, --tm, --voxels, --segment or --plan, which hold for every tile",
+            "--try-orientations cannot turn lines behind a fibre: in an arm that is mirrored, other columns "
+            "see a tile",
+            possible="`acquire diagnose --tile`, which says whether they are; [fibre] of the rig, which says "
+            "where bands lie",
         )
     return tiles
 

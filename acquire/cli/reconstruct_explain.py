@@ -33,6 +33,7 @@ def explain_calibration(
 def _explain(recording: Recording, chosen: Chosen | None, asked: Asked, *, json: bool) -> None:
     from acquire.cores import idle_cores, limit_blas
     from acquire.reconstruct.explain import MOST_LINES, explain
+    from acquire.reconstruct.liveliest import speaker
 
     if chosen is None:
         raise UsageError(
@@ -44,16 +45,21 @@ def _explain(recording: Recording, chosen: Chosen | None, asked: Asked, *, json:
     first = recording.first_available_line if asked.first_line is None else asked.first_line
     lines = recording.first_line + recording.lines - first if asked.lines is None else asked.lines
     count = min(lines, MOST_LINES)
-    segment = recording.cut(first + (lines - count) // 2, count)
+    middle = (first + (lines - count) // 2, count)
+    tile = speaker(recording, asked.tiles, middle, chosen.calibration)
+    segment = recording.cut(*middle, tile)
     with (
         stage_progress("leaving out one part of the calibration after the other") as advance,
         limit_blas(idle_cores()),
     ):
         found = explain(segment, chosen.calibration, voxels.spatial_merge, voxels.temporal_merge, advance)
     if json:
-        print_json({"calibration": chosen.origin, "parts": [asdict(worth) for worth in found]})
+        whose = {} if tile is None else {"tile": str(tile)}
+        parts = [asdict(worth) for worth in found]
+        print_json({"calibration": chosen.origin, **whose, "parts": parts})
         return
-    say(f"calibration: {chosen.origin}; {count} lines from line {segment.first_line} on, voxels {voxels}")
+    which = f"{count} lines from line {segment.first_line} on" + ("" if tile is None else f" of tile {tile}")
+    say(f"calibration: {chosen.origin}; {which}, voxels {voxels}")
     print_table(("corrected", "unseen samples missed by", "gives (dB)", "time"), map(_row, found))
 
 

@@ -202,6 +202,7 @@ def _plan(recording: Recording, selection: Selection, asked: Asked) -> Reconstru
                 whole=asked.ends == "whole",
                 progress=advance,
                 calibration=asked.options.calibration,
+                tiles=asked.tiles,
             )
     if asked.plan is not None:
         return load_plan(asked.plan)

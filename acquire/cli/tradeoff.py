@@ -18,6 +18,7 @@ from acquire.cli.durations import seconds
 from acquire.cli.output import JsonFlag, print_json, print_table, say
 from acquire.cli.places import new_directory
 from acquire.cli.progress import stage_progress, told
+from acquire.cli.tiles import TileOption, tile_of
 from acquire.errors import UsageError
 
 if TYPE_CHECKING:
@@ -78,12 +79,15 @@ def tradeoff(
     budget: Annotated[
         float, typer.Option(parser=seconds, metavar="TIME", help="Longest run; what it cuts short is marked.")
     ] = LONGEST_S,
+    tile: TileOption = None,
     learn: Annotated[
         bool, typer.Option(help="Let `acquire reconstruct --budget` prefer the best preset.")
     ] = True,
     json: JsonFlag = False,
 ) -> None:
     """Draw accuracy against wall and processor time for every solver, preset and kind of voxels, on one page.
+
+    Behind a fibre one tile speaks: the one that is named, or whose lines show most change.
 
     Example: [bold]acquire tradeoff scene-leds splash bullet --full-well clean --full-well 1e4[/]
     """
@@ -106,7 +110,7 @@ def tradeoff(
     if not budget > 0:
         raise UsageError(f"a budget of {budget:g} s is out of range", possible="more than 0")
     with new_directory(out):
-        cases, effects = _cases(sources, out, full_well or [], (first_line, lines, repeats))
+        cases, effects = _cases(sources, out, full_well or [], (first_line, lines, repeats), tile)
         host = HostWatch()
         runs, truths = _measure(cases, repeats, kinds, asked, budget, host)
         heading = {
@@ -163,10 +167,15 @@ def _notes(cases: list[Case], repeats: int) -> list[str]:
 
 
 def _cases(
-    sources: list[str], out: Path, full_well: list[str], asked: tuple[int | None, int, int]
+    sources: list[str],
+    out: Path,
+    full_well: list[str],
+    asked: tuple[int | None, int, int],
+    tile: str | None,
 ) -> tuple[list[Case], Study | None]:
     """What is measured on; what the effects of the first scene that has any are worth."""
     from acquire.evaluate.cases import full_wells, of_recording, procedural
+    from acquire.reconstruct.liveliest import speaker
     from acquire.sim.procedural import SCENES
 
     (first_line, lines, repeats), cases, effects = asked, [], None
@@ -179,8 +188,11 @@ def _cases(
         recording, found = _opened(source, out, most)
         effects = effects or found
         first = _first(recording, first_line, lines)
-        recording.cut(first, lines)  # lines that are not there are refused before anything is measured
-        cases.append(of_recording(Path(source).stem, recording, first, lines, APART))
+        named = tile_of(recording, tile)
+        seen = speaker(recording, () if named is None else (named,), (first, lines))
+        # lines that are not there are refused before anything is measured
+        recording.cut(first, lines, seen)
+        cases.append(of_recording(Path(source).stem, recording, first, lines, APART, seen))
     return cases, effects
 
 

@@ -12,6 +12,7 @@ from acquire.evaluate.tradeoff import Judge
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
+    from acquire.fibre import Tile
     from acquire.store import Recording
 
 READ_NOISE_E = 10.0
@@ -30,15 +31,21 @@ class Case:
     repeats: str
 
 
-def of_recording(name: str, recording: Recording, first_line: int, lines: int, apart: int) -> Case:
-    """Segments of ``lines`` lines, ``apart`` lines from one repeat to the next as far as there are any."""
+def of_recording(
+    name: str, recording: Recording, first_line: int, lines: int, apart: int, tile: Tile | None = None
+) -> Case:
+    """Segments of ``lines`` lines, ``apart`` lines from one repeat to the next as far as there are any.
+
+    Behind a fibre they are of a ``tile``.
+    """
     last = recording.first_line + recording.lines - lines
 
     def judge(repeat: int) -> Judge:
         first = max(recording.first_line, min(first_line + apart * repeat, last))
-        return Judge.of(recording, recording.cut(first, lines))
+        return Judge.of(recording, recording.cut(first, lines, tile), tile)
 
-    return Case(name, judge, "other lines, as far as there are any: another stretch of code, and other noise")
+    words = "other lines, as far as there are any: another stretch of code, and other noise"
+    return Case(name if tile is None else f"{name}, tile {tile}", judge, words)
 
 
 def procedural(name: str, full_well_e: float, lines: int) -> Case:

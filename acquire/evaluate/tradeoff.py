@@ -21,6 +21,7 @@ from acquire.evaluate.metrics import psnr, ssim
 from acquire.forward import merge_video
 from acquire.recon import reconstruct
 from acquire.sim.leds import LedScene
+from acquire.sim.optics import seen_in
 from acquire.sim.scene import Scene
 from acquire.sim.voxels import truth
 from acquire.simulate import bench_of
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.arrays import Dtype
+    from acquire.fibre import Tile
     from acquire.lines import Segment
     from acquire.recon import Look, Preset
     from acquire.recon.segments import Voxels
@@ -108,12 +110,15 @@ class Judge:
     _truths: dict[Voxels, NDArray[np.float32]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, recording: Recording, segment: Segment) -> Judge:
-        """The scene is what a simulated recording says it was."""
+    def of(cls, recording: Recording, segment: Segment, tile: Tile | None = None) -> Judge:
+        """The scene is what a simulated recording says it was; behind a fibre, what is seen in a tile."""
         attrs = recording.attrs
         if not attrs.get("simulated") or "scene" not in attrs:
             return cls(segment, None)
-        return cls(segment, bench_of(*load_recorded(attrs, str(recording))).fine_scene())
+        scene = bench_of(*load_recorded(attrs, str(recording))).fine_scene()
+        if tile is not None and recording.fibre is not None:
+            scene = seen_in(scene, recording.fibre, tile)
+        return cls(segment, scene)
 
     def frames(self, voxels: Voxels) -> slice:
         """What is judged: the trusted frames, or all where none is."""

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
     from acquire.codes import Code
     from acquire.exchange.foreign import LineFile
+    from acquire.fibre import Fibre
 
 BLOCK_LINES = 4096
 COMMIT_BLOCKS = 64
@@ -54,6 +55,7 @@ class Instrument:
     cameras : per arm ``white_dn``, ``black_level_dn`` and ``responsivity_dn``, as far as they are known
     start_ns : UTC at which the first line's read-out begins; None: not known
     config : the rig's configuration, where there is one
+    fibre : which column sees what, of layout ``fibre``
     """
 
     stages: int
@@ -67,6 +69,12 @@ class Instrument:
     start_ns: int | None = None
     config: Mapping[str, Any] | None = None
     layout: str = "dual"
+    fibre: Fibre | None = None
+
+    @property
+    def pixels(self) -> int:
+        """Of a line of either arm."""
+        return self.stages if self.fibre is None else self.fibre.sensor_pixels
 
     @property
     def line_rate_hz(self) -> float:
@@ -149,7 +157,13 @@ def _checked(arms: Mapping[str, Arm], instrument: Instrument, most_lines: int | 
     if len({source.file.dtype.newbyteorder("=") for source in arms.values()}) > 1:
         raise UsageError("the arms have different types", possible="uint8 or uint16 for both")
     for arm, source in arms.items():
-        if source.file.pixels != instrument.stages:
+        if instrument.fibre is not None and source.file.pixels != instrument.pixels:
+            raise UsageError(
+                f"lines of arm {arm} have {source.file.pixels} pixels, with sensors of {instrument.pixels}",
+                possible="lines as wide as the sensors behind the fibre: [fibre] sensor_pixels of the rig",
+                hint=f"--columns-{arm} FIRST:END chooses the pixels that are the sensor's",
+            )
+        if source.file.pixels != instrument.pixels:
             raise UsageError(
                 f"lines of arm {arm} have {source.file.pixels} pixels, with {instrument.stages} stages",
                 possible="as many pixels as stages, M: lines are as long as the image is high",
@@ -261,6 +275,7 @@ def _spec(
         chunk_lines=chunk_lines,
         codec="lz4",
         layout=instrument.layout,
+        fibre=instrument.fibre,
     )
 
 

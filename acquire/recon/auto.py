@@ -44,8 +44,13 @@ class Tempo:
         return f"unseen samples are predicted with an error of: {words}"
 
 
-def tempo(segment: Segment, progress: Callable[[float], object] | None = None) -> Tempo:
-    """How fast a segment changes, from its lines alone; ``progress`` takes the share of it that is done."""
+def tempo(
+    segment: Segment, progress: Callable[[float], object] | None = None, side: int | None = None
+) -> Tempo:
+    """How fast a segment changes, from its lines alone; ``progress`` takes the share of it that is done.
+
+    ``side`` is that of the voxels of what moves, in fine pixels; None: S.
+    """
     most = 1 + len(TEMPORAL_MERGES)
 
     def done() -> None:
@@ -53,7 +58,7 @@ def tempo(segment: Segment, progress: Callable[[float], object] | None = None) -
             progress(len(tried) / most)
 
     geometry = segment.geometry
-    side = min(geometry.substeps, geometry.size)
+    side = min(side or geometry.substeps, geometry.size)
     still = _error(segment, Voxels(1, geometry.span))
     tried = [(0, still)]
     done()

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.calibrate import Calibration
+    from acquire.fibre import Tile
     from acquire.lines import Segment
     from acquire.recon.segments import Stream
     from acquire.store import Recording
@@ -43,15 +44,16 @@ def diagnose_recording(
     first_line: int | None,
     lines: int | None,
     calibration: Calibration | None = None,
+    tile: Tile | None = None,
 ) -> Diagnosis:
     """Which hypothesis explains the lines; where none near does, what the light check finds farther off.
 
-    Lines are read with the ``calibration``, as for a reconstruction.
+    Lines are read with the ``calibration``, as for a reconstruction; behind a fibre those of one ``tile``.
 
     UsageError and DataError as `Recording.cut` raises them.
     """
     first, count = stretch(recording, first_line, lines)
-    segment = recording.cut(first, count)
+    segment = recording.cut(first, count, tile)
     if calibration is not None:
         segment = calibrated(segment, calibration)
     code = code_from_attrs(recording.attrs["code"])
@@ -63,15 +65,15 @@ def diagnose_recording(
     found = diagnose(segment, bits)
     if found.standing is not Standing.UNEXPLAINED:
         return found
-    return _farther(recording, by_lines(recording).stream, found)
+    return _farther(recording, by_lines(recording).stream, found, tile)
 
 
-def _farther(recording: Recording, stream: Stream, found: Diagnosis) -> Diagnosis:
+def _farther(recording: Recording, stream: Stream, found: Diagnosis, tile: Tile | None) -> Diagnosis:
     """With the light check's word on as many lines as it likes, where that is more."""
     whole = stream.end_line - stream.first_line
     count = min(FAR_LINES, whole)
     first = stream.first_line + (whole - count) // 2
-    segment = recording.cut(first, count)
+    segment = recording.cut(first, count, tile)
     judge = Judge(
         stages=segment.geometry.stages,
         substeps=segment.geometry.substeps,

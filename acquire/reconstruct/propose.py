@@ -10,11 +10,13 @@ from acquire.calibrate import calibrated
 from acquire.config.plan import ReconstructionPlan, SegmentPlan
 from acquire.recon.auto import TEMPORAL_MERGES, Tempo, tempo
 from acquire.recon.segments import Stretch, Voxels, split
+from acquire.reconstruct.liveliest import speaker
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Callable, Mapping, Sequence
 
     from acquire.calibrate import Calibration
+    from acquire.fibre import Tile
     from acquire.reconstruct.select import Selection
     from acquire.store import Recording
 
@@ -22,6 +24,9 @@ LOOKED_AT = 4
 """Length of a stretch that is judged by itself, in n; a change is located no better than that."""
 LONGEST = 12
 """Sub-segments are no longer than this, in n."""
+VOXELS_OF_A_TILE = 64
+"""Along a side, as many as the paper's smallest: of a tile without intra-line steps, S = 1 would be far more
+voxels than its lines can tell."""
 PLACES = 9
 """Stretches that are looked at first, evenly spaced; between two that differ more, until the change is found.
 
@@ -37,25 +42,40 @@ def propose(
     whole: bool = False,
     progress: Callable[[float, int], object] | None = None,
     calibration: Calibration | None = None,
+    tiles: Sequence[Tile] = (),
 ) -> ReconstructionPlan:
-    """Sub-segments of neighbouring stretches that are equally fast, each with the reason."""
+    """Sub-segments of neighbouring stretches that are equally fast, each with the reason.
+
+    Behind a fibre they follow the tile where most changes, of ``tiles``, and the reason names it.
+    """
     stream = selection.stream
     size = stream.geometry(1).size
     begin, end = selection.extent(Voxels(1, 1), Voxels(1, 1), whole=whole)
     stretches = split(begin, end, Voxels(1, 1), LOOKED_AT * size)
+    tile = speaker(recording, tiles, (stream.first_line, stream.end_line - stream.first_line), calibration)
+    side = None if tile is None else _side_in_tile(stream.substeps, size)
 
     def look(number: int, done: Callable[[float], object]) -> Tempo:
         # lines that see nothing else: what the neighbours do is judged with them
         stretch = stretches[number]
         inner = stream.sub_segment(Stretch(stretch.begin, stretch.end, Voxels(1, size)))
-        lines = recording.cut(inner.first_line, inner.lines)
-        return tempo(lines if calibration is None else calibrated(lines, calibration), done)
+        lines = recording.cut(inner.first_line, inner.lines, tile)
+        return tempo(lines if calibration is None else calibrated(lines, calibration), done, side)
 
     found = list(zip(stretches, _tempos(len(stretches), look, progress), strict=True))
     groups = [list(group) for _, group in groupby(found, key=lambda each: each[1].voxels)]
     parts = [part for group in groups for part in _parts(group, LONGEST // LOOKED_AT)]
+    if tile is not None:
+        parts = [part.model_copy(update={"why": f"tile {tile}: {part.why}"}) for part in parts]
     last = parts.pop().model_copy(update={"substeps": None})
     return ReconstructionPlan(ends="whole" if whole else "trusted", segments=(*parts, last))
+
+
+def _side_in_tile(substeps: int, size: int) -> int:
+    """The voxels' side for what moves behind a fibre: S, as it is elsewhere, or as many as make a tile of 64
+    voxels; they must fill it."""
+    least = min(size, max(substeps, size // VOXELS_OF_A_TILE))
+    return next(side for side in range(least, size + 1) if not size % side)
 
 
 def _tempos(

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from acquire.fibre import Fibre
+    from acquire.fibre import Fibre, Tile
 
     Image = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 
@@ -38,6 +38,18 @@ def laid_out(scene: Scene, fibre: Fibre, arm: str) -> Scene:
     if isinstance(scene, SeparableScene):
         return _MappedMasks(scene, image)
     return _MappedFrames(scene, image, fibre.size)
+
+
+def seen_in(scene: Scene, fibre: Fibre, tile: Tile) -> Scene:
+    """What a tile behind a fibre shows of the square scene that the field lies in."""
+    row, column = (
+        side.start + fibre.size * place
+        for side, place in zip(fibre.field(), (tile.row, tile.column), strict=True)
+    )
+    part = np.s_[:, row : row + fibre.size, column : column + fibre.size]
+    if isinstance(scene, SeparableScene):
+        return _MappedMasks(scene, lambda masks: masks[part])
+    return _MappedFrames(scene, lambda frames: frames[part], fibre.size)
 
 
 class _MappedMasks(MaskScene):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,8 @@ import pytest
 from acquire.calibrate import Calibration, calibrated
 from acquire.calibrate.columns import dark, flat
 from acquire.calibrate.exposure import open_exposure
+from acquire.calibrate.file import save_calibration
+from acquire.cli import main
 from acquire.config import load_rig
 from acquire.config.rig import ConstantCodeConfig
 from acquire.errors import UsageError
@@ -85,3 +89,24 @@ def test_a_calibration_without_these_columns_is_refused(known: Calibration, tmp_
     uneven = recorded(tmp_path / "uneven.zarr", "x", [])
     with pytest.raises(UsageError, match="16 columns does not reach those of the lines"):
         calibrated(uneven.cut(100, 200, uneven.fibre.tiles[-1]), narrow)
+
+
+def test_what_it_gives_is_told_of_one_tile(
+    known: Calibration,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    recorded(tmp_path / "uneven.zarr", "x", [*UNEVEN, {"kind": "read_noise", "sigma_e": 10.0}])
+    save_calibration(tmp_path / "cal.zarr", known)
+    words = ("--calibration", tmp_path / "cal.zarr", "--explain", "--json", "--nm", 2, "--tm", 75)
+    words += ("--lines", 60, "--tiles", "0-1,1")
+    monkeypatch.setattr(
+        sys, "argv", ["acquire", "reconstruct", str(tmp_path / "uneven.zarr"), *map(str, words)]
+    )
+    assert main() == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["tile"] in {"0,1", "1,1"}
+    by_part = {each["part"]: each for each in told["parts"]}
+    assert by_part["all of it"]["prediction"] < 0.9 * by_part["nothing"]["prediction"]
+    assert by_part["gains per column"]["gain_db"] > 0.3

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from acquire.store import open_video
+from acquire.store import open_recording, open_video
 
 Cli = Callable[..., Any]
 
@@ -100,8 +100,8 @@ def test_a_part_and_a_preview(cli: Cli, recording: Path, tmp_path: Path) -> None
             ("--nm", 3),
             "voxels of N_m = 3 do not fill the tiles behind the fibre, which are 16 fine pixels wide",
         ),
-        (("--auto",), "--auto needs lines that see one scene, and these see tiles behind a fibre"),
-        (("--try-orientations",), "--try-orientations needs lines that see one scene"),
+        (("--try-orientations",), "--try-orientations cannot turn lines behind a fibre"),
+        (("--search", "none"), "--search none is not known possible: each, shared"),
     ],
 )
 def test_what_cannot_be_is_refused_before_anything_is_made(
@@ -110,3 +110,42 @@ def test_what_cannot_be_is_refused_before_anything_is_made(
     answer = cli("reconstruct", recording, "--out", tmp_path / "v.zarr", *words)
     assert (answer.code, reason in " ".join(answer.err.split())) == (2, True), answer.err
     assert not (tmp_path / "v.zarr").exists()
+
+
+def test_one_tile_speaks_where_a_look_at_one_is_enough(cli: Cli, recording: Path, tmp_path: Path) -> None:
+    answer = cli("diagnose", recording, "--json")
+    assert answer.code == 0, answer.err
+    assert answer.json["standing"] == "right"
+    assert answer.json["tile"] in {"0,0", "0,1", "1,0", "1,1"}  # the others are dark
+    answer = cli("diagnose", recording, "--tile", "1,0")
+    assert "1,0" in answer.out
+    answer = cli("diagnose", recording, "--tile", "0-1,0")
+    assert (answer.code, "--tile takes one tile" in answer.err) == (2, True)
+    answer = cli("reconstruct", recording, "--auto", "--save-plan", tmp_path / "plan.toml")
+    assert answer.code == 0, answer.err
+    assert 'why = "tile ' in (tmp_path / "plan.toml").read_text()
+
+
+def test_a_tile_is_measured_against_what_it_shows(cli: Cli, recording: Path, tmp_path: Path) -> None:
+    words = ("--preset", "fast", "--solver", "admm", "--repeats", 1, "--lines", 60, "--voxels", "2x75")
+    words += ("--no-learn", "--json", "--tile", "0,1")
+    answer = cli("tradeoff", recording, "--out", tmp_path / "page", *words)
+    assert answer.code == 0, answer.err
+    assert {row["case"] for row in answer.json["rows"]} == {"run, tile 0,1"}
+    assert answer.json["rows"][-1]["psnr_db"] > 20
+
+
+def test_lines_of_another_program_behind_a_fibre(cli: Cli, recording: Path, tmp_path: Path) -> None:
+    opened = open_recording(recording)
+    for arm in ("a", "b"):
+        np.save(tmp_path / f"{arm}.npy", opened.camera(arm).lines[:])
+    files, words = (tmp_path / "a.npy", tmp_path / "b.npy"), ("--config", recording.parent / "rig.toml")
+    answer = cli("import", *files, "--out", tmp_path / "in.zarr", *words)
+    assert answer.code == 0, answer.err
+    found = open_recording(tmp_path / "in.zarr")
+    assert found.fibre == opened.fibre
+    tile = found.fibre.tiles[1]
+    np.testing.assert_array_equal(found.cut(0, 60, tile).lines, opened.cut(0, 60, tile).lines)
+    np.testing.assert_array_equal(found.cut(0, 60, tile).code, opened.cut(0, 60, tile).code)
+    answer = cli("import", *files, "--out", tmp_path / "in2.zarr", *words, "--columns-a", "0:64")
+    assert (answer.code, "with sensors of 96" in " ".join(answer.err.split())) == (2, True)

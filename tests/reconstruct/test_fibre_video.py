@@ -16,7 +16,7 @@ from acquire.recon import reconstruct
 from acquire.recon.handed import Choice
 from acquire.recon.segments import Voxels
 from acquire.reconstruct import Options, Outcome, Watcher, by_lines, combine, in_tiles, in_voxels, open_pool
-from acquire.reconstruct.handing import energies
+from acquire.reconstruct.liveliest import energies
 from acquire.sim.leds import LedConfig, LedSceneConfig
 from acquire.sim.scenes import build_scene
 from acquire.simulate import simulate
