@@ -141,7 +141,14 @@ class _Comparison:
 
     def _pairs(self, numbers: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.bool_]]:
         """A and B where they show the same point, and whether both do."""
-        at_a_row, at_b_column = self._crossings(numbers)
+        # Row y of B and column x of A show one point where (y, q) − middle = m·Q·((p, x) − middle) + shift:
+        # two equations, linear in p, the row of A, and q, the column of B.
+        alignment = _alignment(numbers, self._images.geometry)
+        (d, e), (f, g) = alignment.matrix
+        y, x = self._b_rows - self._middle - alignment.rows, self._a_columns - self._middle
+        p = (y - e * x) / d
+        q = f * p + g * x + alignment.columns
+        at_a_row, at_b_column = p + self._middle, q + self._middle
         half = (self._S - 1) / 2
         rows_a = at_a_row + half
         columns_a = (self._a_columns - half) / self._S
@@ -152,15 +159,3 @@ class _Comparison:
         low, high = EDGE, self._n - 1 - EDGE
         inside = (at_a_row > low) & (at_a_row < high) & (at_b_column > low) & (at_b_column < high)
         return a, b, inside
-
-    def _crossings(self, numbers: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[Any]]:
-        """For each row y of B and column x of A: the row p of A and the column q of B with (y, q) ≙ (p, x).
-
-        With (y, q) − middle = m·Q·((p, x) − middle) + shift: two equations, linear in p and q.
-        """
-        alignment = _alignment(numbers, self._images.geometry)
-        (d, e), (f, g) = alignment.matrix
-        y, x = self._b_rows - self._middle - alignment.rows, self._a_columns - self._middle
-        p = (y - e * x) / d
-        q = f * p + g * x + alignment.columns
-        return p + self._middle, q + self._middle

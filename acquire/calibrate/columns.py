@@ -61,7 +61,11 @@ def dark(exposure: Exposure, *, covered: bool = False, progress: Progress = unse
     refuse_clipped(exposure, found)
     noise = np.sqrt(found.variance)
     lines = found.lines[:, None]
-    usable = _quiet(noise)
+    # usable: columns whose noise is like that of most
+    size = np.log(np.maximum(noise, 1e-6))
+    middle = np.median(size, axis=1, keepdims=True)
+    spread = np.median(np.abs(size - middle), axis=1, keepdims=True)
+    usable: NDArray[np.bool_] = size - middle <= np.maximum(NOISY * spread, np.log(3.0))
     quantities = {
         "offset_dn": Measured(found.mean, np.sqrt(np.maximum(found.variance, QUANTISATION) / lines)),
         "noise_dn": Measured(noise, noise / np.sqrt(2 * lines)),
@@ -137,15 +141,6 @@ def flat(
     }
     warnings = (*dim(exposure, light), *drift(found), *left_out(usable | ~exposure.lit, "response"))
     return Finding("flat", exposure.instrument, quantities, usable, facts=facts, warnings=warnings)
-
-
-def _quiet(noise: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Columns whose noise is like that of most."""
-    size = np.log(np.maximum(noise, 1e-6))
-    middle = np.median(size, axis=1, keepdims=True)
-    spread = np.median(np.abs(size - middle), axis=1, keepdims=True)
-    quiet: NDArray[np.bool_] = size - middle <= np.maximum(NOISY * spread, np.log(3.0))
-    return quiet
 
 
 def _dark_edges(shape: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:

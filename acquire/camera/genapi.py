@@ -119,15 +119,12 @@ class GenapiNode:
             if self.kind != "command":
                 self._node.value = value
             elif value:
-                self._execute()
-
-    def _execute(self) -> None:
-        self._node.execute()
-        deadline = time.monotonic() + _COMMAND_S
-        while not self._node.is_done():
-            if time.monotonic() > deadline:
-                raise CameraError(f"{self.name} is not done after {_COMMAND_S:g} s")
-            time.sleep(0.001)
+                self._node.execute()
+                deadline = time.monotonic() + _COMMAND_S
+                while not self._node.is_done():
+                    if time.monotonic() > deadline:
+                        raise CameraError(f"{self.name} is not done after {_COMMAND_S:g} s")
+                    time.sleep(0.001)
 
     def limits(self) -> tuple[float, float, float]:
         with told(self.name):

@@ -152,7 +152,13 @@ class HarvestersCamera:
         if not self._ready:
             buffer = self._await_buffer(timeout_s)
             if buffer is None:
-                self._ask_alive()
+                # Some producers are silent when their camera goes: reading a register is not.
+                if time.monotonic() - self._heard_s > _ALIVE_S:
+                    self._heard_s = time.monotonic()
+                    remote = self._features["remote"]
+                    node = remote.find("AcquisitionMode") or remote.find("Width")
+                    if node is not None:
+                        node.read_afresh()
                 return None
             self._heard_s = time.monotonic()
             with told(f"camera {self._spec.serial}"):
@@ -176,14 +182,6 @@ class HarvestersCamera:
             if isinstance(error.__cause__, gentl.TimeoutException):
                 return None
             raise
-
-    def _ask_alive(self) -> None:
-        """Some producers are silent when their camera goes: reading a register is not."""
-        if time.monotonic() - self._heard_s > _ALIVE_S:
-            self._heard_s = time.monotonic()
-            node = self._features["remote"].find("AcquisitionMode") or self._features["remote"].find("Width")
-            if node is not None:
-                node.read_afresh()
 
     def _take(self, buffer: Any) -> None:
         """Put a filled buffer in its place among the frames."""

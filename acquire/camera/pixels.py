@@ -80,7 +80,9 @@ class LineReader:
         """(count, width) pixels from the beginning of ``memory`` (bytes)."""
         layout = self._layout
         if self._joined:
-            return self._joined_lines(memory, count)
+            pixels = count * self._width
+            run = memory[: self.size(count)].reshape(1, -1)
+            return _UNPACK[self._layout.name](run, pixels).reshape(count, self._width)
         rows = memory[: count * self.pitch].reshape(count, self.pitch)[:, : self._row]
         if layout.stored_bits == 8:
             return rows
@@ -101,11 +103,6 @@ class LineReader:
         """The reader for a camera of whose frames one of ``height`` lines fills ``filled`` bytes."""
         joined, aligned = cls(layout, width, joined=True), cls(layout, width, padding)
         return joined if filled == joined.size(height) != aligned.size(height) else aligned
-
-    def _joined_lines(self, memory: NDArray[np.uint8], count: int) -> NDArray[Any]:
-        pixels = count * self._width
-        run = memory[: self.size(count)].reshape(1, -1)
-        return _UNPACK[self._layout.name](run, pixels).reshape(count, self._width)
 
 
 def _groups(rows: NDArray[np.uint8], group: int) -> NDArray[np.uint16]:

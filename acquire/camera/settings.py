@@ -91,7 +91,12 @@ def apply_settings(settings: Iterable[Setting], modules: Mapping[str, Features])
     for setting in settings:
         node = find_node(setting.module, setting.feature, modules)
         value = coerce(setting, node)
-        _check_writable(setting, node)
+        if not node.writable:
+            now = f", it reads {node.read()!r}" if node.readable else ""
+            raise CameraError(
+                f"{setting}: it cannot be written now{now}",
+                hint="a setting that frees it first (a selector or mode), or none: it may be read-only",
+            )
         node.write(value)
         if node.kind != "command":
             _compare(setting, node, "when it is read back")
@@ -152,15 +157,6 @@ def _check_range(setting: Setting, node: Node, value: float) -> None:
     inside = low <= value <= high
     if not inside or (step and node.kind == "integer" and (value - low) % step):
         raise CameraError(f"{setting}: the value is out of range", possible=describe(node))
-
-
-def _check_writable(setting: Setting, node: Node) -> None:
-    if not node.writable:
-        now = f", it reads {node.read()!r}" if node.readable else ""
-        raise CameraError(
-            f"{setting}: it cannot be written now{now}",
-            hint="a setting that frees it first (a selector or mode), or none: it may be read-only",
-        )
 
 
 def _compare(setting: Setting, node: Node, when: str) -> None:

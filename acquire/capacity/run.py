@@ -189,12 +189,8 @@ def _cpu_s(pids: dict[str, int | None]) -> dict[str, float]:
     used_s = {}
     for name, pid in pids.items():
         try:
-            used_s[name] = time.clock_gettime(_cpu_clock(pid or os.getpid()))
+            # The kernel's clock of another process's time, as clock_getcpuclockid(3) makes it.
+            used_s[name] = time.clock_gettime((~(pid or os.getpid()) << 3) | 2)
         except OSError as error:
             raise DataError(f"the load could not be held: process {name} ended") from error
     return used_s
-
-
-def _cpu_clock(pid: int) -> int:
-    """The kernel's clock of a process's own time, as clock_getcpuclockid(3) makes it."""
-    return (~pid << 3) | 2

@@ -46,7 +46,11 @@ def main() -> int:
     except ModuleNotFoundError as error:
         return _failed(not_installed(error))
     except OSError as error:
-        _give_up_stdout()
+        # What stdout could not take is not tried again, with a traceback, when the interpreter ends.
+        try:
+            sys.stdout.flush()
+        except OSError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if error.errno == errno.EPIPE:
             return 1
         return _failed(_refused(error))
@@ -64,11 +68,3 @@ def _refused(error: OSError) -> AcquireError:
     where = f"{error.filename}: " if error.filename else ""
     kind = DeviceError if error.errno in HOST_ERRORS else UsageError
     return kind(f"{where}{error.strerror or error}")
-
-
-def _give_up_stdout() -> None:
-    """What stdout could not take is not tried again, with a traceback, when the interpreter ends."""
-    try:
-        sys.stdout.flush()
-    except OSError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

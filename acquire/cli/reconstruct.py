@@ -24,7 +24,6 @@ from acquire.showing import error_in_words
 
 if TYPE_CHECKING:
     from acquire.cli.reconstruct_request import Asked, Prepared
-    from acquire.config.plan import ReconstructionPlan
     from acquire.fibre import Tile
     from acquire.reconstruct import Options, Outcome, VideoRequest
     from acquire.store import Recording
@@ -423,13 +422,9 @@ def _print_prepared(prepared: Prepared) -> None:
     if prepared.learned:
         note(f"preset {prepared.options.preset}: {prepared.learned}")
     if prepared.plan is not None:
-        _print_plan(prepared.plan)
-
-
-def _print_plan(plan: ReconstructionPlan) -> None:
-    rows = [
-        (part.name or number, part.length, f"{part.spatial_merge}x{part.temporal_merge}", part.why)
-        for number, part in enumerate(plan.segments, 1)
-    ]
-    print_table(("segment", "length", "voxels", "because"), rows)
-    say()
+        rows = [
+            (part.name or number, part.length, f"{part.spatial_merge}x{part.temporal_merge}", part.why)
+            for number, part in enumerate(prepared.plan.segments, 1)
+        ]
+        print_table(("segment", "length", "voxels", "because"), rows)
+        say()

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from acquire.lines import Segment
-    from acquire.store import Mirrored, Outline, Verification
+    from acquire.store import Mirrored, Outline
 
 PlaceArgument = Annotated[
     str,
@@ -114,7 +114,12 @@ def verify(recording: PlaceArgument, json: JsonFlag = False) -> None:
     if json:
         print_json(found.to_dict())
     else:
-        _print_verification(found)
+        verdict = "intact" if found.intact else "DAMAGED"
+        size = quantity(found.bytes, "B")
+        say(f"{found.path}: {verdict}; {found.state}, {found.lines} lines, {size}")
+        _print_list("not intact on disk", map(str, found.damage))
+        _print_list("contradictions", found.contradictions)
+        _print_list("note", found.notes)
     if not found.intact:
         raise typer.Exit(DataError.exit_code)
 
@@ -251,15 +256,6 @@ def cut(
         print_json(facts)
     else:
         say(f"{out}: lines {first} to {first + count - 1}, {quantity(size, 'B')}")
-
-
-def _print_verification(found: Verification) -> None:
-    verdict = "intact" if found.intact else "DAMAGED"
-    size = quantity(found.bytes, "B")
-    say(f"{found.path}: {verdict}; {found.state}, {found.lines} lines, {size}")
-    _print_list("not intact on disk", map(str, found.damage))
-    _print_list("contradictions", found.contradictions)
-    _print_list("note", found.notes)
 
 
 def _print_list(title: str, items: Iterable[str]) -> None:

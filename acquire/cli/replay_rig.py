@@ -54,16 +54,13 @@ def replay_rig(stored: Recording, speed: float, directory: Path, **simulation: A
             "substep_ticks": stored.attrs["trigger"]["line_period_ticks"] // substeps,
             "tag_every_lines": max(1, min(256, slots * block // 4)),
         },
-        "cameras": {arm: _camera(stored, arm) for arm in ARMS} | _layout(fibre),
+        "cameras": {arm: _camera(stored, arm) for arm in ARMS}
+        | ({} if fibre is None else {"layout": "fibre"}),
         "fibre": _table(fibre),
         "stream": {"block_lines": block, "ring_slots": slots, "reopen_s": PATIENCE_S},
         "recording": {"directory": str(directory), "chunk_lines": _chunk_lines(stored), "reserve_gb": 0.0},
         "simulation": {"speed": speed, "replay": str(stored.path.resolve()), **simulation},
     }
-
-
-def _layout(fibre: Fibre | None) -> dict[str, str]:
-    return {} if fibre is None else {"layout": "fibre"}
 
 
 def _table(fibre: Fibre | None) -> dict[str, Any] | None:

@@ -56,7 +56,12 @@ def build(modules: Iterable[str] = MODULES) -> typer.Typer:
 def run(words: Sequence[str]) -> int:
     """Run the command that the words name; its exit code. Raises UsageError for words that are wrong."""
     if VARIABLE in os.environ:
-        return _complete()
+        # What Tab offers: of the command that is there already, or of all.
+        from acquire.cli.completion import complete, words_so_far
+
+        before = [word for word in words_so_far() if not word.startswith("-")][:1]
+        modules = {BY_NAME[word].module for word in before if word in BY_NAME} or MODULES
+        return complete(command_of(modules))
     first = words[0] if words else ""
     if first in ("", *_HELP):
         say_lines(overview(), err=not first)
@@ -76,15 +81,6 @@ def run(words: Sequence[str]) -> int:
             return UsageError.exit_code
         raise _as_ours(error) from error
     return code if isinstance(code, int) else 0
-
-
-def _complete() -> int:
-    """What Tab offers; of the command that is there already, or of all."""
-    from acquire.cli.completion import complete, words_so_far
-
-    before = [word for word in words_so_far() if not word.startswith("-")][:1]
-    modules = {BY_NAME[word].module for word in before if word in BY_NAME} or MODULES
-    return complete(command_of(modules))
 
 
 def say_lines(text: str, *, err: bool = False) -> None:

@@ -128,7 +128,13 @@ class Connection(H11Protocol):
         super().connection_made(transport)
         self._wait(REQUEST_S)
         if len(self.connections) > self.most_connections:
-            self._make_room()
+            # The one that has waited for longest is closed; this one, where all others are at work.
+            others = [cast("Connection", one) for one in self.connections if one is not self]
+            idle = [one for one in others if not one.is_working] or [self]
+            longest = min(idle, key=lambda one: one._waiting_since or 0.0)
+            self.connections.discard(longest)
+            longest.transport.abort()
+            log.warning("more than %d connections: the longest idle one is closed", self.most_connections)
 
     def data_received(self, data: bytes) -> None:
         super().data_received(data)
@@ -165,15 +171,6 @@ class Connection(H11Protocol):
         if self._timer is not None:
             self._timer.cancel()
         self._timer = self._waiting_since = None
-
-    def _make_room(self) -> None:
-        """End the connection that has waited for longest; this one, where all others are at work."""
-        others = [cast("Connection", one) for one in self.connections if one is not self]
-        idle = [one for one in others if not one.is_working] or [self]
-        longest = min(idle, key=lambda one: one._waiting_since or 0.0)
-        self.connections.discard(longest)
-        longest.transport.abort()
-        log.warning("more than %d connections: the longest idle one is closed", self.most_connections)
 
 
 class ApiServer(uvicorn.Server):

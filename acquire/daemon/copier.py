@@ -178,7 +178,12 @@ class Copier:
     def _begin(self, job: Job) -> bool:
         """Open the copy, if its time has come. Raises as `Mirror` does."""
         if not (job.path / "zarr.json").exists():
-            self._miss(job)
+            # It is not made yet, or its disk is not there, or it was removed.
+            young = job.ours and time.monotonic() - job.begun_s < UNBORN_S
+            if not young and job.path.parent.is_dir():
+                self._end(job, state="gone", error=f"{job.path} is not there any more", hint="")
+            else:
+                self._put_off(job, "" if young else f"{job.path.parent} is not there")
             return False
         if not job.ours and read_root(LocalSource(job.path))["attributes"].get("state") != "sealed":
             self._put_off(job, "it is open, and not recovered yet", f"acquire recover {job.path}")
@@ -187,33 +192,23 @@ class Copier:
         job.mirror = Mirror(job.path, job.said.url, pause=self._listen)
         return True
 
-    def _miss(self, job: Job) -> None:
-        """It is not made yet, or its disk is not there, or it was removed."""
-        young = job.ours and time.monotonic() - job.begun_s < UNBORN_S
-        if not young and job.path.parent.is_dir():
-            self._end(job, state="gone", error=f"{job.path} is not there any more", hint="")
-        else:
-            self._put_off(job, "" if young else f"{job.path.parent} is not there")
-
     def _advance(self, job: Job, mirror: Mirror) -> None:
         done = mirror.step(most_shards=1)
         before, job.shards = job.shards, done.shards
         job.tries, job.grows = 0, mirror.grows
         facts = {"lines": done.lines, "waiting_lines": done.waiting_lines, "bytes": done.bytes}
         if done.sealed:
-            self._renew_first(job.path)
+            # The first recording of a run lists its segments, this one by now: its root has to be copied
+            # again.
+            segment = segment_of(read_root(LocalSource(job.path))["attributes"])
+            if segment is not None and (first := job.path.with_name(segment[0])).exists():
+                self.add(first, ours=False)
+                self._mailbox.post(self._jobs[first].said)
             self._end(job, state="copied", error="", hint="", **facts)
             return
         self._tell(job, state="copying", error="", hint="", **facts)
         if done.shards == before:
             job.not_before_s = time.monotonic() + LOOK_S
-
-    def _renew_first(self, path: Path) -> None:
-        """The first recording of a run lists its segments, this one by now."""
-        segment = segment_of(read_root(LocalSource(path))["attributes"])
-        if segment is not None and (first := path.with_name(segment[0])).exists():
-            self.add(first, ours=False)
-            self._mailbox.post(self._jobs[first].said)
 
     def _end(self, job: Job, **facts: Any) -> None:
         del self._jobs[job.path]

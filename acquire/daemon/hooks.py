@@ -60,20 +60,18 @@ class Hooks:
             found = self._news.after(self._last_id)
             self._last_id = found[-1].id if found else self._last_id
             for news in [one for one in found if self._concerns(one)][-MOST_AT_ONCE:]:
-                self._tell(news)
+                told = news.model_copy(update={"text": f"{self._rig}: {news.text}"})
+                text = told.model_dump_json().encode()
+                if self._config.command:
+                    self._call(text)
+                if self._config.webhook:
+                    self._post(self._config.webhook, text)
             if self._ended:
                 return
 
     def _concerns(self, news: News) -> bool:
         fault = news.kind == "state" and news.state is State.FAULTED and news.level == "error"
         return ("fault" if fault else news.kind) in self._config.on
-
-    def _tell(self, news: News) -> None:
-        text = news.model_copy(update={"text": f"{self._rig}: {news.text}"}).model_dump_json().encode()
-        if self._config.command:
-            self._call(text)
-        if self._config.webhook:
-            self._post(self._config.webhook, text)
 
     def _call(self, text: bytes) -> None:
         words, limit_s = list(self._config.command), self._config.timeout_s

@@ -37,7 +37,15 @@ def check_host(config: RigConfig) -> None:
     check_directory(config)
     _check_disk(config)
     _check_spec(config)
-    _check_memory(config)
+    rings, scene = needed_bytes(config)
+    most = int(MEMORY_PART * memory_bytes())
+    if rings + scene > most:
+        raise ConfigError(
+            f"geometry.stages = {config.geometry.stages}: the rings need {rings / 1e9:.3g} GB of memory and "
+            f"the simulated scene {scene / 1e9:.3g} GB, {(rings + scene) / 1e9:.3g} GB in all",
+            possible=f"up to {most / 1e9:.3g} GB on this host",
+            hint="fewer geometry.stages, or a smaller stream.ring_seconds or ring_slots",
+        )
 
 
 def _check_spec(config: RigConfig) -> None:
@@ -98,18 +106,6 @@ def needed_bytes(config: RigConfig) -> tuple[int, int]:
     line_bytes = config.pixels * np.dtype(config.cameras.a.dtype).itemsize
     rings = len(ARMS) * config.ring_slots * config.stream.block_lines * line_bytes
     return rings, SIMULATING * _scene_bytes(config)
-
-
-def _check_memory(config: RigConfig) -> None:
-    rings, scene = needed_bytes(config)
-    most = int(MEMORY_PART * memory_bytes())
-    if rings + scene > most:
-        raise ConfigError(
-            f"geometry.stages = {config.geometry.stages}: the rings need {rings / 1e9:.3g} GB of memory and "
-            f"the simulated scene {scene / 1e9:.3g} GB, {(rings + scene) / 1e9:.3g} GB in all",
-            possible=f"up to {most / 1e9:.3g} GB on this host",
-            hint="fewer geometry.stages, or a smaller stream.ring_seconds or ring_slots",
-        )
 
 
 def _scene_bytes(config: RigConfig) -> int:

@@ -122,10 +122,21 @@ class Changes:
         same_run = before is not None and before.run_id == status.run_id
         if not same_run:
             self._lost.clear()
-        found = self._losses(status)
+        found = []
+        for arm, facts in status.arms.items():
+            for cause, lines in facts.lost.items():
+                told, at_s = self._lost.get((arm, cause), (0, -LOSSES_EVERY_S))
+                if lines <= told or self._now_s() - at_s < LOSSES_EVERY_S:
+                    continue
+                self._lost[arm, cause] = lines, self._now_s()
+                text = f"arm {arm} lost {lines - told} lines: {cause.replace('_', ' ')}"
+                found.append(_fact("loss", text, "error", arm=arm, lines=lines - told))
         if before is not None and same_run:
             found += _verdicts(before, status) + _segment(before, status)
-        found += self._disk_level(status) + _troubles(before, status)
+        known = {one.text: one.times for one in before.troubles} if before else {}
+        new = [one for one in status.troubles if one.times > known.get(one.text, 0)]
+        troubles = [_fact("trouble", one.text, "error") for one in new]
+        found += self._disk_level(status) + troubles
         return found + _waiting(before, status) + _recoveries(before, status) + _uploads(before, status)
 
     def _disk_level(self, status: Status) -> list[dict[str, Any]]:
@@ -138,18 +149,6 @@ class Changes:
             return []
         level: Level = {"good": "info", "warning": "warning"}.get(check.level, "error")  # type: ignore[assignment]
         return [_fact("disk", check.text, level)]
-
-    def _losses(self, status: Status) -> list[dict[str, Any]]:
-        found = []
-        for arm, facts in status.arms.items():
-            for cause, lines in facts.lost.items():
-                told, at_s = self._lost.get((arm, cause), (0, -LOSSES_EVERY_S))
-                if lines <= told or self._now_s() - at_s < LOSSES_EVERY_S:
-                    continue
-                self._lost[arm, cause] = lines, self._now_s()
-                text = f"arm {arm} lost {lines - told} lines: {cause.replace('_', ' ')}"
-                found.append(_fact("loss", text, "error", arm=arm, lines=lines - told))
-        return found
 
 
 def _fact(kind: NewsKind, text: str, level: Level = "info", **more: Any) -> dict[str, Any]:
@@ -186,12 +185,6 @@ def _waiting(before: Status | None, after: Status) -> list[dict[str, Any]]:
     if now and not was:
         return [_fact("waiting", now, "warning")]
     return [_fact("waiting", "what was waited for has answered")] if was and not now else []
-
-
-def _troubles(before: Status | None, after: Status) -> list[dict[str, Any]]:
-    known = {one.text: one.times for one in before.troubles} if before else {}
-    new = [one for one in after.troubles if one.times > known.get(one.text, 0)]
-    return [_fact("trouble", one.text, "error") for one in new]
 
 
 def _recoveries(before: Status | None, after: Status) -> list[dict[str, Any]]:

@@ -290,7 +290,12 @@ class Service:
     def _poll(self) -> CaptureStatus:
         assert self._run is not None
         before, self._seen = self._seen, self._run.capture.poll()
-        self._tell_waiting(before)
+        if self._seen.waiting and not before.waiting:
+            log.warning("%s", self._seen.waiting)
+        elif before.waiting and not self._seen.waiting:
+            log.warning("over: %s", before.waiting)
+        if self._seen.recording and before.recording and before.path != self._seen.path:
+            log.warning("%s goes on in %s", before.path, self._seen.path)
         self._salvage.add(self._seen.orphans)
         if self._seen.path is not None:
             if self._take is not None:
@@ -298,15 +303,6 @@ class Service:
             self._uploads.add(Path(self._seen.path))
         self._rates.update(self._seen)
         return self._seen
-
-    def _tell_waiting(self, before: CaptureStatus) -> None:
-        """In the log: when waiting begins and ends, and where a recording goes on."""
-        if self._seen.waiting and not before.waiting:
-            log.warning("%s", self._seen.waiting)
-        elif before.waiting and not self._seen.waiting:
-            log.warning("over: %s", before.waiting)
-        if self._seen.recording and before.recording and before.path != self._seen.path:
-            log.warning("%s goes on in %s", before.path, self._seen.path)
 
     def _begin(self, begin: Begin, *, by_event: bool = False) -> None:
         assert self._run is not None

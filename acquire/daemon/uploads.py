@@ -150,7 +150,10 @@ class Uploads:
         death = worker.death
         why = self._hear(worker)
         if death is not None or why is not None:
-            self._bury(worker, why or death or "")
+            self._worker = None
+            with contextlib.suppress(DeviceError):
+                worker.end(time.monotonic() + _END_S)
+            self._wait_for_another(why or death or "")
         self._note()
 
     def prove(self, *, force: bool = False) -> None:
@@ -215,14 +218,11 @@ class Uploads:
         try:
             self._born_s = time.monotonic()
             self._awake = False
-            self._worker = Worker("uploads", copy_recordings, self._target, self._copies())
+            left = [path for path, one in self._found.items() if one.state not in _OVER]
+            copies = tuple(Copy(path, path in self._ours) for path in left)
+            self._worker = Worker("uploads", copy_recordings, self._target, copies)
         except DeviceError as error:
             self._wait_for_another(str(error))
-
-    def _copies(self) -> tuple[Copy, ...]:
-        """All that is left, in order."""
-        left = [path for path, one in self._found.items() if one.state not in _OVER]
-        return tuple(Copy(path, path in self._ours) for path in left)
 
     def _hear(self, worker: Worker) -> str | None:
         """Take what the process says; why it ends, if it says so."""
@@ -245,12 +245,6 @@ class Uploads:
         if said.state in ("copying", "copied"):
             self.warning = None
         self._tell(said)
-
-    def _bury(self, worker: Worker, why: str) -> None:
-        self._worker = None
-        with contextlib.suppress(DeviceError):
-            worker.end(time.monotonic() + _END_S)
-        self._wait_for_another(why)
 
     def _wait_for_another(self, why: str) -> None:
         if time.monotonic() - self._born_s > MOST_WAIT_S:

@@ -23,18 +23,19 @@ _LEAST_SENSORS = 8
 def watch_plan(config: RigConfig) -> WatchPlan | None:
     """None where nothing is looked for: no process is started then."""
     threshold = threshold_plan(config)
-    judge = judge_of(config) if config.check.enable and _sees_light(config) else None
+    # A camera that shows a pattern has no light whose code could be checked.
+    judge = (
+        judge_of(config)
+        if config.check.enable
+        and all(CAMERAS.load(config.cameras.arm(arm).driver).sees_light for arm in ARMS)
+        else None
+    )
     if threshold is None and judge is None:
         return None
     passing_hz = config.line_rate_hz * config.simulation.speed
     lines = max(_LEAST_SENSORS * config.geometry.stages, min(_MOST_LINES, round(_CHECK_S * passing_hz)))
     black_dn = {arm: config.cameras.arm(arm).black_level_dn for arm in ARMS}
     return WatchPlan(judge, lines, black_dn, threshold)
-
-
-def _sees_light(config: RigConfig) -> bool:
-    """A camera that shows a pattern has no light whose code could be checked."""
-    return all(CAMERAS.load(config.cameras.arm(arm).driver).sees_light for arm in ARMS)
 
 
 def judge_of(config: RigConfig) -> Judge:

@@ -135,7 +135,11 @@ def fit_sine(
     else:
         harmonics = _visible_harmonics(frequency_hz, interval_s, harmonics)
     coefficients, residual = _project(values, times_s, frequency_hz, harmonics)
-    return _as_sine(frequency_hz, coefficients, residual)
+    p, q = coefficients[1::2], coefficients[2::2]
+    terms = [(float(a), float(phase)) for a, phase in zip(np.hypot(p, q), np.arctan2(q, p), strict=True)]
+    (amplitude, phase_rad), *overtones = terms
+    rms = float(np.sqrt(np.mean(np.square(residual))))
+    return SineFit(frequency_hz, amplitude, float(coefficients[0]), phase_rad, rms, tuple(overtones))
 
 
 def fit_constant(values: NDArray[Any]) -> SineFit:
@@ -231,16 +235,6 @@ def _project(
     design = np.stack(columns, axis=1)
     coefficients = np.linalg.lstsq(design, values, rcond=None)[0].astype(np.float64, copy=False)
     return coefficients, values - design @ coefficients
-
-
-def _as_sine(
-    frequency_hz: float, coefficients: NDArray[np.float64], residual: NDArray[np.float64]
-) -> SineFit:
-    p, q = coefficients[1::2], coefficients[2::2]
-    terms = [(float(a), float(phase)) for a, phase in zip(np.hypot(p, q), np.arctan2(q, p), strict=True)]
-    (amplitude, phase_rad), *overtones = terms
-    rms = float(np.sqrt(np.mean(np.square(residual))))
-    return SineFit(frequency_hz, amplitude, float(coefficients[0]), phase_rad, rms, tuple(overtones))
 
 
 def _correlation(theory: NDArray[np.float64], measured: NDArray[np.float64]) -> float | None:

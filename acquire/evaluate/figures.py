@@ -146,17 +146,12 @@ def psnr_over_time(result: DemoResult) -> Figure:
 def representative_frames(result: DemoResult, count: int = FRAME_COLUMNS) -> NDArray[np.int64]:
     """Indices (count,) spread over one period of the slowest region; over the whole video without one."""
     total = len(result.frame_ms)
-    period = _slowest_period(result)
+    rates = [curve.theory.frequency_hz for curve in result.solvers[0].curves if not curve.constant]
+    period = round(1e6 / (min(rates) * result.frame_interval_us)) if rates else 0
     if not count <= period <= total:
         return np.linspace(0, total - 1, min(count, total)).round().astype(np.int64)
     first = min(total // 2, total - period)
     return first + (np.arange(count) * period) // count
-
-
-def _slowest_period(result: DemoResult) -> int:
-    """Frames in one period of the slowest region that changes; 0 without one."""
-    rates = [curve.theory.frequency_hz for curve in result.solvers[0].curves if not curve.constant]
-    return round(1e6 / (min(rates) * result.frame_interval_us)) if rates else 0
 
 
 def _detail_window(result: DemoResult, row: int) -> tuple[float, float]:
@@ -192,7 +187,8 @@ def _show_region(ax: Axes, result: DemoResult, region: Region) -> None:
 
 def _plot_curves(ax: Axes, result: DemoResult, row: int) -> None:
     region = result.regions[row]
-    scale = _brightest(region)
+    # What the figure shows as 1: theory and measurement share it, so that a lost amplitude is seen.
+    scale = float(np.max(np.abs(region.theory))) or 1.0
     ax.plot(result.frame_ms, region.theory / scale, color=THEORY, lw=3.0, label="theory")
     for rank, (solver, colour) in enumerate(_coloured(result)):
         measured = region_mean(solver.video, region.mask) / scale
@@ -209,11 +205,6 @@ def _list_fits(ax: Axes, result: DemoResult, row: int) -> None:
     for i, (text, colour) in enumerate(texts):
         y = 0.5 + 0.22 * ((len(texts) - 1) / 2 - i)
         ax.text(1.05, y, text, color=colour, fontsize=9, va="center", transform=ax.transAxes)
-
-
-def _brightest(region: Region) -> float:
-    """What the figure shows as 1; theory and measurement share it, so that a lost amplitude is seen."""
-    return float(np.max(np.abs(region.theory))) or 1.0
 
 
 def _fit_text(curve: CurveComparison) -> str:

@@ -110,7 +110,18 @@ def open_lines(path: Path, layout: Layout) -> Iterator[LineFile]:
             file = openers[kind](path, layout, held)
         except DAMAGE as error:
             raise UsageError(f"{path} cannot be read as {kind}: {error}") from error
-        _check(file)
+        shape = " x ".join(map(str, file.shape))
+        if len(file.shape) not in {2, 3} or 0 in file.shape or file.arms not in {1, 2}:
+            raise UsageError(
+                f"{file.path} has the shape {shape}",
+                possible="(line, pixel), or (arm, line, pixel) of two arms",
+            )
+        if file.dtype.newbyteorder("=").name not in TYPES:
+            raise UsageError(
+                f"{file.path} holds {file.dtype.name}",
+                possible=", ".join(TYPES),
+                hint="raw values of the camera",
+            )
         yield file if layout.columns is None else _cropped(file, layout.columns)
 
 
@@ -134,18 +145,6 @@ def _kind(path: Path, layout: Layout) -> str:
             hint="--dtype and --pixels for bare numbers",
         )
     return kind
-
-
-def _check(file: LineFile) -> None:
-    shape = " x ".join(map(str, file.shape))
-    if len(file.shape) not in {2, 3} or 0 in file.shape or file.arms not in {1, 2}:
-        raise UsageError(
-            f"{file.path} has the shape {shape}", possible="(line, pixel), or (arm, line, pixel) of two arms"
-        )
-    if file.dtype.newbyteorder("=").name not in TYPES:
-        raise UsageError(
-            f"{file.path} holds {file.dtype.name}", possible=", ".join(TYPES), hint="raw values of the camera"
-        )
 
 
 def _cropped(file: LineFile, columns: tuple[int, int]) -> LineFile:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,8 +14,6 @@ from acquire.exchange.libraries import library
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
-
-    from numpy.typing import NDArray
 
     from acquire.exchange.content import Content
 
@@ -59,17 +57,14 @@ def write_movie(
         stream.width, stream.height = width + width % 2, height + height % 2
         for _, block in content.image.blocks():
             for frame in block:
-                container.mux(stream.encode(_picture(av, frame, white, times)))
+                # The codec wants even sides: an odd one gets its last row or column twice.
+                grey = np.rint(np.clip(frame.astype(np.float32) * (255 / white), 0, 255)).astype(np.uint8)
+                large = grey.repeat(times, axis=0).repeat(times, axis=1)
+                even = np.pad(large, [(0, side % 2) for side in large.shape], mode="edge")
+                picture = av.VideoFrame.from_ndarray(even, format="gray")
+                container.mux(stream.encode(picture))
             advance(block.nbytes)
         container.mux(stream.encode())
-
-
-def _picture(av: Any, frame: NDArray[Any], white: float, times: int) -> Any:
-    """The codec wants even sides: an odd one gets its last row or column twice."""
-    grey = np.rint(np.clip(frame.astype(np.float32) * (255 / white), 0, 255)).astype(np.uint8)
-    large = grey.repeat(times, axis=0).repeat(times, axis=1)
-    even = np.pad(large, [(0, side % 2) for side in large.shape], mode="edge")
-    return av.VideoFrame.from_ndarray(even, format="gray")
 
 
 def _white(content: Content) -> float:

@@ -83,20 +83,15 @@ def sampling_matrix(alignment: Alignment, size: int, spatial_merge: int = 1) -> 
     if spatial_merge == 1:
         fine.eliminate_zeros()
         return fine
-    held = _holding(size, spatial_merge)
+    # H = B ⊗ B, (n², n′²): voxels held over their blocks, and means over them the other way.
+    _, lengths = block_bounds(size, spatial_merge)
+    block = np.repeat(np.arange(len(lengths)), lengths)
+    one = sparse.coo_array((np.ones(size), (np.arange(size), block))).tocsr()
+    held: sparse.csr_array = sparse.kron(one, one).tocsr()
     means = sparse.diags_array(1 / held.sum(axis=0)) @ held.T
     merged: sparse.csr_array = (means @ fine @ held).tocsr()
     merged.eliminate_zeros()
     return merged
-
-
-def _holding(size: int, merge: int) -> sparse.csr_array:
-    """Voxels held over their blocks: (n², n′²)."""
-    _, lengths = block_bounds(size, merge)
-    block = np.repeat(np.arange(len(lengths)), lengths)
-    one = sparse.coo_array((np.ones(size), (np.arange(size), block))).tocsr()
-    whole: sparse.csr_array = sparse.kron(one, one).tocsr()
-    return whole
 
 
 class _Gather:

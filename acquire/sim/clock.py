@@ -265,7 +265,10 @@ class Wire:
             payload = self._page[_PAYLOAD_AT : _PAYLOAD_AT + length]
             if zlib.crc32(payload) != checksum:
                 return False
-            self._known = (sequence, _decode(payload))
+            run, start_ns, line_period_ns, speed, code, stopped, budget, settled_s, lit = json.loads(payload)
+            timing = run, start_ns, Fraction(line_period_ns), Fraction(speed), code
+            train = PulseTrain(*timing, stopped, budget, settled_s, (lit[0], lit[1]))
+            self._known = (sequence, train)
         return True
 
     def _write(self, sequence: int, train_at: Callable[[int], PulseTrain]) -> PulseTrain:
@@ -283,12 +286,6 @@ def _encode(train: PulseTrain) -> bytes:
     timing = (train.run, train.start_ns, str(train.line_period_ns), str(train.speed), dict(train.code))
     limits = (train.stopped_after, train.budget)
     return json.dumps([*timing, *limits, dict(train.settled_s), train.lit_part]).encode()
-
-
-def _decode(payload: bytes) -> PulseTrain:
-    run, start_ns, line_period_ns, speed, code, stopped, budget, settled_s, lit = json.loads(payload)
-    timing = run, start_ns, Fraction(line_period_ns), Fraction(speed), code
-    return PulseTrain(*timing, stopped, budget, settled_s, (lit[0], lit[1]))
 
 
 def _receive(duplicate: Any) -> Wire:

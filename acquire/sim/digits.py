@@ -72,7 +72,9 @@ class DigitScene(MaskScene):
         self, displays: tuple[DisplayConfig, ...], period_s: float, size: int, substep_s: float
     ) -> None:
         self._displays, self._period_s, self._substep_s = displays, period_s, substep_s
-        self.segments = [(display, name) for display in displays for name in _PLACES if _used(display, name)]
+        self.segments = [
+            (display, name) for display in displays for name in _PLACES if bool(_shows(display, name).any())
+        ]
         self.masks = np.stack([_segment(display, name, size) for display, name in self.segments])
 
     def intensity(self, first: int, count: int, substep_s: float | None = None) -> NDArray[np.float64]:
@@ -87,10 +89,6 @@ class DigitScene(MaskScene):
 def _shows(display: DisplayConfig, name: str) -> NDArray[np.bool_]:
     """(digit): whether the display's digits light the segment."""
     return np.array([name in SEGMENTS[int(digit)] for digit in display.digits])
-
-
-def _used(display: DisplayConfig, name: str) -> bool:
-    return bool(_shows(display, name).any())
 
 
 def _digit_light(display: DisplayConfig, first: int, count: int, step: float) -> NDArray[np.float64]:

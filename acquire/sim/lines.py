@@ -112,7 +112,10 @@ class SeparableLines:
 
     def __init__(self, scene: SeparableScene, light: Illumination, substeps: int, optics: ArmOptics) -> None:
         self._size, self._source, self._substeps = scene.size, light, substeps
-        pixels = _merge_columns(seen(scene.masks, optics), substeps)
+        video = seen(scene.masks, optics)
+        pixels: NDArray[np.float32] = video[:, :, ::substeps].copy()
+        for column in range(1, substeps):
+            pixels += video[:, :, column::substeps]
         # A mask covers few rows: the others add nothing to the product.
         self._rows = [_covered_rows(mask) for mask in pixels]
         self._weights = np.concatenate([mask[rows] for mask, rows in zip(pixels, self._rows, strict=True)])
@@ -224,14 +227,6 @@ def seen(video: NDArray[Any], optics: ArmOptics) -> NDArray[Any]:
     """Frames (…, row, column) as an arm sees them: mirrored, then turned counter-clockwise."""
     mirrored = video[:, :, ::-1] if optics.mirror else video
     return np.rot90(mirrored, optics.turn_deg // 90, axes=(1, 2))
-
-
-def _merge_columns(video: NDArray[np.float32], substeps: int) -> NDArray[np.float32]:
-    """(…, row, pixel): the sum of S columns per pixel; one column after the other."""
-    merged: NDArray[np.float32] = video[:, :, ::substeps].copy()
-    for column in range(1, substeps):
-        merged += video[:, :, column::substeps]
-    return merged
 
 
 def _covered_rows(mask: NDArray[np.float32]) -> slice:

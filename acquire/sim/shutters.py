@@ -71,12 +71,9 @@ class Window:
             phase = self._phases[number]
             if phase.axis != "open":
                 done = 1 - (self._ends_s[number] - at_s) / phase.duration_s
-                opened = self._slit(phase, float(done))
+                middle = phase.begin + (phase.end - phase.begin) * float(done)
+                opened = overlap(self._size, middle - phase.width / 2, phase.width).astype(np.float32)
                 np.multiply(frame, opened[:, None] if phase.axis == "row" else opened, out=frame)
-
-    def _slit(self, phase: WindowPhase, done: float) -> NDArray[np.float32]:
-        middle = phase.begin + (phase.end - phase.begin) * done
-        return overlap(self._size, middle - phase.width / 2, phase.width).astype(np.float32)
 
 
 class Chopper:

@@ -143,7 +143,8 @@ class TriggerModel:
         with self._lock:
             self._advance()
             self._pps = (self._tick(), self._pps[1] + 1)
-            self._event(TagFlag.PPS)
+            if self._run.state in (State.RUNNING, State.STOPPING):
+                self._tell(self._record(self._run.lines, self._tick(), TagFlag.PPS))
 
     def lose_clock(self, lost: bool = True) -> None:
         """The reference clock goes away, or comes back. A run under way ends."""
@@ -255,21 +256,15 @@ class TriggerModel:
         self._hear(run.start_tick - self._lead() - RUN_CLOCKS)
         period_ns = Fraction(run.line_clocks * NS_PER_S, self._clock_hz)
         attrs = light_attrs(self.registers.get)
-        optics = self._settled_s(), self._lit_part()
-        self._wire.start(period_ns, self._speed, attrs, start_ns, self._lines_allowed(), *optics)
-
-    def _settled_s(self) -> dict[str, float]:
-        """Arm → how much later its line starts than the light of the line's first sub-step."""
+        # arm → how much later its line starts than the light of the line's first sub-step
         delays = {"a": r.TRIGGER_A_DELAY, "b": r.TRIGGER_B_DELAY}
-        return {
+        settled_s = {
             arm: (self._lead() + self.registers.get(delay)) / self._clock_hz for arm, delay in delays.items()
         }
-
-    def _lit_part(self) -> tuple[float, float]:
-        """From where to where of a lit sub-step the light is on."""
         begin, end = self.registers.get(r.WINDOW_OPEN), self.registers.get(r.WINDOW_CLOSE)
         clocks = self.registers.get(r.SUBSTEP_CLOCKS)
-        return begin / clocks, end / clocks
+        lit_part = begin / clocks, end / clocks
+        self._wire.start(period_ns, self._speed, attrs, start_ns, self._lines_allowed(), settled_s, lit_part)
 
     def _hear(self, tick: int) -> None:
         """The host lived at ``tick``: that is what it may be silent from.
@@ -350,10 +345,6 @@ class TriggerModel:
             if line == 0:
                 flags |= TagFlag.FIRST | (TagFlag.EXTERNAL if run.external else TagFlag(0))
             self._tell(self._record(line + 1, run.start_tick + line * run.line_clocks, flags))
-
-    def _event(self, flags: TagFlag) -> None:
-        if self._run.state in (State.RUNNING, State.STOPPING):
-            self._tell(self._record(self._run.lines, self._tick(), flags))
 
     def _record(self, lines: int, tick: int, flags: int) -> TagRecord:
         run, line = self._run, max(0, lines - 1)

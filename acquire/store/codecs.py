@@ -129,7 +129,11 @@ def choose_codec(
         )
     measured = tuple(measure_codec(lines, codec) for codec in CODECS)
     needed = bytes_per_s * margin
-    held = {speed.codec: _sustained(speed, disk_bytes_per_s, threads) for speed in measured}
+    # Packing and writing go on beside each other: the slower one counts.
+    held = {
+        speed.codec: min(speed.megabytes_per_s * 1e6 * threads, disk_bytes_per_s * speed.ratio)
+        for speed in measured
+    }
     able = [speed for speed in measured if held[speed.codec] >= needed]
     if able:
         best = max(able, key=lambda speed: speed.ratio)
@@ -149,8 +153,3 @@ def measure_codec(lines: NDArray[Any], codec: Codec, seconds: float = 0.1) -> Co
         crc32c(payload.data)
         best = min(best, time.perf_counter() - begun)
     return CodecSpeed(codec, rows.nbytes / best / 1e6, rows.nbytes / len(payload))
-
-
-def _sustained(speed: CodecSpeed, disk_bytes_per_s: float, threads: int) -> float:
-    """Bytes of lines per second: packing and writing go on beside each other, the slower one counts."""
-    return min(speed.megabytes_per_s * 1e6 * threads, disk_bytes_per_s * speed.ratio)

@@ -26,7 +26,12 @@ def check_lengths(recording: Outline) -> None:
             raise ValueError(f"files of {key} have other rows than those of {ARMS[0]}/lines")
         if array.rows > MOST_LINES:
             raise ValueError(f"{key} claims {array.rows} lines")
-    _check_dropped(recording)
+    # Dropped stretches are parts of the recording, one after the other.
+    end = 0
+    for rows in sorted(recording.dropped_rows(), key=lambda rows: rows.start):
+        if not end <= rows.start < rows.stop <= recording.lines:
+            raise ValueError(f"lines are said to be dropped that are none: rows {rows.start} to {rows.stop}")
+        end = rows.stop
     claimed = kept_shards(recording)
     chunks = max(array.shape.shard_chunks for array in arrays.values())
     if claimed * chunks <= MOST_ABSENT_CHUNKS:
@@ -41,12 +46,3 @@ def kept_shards(recording: Outline) -> int:
     """Files of each array that hold lines which retention has not dropped, as the root says."""
     size = recording.arms[ARMS[0]].files("lines").shape.shard_rows
     return sum((rows.stop - 1) // size - rows.start // size + 1 for rows in recording.kept_rows())
-
-
-def _check_dropped(recording: Outline) -> None:
-    """Dropped stretches are parts of the recording, one after the other."""
-    end = 0
-    for rows in sorted(recording.dropped_rows(), key=lambda rows: rows.start):
-        if not end <= rows.start < rows.stop <= recording.lines:
-            raise ValueError(f"lines are said to be dropped that are none: rows {rows.start} to {rows.stop}")
-        end = rows.stop

@@ -238,21 +238,42 @@ class Mirror:
                 self._publish(recording, lines)
         except OSError as error:
             raise _not_copied(self, error) from error
-        self._let_go(None if sealed else recording.first_line + lines)
+        # Retention may have what is copied: lines before this one; all of a recording that is sealed.
+        line = None if sealed else recording.first_line + lines
+        if line is None:
+            release(self.path, self._disk)
+        elif line != self._kept_from:
+            keep_from(self.path, line, self.target.url, self._disk)
+            self._kept_from = line
         waiting = recording.lines - lines
         return Mirrored(str(self.target), lines, self._shards, self._bytes, whole, waiting)
 
     def _copy_shards(self, recording: Recording, end: int, most: int | None) -> None:
         before = self._shards
-        if self._next < end:
-            self._mark()
+        if self._next < end and not self._root and MARK not in self._there:
+            # Say whose copy this is, before its root can.
+            run_id, number = self._identity
+            facts = {"run_id": run_id} | ({"segment_number": number} if number > 1 else {})
+            self._put(MARK, to_json({"attributes": facts}))
+            self._there[MARK] = 0
         while self._next < end and (most is None or self._shards - before < most):
             if (kept := self._next_kept(recording)) != self._next:
                 self._next = kept
                 continue
             if not self._sealed:
                 self._refuse_shortfall(recording, range(self._next, self._next + 1))
-            self._copy_shard(self._next)
+            # What is there of the right size is the same: a shard that is whole is never written again.
+            copied = False
+            for file in shard_files(self.path, self._next):
+                key = file.relative_to(self.path).as_posix()
+                size = file.stat().st_size
+                if self._there.get(key) != size:
+                    self._make_way(key)
+                    self.target.put_file(key, file)
+                    self._there[key] = size
+                    self._bytes += size
+                    copied = True
+            self._shards += copied
             self._next += 1
 
     def _next_kept(self, recording: Recording) -> int:
@@ -269,14 +290,6 @@ class Mirror:
                 possible="a recording of which all lines are on disk, or flagged as missing",
                 hint=f"acquire verify {self.path}; acquire recover flags what is lost, then copy again",
             )
-
-    def _let_go(self, line: int | None) -> None:
-        """Retention may have what is copied: lines before ``line``; all of a recording that is sealed."""
-        if line is None:
-            release(self.path, self._disk)
-        elif line != self._kept_from:
-            keep_from(self.path, line, self.target.url, self._disk)
-            self._kept_from = line
 
     def _check_target(self) -> None:
         """Only a copy of the same recording may be there, or one that was begun and never published."""
@@ -296,28 +309,6 @@ class Mirror:
             )
         if said is None:  # nothing there says whose it is: nothing there is relied on
             self._there = {}
-
-    def _mark(self) -> None:
-        """Say whose copy this is, before its root can."""
-        if not self._root and MARK not in self._there:
-            run_id, number = self._identity
-            facts = {"run_id": run_id} | ({"segment_number": number} if number > 1 else {})
-            self._put(MARK, to_json({"attributes": facts}))
-            self._there[MARK] = 0
-
-    def _copy_shard(self, shard: int) -> None:
-        """A shard that is whole is never written again: what is there of the right size is the same."""
-        copied = False
-        for file in shard_files(self.path, shard):
-            key = file.relative_to(self.path).as_posix()
-            size = file.stat().st_size
-            if self._there.get(key) != size:
-                self._make_way(key)
-                self.target.put_file(key, file)
-                self._there[key] = size
-                self._bytes += size
-                copied = True
-        self._shards += copied
 
     def _publish(self, recording: Recording, lines: int) -> None:
         """Tables and metadata of what is copied; nothing where the root would be the same."""

@@ -95,14 +95,10 @@ class MosaicWriter(VideoWriter):
             for array, values in zip(self._columns.values(), columns, strict=True):
                 array.resize((self.frames, *array.shape[1:]))
                 array[:] = values
-            self._halve()
+            step = self._levels[0].chunks[0]
+            for larger, smaller in zip(self._levels, self._levels[1:], strict=False):
+                smaller.resize((self.frames, *smaller.shape[1:]))
+                for first in range(0, self.frames, step):
+                    frames = np.asarray(larger[first : first + step])
+                    smaller[first : first + step] = layout.halved(frames)
         self._end(provenance)
-
-    def _halve(self) -> None:
-        """The smaller copies, some whole frames at a time."""
-        step = self._levels[0].chunks[0]
-        for larger, smaller in zip(self._levels, self._levels[1:], strict=False):
-            smaller.resize((self.frames, *smaller.shape[1:]))
-            for first in range(0, self.frames, step):
-                frames = np.asarray(larger[first : first + step])
-                smaller[first : first + step] = layout.halved(frames)

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from acquire.errors import AcquireError
-    from acquire.store.array_files import ArmFiles
     from acquire.store.layout import Document
     from acquire.store.outline import Outline
     from acquire.store.source import Source
@@ -136,10 +135,6 @@ def _check_complete(recording: Outline) -> None:
     for table in ("gaps", "events"):
         int(recording.document["consolidated_metadata"]["metadata"][table]["attributes"]["not_listed"])
     for arm in recording.arms.values():
-        _check_arm(arm)
-
-
-def _check_arm(arm: ArmFiles) -> None:
-    for name in COLUMNS:
-        if len(arm.files(name).shape.chunk_shape) != (2 if name == "lines" else 1):
-            raise ValueError(f"{arm.arm}/{name} has the wrong number of axes")
+        for name in COLUMNS:
+            if len(arm.files(name).shape.chunk_shape) != (2 if name == "lines" else 1):
+                raise ValueError(f"{arm.arm}/{name} has the wrong number of axes")

@@ -233,16 +233,13 @@ class _Recoverer:
         for leftover in (SCRATCH, RESERVE):
             self.disk.remove(hidden / leftover)
         release(self.path, self.disk)
-        self._delete_dropped()
-        self.disk.sync_directory(self.path.parent)
-
-    def _delete_dropped(self) -> None:
-        """Shards that retention had told of, and may have had no time to delete."""
+        # Shards that retention had told of, and may have had no time to delete.
         size = self.shape.shard_rows
         told = [range(-(-rows.start // size), rows.stop // size) for rows in self.recording.dropped_rows()]
         for shard in shards_on_disk(self.path):
             if any(shard in shards for shards in told):
                 remove(self.disk, self.path, Dropped(shard, told))
+        self.disk.sync_directory(self.path.parent)
 
     def _tables(
         self, publisher: Publisher, new_gaps: dict[str, list[tuple[int, int, str]]]

@@ -58,7 +58,11 @@ def refusal(place: object, error: OSError, doing: str, hint: str = "") -> Acquir
         return _far(text, error, hint)
     if error.errno == errno.EIO and doing == "read":
         return DataError(text, hint="a copy of the recording, and the kernel's log for errors of the disk")
-    return _near(text, error, hint)
+    if error.errno in NOT_A_PLACE:
+        return PlaceError(text, hint=hint or "another path, or the permissions of this one")
+    if error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}:
+        return StoreError(text, hint="free space there, or another disk")
+    return StoreError(text, hint=hint or "the kernel's log for errors of the disk")
 
 
 def _far(text: str, error: OSError, hint: str) -> AcquireError:
@@ -67,11 +71,3 @@ def _far(text: str, error: OSError, hint: str) -> AcquireError:
     if isinstance(error, PermissionError):
         return PlaceError(text, hint="; ".join(filter(None, (_RIGHTS, hint))))
     return StoreError(text, hint="; ".join(filter(None, (_NETWORK, hint))))
-
-
-def _near(text: str, error: OSError, hint: str) -> AcquireError:
-    if error.errno in NOT_A_PLACE:
-        return PlaceError(text, hint=hint or "another path, or the permissions of this one")
-    if error.errno in {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}:
-        return StoreError(text, hint="free space there, or another disk")
-    return StoreError(text, hint=hint or "the kernel's log for errors of the disk")

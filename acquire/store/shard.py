@@ -118,7 +118,11 @@ class Pages:
         """
         wholes = [len(payload) // PAGE * PAGE if is_aligned(payload) else 0 for payload in payloads]
         rests = [payload[whole:] for payload, whole in zip(payloads, wholes, strict=True)]
-        free = self._at_least(sum(page_up(len(rest) + CRC_BYTES) for rest in rests))
+        # A quarter more, so that pieces that grow a little do not ask for memory each time.
+        size = sum(page_up(len(rest) + CRC_BYTES) for rest in rests)
+        if size > len(self._memory):
+            self._memory = aligned_bytes(size + size // 4)
+        free = self._memory
         parts: list[Buffer] = []
         for payload, whole, rest in zip(payloads, wholes, rests, strict=True):
             end = len(rest) + CRC_BYTES
@@ -128,11 +132,6 @@ class Pages:
             last[end:] = 0
             parts += [payload[:whole].data, last.data]
         return Piece(parts, [len(payload) + CRC_BYTES for payload in payloads])
-
-    def _at_least(self, size: int) -> NDArray[np.uint8]:
-        if size > len(self._memory):
-            self._memory = aligned_bytes(size + size // 4)
-        return self._memory
 
 
 def small_piece(payloads: Sequence[NDArray[np.uint8]]) -> Piece:

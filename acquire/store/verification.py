@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from acquire.store.camera_stream import CameraStream
     from acquire.store.reader import Recording
     from acquire.store.scan import ArmScan
 
@@ -123,12 +122,12 @@ def _listed(recording: Recording, arm: str) -> tuple[int, int]:
     """Lines that are listed as lost, and those of them that retention has not dropped."""
     lost = recording.lost_rows(arm)
     every = sum(len(rows) for rows in lost)
-    gone = sum(len(_common(rows, drop)) for rows in lost for drop in recording.dropped_rows())
+    gone = sum(
+        len(range(max(rows.start, drop.start), min(rows.stop, drop.stop)))
+        for rows in lost
+        for drop in recording.dropped_rows()
+    )
     return every, every - gone
-
-
-def _common(one: range, other: range) -> range:
-    return range(max(one.start, other.start), min(one.stop, other.stop))
 
 
 def _read_tags(recording: Recording, found: ArmScan) -> tuple[int | None, int]:
@@ -141,14 +140,11 @@ def _read_tags(recording: Recording, found: ArmScan) -> tuple[int | None, int]:
         rows = min(size, recording.lines - chunk * size)
         missing = missing_rows(found.stream.reader("flags").chunk(chunk)[:rows])
         flagged += int(missing.sum())
-        misnumbered += int((_misnumbered(recording, found.stream, chunk, rows) & ~missing).sum())
+        first = recording.first_line + chunk * found.stream.reader("flags").shape.chunk_rows
+        expected = recording.substeps * np.arange(first, first + rows, dtype=np.uint64)
+        wrong = found.stream.reader("code_index").chunk(chunk)[:rows] != expected
+        misnumbered += int((wrong & ~missing).sum())
     return flagged, misnumbered
-
-
-def _misnumbered(recording: Recording, stream: CameraStream, chunk: int, rows: int) -> Any:
-    first = recording.first_line + chunk * stream.reader("flags").shape.chunk_rows
-    expected = recording.substeps * np.arange(first, first + rows, dtype=np.uint64)
-    return stream.reader("code_index").chunk(chunk)[:rows] != expected
 
 
 def _unbalanced(recording: Recording, arm: str, listed: int | None) -> Iterator[str]:

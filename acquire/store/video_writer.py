@@ -121,16 +121,13 @@ class VideoWriter:
         first, end = provenance.get("trusted") or (0, 0)
         with refused(self._place, "written"):
             if "trusted" in provenance:
-                self._mark(int(first), int(end))
+                frame = np.arange(self.frames)
+                column = _column(self._group, "trusted", "bool", layout.TRUSTED_ATTRIBUTES)
+                column.resize((self.frames,))
+                column[:] = (int(first) <= frame) & (frame < int(end))
+                self._columns["trusted"] = column
             self._publish(provenance, min(int(first), self.frames - 1))
         self._delivery.deliver()
-
-    def _mark(self, first: int, end: int) -> None:
-        frame = np.arange(self.frames)
-        column = _column(self._group, "trusted", "bool", layout.TRUSTED_ATTRIBUTES)
-        column.resize((self.frames,))
-        column[:] = (first <= frame) & (frame < end)
-        self._columns["trusted"] = column
 
     def _publish(self, provenance: Mapping[str, Any], first_frame: int) -> None:
         """Consolidated by hand: the columns are not listed, and zarr-python would warn."""

@@ -290,7 +290,10 @@ class RecordingWriter:
         ``ledger["store"]``. Raises DataError when the disk fails; a second call then seals what is there.
         """
         self._check_open()
-        _check_ledger(ledger)
+        try:
+            json.dumps(ledger, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            raise UsageError(f"the ledger of a recording is not JSON: {error}") from error
         with self._failing("sealing"):
             rows = self._rescue() if self._failure else self._pad()
             self._disk.remove(self._reserve)
@@ -449,10 +452,3 @@ def _advice(error: OSError) -> str:
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         return "free space there, or record to another disk"
     return "check that the directory still exists and the kernel's log for errors of the disk"
-
-
-def _check_ledger(ledger: dict[str, Any]) -> None:
-    try:
-        json.dumps(ledger, allow_nan=False)
-    except (TypeError, ValueError) as error:
-        raise UsageError(f"the ledger of a recording is not JSON: {error}") from error

@@ -231,7 +231,13 @@ class Capture:
             plan.goes_on,
         )
         return Worker(
-            RECORDER, recorder.record, what, self._rings, self._tags, self._counters[RECORDER], self._others()
+            RECORDER,
+            recorder.record,
+            what,
+            self._rings,
+            self._tags,
+            self._counters[RECORDER],
+            {name: counters for name, counters in self._counters.items() if name != RECORDER},
         )
 
     def _new_watcher(self) -> Worker:
@@ -266,9 +272,6 @@ class Capture:
         if not all(self._counters[arm]["stamp_ns"] for arm in arms):
             return None
         return self._new_grabber(name, successor=True)
-
-    def _others(self) -> dict[str, Counters]:
-        return {name: counters for name, counters in self._counters.items() if name != RECORDER}
 
     def _grabber_plan(self, arm: str) -> grabber.GrabberPlan:
         plan = self._plan

@@ -191,7 +191,13 @@ class Intake:
         """Put the block's lines into the ring. Raises CameraError for a block that cannot be right."""
         if self._plan.columns is not None:
             block = replace(block, pixels=block.pixels[:, slice(*self._plan.columns)])
-        self._check(block)
+        shape = self._ring.shape
+        if block.pixels.shape != (len(block.flags), shape.width) or block.pixels.dtype != shape.dtype:
+            raise CameraError(
+                f"camera {self._plan.arm} gave a block of {block.pixels.shape} {block.pixels.dtype} "
+                f"with {len(block.flags)} flags",
+                possible=f"(lines, {shape.width}) {shape.dtype} with a flag per line",
+            )
         if self._away:
             if block.time_ns is None and block.flags.all():
                 return  # an incomplete frame has no time, and the next one may have
@@ -200,7 +206,10 @@ class Intake:
         first = block.first_line + self._shift
         self._note_jump(first, block.losses)
         if block.time_ns is not None:
-            self._stamp(first, block.time_ns)
+            self._clock.note(first, block.time_ns)
+            stamp = {"stamp_line": first, "stamp_ns": block.time_ns, "drift_ppb": self._clock.drift_ppb}
+            for name, value in stamp.items():
+                self._counters[name] = value
         count = len(block.flags)
         preroll = min(max(-first, 0), count)
         self._counters.add("delivered", count)
@@ -210,21 +219,6 @@ class Intake:
             self._put(first + at, block.pixels[part], block.flags[part])
         self._next = first + count
         self._counters["next_line"] = self._next
-
-    def _stamp(self, line: int, time_ns: int) -> None:
-        self._clock.note(line, time_ns)
-        stamp = {"stamp_line": line, "stamp_ns": time_ns, "drift_ppb": self._clock.drift_ppb}
-        for name, value in stamp.items():
-            self._counters[name] = value
-
-    def _check(self, block: CameraBlock) -> None:
-        shape = self._ring.shape
-        if block.pixels.shape != (len(block.flags), shape.width) or block.pixels.dtype != shape.dtype:
-            raise CameraError(
-                f"camera {self._plan.arm} gave a block of {block.pixels.shape} {block.pixels.dtype} "
-                f"with {len(block.flags)} flags",
-                possible=f"(lines, {shape.width}) {shape.dtype} with a flag per line",
-            )
 
     def _come_back(self, block: CameraBlock) -> None:
         """Number a camera that was away by its time stamps; what it missed is lost."""

@@ -127,7 +127,11 @@ class Recorder:
         try:
             self._listen()
             self._look_at_disk()
-            self._read_tags()
+            while (block := self._tags.acquire()) is not None:
+                found = self._tagger.verify(block.pixels) if self._tagger else []
+                self._tags.release()
+                if self._session is not None:
+                    self._session.mismatches(found)
             self._busy = self._drain()
             if self._session is not None:
                 self._look_after(self._session)
@@ -350,13 +354,6 @@ class Recorder:
 
     # ---- tags and lines
 
-    def _read_tags(self) -> None:
-        while (block := self._tags.acquire()) is not None:
-            found = self._tagger.verify(block.pixels) if self._tagger else []
-            self._tags.release()
-            if self._session is not None:
-                self._session.mismatches(found)
-
     def _drain(self) -> bool:
         """Take what the rings have, some blocks at most; says whether there was any.
 
@@ -449,16 +446,14 @@ class Recorder:
         """Nothing is gained by letting the block wait any longer for its tag."""
         if self._session is None or self._tagger is None or block.end_line <= self._tagger.confirmed_end:
             return True
-        return self._tags_overdue(self._tagger.confirmed_end, ring, block) or not self._owner
-
-    def _tags_overdue(self, confirmed_end: int, ring: Ring, block: RingBlock) -> bool:
-        """The block has waited long enough; those after it do not wait at all until a tag comes again."""
+        # Once one block has waited in vain, those after it do not wait at all until a tag comes again.
         now_s = time.monotonic()
         waited_s = now_s - max(block.time_ns / 1e9, self._hold_ups.over_s)
         is_pressing = 2 * ring.fill > ring.shape.slots and now_s > self._hold_ups.over_s + HELD_UP_S
         if waited_s > self._plan.tag_wait_s or is_pressing:
-            self._waited_in_vain_for = confirmed_end
-        return self._waited_in_vain_for == confirmed_end
+            self._waited_in_vain_for = self._tagger.confirmed_end
+        overdue = self._waited_in_vain_for == self._tagger.confirmed_end
+        return overdue or not self._owner
 
     # ---- the recording under way
 
@@ -477,16 +472,13 @@ class Recorder:
         if stall is not None:
             session.lost.update(dict.fromkeys(stall.arms, Cause.STALLED))
             session.end(self._common_line(), stall.reason, stall.condition)
-        self._commit_now_and_then(session)
-        self._publish(session)
-
-    def _commit_now_and_then(self, session: Session) -> None:
         begun = time.monotonic()
         if begun >= self._commit_s:
             with self._waits.loop():
                 session.commit()
             ended = time.monotonic()
             self._commit_s = ended + max(_COMMIT_INTERVAL_S, (_COMMIT_SHARE - 1) * (ended - begun))
+        self._publish(session)
 
     def _publish(self, session: Session) -> None:
         counters = self._counters

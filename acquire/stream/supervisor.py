@@ -148,8 +148,10 @@ class Supervisor:
                 self._workers[RECORDER].post(Cancel())
             if self.fault is not None:
                 raise DeviceError(f"start: {self.fault}")
+        waits = self._counters[RECORDER]["disk_since_ns"] or self._counters[RECORDER]["store_since_ns"]
+        excuse = "it waits for the disk" if waits else f"no sign of life for {self.silent_s:.1f} s"
         raise DeviceError(
-            f"start: the recorder has not begun within {_ANSWER_S:g} s: {self._excuse()}",
+            f"start: the recorder has not begun within {_ANSWER_S:g} s: {excuse}",
             possible="nothing was recorded",
             hint="start again once the disk answers",
         )
@@ -197,22 +199,23 @@ class Supervisor:
     def _live(self) -> None:
         try:
             while not self._ending.is_set():
-                self._turn()
+                begun = time.monotonic()
+                tags = self._take_tags()
+                self._ask_trigger(begun)
+                for name, worker in self._workers.items():
+                    self._hear(name, worker)
+                    worker.flush()
+                # A recording that the disk ended goes on in a further segment.
+                with self._news:
+                    following = self.life.due(time.monotonic())
+                if following is not None:
+                    self._workers[RECORDER].post(following)
+                if self.fault is None:
+                    self._watch(time.monotonic())
+                if not tags:  # a trigger that does not wait by itself must not make this loop spin
+                    self._ending.wait(max(0.0, begun + _TAG_WAIT_S - time.monotonic()))
         except Exception as error:  # noqa: BLE001 - the outermost boundary of the thread: a fault, told
             self._fail(f"supervisor: {type(error).__name__}: {error}")
-
-    def _turn(self) -> None:
-        begun = time.monotonic()
-        tags = self._take_tags()
-        self._ask_trigger(begun)
-        for name, worker in self._workers.items():
-            self._hear(name, worker)
-            worker.flush()
-        self._resume_when_due()
-        if self.fault is None:
-            self._watch(time.monotonic())
-        if not tags:  # a trigger that does not wait by itself must not make this loop spin
-            self._ending.wait(max(0.0, begun + _TAG_WAIT_S - time.monotonic()))
 
     def _take_tags(self) -> list[LineTag]:
         if self._trigger_lost:
@@ -282,10 +285,6 @@ class Supervisor:
         elif silent_s > self._plan.hung_after_s:
             self._hung = f"{self._workers[RECORDER].name}: no sign of life for {self._plan.hung_after_s:g} s"
             self._workers[RECORDER].kill()
-
-    def _excuse(self) -> str:
-        waits = self._counters[RECORDER]["disk_since_ns"] or self._counters[RECORDER]["store_since_ns"]
-        return "it waits for the disk" if waits else f"no sign of life for {self.silent_s:.1f} s"
 
     @property
     def waits_for_disk(self) -> bool:
@@ -382,13 +381,6 @@ class Supervisor:
                     # Those of a defect begin with the process's name already.
                     self._last_words[name] = str(error).removeprefix(f"{self._workers[name].name}: ")
             self._news.notify_all()
-
-    def _resume_when_due(self) -> None:
-        """Have a recording that the disk ended go on in a further segment."""
-        with self._news:
-            following = self.life.due(time.monotonic())
-        if following is not None:
-            self._workers[RECORDER].post(following)
 
     def _cancel_if(self, *, begins: bool) -> None:
         """Nobody wants what the recorder only begins."""

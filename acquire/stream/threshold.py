@@ -36,7 +36,14 @@ class Threshold:
         """First line of every stretch in ``pixels`` (line, pixel) in which the level is crossed."""
         plan, sign = self.plan, 1.0 if self.plan.rising else -1.0
         found = []
-        for number, mean_dn in enumerate(_means(pixels, plan.average_lines)):
+        # Means of average_lines lines each, and of what remains, over some of the columns: all of them would
+        # cost a wide sensor's processor, and a threshold needs no more.
+        step = -(-pixels.shape[1] // _MOST_COLUMNS)
+        levels = pixels[:, ::step].mean(axis=1, dtype=np.float32)
+        starts = np.arange(0, len(levels), plan.average_lines)
+        counts = np.diff(starts, append=len(levels))
+        means: list[float] = (np.add.reduceat(levels, starts) / counts).tolist()
+        for number, mean_dn in enumerate(means):
             above = sign * (mean_dn - plan.level_dn)
             if above >= 0 and self._beyond is False:
                 found.append(first_line + number * plan.average_lines)
@@ -45,13 +52,3 @@ class Threshold:
             elif self._beyond is None or above < -plan.hysteresis_dn:
                 self._beyond = False
         return found
-
-
-def _means(pixels: NDArray[Any], lines: int) -> list[float]:
-    """Mean of each ``lines`` lines; of what remains, too."""
-    step = -(-pixels.shape[1] // _MOST_COLUMNS)
-    levels = pixels[:, ::step].mean(axis=1, dtype=np.float32)
-    starts = np.arange(0, len(levels), lines)
-    counts = np.diff(starts, append=len(levels))
-    means: list[float] = (np.add.reduceat(levels, starts) / counts).tolist()
-    return means

@@ -103,7 +103,12 @@ class Watcher:
         """Take what has come; judge when both arms have the lines for it."""
         self._now_s = now_s
         if self._plan.judge is not None and not self._intakes and now_s >= self._next_s:
-            self._begin(now_s)
+            # From the first line on that neither arm has delivered yet.
+            first_line = max(ring.newest_line for ring in self._rings.values())
+            self._next_s = now_s + _CHECK_EVERY_S
+            self._intakes = {
+                arm: Intake(first_line, self._plan.lines, self._plan.black_dn[arm]) for arm in ARMS
+            }
         for arm, observer in self._observers.items():
             self._look(arm, observer)
         if self._intakes and all(intake.full for intake in self._intakes.values()):
@@ -116,12 +121,6 @@ class Watcher:
         """Let go of the rings' memory, before they do."""
         for observer in self._observers.values():
             observer.close()
-
-    def _begin(self, now_s: float) -> None:
-        """From the first line on that neither arm has delivered yet."""
-        first_line = max(ring.newest_line for ring in self._rings.values())
-        self._next_s = now_s + _CHECK_EVERY_S
-        self._intakes = {arm: Intake(first_line, self._plan.lines, self._plan.black_dn[arm]) for arm in ARMS}
 
     def _look(self, arm: str, observer: Observer) -> None:
         intake = self._intakes.get(arm)

@@ -165,7 +165,9 @@ class TriggerDriver:
             limit_s = ANSWER_S + period_ticks / device.capabilities.clock_hz
             status = device.await_status(lambda status: status.at_rest, limit_s, "end")
             self._owed = 0
-            self._end_waits(device)
+            device.link.interrupt()
+            with self._stopped:
+                self._stopped.notify_all()
             return status.lines
 
     def statistics(self) -> dict[str, Any]:
@@ -260,11 +262,6 @@ class TriggerDriver:
         if not device.await_status(begun, limit_s, "start").lines:
             raise TriggerError(f"run {run.run_id!r} was stopped before its first line")
         return device.read(r.START_TIME)
-
-    def _end_waits(self, device: Device) -> None:
-        device.link.interrupt()
-        with self._stopped:
-            self._stopped.notify_all()
 
     def _show_life(self, device: Device) -> float:
         """Keep the watchdog quiet while somebody asks for tags; for how long it is now."""

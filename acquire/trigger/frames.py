@@ -105,7 +105,18 @@ class Decoder:
         found: list[Frame] = []
         for piece in ended:
             self._keep(piece)
-            self._close(found)
+            # Zeros in a row are nothing: a sender may begin with one.
+            encoded, overlong = bytes(self._rest), self._overlong
+            self._rest.clear()
+            self._overlong = False
+            if overlong:
+                self.faults[FrameLengthError.__name__] += 1
+            elif encoded:
+                try:
+                    found.append(decode(encoded))
+                    self.frames += 1
+                except FrameError as error:
+                    self.faults[type(error).__name__] += 1
         self._keep(rest)
         return found
 
@@ -115,20 +126,6 @@ class Decoder:
             self._rest.clear()
         else:
             self._rest += piece
-
-    def _close(self, found: list[Frame]) -> None:
-        """A zero has come. Zeros in a row are nothing: a sender may begin with one."""
-        encoded, overlong = bytes(self._rest), self._overlong
-        self._rest.clear()
-        self._overlong = False
-        if overlong:
-            self.faults[FrameLengthError.__name__] += 1
-        elif encoded:
-            try:
-                found.append(decode(encoded))
-                self.frames += 1
-            except FrameError as error:
-                self.faults[type(error).__name__] += 1
 
 
 # What the payloads say.

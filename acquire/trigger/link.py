@@ -165,19 +165,16 @@ class Link:
         try:
             while not self._ending.is_set():
                 if data := self.transport.read():
-                    self._take(data)
+                    with self._news:
+                        self._tags += self._dialogue.receive(data, time.monotonic())
+                        while len(self._tags) > _TAGS_KEPT:
+                            self._tags.popleft()
+                            self._tags_dropped += 1
+                        self._news.notify_all()
         except TriggerError as error:
             self._die(error)
         except Exception as error:  # noqa: BLE001 - the outermost boundary of the thread: told to all who wait
             self._die(TriggerError(f"{self.transport.name}: {type(error).__name__}: {error}"))
-
-    def _take(self, data: bytes) -> None:
-        with self._news:
-            self._tags += self._dialogue.receive(data, time.monotonic())
-            while len(self._tags) > _TAGS_KEPT:
-                self._tags.popleft()
-                self._tags_dropped += 1
-            self._news.notify_all()
 
     def _die(self, error: TriggerError) -> None:
         with self._news:

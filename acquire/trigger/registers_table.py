@@ -113,7 +113,8 @@ def _reset(register: Register) -> str:
 
 
 def _enum_table(kind: type[IntEnum | IntFlag]) -> str:
-    docs = _member_docs(kind)
+    found = re.findall(r"^    (\w+) = .*\n    \"\"\"(.*?)\"\"\"", inspect.getsource(kind), re.MULTILINE)
+    docs = dict(found)
     rows = [f"| {_number(item)} | {item.name} | {docs[str(item.name)]} |\n" for item in kind]
     return "| value | name | |\n|---|---|---|\n" + "".join(rows)
 
@@ -121,9 +122,3 @@ def _enum_table(kind: type[IntEnum | IntFlag]) -> str:
 def _number(item: IntEnum | IntFlag) -> str:
     """Types, whose bits matter, in hexadecimal."""
     return f"0x{item:02x}" if isinstance(item, FrameType) else str(int(item))
-
-
-def _member_docs(kind: type[IntEnum | IntFlag]) -> dict[str, str]:
-    """The text below each member in the source."""
-    found = re.findall(r"^    (\w+) = .*\n    \"\"\"(.*?)\"\"\"", inspect.getsource(kind), re.MULTILINE)
-    return dict(found)

@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from acquire.cli.demo.plan import DemoPlan
     from acquire.cli.journal import Journal
     from acquire.config import RigConfig
-    from acquire.daemon.messages import ArmStatus
     from acquire.lines import Segment
 
 INNER = 0.9
@@ -195,18 +194,17 @@ def _capture_facts(recording: Recording, captured: Captured) -> CaptureFacts:
         end_reason=str(recording.attrs["end_reason"]),
         seconds=captured.seconds,
         size_bytes=int(recording.info()["bytes"]),
-        arms={name: _ledger(arm) for name, arm in captured.status.arms.items()},
-    )
-
-
-def _ledger(arm: ArmStatus) -> ArmLedger:
-    return ArmLedger(
-        delivered=arm.delivered,
-        preroll=arm.preroll,
-        discarded=arm.discarded,
-        recorded=arm.recorded,
-        missing=arm.missing,
-        ring_peak=arm.ring.peak,
-        ring_slots=arm.ring.slots,
-        lost=arm.lost,
+        arms={
+            name: ArmLedger(
+                delivered=arm.delivered,
+                preroll=arm.preroll,
+                discarded=arm.discarded,
+                recorded=arm.recorded,
+                missing=arm.missing,
+                ring_peak=arm.ring.peak,
+                ring_slots=arm.ring.slots,
+                lost=arm.lost,
+            )
+            for name, arm in captured.status.arms.items()
+        },
     )

@@ -98,8 +98,14 @@ def check(plan: DemoPlan, rig: RigConfig) -> None:
     """Raise UsageError for what could not be carried out to the end."""
     from acquire.config import check_directory
 
-    _check_out(plan.out)
-    _check_budgets(plan)
+    out = plan.out
+    if out.exists():
+        raise UsageError(f"demo to {out}: it exists and stays untouched", hint="--out with a new directory")
+    if not out.absolute().parent.is_dir():
+        raise UsageError(f"demo to {out}: there is no directory {out.absolute().parent}")
+    for budget_s in (plan.budget_s, plan.twist_budget_s):
+        if budget_s is not None and not budget_s > 0:
+            raise UsageError(f"a budget of {budget_s} s is out of range", possible="more than 0")
     _check_rig(plan, rig)
     check_directory(rig)
     if rig.trigger.driver == "rtl":
@@ -118,19 +124,6 @@ def check(plan: DemoPlan, rig: RigConfig) -> None:
 def segment_row(rig: RigConfig) -> int:
     """Row of the recording at which the segment begins."""
     return round(SEGMENT_START_S * rig.line_rate_hz)
-
-
-def _check_out(out: Path) -> None:
-    if out.exists():
-        raise UsageError(f"demo to {out}: it exists and stays untouched", hint="--out with a new directory")
-    if not out.absolute().parent.is_dir():
-        raise UsageError(f"demo to {out}: there is no directory {out.absolute().parent}")
-
-
-def _check_budgets(plan: DemoPlan) -> None:
-    for budget_s in (plan.budget_s, plan.twist_budget_s):
-        if budget_s is not None and not budget_s > 0:
-            raise UsageError(f"a budget of {budget_s} s is out of range", possible="more than 0")
 
 
 def _check_cameras(rig: RigConfig) -> None:

@@ -49,28 +49,24 @@ def build() -> Path:
     target = _cache() / f"acquire-simulated-{digest[:16]}.cti"
     if not target.is_file():
         target.parent.mkdir(parents=True, exist_ok=True)
-        _compile(found, target)
+        # Into a directory beside the target, then moved: two builds at once both end well.
+        with tempfile.TemporaryDirectory(dir=target.parent) as name:
+            directory = Path(name)
+            (directory / "layout.h").write_text(header())
+            made = directory / target.name
+            command = [found, *OPTIONS, f"-I{directory}", "-o", str(made), str(SOURCE)]
+            done = subprocess.run(  # noqa: S603 - the user's own compiler
+                command, capture_output=True, text=True, timeout=COMPILE_S, check=False
+            )
+            if done.returncode:
+                raise DeviceError(f"{found} refused the producer: {done.stderr.strip()[-2000:]}")
+            made.replace(target)
     return target
 
 
 def _cache() -> Path:
     base = os.environ.get("XDG_CACHE_HOME")
     return (Path(base) if base else Path.home() / ".cache") / "tdi-acquire"
-
-
-def _compile(found: str, target: Path) -> None:
-    """Into a directory beside the target, then moved: two builds at once both end well."""
-    with tempfile.TemporaryDirectory(dir=target.parent) as name:
-        directory = Path(name)
-        (directory / "layout.h").write_text(header())
-        made = directory / target.name
-        command = [found, *OPTIONS, f"-I{directory}", "-o", str(made), str(SOURCE)]
-        done = subprocess.run(  # noqa: S603 - the user's own compiler
-            command, capture_output=True, text=True, timeout=COMPILE_S, check=False
-        )
-        if done.returncode:
-            raise DeviceError(f"{found} refused the producer: {done.stderr.strip()[-2000:]}")
-        made.replace(target)
 
 
 if __name__ == "__main__":

@@ -46,17 +46,13 @@ def feed(mailbox: Mailbox, memory: CameraMemory, opener: Callable[[], Any]) -> N
     while True:
         mailbox.take()
         if memory.asked:
-            wanted = _turn(memory, sensor)
+            session = memory["SESSION"]
+            if session & 1:
+                sensor.arm()
+            else:
+                sensor.disarm()
+            wanted = memory.obey(session)
         elif not wanted:
             time.sleep(_IDLE_S)
         elif (block := sensor.next_block(_BLOCK_WAIT_S)) is not None:
             memory.write(block.first_line, block.pixels, sensor.times_ns(block.first_line, len(block.pixels)))
-
-
-def _turn(memory: CameraMemory, sensor: Sensor) -> bool:
-    session = memory["SESSION"]
-    if session & 1:
-        sensor.arm()
-    else:
-        sensor.disarm()
-    return memory.obey(session)

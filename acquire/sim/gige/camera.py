@@ -106,7 +106,13 @@ class GigeCamera:
             self._answer(control)
         if self._acquiring and (block := self._sensor.next_block(_BLOCK_WAIT_S)) is not None:
             self._waiting.append((block.first_line, np.array(block.pixels)))
-            self._send_whole_frames()
+            height = self._register("Height")
+            while sum(len(lines) for _, lines in self._waiting) >= height:
+                first_line = self._waiting[0][0]
+                lines = np.concatenate([lines for _, lines in self._waiting])
+                self._send(int(self._sensor.times_ns(first_line, 1)[0]), lines[:height])
+                rest = lines[height:]
+                self._waiting = [(first_line + height, rest)] if len(rest) else []
 
     def _answer(self, control: socket.socket) -> None:
         packet, sender = control.recvfrom(2048)
@@ -141,15 +147,6 @@ class GigeCamera:
                     self._sensor.arm()
                 else:
                     self._sensor.disarm()
-
-    def _send_whole_frames(self) -> None:
-        height = self._register("Height")
-        while sum(len(lines) for _, lines in self._waiting) >= height:
-            first_line = self._waiting[0][0]
-            lines = np.concatenate([lines for _, lines in self._waiting])
-            self._send(int(self._sensor.times_ns(first_line, 1)[0]), lines[:height])
-            rest = lines[height:]
-            self._waiting = [(first_line + height, rest)] if len(rest) else []
 
     def _send(self, time_ns: int, lines: NDArray[Any]) -> None:
         code = self._register("PixelFormat")

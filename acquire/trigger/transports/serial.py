@@ -60,17 +60,14 @@ class SerialTransport:
         try:
             if self._local:
                 return bytes(self._port.read(self._port.in_waiting or 1))
-            return self._read_remote()
+            # A socket does not say how much waits; asked without a time limit, it gives what it has.
+            data = bytes(self._port.read(1))
+            if data:
+                self._port.timeout = 0
+                data += self._port.read(_READ_BYTES)
+                self._port.timeout = READ_WAIT_S
         except OSError as error:
             raise self._gone(error) from error
-
-    def _read_remote(self) -> bytes:
-        """A socket does not say how much waits; asked without a time limit, it gives what it has."""
-        data = bytes(self._port.read(1))
-        if data:
-            self._port.timeout = 0
-            data += self._port.read(_READ_BYTES)
-            self._port.timeout = READ_WAIT_S
         return data
 
     def write(self, data: bytes) -> None:
