@@ -40,6 +40,7 @@ from acquire.sim.media import VideoSceneConfig
 from acquire.sim.scenes import build_scene
 from acquire.simulate import bench_of, simulate
 from acquire.store import open_recording
+from tools.results import Run, add_option, recorded
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -252,7 +253,7 @@ def _psnr(segment: Segment, truth: NDArray[np.float32]) -> float:
     return float(10 * np.log10(truth[at].max() ** 2 / np.mean((result.video[at] - truth[at]) ** 2)))
 
 
-def orientations(seed: int, lines: int) -> None:
+def orientations(seed: int, lines: int, run: Run) -> None:
     """24 instruments: eight views of arm B, three targets each."""
     right = wrong = untold = 0
     for number, view in enumerate(VIEWS * 3):
@@ -276,6 +277,7 @@ def orientations(seed: int, lines: int) -> None:
         wrong += found.orientation not in (None, view.name)
         print(f"{view.name:20} found {found.orientation!s:20} ratio {found.facts['ratio']:.2f}", flush=True)
     print(f"{right} right, {untold} not told, {wrong} wrong")
+    run.add("orientations", right=right, not_told=untold, wrong=wrong)
 
 
 def main() -> None:
@@ -288,10 +290,17 @@ def main() -> None:
     parser.add_argument("--no-video", action="store_true")
     parser.add_argument("--orientations", action="store_true")
     parser.add_argument("--json", type=Path)
+    add_option(parser)
     asked = parser.parse_args()
-    if asked.orientations:
-        orientations(asked.seed, asked.lines)
-        return
+    with recorded("bench_calibrate", keep=asked.record) as run:
+        if asked.orientations:
+            orientations(asked.seed, asked.lines, run)
+        else:
+            instruments(asked, run)
+
+
+def instruments(asked: argparse.Namespace, run: Run) -> None:
+    """Instruments drawn at random, each calibrated, and the worst of each figure."""
     rows = []
     for number in range(asked.instruments):
         drawn = Drawn.at_random(asked.seed + number)
@@ -308,10 +317,10 @@ def main() -> None:
             f"{asked.seed + number:3} {where:44} " + "  ".join(f"{k} {v:.4g}" for k, v in row.items()),
             flush=True,
         )
-    print(
-        "worst "
-        + "  ".join(f"{key} {max(row[key] for row in rows):.4g}" for key in rows[0] if key != "instrument")
-    )
+        run.add(f"seed {asked.seed + number}", **row)
+    worst = {key: max(row[key] for row in rows) for key in rows[0] if key != "instrument"}
+    print("worst " + "  ".join(f"{key} {value:.4g}" for key, value in worst.items()))
+    run.add("the largest of each", **worst)
     if asked.json is not None:
         asked.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
 

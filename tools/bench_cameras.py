@@ -30,6 +30,7 @@ from acquire.sim.gentl.bench import GentlBench
 from acquire.sim.gentl.models import CameraModel
 from acquire.stream import grabber
 from acquire.stream.ring import Ring, RingShape
+from tools.results import Run, add_option, recorded
 
 if TYPE_CHECKING:
     from acquire.processes.worker import Mailbox
@@ -105,7 +106,8 @@ class Side:
 
     def settle(self) -> bool:
         """Throw away what has gathered since the camera was armed; True when lines come as they are due."""
-        return self._ring.empty() < 2 * self._load.height and self.memory["HEAD"] > 0
+        waited = sum(len(lines) for lines in self._ring.empty())
+        return waited < 2 * self._load.height and self.memory["HEAD"] > 0
 
     def take(self) -> bool:
         block = self._ring.acquire()
@@ -158,7 +160,7 @@ def models(load: Load) -> list[CameraModel]:
     ]
 
 
-def run(load: Load, seconds: float) -> None:
+def capture(load: Load, seconds: float, run: Run) -> None:
     """Two grabbers as a capture has them; this process is the recorder that checks and forgets."""
     print(load.title)
     cameras = models(load)
@@ -176,7 +178,7 @@ def run(load: Load, seconds: float) -> None:
         for worker in workers:
             worker.expect(Ready, time.monotonic() + 30)
         try:
-            _watch(load, seconds, bench, list(zip(cameras, rings, counts, workers, strict=True)))
+            _watch(load, seconds, bench, list(zip(cameras, rings, counts, workers, strict=True)), run)
         finally:
             for worker in workers:
                 worker.end(time.monotonic() + 5)
@@ -185,7 +187,7 @@ def run(load: Load, seconds: float) -> None:
                 counters.close()
 
 
-def _watch(load: Load, seconds: float, bench: GentlBench, arms: list[Any]) -> None:
+def _watch(load: Load, seconds: float, bench: GentlBench, arms: list[Any], run: Run) -> None:
     """Take and check for ``seconds``, from the moment when all rings are empty."""
     sides = [
         Side(bench.cameras[model.serial], ring, counts, worker, load) for model, ring, counts, worker in arms
@@ -211,6 +213,17 @@ def _watch(load: Load, seconds: float, bench: GentlBench, arms: list[Any]) -> No
             f" first line of a block to ring: median {np.median(late):.2f},"
             f" p99 {np.percentile(late, 99):.2f}, most {late.max():.1f} ms"
         )
+        run.add(
+            f"{load.title}, {side.memory.model.serial}",
+            lines=side.lines,
+            lost=side.lost,
+            torn=side.torn,
+            grabber_cores=own,
+            producer_cores=producer,
+            median_ms=np.median(late),
+            p99_ms=np.percentile(late, 99),
+            worst_ms=late.max(),
+        )
 
 
 def threads_of(pid: int | None) -> dict[int, float]:
@@ -225,7 +238,7 @@ def share(
     return used.pop(pid or 0), sum(used.values())
 
 
-def bare_copy(load: Load) -> None:
+def bare_copy(load: Load, run: Run) -> None:
     """The same bytes, copied by numpy from one place to another, and looked through for their maximum."""
     source = [np.ones((load.height, load.width), np.uint8) for _ in range(64)]
     target = [np.ones((load.height, load.width), np.uint8) for _ in range(64)]
@@ -243,9 +256,15 @@ def bare_copy(load: Load) -> None:
         f"  bare memcpy of one camera's lines: core {copied_s / rate:.3f}"
         f" ({blocks * load.height * load.width / wall_s / 1e9:.1f} GB/s), maximum {looked_s / rate:.3f}"
     )
+    run.add(
+        f"bare memcpy of one camera's lines, {load.title}",
+        cores=copied_s / rate,
+        gb_s=blocks * load.height * load.width / wall_s / 1e9,
+        cores_of_a_maximum=looked_s / rate,
+    )
 
 
-def cycles(count: int) -> None:
+def cycles(count: int, run: Run) -> None:
     """Arm and disarm one camera; memory, descriptors and threads before and after."""
     load = Load(512, 10_000.0, 64)
     model = models(load)[0]
@@ -256,6 +275,7 @@ def cycles(count: int) -> None:
             if k % max(1, count // 10) == 0:
                 mb, fds = process.memory_info().rss / 1e6, process.num_fds()
                 print(f"  {k:5d} cycles: {mb:.1f} MB, {fds} descriptors, {process.num_threads()} threads")
+                run.add(f"after {k} cycles", memory_mb=mb, descriptors=fds, threads=process.num_threads())
             camera.arm()
             camera.disarm()
         camera.close()
@@ -265,13 +285,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--cycles", type=int, default=0)
+    add_option(parser)
     options = parser.parse_args()
-    if options.cycles:
-        cycles(options.cycles)
-        return
-    for load in LOADS:
-        run(load, options.seconds)
-        bare_copy(load)
+    with recorded("bench_cameras", keep=options.record) as run:
+        if options.cycles:
+            cycles(options.cycles, run)
+            return
+        for load in LOADS:
+            capture(load, options.seconds, run)
+            bare_copy(load, run)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from acquire.evaluate.metrics import psnr
 from acquire.recon import reconstruct
 from acquire.sim.voxels import truth
 from tools.bench_reconstruct import CASES, record
+from tools.results import Run, add_option, recorded
 
 ITERATIONS = {"admm": 30, "twist-band": 20, "twist": 8}
 BANDWIDTH = 0.13
@@ -50,7 +51,14 @@ def main() -> None:
     parser.add_argument("--dtypes", nargs="+", default=list(DTYPES), choices=list(DTYPES))
     parser.add_argument("--threads", nargs="+", type=int, default=[usable_cores()])
     parser.add_argument("--solvers", nargs="+", default=list(ITERATIONS), choices=list(ITERATIONS))
+    add_option(parser)
     asked = parser.parse_args()
+    with recorded("bench_devices", keep=asked.record) as run:
+        table(asked, run)
+
+
+def table(asked: argparse.Namespace, run: Run) -> None:
+    """A line per solver, device, dtype and number of threads."""
     case = CASES["fig9"]
     scene, segment = record(case, 1)
     true = truth(scene, case.geometry.substeps * case.first_line, case.geometry.span, *case.merges)
@@ -73,6 +81,14 @@ def main() -> None:
                 f"{solver:11}{device:>7}{dtype:>9}{threads:8}{wall:8.2f}{busy:7.2f}"
                 f"{wall / first[0]:8.2f}{busy / first[1]:7.2f}{decibel:10.4f}",
                 flush=True,
+            )
+            run.add(
+                f"{solver}, {device}, {dtype}, {threads} threads",
+                wall_s=wall,
+                cpu_s=busy,
+                wall_ratio=wall / first[0],
+                cpu_ratio=busy / first[1],
+                psnr_db=decibel,
             )
 
 

@@ -31,6 +31,7 @@ from acquire.recon.diagnosis import Diagnosis, diagnose
 from acquire.recon.hypotheses import Hypothesis, Turn
 from acquire.recon.search import Standing
 from acquire.sim.procedural import SCENES, Camera, record
+from tools.results import Run, add_option, recorded
 
 DEGREE, AHEAD = 31, 64
 """Recordings begin some bits into their code, so that it can be early as well as late."""
@@ -85,7 +86,7 @@ def mark(found: Diagnosis, truth: Hypothesis | None) -> str:
     return "✓" if found.hypothesis == truth else "✗"
 
 
-def recorded(name: str, seed: int, camera: Camera) -> tuple[Segment, np.ndarray]:
+def segment_of(name: str, seed: int, camera: Camera) -> tuple[Segment, np.ndarray]:
     """A segment, and the code's bits from `AHEAD` before it on."""
     segment = record(name, seed, camera=camera).segment
     later = prbs(DEGREE, mix_seed(seed, DEGREE), 0, 2 * segment.geometry.span)
@@ -94,12 +95,14 @@ def recorded(name: str, seed: int, camera: Camera) -> tuple[Segment, np.ndarray]
     return segment, np.concatenate([before, later])
 
 
-def table(scenes: list[str], seeds: list[int], camera: Camera, say: Callable[[str], object]) -> None:
+def table(
+    scenes: list[str], seeds: list[int], camera: Camera, say: Callable[[str], object], run: Run
+) -> None:
     total: dict[str, list[str]] = {}
     seconds = []
     for seed in seeds:
         for name in scenes:
-            segment, bits = recorded(name, seed, camera)
+            segment, bits = segment_of(name, seed, camera)
             row = []
             for fault, (described, truth) in faults(segment, bits, seed).items():
                 began = time.process_time()
@@ -115,9 +118,22 @@ def table(scenes: list[str], seeds: list[int], camera: Camera, say: Callable[[st
     wrong = [each for fault, marks in total.items() if fault != "right" for each in marks]
     say("")
     say(f"{'named':12s}" + "".join(f"{m.count('✓'):>6d}/{len(m):<3d}" for m in total.values()))
+    false_alarms = sum(m not in "✓?" for m in total["right"])
+    for fault, marks in total.items():
+        run.add(fault, named=marks.count("✓"), misnamed=marks.count("✗"), cases=len(marks))
+    run.add(
+        "all",
+        wrong_named=wrong.count("✓"),
+        wrong_misnamed=wrong.count("✗"),
+        wrong_cases=len(wrong),
+        false_alarms=false_alarms,
+        right_cases=len(total["right"]),
+        median_cpu_s=np.median(seconds),
+        worst_cpu_s=max(seconds),
+    )
     say(
         f"wrong descriptions named: {wrong.count('✓')} of {len(wrong)}, misnamed {wrong.count('✗')}; "
-        f"false alarms {sum(m not in '✓?' for m in total['right'])} of {len(total['right'])}; "
+        f"false alarms {false_alarms} of {len(total['right'])}; "
         f"processor seconds: median {np.median(seconds):.1f}, most {max(seconds):.1f}"
     )
 
@@ -129,10 +145,11 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[11])
     parser.add_argument("--scenes", nargs="+", choices=list(SCENES), default=list(SCENES))
     parser.add_argument("--full-well", type=float, default=1e4, help="electrons of the brightest sample")
+    add_option(parser)
     asked = parser.parse_args()
     camera = Camera(full_well_e=asked.full_well)
-    with limit_threads(1):
-        table(asked.scenes, asked.seeds, camera, lambda line: print(line, flush=True))
+    with limit_threads(1), recorded("bench_diagnose", keep=asked.record) as run:
+        table(asked.scenes, asked.seeds, camera, lambda line: print(line, flush=True), run)
 
 
 if __name__ == "__main__":

@@ -27,6 +27,7 @@ from acquire.lines import Segment
 from acquire.recon import reconstruct
 from acquire.simulate import simulate
 from acquire.store import open_recording
+from tools.results import Run, add_option, recorded
 
 LINES = 263
 COLUMNS = ("offset_dn", "gain", "balance", "dn_per_electron", "read_noise_e")
@@ -72,7 +73,14 @@ def cases(directory: Path) -> dict[str, Segment]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--iterations", type=int, default=80)
+    add_option(parser)
     asked = parser.parse_args()
+    with recorded("bench_model", keep=asked.record) as run:
+        measure(asked.iterations, run)
+
+
+def measure(iterations: int, run: Run) -> None:
+    """Every case at one bandwidth and with as many iterations."""
     with tempfile.TemporaryDirectory() as directory:
         segments = cases(Path(directory))
     frames = segments["nothing"].geometry.video_shape(3, 1)[0]
@@ -84,10 +92,11 @@ def main() -> None:
         times = []
         for _ in range(2):
             began = time.process_time()
-            reconstruct(segment, 3, 1, iterations=asked.iterations, bandwidth=bandwidth)
+            reconstruct(segment, 3, 1, iterations=iterations, bandwidth=bandwidth)
             times.append(time.process_time() - began)
         bare = bare or min(times)
         print(f"{name:20}  {min(times):6.2f} s  {min(times) / bare:5.2f}", flush=True)
+        run.add(name, cpu_s=min(times), ratio=min(times) / bare)
 
 
 if __name__ == "__main__":

@@ -1,14 +1,14 @@
 """What the sensing matrix costs: matrix-free, as scipy.sparse, and beside a bare pass over the voxels.
 
-Usage: python tools/bench_operator.py
+Usage: python tools/bench_operator.py [--record]
 
 For the sizes of the paper's figures: one forward and one adjoint of both arms, the same with an explicit
-sparse matrix, and a copy of the voxels, the least that touching them
-all can cost. Best of five each.
+sparse matrix, and a copy of the voxels, the least that touching them all can cost. Best of five each.
 """
 
 from __future__ import annotations
 
+import argparse
 import time
 from collections.abc import Callable
 
@@ -18,6 +18,7 @@ from scipy import sparse
 from acquire.codes import mix_seed, prbs
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
+from tools.results import add_option, recorded
 
 CASES = {
     "Fig. 9, 64 × 64 × 980": (64, 263, 3, 1),
@@ -59,11 +60,20 @@ def explicit(geometry: Geometry, code: np.ndarray, N_m: int, T_m: int) -> sparse
     ).tocsr()
 
 
+FIGURES = ("forward_ms", "adjoint_ms", "sparse_ms", "sparse_transposed_ms", "copy_ms")
+
+
 def main() -> None:
-    print(f"{'case':32}{'forward':>10}{'adjoint':>10}{'sparse':>10}{'sparse T':>10}{'copy':>8}   ms")
-    for name, case in CASES.items():
-        figures = measure(*case)
-        print(f"{name:32}" + "".join(f"{figure:10.2f}" for figure in figures[:4]) + f"{figures[4]:8.2f}")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add_option(parser)
+    with recorded("bench_operator", keep=parser.parse_args().record) as run:
+        print(f"{'case':32}{'forward':>10}{'adjoint':>10}{'sparse':>10}{'sparse T':>10}{'copy':>8}   ms")
+        for name, case in CASES.items():
+            figures = measure(*case)
+            print(f"{name:32}" + "".join(f"{figure:10.2f}" for figure in figures[:4]) + f"{figures[4]:8.2f}")
+            run.add(name, **dict(zip(FIGURES, figures, strict=True)))
 
 
 def measure(M: int, L_R: int, N_m: int, T_m: int) -> list[float]:

@@ -37,6 +37,7 @@ from acquire.daemon.service import Service
 from acquire.processes.nursery import warm_up
 from acquire.rig import Rig
 from acquire.web.tokens import load_tokens
+from tools.results import add_option, recorded
 
 CLIENTS = 4
 """That read; one more does not."""
@@ -207,8 +208,12 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--out", type=Path, default=Path(tempfile.gettempdir()))
     parser.add_argument("--small", action="store_true")
+    add_option(parser)
     options = parser.parse_args()
-    with tempfile.TemporaryDirectory(dir=options.out) as place:
+    with (
+        recorded("bench_page", keep=options.record) as run,
+        tempfile.TemporaryDirectory(dir=options.out) as place,
+    ):
         directory = Path(place)
         config = rig_of(directory, small=options.small)
         with (
@@ -218,22 +223,29 @@ def main() -> None:
             client = Client(directory / "c.sock")
             client.arm(force=True)
             time.sleep(2)
-            print("without clients:", take(client, rig, directory, "alone", options.seconds))
+            alone = take(client, rig, directory, "alone", options.seconds)
+            print("without clients:", alone)
+            run.add("recorded, no client", **alone)
             followers = [Follower(address, reads=k < CLIENTS) for k in range(CLIENTS + 1)]
             time.sleep(2)
-            print(
-                f"with {CLIENTS + 1}, one of them stopped:",
-                take(client, rig, directory, "followed", options.seconds),
-            )
+            followed = take(client, rig, directory, "followed", options.seconds)
+            print(f"with {CLIENTS + 1}, one of them stopped:", followed)
+            run.add(f"recorded, {CLIENTS + 1} clients, one of them stopped", **followed)
             mb_s = max(one.bytes for one in followers) / (options.seconds + 2) / 1e6
-            print(f"pictures: {mb_s:.2f} MB/s to each; page's process {cores(process, 5.0):.3f} cores")
+            used = cores(process, 5.0)
+            print(f"pictures: {mb_s:.2f} MB/s to each; page's process {used:.3f} cores")
+            run.add(f"page's process, {CLIENTS + 1} clients", cores=used, pictures_to_each_mb_s=mb_s)
             for one in followers[1:]:
                 one.close()
             time.sleep(1)
-            print(f"with one client: {cores(process, 5.0):.3f} cores")
+            used = cores(process, 5.0)
+            print(f"with one client: {used:.3f} cores")
+            run.add("page's process, one client", cores=used, pictures_to_each_mb_s=None)
             followers[0].close()
             if which("chromium"):
-                print("browser:", browse(address, client))
+                found = browse(address, client)
+                print("browser:", found)
+                run.add("browser", **found)
             client.disarm()
 
 

@@ -20,6 +20,7 @@ from acquire.recon.segments import Voxels
 from acquire.reconstruct import Options, Watcher, by_lines, combine, in_voxels, open_pool
 from acquire.simulate import simulate
 from acquire.store import open_recording
+from tools.results import add_option, recorded
 
 
 def measure(path: Path, lines: int, iterations: int, answer: multiprocessing.queues.Queue) -> None:
@@ -45,9 +46,10 @@ def main() -> None:
     )
     parser.add_argument("--lines", type=int, nargs="+", default=[1000, 4000])
     parser.add_argument("--iterations", type=int, default=10)
+    add_option(parser)
     asked = parser.parse_args()
     context = multiprocessing.get_context("spawn")
-    with tempfile.TemporaryDirectory() as directory:
+    with tempfile.TemporaryDirectory() as directory, recorded("bench_segments", keep=asked.record) as run:
         path = Path(directory) / "stream.zarr"
         simulate(load_rig("rig-demo"), load_scene("scene-leds"), path, max(asked.lines))
         print(f"{'lines':>8}{'frames/s':>10}{'pieces':>8}{'s':>8}{'MB here':>9}{'MB worker':>11}")
@@ -58,6 +60,14 @@ def main() -> None:
             seconds, tasks, here, worker = answer.get()
             process.join()
             print(f"{lines:8}{3 * lines / seconds:10.0f}{tasks:8}{seconds:8.1f}{here:9.0f}{worker:11.0f}")
+            run.add(
+                f"{lines} lines",
+                frames_per_s=3 * lines / seconds,
+                pieces=tasks,
+                s=seconds,
+                peak_here_mb=here,
+                peak_worker_mb=worker,
+            )
 
 
 if __name__ == "__main__":

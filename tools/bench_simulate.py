@@ -1,6 +1,6 @@
 """How fast the streaming simulation gives lines: against real time, bare operators, memory and scipy.
 
-    python tools/bench_simulate.py [--stages 64] [--substeps 3] [--seconds 2]
+    python tools/bench_simulate.py [--stages 64] [--substeps 3] [--seconds 2] [--record]
 
 1. LEDs (separable), one thread: what a scene without effects costs beside the bare operator it consists of
    (the two in turns), and that beside the matrix product inside, on the same windows and weights.
@@ -30,6 +30,7 @@ from acquire.lines import ARMS
 from acquire.sim.lines import SeparableLines, StreamingArm
 from acquire.sim.pipeline import Bench, Converter
 from acquire.sim.scenes import build_scene
+from tools.results import Run, add_option, recorded
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -70,7 +71,7 @@ class Ready:
         return self._frames[begin : self._next]
 
 
-def separable(bench: Bench, seconds: float) -> None:
+def separable(bench: Bench, seconds: float, run: Run) -> None:
     M, S = bench.geometry.stages, bench.geometry.substeps
     scene, convert = (
         build_scene(bench.scene, M * S, bench.substep_s),
@@ -95,9 +96,16 @@ def separable(bench: Bench, seconds: float) -> None:
             f"bare operator {rates[0]:9.0f} (ratio {times[1] / times[0]:.3f}); "
             f"of the bare product {rates[1] / rates[2]:.2f}"
         )
+        run.add(
+            f"LEDs, arm {arm}, lines",
+            times_real_time=rates[1] / LINE_RATE_HZ,
+            lines_per_s=rates[1],
+            bare_operator_lines_per_s=rates[0],
+            of_the_bare_product=rates[1] / rates[2],
+        )
 
 
-def dense(M: int, S: int, seconds: float) -> None:
+def dense(M: int, S: int, seconds: float, run: Run) -> None:
     n = M * S
     pool = np.random.default_rng(0).random((POOL_FRAMES, n, n), np.float32)
     arms = [StreamingArm(Ready(pool), CODE, M, S, arm) for arm in ARMS]
@@ -118,6 +126,13 @@ def dense(M: int, S: int, seconds: float) -> None:
         f"reading their {2 * lit * 4e-6 * n**2:.0f} MB allows {bound:.0f} "
         f"({2 * pool.nbytes / read_s * 1e-9:.1f} GB/s): {rate / bound:.2f} of it"
     )
+    run.add(
+        "frames, both arms on two threads",
+        times_real_time=rate / LINE_RATE_HZ,
+        lines_per_s=rate,
+        reading_them_gb_s=2 * pool.nbytes / read_s * 1e-9,
+        of_what_reading_allows=rate / bound,
+    )
     block = pool[: min(POOL_FRAMES, 256)]
     matrix = packets_matrix(len(block), n)
     arm = StreamingArm(Ready(block), CODE, M, S, "a")
@@ -134,6 +149,12 @@ def dense(M: int, S: int, seconds: float) -> None:
         f"scipy.sparse {a_s / len(block) * 1e6:.1f} us (arm a), {b_s / len(block) * 1e6:.1f} us (arm b): "
         f"{a_s / len(block) / per_frame:.1f} and {b_s / len(block) / per_frame:.1f} times as long"
     )
+    run.add(
+        "a lit frame, one arm, one thread",
+        us=per_frame * 1e6,
+        scipy_sparse_a_us=a_s / len(block) * 1e6,
+        scipy_sparse_b_us=b_s / len(block) * 1e6,
+    )
 
 
 def packets_matrix(frames: int, n: int) -> sparse.csr_array:
@@ -143,7 +164,7 @@ def packets_matrix(frames: int, n: int) -> sparse.csr_array:
     return sparse.coo_array((ones, (t - r + n - 1, np.arange(frames * n)))).tocsr()
 
 
-def effects(bench: Bench, seconds: float) -> None:
+def effects(bench: Bench, seconds: float, run: Run) -> None:
     listed = load_scene("scene-leds-measured").effects
     for effect in listed:
         scene = SceneFile.model_validate(
@@ -157,7 +178,9 @@ def effects(bench: Bench, seconds: float) -> None:
             for c, f in zip(cameras, firsts, strict=True)
         ]
         without, with_it = best_s(seconds / 4, *works)
-        print(f"{effect.kind:18} {(with_it - without) / BLOCK_LINES * 1e6:+7.3f} us per line and arm")
+        added_us = (with_it - without) / BLOCK_LINES * 1e6
+        print(f"{effect.kind:18} {added_us:+7.3f} us per line and arm")
+        run.add(f"effect {effect.kind}, added per line and arm", us=added_us)
 
 
 def main() -> None:
@@ -165,15 +188,17 @@ def main() -> None:
     parser.add_argument("--stages", type=int, default=64)
     parser.add_argument("--substeps", type=int, default=3)
     parser.add_argument("--seconds", type=float, default=2.0)
+    add_option(parser)
     options = parser.parse_args()
     told = limit_blas(1).get_original_num_threads()
     print(f"M = {options.stages}, S = {options.substeps}; libraries limited to one thread: {len(told)}")
     camera = CameraConfig(responsivity_dn=6.0)
     geometry = GeometryConfig(stages=options.stages, substeps=options.substeps)
     bench = Bench(load_scene("scene-leds"), geometry, {"a": camera, "b": camera}, 1e-5)
-    separable(bench, options.seconds)
-    dense(options.stages, options.substeps, options.seconds)
-    effects(bench, options.seconds)
+    with recorded("bench_simulate", keep=options.record) as run:
+        separable(bench, options.seconds, run)
+        dense(options.stages, options.substeps, options.seconds, run)
+        effects(bench, options.seconds, run)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from acquire.stream.messages import Checked
 from acquire.stream.ring import Ring, RingShape
 from acquire.stream.threshold import ThresholdPlan
 from acquire.stream.watcher import COUNTERS, WatchPlan, watch
+from tools.results import Figure, add_option, recorded
 
 BLOCK_LINES = 256
 SLOTS = 512
@@ -54,14 +56,19 @@ CASES = (
 def main() -> None:
     words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     words.add_argument("--seconds", type=float, default=4.0, help="of lines, per case")
-    seconds = words.parse_args().seconds
-    for case in CASES:
-        print(case.name)
-        for name, value in measure(case, seconds).items():
-            print(f"  {name:<40} {value}")
+    add_option(words)
+    asked = words.parse_args()
+    with recorded("bench_watcher", keep=asked.record) as run:
+        for case in CASES:
+            print(case.name)
+            found = measure(case, asked.seconds)
+            for name, value in found.items():
+                print(f"  {name:<40} {f'{value:.3f}' if isinstance(value, float) else value}")
+            run.add(case.name, **found)
 
 
-def measure(case: Case, seconds: float) -> dict[str, str]:
+def measure(case: Case, seconds: float) -> dict[str, Figure]:
+    """Figures by name; ``noticed_after_s`` is None where the slip was not noticed."""
     rig = load_rig("rig-demo", {"geometry.stages": case.stages, "code.degree": CODE_DEGREE})
     lines = simulated(rig, int(seconds * case.line_rate_hz) // BLOCK_LINES * BLOCK_LINES)
     shape = RingShape(SLOTS, BLOCK_LINES, case.stages, "uint16", observers=2)
@@ -72,7 +79,8 @@ def measure(case: Case, seconds: float) -> dict[str, str]:
     plan = WatchPlan(judge_of(rig), check_lines, {"a": 0.0, "b": 0.0}, threshold)
     worker = Worker("watcher", watch, plan, rings, counters)
     context = multiprocessing.get_context("fork")  # the lines need not be copied
-    producer = context.Process(target=produce, args=(rings, lines, case.line_rate_hz))
+    copying = context.Value("d", 0.0)
+    producer = context.Process(target=produce, args=(rings, lines, case.line_rate_hz, copying))
     try:
         worker.expect(Ready, time.monotonic() + 30)
         before_s, begun_s = cpu_s(worker.pid), time.monotonic()
@@ -92,11 +100,12 @@ def measure(case: Case, seconds: float) -> dict[str, str]:
             ring.close()
     slipped = [at - slip_s for at, message in told if message.doubtful]
     return {
-        "cores, watcher": f"{used_s / took_s:.3f}",
-        "checks": str(checks),
+        "watcher_cores": used_s / took_s,
+        "copying_both_arms_cores": copying.value,
+        "checks": checks,
+        "noticed_after_s": slipped[0] if slipped else None,
+        "slots_lost": lost,
         "verdicts": "; ".join(message.text for _, message in told),
-        "from the slip to the verdict": f"{slipped[0]:.2f} s" if slipped else "not noticed",
-        "slots lost": str(lost),
     }
 
 
@@ -112,7 +121,8 @@ def simulated(rig: RigConfig, count: int) -> dict[str, np.ndarray]:
     return lines
 
 
-def produce(rings: dict[str, Ring], lines: dict[str, np.ndarray], line_rate_hz: float) -> None:
+def produce(rings: dict[str, Ring], lines: dict[str, np.ndarray], line_rate_hz: float, cores: Any) -> None:
+    """Put the lines into the rings at their rate; ``cores`` (a shared double) is what that took."""
     begun_s, used_s = time.monotonic(), time.process_time()
     for at in range(0, len(lines["a"]), BLOCK_LINES):
         while time.monotonic() < begun_s + (at + BLOCK_LINES) / line_rate_hz:
@@ -125,11 +135,7 @@ def produce(rings: dict[str, Ring], lines: dict[str, np.ndarray], line_rate_hz: 
             ring.commit(at, BLOCK_LINES)
             ring.acquire()
             ring.release()
-    took_s = time.monotonic() - begun_s
-    print(
-        f"  {'cores, copying both arms into the rings':<40} {(time.process_time() - used_s) / took_s:.3f}",
-        flush=True,
-    )
+    cores.value = (time.process_time() - used_s) / (time.monotonic() - begun_s)
 
 
 def cpu_s(pid: int | None) -> float:

@@ -193,14 +193,14 @@ UNITS = {
     "mb_s": "MB/s",
     "gb_s": "GB/s",
     "s_per_gb": "s per GB",
+    "mb": "MB",
+    "us": "µs",
     "ms": "ms",
     "s": "s",
     "db": "dB",
     "hz": "Hz",
     "percent": "%",
 }
-
-
 """Ending of a figure's name → its unit. Longer endings first: gb_s is none of seconds."""
 
 
