@@ -31,6 +31,9 @@ from acquire.errors import CameraError, CameraLostError
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+# GigE Vision's block ids have 16 bits and go from 65535 to 1 (0 is for test packets), or 64 with extended
+# ids, as in USB3 Vision. GenTL gives all of them as 64 bits (BUFFER_INFO_FRAMEID) and does not say which,
+# and grabbers have widths of their own: it shows at the first wrap.
 _ID_BITS = (8, 16, 24, 32, 48, 64)
 _COUNTER_BITS = (16, 32, 64)
 _MOST_DOUBT = 256
@@ -169,6 +172,7 @@ class FrameCount:
             return number - self._last_id or None
         bits = self._id_bits or next(bits for bits in _ID_BITS if self._largest_id < 1 << bits)
         ahead = (number - self._last_id) % (1 << bits)
+        # More than half of all numbers ahead is less than half behind: late, rather than a day of losses.
         if ahead == 0 or ahead > 1 << (bits - 1) or (not self._id_bits and self._is_earlier(frame)):
             return None
         if number < self._last_id:
@@ -208,6 +212,8 @@ class FrameCount:
         if last is None or last.time_ns is None or frame.time_ns is None or self._doubtful > _MOST_DOUBT:
             missed, self._pending = self._pending, 0
             return missed
+        # The counter is read when a frame is taken from its queue, and may by then have counted what the
+        # camera missed after it: before it there were no more than the time stamps leave room for.
         elapsed_ns = frame.time_ns - last.time_ns
         lines = (1 + lost) * self._height
         if not self._pending or self._period_ns is None:

@@ -140,6 +140,7 @@ class HarvestersCamera:
             # harvesters keeps its monitors to itself; without one there is no word of incomplete buffers.
             self._stream = acquirer.data_streams[0]
             self._monitor = acquirer._new_buffer_event_monitor_dict[self._stream]
+            # GenTL counts STREAM_INFO_NUM_UNDERRUN from the opening of the stream on, not from its start.
             self._underruns = Tally(self._read_underruns())
             acquirer.start()
             self._armed = True
@@ -176,6 +177,7 @@ class HarvestersCamera:
 
         try:
             with told(f"camera {self._spec.serial}"):
+                # In whole ms, as GenTL has them; 0 would not wait at all, and the loop above would spin.
                 self._monitor.update_event_data(max(1, round(timeout_s * 1000)))
                 return self._monitor.buffer
         except CameraError as error:
@@ -219,6 +221,7 @@ class HarvestersCamera:
 
     def release(self, block: CameraBlock) -> None:
         buffer = self._held.pop(block, None)
+        # A stream that has ended has its buffers back: to queue one of them again is an error.
         if buffer is not None and self._armed:
             with told(f"camera {self._spec.serial}"):
                 self._stream.module.queue_buffer(buffer, False)

@@ -38,6 +38,7 @@ def shear(
     out: NDArray[Any],
 ) -> None:
     """out[i, c] = Σ_q Σ_d m(d)·E(t)·voxels[t // T_m, q, c]."""
+    # Threads share no element of out: sums come in the same order however many there are.
     for i in numba.prange(out.shape[0]):
         out[i, :] = 0
         for q in range(len(starts)):
@@ -71,11 +72,14 @@ def unshear(
     out: NDArray[Any],
 ) -> None:
     """The transpose of `shear`: out[f, q, c] = Σ_i Σ_{d: t in frame f} m(d)·E(t)·lines[i, c]."""
+    # By frames, though the sum is over lines: a line adds to all frames that it met, and threads with a line
+    # each would have to take turns.
     for f in numba.prange(out.shape[0]):
         t_first, t_end = f * T_m, min((f + 1) * T_m, len(code))
         for q in range(len(starts)):
             out[f, q, :] = 0
             steps = lengths[q] + S - 1
+            # The lines of which a sub-step first .. first + steps - 1, first = i·S + start, is in the frame.
             i_first = max(0, -((steps - 1 + starts[q] - t_first) // S))
             i_end = min(lines.shape[0], (t_end - 1 - starts[q]) // S + 1)
             for i in range(i_first, i_end):
@@ -93,6 +97,7 @@ def unshear(
 @numba.njit(cache=True)
 def blocks_to_pixels(blocks: NDArray[Any], n: int, S: int, N_m: int) -> NDArray[Any]:
     """blocks·C_N: (L_R, n/N_m) → (L_R, M); every fine column carries its block's value into its pixel."""
+    # Column by column: where N_m is no divisor of S, a block lies across the edge of a pixel.
     pixels = np.zeros((blocks.shape[0], n // S), blocks.dtype)
     for i in range(blocks.shape[0]):
         for column in range(n):

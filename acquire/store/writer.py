@@ -256,6 +256,7 @@ class RecordingWriter:
         self._check_alive()
         with self._failing("committing"):
             for arm in self._arms.values():
+                # Rows count once they are on disk, so what is on its way is waited for.
                 arm.settle()
             rows = self._whole_rows()
             room = self._watch.look(self.bytes_written)
@@ -382,6 +383,7 @@ class RecordingWriter:
         if going:
             self._publish_copy()
         self._publish_root(rows, nodes)
+        # What could not be deleted, or was claimed by a hold in the meantime, is told of again.
         if self._keeper and self._keeper.delete(going):
             self._publish_root(rows, nodes)
 

@@ -43,8 +43,11 @@ that comes next. How often the camera was opened again; a line and its time by t
 much faster that runs than the trigger's. Lines with a saturated pixel.
 """
 
+# A driver that waits does not hear us: an end, and an owner that is gone, are noticed so late.
 _BLOCK_WAIT_S = 0.05
+# A camera takes seconds to come back; to look for it ten times a second costs nobody anything.
 _REOPEN_PAUSE_S = 0.1
+# Blocks may come every 2 ms: a look at the mailbox for each would be a system call that nobody needs.
 _MAIL_INTERVAL_S = 0.02
 
 
@@ -214,6 +217,7 @@ class Intake:
         preroll = min(max(-first, 0), count)
         self._counters.add("delivered", count)
         self._counters.add("preroll", preroll)
+        # A frame may have more lines than a slot: its height is the camera's, the slot's is the rig's.
         for at in range(preroll, count, self._ring.shape.rows):
             part = slice(at, at + self._ring.shape.rows)
             self._put(first + at, block.pixels[part], block.flags[part])
@@ -254,6 +258,7 @@ class Intake:
 
     def _lose(self, first: int, count: int, cause: Cause) -> None:
         """Note lines that did not come, but for the preroll's."""
+        # Lines before the trigger's line 0 are nobody's: no ledger has them.
         count += min(first, 0)
         if count > 0:
             self._counters.add(cause, count)
@@ -263,6 +268,8 @@ class Intake:
         count = len(flags)
         slot = self._ring.claim()
         if slot is None:
+            # Nobody waits for a slot: what is dropped here has a number and a cause. Cameras that run out of
+            # buffers do not always say how many lines that was.
             self._ring.drop(first_line, count)
             self._losses.add(Loss(first_line, count, Cause.RING_FULL))
             return

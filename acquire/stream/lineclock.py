@@ -56,6 +56,7 @@ class LineClock:
         self._jitter_ns = max(abs(time_ns - expected), self._jitter_ns * 0.999)
         self._last = stamp
         assert self._middle is not None
+        # Two halves, so that at least one whole half is behind the measured interval at any time.
         if line - self._middle.line > _FRESH_LINES:
             self._first, self._middle = self._middle, stamp
 

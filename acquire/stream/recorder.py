@@ -45,10 +45,13 @@ if TYPE_CHECKING:
     from acquire.stream.recorder_plan import RecorderPlan
     from acquire.stream.ring import Ring, RingBlock
 
+# Bells end the wait as soon as lines come. This is for what has none: a commit that is due, silence.
 _WAIT_S = 0.02
+# What `kill -9` may take, besides the chunks that are not whole yet.
 _COMMIT_INTERVAL_S = 0.1
 _COMMIT_SHARE = 4
 """Commits take at most one part in so many of the time, however slow the disk."""
+# A recorder that lags behind must still commit, and hear that it is to end.
 _BLOCKS_PER_TURN = 8
 _CALM_BLOCKS = 2
 """Waiting in a ring. With more, the disk is kept busy while blocks are made ready: two processors for one."""
@@ -125,6 +128,8 @@ class Recorder:
         """One round over messages, disk, tags and rings; False when nothing is left to live for."""
         self._counters.add("turns", 1)
         try:
+            # The order matters: commands are not kept waiting by lines, and tags come before the lines that
+            # they confirm, which else would wait a turn for them.
             self._listen()
             self._look_at_disk()
             while (block := self._tags.acquire()) is not None:
@@ -198,6 +203,8 @@ class Recorder:
         except (StateError, UsageError) as error:
             self._mailbox.post(Refused(error))
             return
+        # Directories, locks and reserved space can take a busy disk seconds, in which the rings must be
+        # emptied.
         writer = self._disk.submit(
             self._waits.elsewhere, RecordingWriter.prepare, begin.path, begin.spec, self._plan.disk
         )

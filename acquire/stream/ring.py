@@ -50,8 +50,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _HEAD, _PEAK, _DROPPED_BLOCKS, _DROPPED_LINES, _NEWEST, _DROPPED_END = range(6)
-_TAIL = 8
-_OBSERVERS = 16
+_TAIL = 8  # the reader's, in a line of its own
+_OBSERVERS = 16  # and each observer in one
 _LINE_WORDS = 8  # a cache line: writers in different processes do not wait for each other's
 _SEQUENCE, _FIRST_LINE, _COUNT, _TIME_NS, _TOTAL, _LOSS_COUNT, _LOSSES = range(7)
 _HEADER_WORDS = 32  # six, and three for each of MAX_LOSSES, in whole cache lines
@@ -180,6 +180,8 @@ class Ring:
         if head - self._control[_TAIL] == self.shape.slots:
             return None
         index = head % self.shape.slots
+        # Before a pixel is touched: an observer that still reads the slot's old block finds it odd
+        # afterwards.
         self._headers[index][_SEQUENCE] = 2 * head + 1
         return self._slots[index]
 

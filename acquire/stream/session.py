@@ -45,6 +45,7 @@ TAINTING_EVENTS = (
 CODE_DOUBTS = frozenset(DOUBTFUL.values())
 """Events of lines in the recording that do so, though they may have been written before the verdict."""
 
+# With a wrong code every tag is a mismatch, and a recording lists 4096 events in all.
 MAX_MISMATCH_EVENTS = 100
 _BEST_FIRST = (
     RunCondition.GOOD,

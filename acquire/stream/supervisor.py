@@ -32,11 +32,14 @@ if TYPE_CHECKING:
 RECORDER = "recorder"
 """Key of the recorder among the workers; the grabbers have their arms' names."""
 
+# The thread waits for tags alone, and looks at all else in between: so late is a death noticed.
 _TAG_WAIT_S = 0.02
 _ANSWER_S = 120.0
 """For a recording to be created. A recorder that hangs, rather than waits for the disk, is noticed sooner."""
 _JOIN_S = 30.0
+# Between two looks of the service, tenths of a second: a trigger that floods must not fill the memory.
 _MOST_EVENTS = 1024
+# Questions share the trigger's link with its tags.
 _ASK_EVERY_S = 1.0
 
 

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 UNCONFIRMED = np.uint16(LineFlag.TIME_ESTIMATED | LineFlag.CODE_UNVERIFIED)
 
+# Code and times are computed for so many lines at once and for both arms: tables of what the one has had
+# and the other not yet are kept, as far as arms are apart in an ordinary run.
 _SPAN_LINES = 32768
 _SPANS_KEPT = 4
 

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
 
 _DRIFT = 1e-4
 """How far an ordinary oscillator may be off: the uncertainty that grows with the age of a comparison."""
+# A watchdog that bites ends the run: all but one may be lost, or late on a busy host.
 _SIGNS_OF_LIFE_PER_WATCHDOG = 8
 _SIGN_OF_LIFE_S = 0.5
 """At least as often as this: a simulated device's time may pass faster than the host's."""
@@ -125,6 +126,7 @@ class TriggerDriver:
             external = self._config.external_start != "off"
             if not external:
                 device.command(Command.START, run_number(run.run_id))
+        # Without the lock from here on: `stop` must be able to end the wait for an edge that never comes.
         limit_s = self._config.external_timeout_s if external else ANSWER_S
         start_tick = self._await_line_0(device, run, limit_s)
         if external:  # the edge may have come long after the first comparison, and clocks drift

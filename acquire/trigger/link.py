@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     from acquire.trigger.transports.base import Transport
 
+# Half a minute at 600 000 lines/s and a tag every 256; a host that is away for longer has other troubles.
 _TAGS_KEPT = 1 << 16
 _END_S = 5.0
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from acquire.config.device import LightOutputConfig, LineOutputConfig, TriggerConfig
     from acquire.trigger.base import Delays, LightWindow, TriggerRun
 
-_DEFAULT_WIDTH = 90
+_DEFAULT_WIDTH = 90  # 1 µs at 90 MHz
 _TWINS = (r.Board.NONE, r.Board.MODEL)
 """Their light is simulated."""
 _TAG_FRAME_BYTES = r.TAG_BYTES + 10
