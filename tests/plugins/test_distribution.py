@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -150,6 +151,17 @@ def test_it_passes_the_suites_that_are_public(acquire: Run) -> None:
     done = acquire(*suite, program=("-m", "pytest"))
     assert done.returncode == 0, done.stdout
     assert "skipped" not in done.stdout
+
+
+def test_the_document_can_be_copied_from_top_to_bottom(monkeypatch: pytest.MonkeyPatch) -> None:
+    blocks = re.findall(r"```python\n(.*?)\n```", DOCUMENT.read_text(encoding="utf-8"), re.DOTALL)
+    for name, text in (("lab_extras", "\n\n\n".join(blocks[:-1])), ("check_lab_extras", blocks[-1])):
+        module = ModuleType(name)
+        monkeypatch.setitem(sys.modules, name, module)
+        exec(compile(text, f"{DOCUMENT.name}: {name}", "exec"), vars(module))
+    assert {"Flicker", "Stars", "RampCameras", "SlowLinkTrigger", "LeastSquares", "LocalWiener"} <= set(
+        vars(sys.modules["lab_extras"])
+    )
 
 
 def test_the_document_shows_what_is_installed_here() -> None:

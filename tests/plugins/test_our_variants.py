@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from acquire.config import load_scene
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
 from acquire.plugins import EFFECTS
 from acquire.recon import HaarShrink
 from acquire.sim.effects.base import Effect
-from acquire.testing.adjoints import assert_adjoint
-from acquire.testing.effects import EffectContract
-from acquire.testing.solvers import DenoiserContract, SolverContract
+from acquire.sim.scene import SceneModel
+from acquire.testing import DenoiserContract, EffectContract, SceneContract, SolverContract, assert_adjoint
 
 OF_EACH_PLACE = {
     "led_rise_fall": {"rise_s": 3e-6, "fall_s": 5e-6},
@@ -25,11 +25,21 @@ OF_EACH_PLACE = {
     "duplicated_lines": {"rate": 0.02},
 }
 
+OF_EACH_KIND = ("scene-leds", "scene-usaf", "scene-digits", "scene-goldfish", "scene-practice")
+
 
 class TestEffects(EffectContract):
     @pytest.fixture(params=OF_EACH_PLACE)
     def effect(self, request: pytest.FixtureRequest) -> Effect:
         return EFFECTS.load(request.param)(kind=request.param, **OF_EACH_PLACE[request.param])
+
+
+class TestScenes(SceneContract):
+    @pytest.fixture(params=OF_EACH_KIND)
+    def scene(self, request: pytest.FixtureRequest) -> SceneModel:
+        scene = load_scene(request.param)
+        assert isinstance(scene, SceneModel)
+        return scene
 
 
 class TestAdmm(SolverContract):

@@ -6,16 +6,21 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from lab_extras import Flicker, LocalWiener
+from lab_extras import Flicker, LocalWiener, Stars
 
 from acquire.codes import ConstantCode
 from acquire.config import load_rig
 from acquire.rig import Rig
 from acquire.sim.instrument import SimulatedDevices
-from acquire.testing.cameras import CameraContract, CameraStand
-from acquire.testing.effects import EffectContract
-from acquire.testing.solvers import DenoiserContract, SolverContract
-from acquire.testing.triggers import TriggerContract
+from acquire.testing import (
+    CameraContract,
+    CameraStand,
+    DenoiserContract,
+    EffectContract,
+    SceneContract,
+    SolverContract,
+    TriggerContract,
+)
 
 STAGES = 16
 RAMPS = {
@@ -30,6 +35,12 @@ class TestFlicker(EffectContract):
     @pytest.fixture
     def effect(self):
         return Flicker(kind="flicker", depth=0.3)
+
+
+class TestStars(SceneContract):
+    @pytest.fixture
+    def scene(self):
+        return Stars(kind="stars", count=5)
 
 
 class TestLeastSquares(SolverContract):

@@ -1,0 +1,62 @@
+"""What every scene must do: extend `SceneContract` with a fixture ``scene``."""
+
+from __future__ import annotations
+
+import pickle
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from acquire.config.scene import SceneFile
+from acquire.plugins import SCENES
+from acquire.sim.scene import SeparableScene, frames_at
+
+if TYPE_CHECKING:
+    from acquire.sim.scene import Scene, SceneModel
+
+SIZE, SUBSTEP_S = 24, 1e-5
+FIRST, COUNT = -7, 40
+"""A scene has no beginning: some of the sub-steps that are looked at are before the run."""
+
+
+class SceneContract:
+    """Needs a fixture ``scene``: a model of a scene, installed, that is not dark all the time."""
+
+    def shown(self, scene: SceneModel) -> Scene:
+        """What it shows on 24 × 24 at 100 kHz; extend this where your scene needs another size."""
+        return scene.build(SIZE, SUBSTEP_S)
+
+    def test_a_scene_file_finds_it_and_another_process_is_given_the_same(self, scene: SceneModel) -> None:
+        assert SCENES.load(scene.kind) is type(scene)
+        assert SceneFile.model_validate(scene.model_dump(mode="json")).root == scene
+        assert pickle.loads(pickle.dumps(scene)) == scene  # noqa: S301  # our own bytes
+
+    def test_it_shows_finite_light_of_the_size_that_was_asked(self, scene: SceneModel) -> None:
+        shown = self.shown(scene)
+        light = shown.frames(FIRST, COUNT)
+        assert light.shape == (COUNT, shown.size, shown.size)
+        assert light.dtype == np.float32
+        assert np.isfinite(light).all()
+        assert light.min() >= 0, "light below zero"
+        assert light.max() > 0, "nothing is lit"
+        assert shown.frames(3, 0).shape == (0, shown.size, shown.size), "no sub-step at all may be asked"
+
+    def test_frames_do_not_depend_on_how_they_are_asked(self, scene: SceneModel) -> None:
+        shown, again = self.shown(scene), self.shown(scene)
+        whole = shown.frames(FIRST, COUNT)
+        later, earlier = again.frames(FIRST + 15, COUNT - 15), again.frames(FIRST, 15)  # in any order
+        np.testing.assert_array_equal(np.concatenate([earlier, later]), whole)
+        some = np.array([0, 1, 5, 17, COUNT - 1])
+        np.testing.assert_array_equal(frames_at(shown, FIRST + some), whole[some])
+
+    def test_masks_and_intensities_make_its_frames(self, scene: SceneModel) -> None:
+        """Of a scene without masks there is nothing to compare: it is computed frame by frame."""
+        shown = self.shown(scene)
+        if not isinstance(shown, SeparableScene):
+            return
+        light, masks = shown.intensity(FIRST, COUNT), shown.masks
+        assert light.shape == (len(masks), COUNT)
+        assert masks.dtype == np.float32
+        made = np.einsum("kt,krc->trc", light, masks)
+        np.testing.assert_allclose(shown.frames(FIRST, COUNT), made, rtol=1e-4, atol=1e-6)
+        assert shown.intensity(0, 4, SUBSTEP_S / 3).shape == (len(masks), 4)  # steps of another duration
