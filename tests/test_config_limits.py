@@ -65,6 +65,19 @@ def test_a_mark_of_the_editor_s_before_the_text_is_none_of_it(tmp_path: Path, ri
     assert load_rig(file) == load_rig("rig-demo")
 
 
+def test_a_rig_that_names_no_scene_is_given_the_one_that_is_asked_for(tmp_path: Path) -> None:
+    sizes = 'name = "bare"\n[geometry]\nstages = 16\nsubsteps = 2\n'
+    bare = sizes + '[cameras.a]\nserial = "A"\n[cameras.b]\nserial = "B"\n'
+    (tmp_path / "bare.toml").write_text(bare)
+    (tmp_path / "own.toml").write_text(f'{bare}[simulation]\nscene = "scene-digits"\n')
+    seen = load_rig(tmp_path / "bare.toml", scene="scene-usaf").simulation.scene
+    assert seen == str(builtin_directory() / "scene-usaf.toml")
+    seen = load_rig(tmp_path / "own.toml", scene="scene-usaf").simulation.scene
+    assert seen == str(builtin_directory() / "scene-digits.toml"), "what the file says goes first"
+    with pytest.raises(ConfigError, match="scene is missing"):
+        load_rig(tmp_path / "bare.toml")
+
+
 @pytest.mark.parametrize(
     ("key", "value"),
     [

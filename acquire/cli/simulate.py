@@ -70,7 +70,7 @@ def simulate(
         )
     limit_blas(1)  # the arms share the cores
     shown = load_scene(scene)
-    rig = load_rig(config or shown.rig, parse_settings(settings or []))
+    rig = load_rig(config or shown.rig, parse_settings(settings or []), scene)
     count = _line_count(rig, shown.lines, lines, duration)
     facts: dict[str, Any] = {}
     if out is not None and not explain:

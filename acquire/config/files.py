@@ -65,10 +65,13 @@ def find(name: str | Path, beside: Path | None = None, kind: str = "") -> Path:
     )
 
 
-def load_rig(name: str | Path, overrides: Mapping[str, Any] | None = None) -> RigConfig:
+def load_rig(
+    name: str | Path, overrides: Mapping[str, Any] | None = None, scene: str | None = None
+) -> RigConfig:
     """Read, override (dotted keys, as ``{"simulation.speed": 10}``) and validate a rig file.
 
-    Relative paths of scenes and calibrations are resolved against the file.
+    Relative paths of scenes and calibrations are resolved against the file. ``scene`` is what simulated
+    cameras see where the file does not say.
     """
     path = find(name, kind="rig")
     table = _read(path)
@@ -80,8 +83,9 @@ def load_rig(name: str | Path, overrides: Mapping[str, Any] | None = None) -> Ri
         rig = rig.model_copy(update={"calibration": _beside(rig.calibration, path)})
     if not rig.needs_scene:
         return rig
-    scene = find(rig.scene_file(), beside=path, kind="scene").resolve()
-    return rig.model_copy(update={"simulation": rig.simulation.model_copy(update={"scene": str(scene)})})
+    named = scene if scene is not None and rig.simulation.scene is None else rig.scene_file()
+    seen = find(named, beside=path, kind="scene").resolve()
+    return rig.model_copy(update={"simulation": rig.simulation.model_copy(update={"scene": str(seen)})})
 
 
 def _beside(named: Path, file: Path) -> Path:
