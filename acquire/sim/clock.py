@@ -246,6 +246,9 @@ class Wire:
         patience_ns, nap_s = time.monotonic_ns() + int(_TORN_S * 1e9), _WRITE_S
         while time.monotonic_ns() < patience_ns:
             sequence = self._sequence()
+            # A lock that readers never take: odd while a train is being written, and what was read counts
+            # only if the number is the same afterwards. The time is read in between, or a train might issue
+            # pulses that its stop had forbidden.
             if not sequence & 1 and self._refresh(sequence):
                 train, now_ns = self._known[1], self.clock.monotonic_ns()
                 if self._sequence() == sequence == self._known[0]:

@@ -158,6 +158,8 @@ class _Recoverer:
 
     def run(self, progress: Callable[[int, int], None] | None) -> Recovery:
         recording = self.recording
+        # Indices first: chunks are found by them. Then what was committed, and only then what lies beyond
+        # it, since rows count only where every array of both arms has them.
         mended = sum(self._mend(arm) for arm in ARMS)
         scans = scan(recording, self.kept, progress)
         if not self.sealed:

@@ -193,6 +193,7 @@ class Keeper:
 
         Returns the latter: they count as kept again.
         """
+        # Asked once more: somebody may have held them since they were chosen.
         held = [hold.lines for hold in self._marks()]
         saved = [shard for shard in shards if self._held(shard, held) or not self._delete(shard)]
         for shard in saved:

@@ -53,6 +53,7 @@ class RoomWatch:
         now = time.monotonic()
         if now >= self._due_s:
             elapsed = max(1e-3, now - self._begun_s)
+            # An exponential mean; the first look has no rate before it, and is believed.
             share = min(1.0, max(LOOK_S, elapsed) / MEMORY_S) if self._bytes else 1.0
             self._rate += share * ((bytes_written - self._bytes) / elapsed - self._rate)
             self._bytes, self._begun_s, self._due_s = bytes_written, now, now + LOOK_S

@@ -60,6 +60,8 @@ class ShardWriter:
         self._in_pages = direct
         self._index = [(ABSENT, ABSENT)] * chunks
         try:
+            # An empty index first: who reads before the first chunk finds a shard without chunks, not a
+            # broken one.
             self._file.write([pack_index(self._index)], 0)
         except OSError:
             self._file.close()  # a full disk still makes names
@@ -92,6 +94,7 @@ class ShardWriter:
 
     def publish(self) -> None:
         """Put the chunks that are written into the index; several at once cost as much as one."""
+        # After the chunks, never before: what an index names is in the file by then.
         if self.published < self.chunks:
             self._file.write([pack_index(self._index)], 0)
             self.published = self.chunks

@@ -190,6 +190,7 @@ class Dialogue:
             call.attempts += 1
             self._counts["repeated"] += call.attempts > 1
             self._on_the_way[self._sequence] = call
+            # 16 bits of a frame, and far fewer requests in a window: no two on the way have the same.
             self._sequence = self._sequence + 1 & 0xFFFF
             room_bytes -= call.size_bytes
             yield encode(call.frame)

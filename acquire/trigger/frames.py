@@ -101,6 +101,8 @@ class Decoder:
 
     def feed(self, data: bytes) -> list[Frame]:
         """The frames that are complete now."""
+        # COBS leaves no zero inside a frame: after any noise, the next zero is the end of something, and what
+        # follows it is whole again.
         *ended, rest = data.split(b"\0")
         found: list[Frame] = []
         for piece in ended:
