@@ -140,7 +140,7 @@ class SeparableLines:
             start = 0
             for h, rows in zip(light, self._rows, strict=True):
                 width = rows.stop - rows.start
-                # Line i meets row r at sub-step S·i + r: the lines are the windows of h, S apart, times the mask.
+                # Line i meets row r at sub-step S·i + r: lines are windows of h, S apart, times the mask.
                 windows = sliding_window_view(h[rows.start :], width)[:: self._substeps]
                 self._windows[:, start : start + width] = windows[:TILE_LINES]
                 start += width

@@ -228,7 +228,7 @@ def group_document(attributes: Mapping[str, Any], nodes: Mapping[str, Document])
         "consolidated_metadata": {
             "kind": "inline",
             "must_understand": False,
-            "metadata": {path: _inner(document) for path, document in nodes.items()},
+            "metadata": {path: inner(document) for path, document in nodes.items()},
         },
     }
 
@@ -238,7 +238,7 @@ def to_json(document: Document) -> bytes:
     return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
 
 
-def _inner(document: Document) -> Document:
+def inner(document: Document) -> Document:
     """A node inside consolidated metadata: zarr keeps that flat, inner groups carry none of their own."""
     if document["node_type"] == "array":
         return document

@@ -129,7 +129,7 @@ def _tables(path: Path) -> dict[str, layout.Document]:
         own = {key: _own(path / key) for key in keys}
         if all(own.values()):
             nodes |= {key: document for key, document in own.items() if document}
-    return {key: _bare(document) for key, document in nodes.items()}
+    return {key: layout.inner(document) for key, document in nodes.items()}
 
 
 def _own(directory: Path) -> layout.Document | None:
@@ -139,10 +139,3 @@ def _own(directory: Path) -> layout.Document | None:
     except (OSError, ValueError):
         return None
     return document if isinstance(document.get("attributes"), dict) and document.get("node_type") else None
-
-
-def _bare(document: layout.Document) -> layout.Document:
-    """A node as consolidated metadata has it: groups carry none of their own there."""
-    if document["node_type"] == "array":
-        return document
-    return layout.group_document(document["attributes"], {})
