@@ -89,7 +89,15 @@ class Fibre:
             or _in_the_middle(arm, across // size, along // substeps, sensor_pixels)
             for arm, across, along in (("a", rows, columns), ("b", columns, rows))
         }
-        return cls(stages, substeps, rows, columns, sensor_pixels, placed["a"], placed["b"])
+        return cls(
+            stages=stages,
+            substeps=substeps,
+            rows=rows,
+            columns=columns,
+            sensor_pixels=sensor_pixels,
+            bands_a=placed["a"],
+            bands_b=placed["b"],
+        )
 
     @property
     def size(self) -> int:

@@ -183,7 +183,14 @@ def _told_apart(theirs: Sequence[Plugin], ours: Sequence[Plugin]) -> Iterator[Pl
             why = f"the name is {OURS}'s own"
         elif len(origins) > 1:
             why = f"{' and '.join(origins)} both have it"
-        yield Plugin(plugin.group, plugin.name, plugin.distribution, plugin.version, plugin.entry, why)
+        yield Plugin(
+            group=plugin.group,
+            name=plugin.name,
+            distribution=plugin.distribution,
+            version=plugin.version,
+            entry=plugin.entry,
+            refused=why,
+        )
 
 
 @cache

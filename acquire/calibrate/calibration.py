@@ -250,12 +250,12 @@ class Calibration:
                 }
             usable, found = attrs["usable"], attrs["alignment"]
             return cls(
-                Instrument.model_validate(attrs["instrument"]),
-                quantities,
-                None if usable is None else np.asarray(usable, np.bool_),
-                attrs["orientation"],
-                None if found is None else _alignment(found),
-                {name: dict(step) for name, step in attrs["steps"].items()},
+                instrument=Instrument.model_validate(attrs["instrument"]),
+                quantities=quantities,
+                usable=None if usable is None else np.asarray(usable, np.bool_),
+                orientation=attrs["orientation"],
+                alignment=None if found is None else _alignment(found),
+                steps={name: dict(step) for name, step in attrs["steps"].items()},
             )
         except (LookupError, TypeError, ValueError, AttributeError, ValidationError, UsageError) as error:
             raise DataError(f"the calibration is damaged: {error}", hint="measure it again") from error

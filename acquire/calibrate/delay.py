@@ -186,10 +186,10 @@ def _edges(parts: NDArray[np.float64], errors: NDArray[np.float64], whole: int, 
         )
     before, begin, end, after = (float(parts[k]) / row for k in (at - 1, at, at + width - 1, at + width))
     return Beyond(
-        whole + GUARD - at,
-        before,
-        begin,
-        end,
-        after,
-        float(np.hypot(errors[at - 1], errors[at + width]) / np.sqrt(2)) / row,
+        whole=whole + GUARD - at,
+        before=before,
+        first=begin,
+        last=end,
+        after=after,
+        error=float(np.hypot(errors[at - 1], errors[at + width]) / np.sqrt(2)) / row,
     )

@@ -338,7 +338,14 @@ def _describe(info: Any) -> FoundCamera:
         texts[0] = _or(lambda: str(info.id_), "")
     status = _or(lambda: int(info.access_status), 0)
     cti = _or(lambda: str(info.parent.parent.parent.path_name), "")
-    return FoundCamera(texts[0], texts[1], texts[2], texts[3], _ACCESS.get(status, "free"), cti)
+    return FoundCamera(
+        serial=texts[0],
+        model=texts[1],
+        vendor=texts[2],
+        firmware=texts[3],
+        access=_ACCESS.get(status, "free"),
+        cti=cti,
+    )
 
 
 _IDENTITY = ("serial_number", "model", "vendor", "version")

@@ -163,7 +163,13 @@ def capture_plan(load: Load, wire: Wire) -> CapturePlan:
     camera = CameraConfig(pixel_format=_PIXEL_FORMAT[load.dtype])
     openers: dict[str, CameraOpener] = {
         arm: PatternCameraOpener(
-            wire, arm, geometry, camera, load.block_lines, load.line_rate_hz, load.pixels
+            wire=wire,
+            arm=arm,
+            geometry=geometry,
+            config=camera,
+            block_lines=load.block_lines,
+            line_rate_hz=load.line_rate_hz,
+            pixels=load.pixels,
         )
         for arm in ARMS
     }

@@ -74,7 +74,7 @@ def bench(
         _show_parts(load, parts, directory)
     with stage_progress(f"recording at most {runs} times") as advance:
         told = _Told(advance, runs, aloud=not json)
-        trials = search_rate(load, directory, parts.line_rate_hz, seconds, told, runs)
+        trials = search_rate(load, directory, parts.line_rate_hz, seconds=seconds, tell=told, most_runs=runs)
     found = best(trials)
     if json:
         print_json(_facts(load, parts, trials, found))

@@ -137,7 +137,7 @@ def _of_video(video: VideoFile, name: str, part: _Part, *, whole: bool) -> Conte
     frames = range(first, count if part.count is None else first + part.count)
     if part.begin is not None or part.end is not None:
         interval_ns, start = video.interval_ns, int(video.time_ns[0]) if count else 0
-        frames = _numbers(part, 0, count, interval_ns, start, "frames")
+        frames = _numbers(part, 0, count, period_ns=interval_ns, first_ns=start, what="frames")
     return video_content(video, name, frames, whole=whole)
 
 

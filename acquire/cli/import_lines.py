@@ -246,12 +246,12 @@ def _of_rig(name: str) -> Instrument:
     rig = load_rig(name)
     keys = ("white_dn", "black_level_dn", "responsivity_dn")
     return Instrument(
-        rig.geometry.stages,
-        rig.geometry.substeps,
-        rig.code.build(),
-        rig.trigger.clock_hz,
-        rig.trigger.substep_ticks,
-        {arm: {key: getattr(rig.cameras.arm(arm), key) for key in keys} for arm in ("a", "b")},
+        stages=rig.geometry.stages,
+        substeps=rig.geometry.substeps,
+        code=rig.code.build(),
+        clock_hz=rig.trigger.clock_hz,
+        substep_ticks=rig.trigger.substep_ticks,
+        cameras={arm: {key: getattr(rig.cameras.arm(arm), key) for key in keys} for arm in ("a", "b")},
         config=rig.model_dump(mode="json"),
         layout="dual" if rig.laid_out is None else "fibre",
         fibre=rig.laid_out,

@@ -112,14 +112,14 @@ def tradeoff(
     with new_directory(out):
         cases, effects = _cases(sources, out, full_well or [], (first_line, lines, repeats), tile)
         host = HostWatch()
-        runs, truths = _measure(cases, repeats, kinds, asked, budget, host)
+        runs, truths = _measure(cases, repeats, kinds, asked=asked, longest_s=budget, host=host)
         heading = {
             "title": ", ".join(Path(source).stem for source in sources),
             "command": f"acquire {shlex.join(sys.argv[1:])}",
             "notes": _notes(cases, repeats),
             "host": host.busyness().facts(),
         }
-        page = write_page(runs, truths, effects, out, heading, datetime.now(UTC))
+        page = write_page(runs, truths, effects, directory=out, heading=heading, when=datetime.now(UTC))
     kept = remember(_lessons(runs)) if learn else None
     if json:
         print_json({"page": str(page), "learned": kept and str(kept), "rows": table(runs)})
@@ -152,7 +152,15 @@ def _measure(
             host.look()
             what = f"{case.name}: {solver} {preset} {voxels}, {repeat + 1} of {repeats}"
             with stage_progress(what) as advance, limit_threads(idle_cores()):
-                run = measure(judge, solver, voxels, preset, longest_s, advance, dtype=exact)  # type: ignore[arg-type]  # checked before
+                run = measure(
+                    judge,
+                    solver,
+                    voxels,
+                    preset=preset,  # type: ignore[arg-type]  # checked before
+                    longest_s=longest_s,
+                    progress=advance,
+                    dtype=exact,  # type: ignore[arg-type]
+                )
             runs.append(replace(run, case=case.name, repeat=repeat))
             if repeat == 0:
                 true = judge.truth(voxels)

@@ -83,7 +83,7 @@ def serve(config: RigConfig, origin: str = "", reread: Callable[[], RigConfig] |
             check_rig(config)
             return Run(config, rig, proof.choose)
 
-        service = Service(config, open_run, proof, salvage, uploads, troubles)
+        service = Service(config, open_run, proof, salvage=salvage, uploads=uploads, troubles=troubles)
         service.origin = origin
         page, hooks = Page(endpoint.path), Hooks(config.hooks, service.news, config.name)
         reloading = None if reread is None else Reloading(reread, service, hooks)

@@ -139,7 +139,14 @@ def fit_sine(
     terms = [(float(a), float(phase)) for a, phase in zip(np.hypot(p, q), np.arctan2(q, p), strict=True)]
     (amplitude, phase_rad), *overtones = terms
     rms = float(np.sqrt(np.mean(np.square(residual))))
-    return SineFit(frequency_hz, amplitude, float(coefficients[0]), phase_rad, rms, tuple(overtones))
+    return SineFit(
+        frequency_hz=frequency_hz,
+        amplitude=amplitude,
+        offset=float(coefficients[0]),
+        phase_rad=phase_rad,
+        residual_rms=rms,
+        overtones=tuple(overtones),
+    )
 
 
 def fit_constant(values: NDArray[Any]) -> SineFit:

@@ -107,7 +107,7 @@ def render(
     if path.suffix.lower() == ".html":
         from acquire.evaluate.video_page import write_page  # which draws, and so costs more
 
-        return write_page(panels, peaks, times, path, look, progress)
+        return write_page(panels, peaks, times, path=path, look=look, progress=progress)
     pictures = _pictures(panels, times, peaks, look, progress)
     match path.suffix.lower():
         case ".png":

@@ -240,12 +240,12 @@ def measure(
     last = Point(result.iterations, result.seconds, result.processor_s, "end", prediction=prediction)
     earlier = (each for each in points if each.seconds < last.seconds)
     return Run(
-        solver,
-        voxels,
-        dtype,
-        int(result.video.size),
-        (*earlier, judge.judged(last, result.video, voxels)),
-        preset,
+        solver=solver,
+        voxels=voxels,
+        dtype=dtype,
+        voxel_count=int(result.video.size),
+        points=(*earlier, judge.judged(last, result.video, voxels)),
+        preset=preset,
         ended=result.ended,
         mean_db=judge.mean_db(voxels),
     )

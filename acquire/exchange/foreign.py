@@ -158,7 +158,14 @@ def _cropped(file: LineFile, columns: tuple[int, int]) -> LineFile:
         return file.read(arm, start, stop)[:, first:end]
 
     shape = (*file.shape[:-1], end - first)
-    return LineFile(file.path, file.kind, shape, file.dtype, read, file.facts | {"columns": [first, end]})
+    return LineFile(
+        path=file.path,
+        kind=file.kind,
+        shape=shape,
+        dtype=file.dtype,
+        read=read,
+        facts=file.facts | {"columns": [first, end]},
+    )
 
 
 def _sliced(array: Any) -> Callable[[int | None, int, int], NDArray[Any]]:
@@ -201,7 +208,14 @@ def _hdf5(path: Path, layout: Layout, held: ExitStack) -> LineFile:
     dataset = file.get(name)
     if not isinstance(dataset, h5py.Dataset):
         raise UsageError(f"{path} has no dataset {name!r}", possible=", ".join(_datasets(file, h5py)))
-    return LineFile(path, "HDF5", dataset.shape, dataset.dtype, _sliced(dataset), {"dataset": name})
+    return LineFile(
+        path=path,
+        kind="HDF5",
+        shape=dataset.shape,
+        dtype=dataset.dtype,
+        read=_sliced(dataset),
+        facts={"dataset": name},
+    )
 
 
 def _datasets(file: Any, h5py: Any) -> list[str]:
@@ -244,7 +258,14 @@ def _raw(path: Path, layout: Layout, _: ExitStack) -> LineFile:
         )
     shape = (size // line_bytes, pixels)
     facts = {"dtype": dtype.str, "skip_bytes": layout.skip_bytes}
-    return LineFile(path, "raw", shape, dtype, _plain(path, dtype, shape, layout.skip_bytes), facts)
+    return LineFile(
+        path=path,
+        kind="raw",
+        shape=shape,
+        dtype=dtype,
+        read=_plain(path, dtype, shape, layout.skip_bytes),
+        facts=facts,
+    )
 
 
 def _tiff(path: Path, _: Layout, held: ExitStack) -> LineFile:

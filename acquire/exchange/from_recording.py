@@ -46,16 +46,23 @@ def recording_content(recording: Recording, rows: range | None = None) -> Conten
     stream, first_line = recording.arms[ARMS[0]], recording.first_line + asked.start
     words = "lines as recorded" if asked.step == 1 else f"means of {asked.step} lines each"
     image = Array(
-        "lines",
-        ("arm", "line", "pixel"),
-        (len(ARMS), len(asked), stream.pixels),
-        little(stream.dtype if asked.step == 1 else np.dtype(np.float32)),
-        partial(_of_arms, recording, asked, "lines"),
-        {"long_name": words, "units": "DN"},
+        name="lines",
+        dims=("arm", "line", "pixel"),
+        shape=(len(ARMS), len(asked), stream.pixels),
+        dtype=little(stream.dtype if asked.step == 1 else np.dtype(np.float32)),
+        blocks=partial(_of_arms, recording, asked, "lines"),
+        attributes={"long_name": words, "units": "DN"},
     )
     axes = (Axis("arm"), Axis("line", float(asked.step), first_line), Axis("pixel", 1.0))
     facts = _facts(recording, asked)
-    return Content("lines", str(recording), axes, image, tuple(_columns(recording, asked)), facts)
+    return Content(
+        kind="lines",
+        title=str(recording),
+        axes=axes,
+        image=image,
+        columns=tuple(_columns(recording, asked)),
+        facts=facts,
+    )
 
 
 def _facts(recording: Recording, rows: range) -> dict[str, Any]:
@@ -78,7 +85,12 @@ def _columns(recording: Recording, rows: range) -> Iterator[Array]:
     flags = partial(_of_arms, recording, rows, "flags")
     words = "what is known about the line beyond its pixels"
     yield Array(
-        "flags", ("arm", "line"), (len(ARMS), len(rows)), np.dtype("<u2"), flags, {"long_name": words}
+        name="flags",
+        dims=("arm", "line"),
+        shape=(len(ARMS), len(rows)),
+        dtype=np.dtype("<u2"),
+        blocks=flags,
+        attributes={"long_name": words},
     )
     tags = (
         ("time_ns", "time", "UTC at which the line's read-out begins, ns since 1970"),
@@ -88,7 +100,14 @@ def _columns(recording: Recording, rows: range) -> Iterator[Array]:
     for name, column, words in tags if rows.step == 1 else tags[:2]:
         blocks = partial(_of_either, recording, rows, column)
         dtype = little(stream.reader(column).shape.dtype)
-        yield Array(name, ("line",), (len(rows),), dtype, blocks, {"long_name": words})
+        yield Array(
+            name=name,
+            dims=("line",),
+            shape=(len(rows),),
+            dtype=dtype,
+            blocks=blocks,
+            attributes={"long_name": words},
+        )
 
 
 def _steps(recording: Recording, rows: range) -> Iterator[tuple[int, int]]:

@@ -47,22 +47,22 @@ def video_content(
             hint="--all-frames, which marks them instead",
         )
     image = Array(
-        "video",
-        ("time", "y", "x"),
-        (len(kept), *video.video.shape[1:]),
-        little(video.video.dtype),
-        partial(_frames, video, kept),
-        {"long_name": "reconstructed light"},
+        name="video",
+        dims=("time", "y", "x"),
+        shape=(len(kept), *video.video.shape[1:]),
+        dtype=little(video.video.dtype),
+        blocks=partial(_frames, video, kept),
+        attributes={"long_name": "reconstructed light"},
     )
     inside = kept if trusted is None else _common(kept, trusted)
     return Content(
-        "video",
-        title,
-        _axes(video, kept),
-        image,
-        tuple(_columns(video, kept)),
-        _facts(video, title, kept, None if trusted is None else inside),
-        len(kept) - len(inside),
+        kind="video",
+        title=title,
+        axes=_axes(video, kept),
+        image=image,
+        columns=tuple(_columns(video, kept)),
+        facts=_facts(video, title, kept, None if trusted is None else inside),
+        untrusted=len(kept) - len(inside),
     )
 
 
@@ -117,7 +117,14 @@ def _columns(video: VideoFile, kept: range) -> Iterator[Array]:
 def _column(name: str, values: NDArray[Any], words: str) -> Array:
     """A value for each frame, in memory."""
     piece = block((slice(0, len(values)),), values)
-    return Array(name, ("time",), values.shape, piece[1].dtype, lambda: iter([piece]), {"long_name": words})
+    return Array(
+        name=name,
+        dims=("time",),
+        shape=values.shape,
+        dtype=piece[1].dtype,
+        blocks=lambda: iter([piece]),
+        attributes={"long_name": words},
+    )
 
 
 def _frames(video: VideoFile, kept: range) -> Iterator[Block]:

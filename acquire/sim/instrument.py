@@ -70,12 +70,12 @@ class SimulatedDevices:
         simulation = self.config.simulation
         assert simulation.replay is not None
         return ReplayCameraOpener(
-            self._wire,
-            simulation.replay,
-            arm,
-            self.config.stream.block_lines,
-            simulation.replay_loop,
-            simulation.replay_gate,
+            wire=self._wire,
+            path=simulation.replay,
+            arm=arm,
+            block_lines=self.config.stream.block_lines,
+            loop=simulation.replay_loop,
+            gate=simulation.replay_gate,
         )
 
     def _look_at_scene(self) -> None:
@@ -115,13 +115,13 @@ class SimulatedDevices:
         """A camera with stored lines."""
         config = self.config
         return PatternCameraOpener(
-            self.pulses(arm),
-            arm,
-            config.geometry,
-            config.cameras.arm(arm),
-            config.stream.block_lines,
-            config.line_rate_hz,
-            config.pixels,
+            wire=self.pulses(arm),
+            arm=arm,
+            geometry=config.geometry,
+            config=config.cameras.arm(arm),
+            block_lines=config.stream.block_lines,
+            line_rate_hz=config.line_rate_hz,
+            pixels=config.pixels,
         )
 
     def pulses(self, arm: str) -> Wire | PinWire:

@@ -151,7 +151,17 @@ class PinWire:
         period_ns = Fraction(fields[_PERIOD_CLOCKS] * NS_PER_S, fields[_CLOCK_HZ])
         stopped = None if fields[_RUNNING] else issued
         code = {"kind": "pins", "run": fields[_RUN]}
-        return Reading(PulseTrain(fields[_RUN], 0, period_ns, Fraction(1), code, stopped), issued)
+        return Reading(
+            PulseTrain(
+                run=fields[_RUN],
+                start_ns=0,
+                line_period_ns=period_ns,
+                speed=Fraction(1),
+                code=code,
+                stopped_after=stopped,
+            ),
+            issued,
+        )
 
     def wait(self, run: int, pulses: int, timeout_s: float) -> Reading:
         """As `Wire.wait`."""

@@ -100,14 +100,18 @@ class Bench:
                     "the scene has optics of its own, which the rig's fibre leaves no room for",
                     possible="a scene without [optics]; or a rig without [fibre]",
                 )
-            return _sensor(self, arm, code, converter, {arm: 0}, self.fibre.sensor_pixels)
+            return _sensor(
+                self, arm, code, converter=converter, columns={arm: 0}, pixels=self.fibre.sensor_pixels
+            )
         match optics.layout:
             case "emulated":
                 return _emulated(self, arm, code, converter)
             case "compact":
                 return _compact(self, arm, code, converter)
             case _:
-                return _sensor(self, arm, code, converter, {arm: 0}, self.geometry.stages)
+                return _sensor(
+                    self, arm, code, converter=converter, columns={arm: 0}, pixels=self.geometry.stages
+                )
 
     def fine_scene(self) -> Scene:
         """What the cameras look at, as fine as they can tell: in camera A's rows and columns."""
@@ -303,7 +307,9 @@ def _sensor(
     images = []
     for arm, column in columns.items():
         own = stages if arm == name else _stages(bench, replace(setting, arm=arm))
-        images.append(_image(bench.scene.optics, arm, column, code, setting, stages, own))
+        images.append(
+            _image(bench.scene.optics, arm, column, code=code, setting=setting, common=stages, own=own)
+        )
     kept = [stage for stage in stages if stage.place not in ("image", "signal")]
     return Sensor(images, pixels, kept, setting, converter.dtype)
 
@@ -337,7 +343,13 @@ def _image(
     scene = scene if factor == 1 else binned(scene, factor)
     own_optics = getattr(optics, arm)
     streaming = StreamingArm(
-        scene, light, setting.stages, setting.substeps, arm, own_optics, fibre=setting.fibre
+        scene,
+        light,
+        stages=setting.stages,
+        substeps=setting.substeps,
+        arm=arm,
+        optics=own_optics,
+        fibre=setting.fibre,
     )
     return _Image(streaming, [stage for stage in own if stage.place in ("image", "signal")], column)
 
@@ -359,7 +371,7 @@ def _compact(bench: Bench, arm: str, code: Code, converter: Converter) -> Cut:
             "a compact layout cannot have two different cameras",
             possible="cameras.a and .b alike: it has one",
         )
-    sensor = _sensor(bench, "ab", code, converter, columns, optics.sensor_pixels)
+    sensor = _sensor(bench, "ab", code, converter=converter, columns=columns, pixels=optics.sensor_pixels)
     return Cut(sensor, slice(columns[arm], columns[arm] + M))
 
 
@@ -376,4 +388,6 @@ def _emulated(bench: Bench, arm: str, code: Code, converter: Converter) -> Merge
         converter, white_dn=raw_white, black_level_dn=converter.black_level_dn / S**2, dtype="uint16"
     )
     n = bench.geometry.stages * S
-    return Merged(_sensor(bench, arm, code, raw, {arm: 0}, n, merge=S), raw_white, S, converter)
+    return Merged(
+        _sensor(bench, arm, code, converter=raw, columns={arm: 0}, pixels=n, merge=S), raw_white, S, converter
+    )

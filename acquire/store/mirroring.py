@@ -246,7 +246,14 @@ class Mirror:
             keep_from(self.path, line, self.target.url, self._disk)
             self._kept_from = line
         waiting = recording.lines - lines
-        return Mirrored(str(self.target), lines, self._shards, self._bytes, whole, waiting)
+        return Mirrored(
+            url=str(self.target),
+            lines=lines,
+            shards=self._shards,
+            bytes=self._bytes,
+            sealed=whole,
+            waiting_lines=waiting,
+        )
 
     def _copy_shards(self, recording: Recording, end: int, most: int | None) -> None:
         before = self._shards

@@ -170,7 +170,14 @@ class _Recoverer:
         if changed:
             self._publish(new_gaps)
         lines = open_recording(self.path).lines
-        return Recovery(str(self.path), changed, lines, recording.lines, mended, damage)
+        return Recovery(
+            path=str(self.path),
+            changed=changed,
+            lines=lines,
+            lines_before=recording.lines,
+            indices_mended=mended,
+            damage=damage,
+        )
 
     def _mend(self, arm: str) -> int:
         """Torn indices of an arm, mended."""

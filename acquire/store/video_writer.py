@@ -63,9 +63,9 @@ class VideoWriter:
                     self._group,
                     str(number),
                     each,
-                    (frames, min(chunk[0], each[0]), min(chunk[1], each[1])),
-                    dtype,
-                    fill_value,
+                    chunk=(frames, min(chunk[0], each[0]), min(chunk[1], each[1])),
+                    dtype=dtype,
+                    fill_value=fill_value,
                 )
                 for number, each in enumerate(layout.level_shapes(shape))
             ]

@@ -192,9 +192,9 @@ class Capture:
             self._trigger,
             self._workers,
             self._tags,
-            self._counters,
-            self._plan,
-            Succession(
+            counters=self._counters,
+            plan=self._plan,
+            succession=Succession(
                 {RECORDER: self._next_recorder, WATCHER: self._new_watcher}
                 | {name: partial(self._next_grabber, name) for name in self._plan.grabbers}
             ),
@@ -221,14 +221,14 @@ class Capture:
     def _new_recorder(self) -> Worker:
         plan = self._plan
         what = recorder_plan.RecorderPlan(
-            plan.run,
-            plan.stages,
-            plan.stall_timeout_s,
-            plan.tag_wait_s,
-            plan.max_skew_lines,
-            plan.realtime,
-            plan.disk,
-            plan.goes_on,
+            run=plan.run,
+            stages=plan.stages,
+            stall_timeout_s=plan.stall_timeout_s,
+            tag_wait_s=plan.tag_wait_s,
+            max_skew_lines=plan.max_skew_lines,
+            realtime=plan.realtime,
+            disk=plan.disk,
+            goes_on=plan.goes_on,
         )
         return Worker(
             RECORDER,
@@ -276,15 +276,15 @@ class Capture:
     def _grabber_plan(self, arm: str) -> grabber.GrabberPlan:
         plan = self._plan
         return grabber.GrabberPlan(
-            arm,
-            plan.openers[arm],
-            plan.depth_lines,
-            plan.white_dn,
-            plan.max_skew_lines,
-            plan.reopen_timeout_s,
-            plan.line_period_ns,
-            plan.columns.get(arm),
-            plan.realtime,
+            arm=arm,
+            opener=plan.openers[arm],
+            depth_lines=plan.depth_lines,
+            white_dn=plan.white_dn,
+            max_jump_lines=plan.max_skew_lines,
+            reopen_timeout_s=plan.reopen_timeout_s,
+            line_period_ns=plan.line_period_ns,
+            columns=plan.columns.get(arm),
+            realtime=plan.realtime,
         )
 
     def _running(self, command: str) -> Supervisor:

@@ -81,8 +81,24 @@ def account(counted: Counted, *, closed: bool) -> ArmLedger:
         owed = max(0, min(pending, counted.recorded_to - max(counted.next_line, 0)))
         lost |= {UNDELIVERED: owed} if owed else {}
         pending -= owed
-        return ArmLedger(issued, preroll, counted.stored, counted.discarded, lost, waiting, pending, balanced)
+        return ArmLedger(
+            issued=issued,
+            preroll=preroll,
+            stored=counted.stored,
+            discarded=counted.discarded,
+            lost=lost,
+            waiting=waiting,
+            pending=pending,
+            balanced=balanced,
+        )
     balanced = -counted.block <= waiting <= counted.room + counted.block
     return ArmLedger(
-        issued, preroll, counted.stored, counted.discarded, lost, max(0, waiting), pending, balanced
+        issued=issued,
+        preroll=preroll,
+        stored=counted.stored,
+        discarded=counted.discarded,
+        lost=lost,
+        waiting=max(0, waiting),
+        pending=pending,
+        balanced=balanced,
     )

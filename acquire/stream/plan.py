@@ -118,7 +118,12 @@ class CapturePlan:
     @property
     def ring_shape(self) -> RingShape:
         return RingShape(
-            self.ring_slots, self.block_lines, self.pixels, self.dtype, OBSERVERS, self.ring_reserve
+            slots=self.ring_slots,
+            rows=self.block_lines,
+            width=self.pixels,
+            dtype=self.dtype,
+            observers=OBSERVERS,
+            reserve=self.ring_reserve,
         )
 
     @property

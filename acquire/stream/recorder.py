@@ -76,7 +76,9 @@ def record(
     if plan.realtime:
         become_important()  # not in real time: it computes, and must not keep the grabbers waiting
     with ThreadPoolExecutor(1, thread_name_prefix="store") as disk:
-        recorder = Recorder(mailbox, plan, rings, tags, counters, disk, ExternalCounts(others))
+        recorder = Recorder(
+            mailbox, plan, rings, tags=tags, counters=counters, disk=disk, external=ExternalCounts(others)
+        )
         mailbox.post(Ready())
         while recorder.turn():
             recorder.wait()

@@ -202,7 +202,14 @@ def _describe(library: Any, at: int, spec: _ParamSpec, kind: Kind) -> _Property:
         field, number = _NUMBERS[library.g_type_name(spec.value_type)]
         low, high = (number * 2).from_address(behind)
         limits = (low, min(high, _largest_socket())) if spec.name == b"socket-buffer-size" else (low, high)
-    return _Property(spec.name.decode(), kind, spec.value_type, field, limits, entries)
+    return _Property(
+        name=spec.name.decode(),
+        kind=kind,
+        value_type=spec.value_type,
+        field=field,
+        limits=limits,
+        entries=entries,
+    )
 
 
 def _largest_socket() -> float:

@@ -70,7 +70,15 @@ def demo(
     from acquire.config import load_rig
 
     config = rig_of(config, cameras)
-    plan = DemoPlan(out or _free(Path("acquire-demo")), config, seed, lines, budget, twist_budget, trigger)
+    plan = DemoPlan(
+        out=out or _free(Path("acquire-demo")),
+        config=config,
+        seed=seed,
+        lines=lines,
+        budget_s=budget,
+        twist_budget_s=twist_budget,
+        trigger=trigger,
+    )
     rig = load_rig(config, trigger_settings(plan))
     check(plan, rig)
 

@@ -156,7 +156,15 @@ def _save_truth(path: Path, scene: LedScene, segment: Segment) -> None:
     """What the lines of the segment saw: every sub-step at full resolution."""
     frames = scene.frames(_first_substep(segment), segment.geometry.span)
     provenance = {"first_substep": _first_substep(segment), "first_line": segment.first_line}
-    write_video(path, frames, segment.frame_time_ns(), 1.0, segment.substep_ns, provenance, pixel_unit=None)
+    write_video(
+        path,
+        frames,
+        segment.frame_time_ns(),
+        pixel_size=1.0,
+        frame_interval_ns=segment.substep_ns,
+        provenance=provenance,
+        pixel_unit=None,
+    )
 
 
 def _regions(scene: LedScene, segment: Segment, trusted: slice) -> tuple[Region, ...]:

@@ -59,17 +59,17 @@ def figure(studio: Studio) -> PaperFigure:
                 "detail",
                 "(b) N_m = 1, T_m = 820: stripes are clear, the fast fish is blurred along its way.",
                 detail,
-                true_detail,
-                range(5),
-                frame_ms[0],
+                truth=true_detail,
+                picks=range(5),
+                frame_ms=frame_ms[0],
             ),
             _frames(
                 "motion",
                 "(d) N_m = 3, T_m = 4: the fast fish is caught, the stripes have lost contrast.",
                 motion,
-                true_motion,
-                range(102, 1025, 205),
-                frame_ms[1],
+                truth=true_motion,
+                picks=range(102, 1025, 205),
+                frame_ms=frame_ms[1],
             ),
             Picture(
                 "stripes", _stripes(profiles), "(c) light along a line across the stripes, over its mean."

@@ -60,9 +60,18 @@ def figure(studio: Studio) -> PaperFigure:
         "N_m = 3, T_m = 4; #B, at rest, of N_m = 1, T_m = 220 (230 evened out, so that nine fill it), from "
         "the lines that see nothing but it. One video holds them all.",
         pictures=(
-            _strip("a", "(a), (b) #A: the window slides up.", video, fine, picks_a, frame_ms),
-            _strip("b", "(d) #B: open, in fine pixels.", video, fine, picks_b, frame_ms),
-            _strip("c", "(e), (f) #C: the window slides to the left.", video, fine, picks_c, frame_ms),
+            _strip(
+                "a", "(a), (b) #A: the window slides up.", video, truth=fine, picks=picks_a, frame_ms=frame_ms
+            ),
+            _strip("b", "(d) #B: open, in fine pixels.", video, truth=fine, picks=picks_b, frame_ms=frame_ms),
+            _strip(
+                "c",
+                "(e), (f) #C: the window slides to the left.",
+                video,
+                truth=fine,
+                picks=picks_c,
+                frame_ms=frame_ms,
+            ),
             Picture(
                 "close",
                 _close(video, fine, picks_a[-2], picks_b[2], picks_c[-2]),

@@ -166,12 +166,12 @@ class Studio:
         first = geometry.substeps * first_line
         truth = true_voxels(recording, first, geometry.span, 3, 1)[geometry.trusted]
         return Shot(
-            scene_of(recording),
-            segment,
-            result.video[geometry.trusted],
-            truth,
-            first + geometry.trusted.start,
-            result.seconds,
+            scene=scene_of(recording),
+            segment=segment,
+            video=result.video[geometry.trusted],
+            truth=truth,
+            first_substep=first + geometry.trusted.start,
+            seconds=result.seconds,
         )
 
     def stitch(self, recording: Recording, plan_name: str, first_line: int, what: str) -> Outcome:
@@ -183,7 +183,12 @@ class Studio:
         watcher = Watcher(len(request.stretches))
         with open_pool(len(request.stretches), watch=watcher) as pool:
             outcome = combine(
-                recording, request, self.directory / f"{plan_name}.zarr", self.options, pool, watcher
+                recording,
+                request,
+                self.directory / f"{plan_name}.zarr",
+                options=self.options,
+                pool=pool,
+                watcher=watcher,
             )
         self._end(what, time.perf_counter() - began)
         return outcome
@@ -202,9 +207,9 @@ class Studio:
                 recording,
                 request,
                 self.directory / f"{what.split(maxsplit=1)[0]}-video.zarr",
-                self.options,
-                pool,
-                watcher,
+                options=self.options,
+                pool=pool,
+                watcher=watcher,
             )
         self._end(what, time.perf_counter() - began)
         return outcome
