@@ -12,9 +12,16 @@ A calibration holds what was measured and nothing else; what it does not hold is
 are never altered.
 """
 
-from acquire.calibrate.apply import calibrated, calibration_of
-from acquire.calibrate.calibration import AlignmentFound, Calibration, Finding, Instrument, Measured
-from acquire.calibrate.file import open_calibration, save_calibration
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from acquire.lazy import lazily
+
+if TYPE_CHECKING:
+    from acquire.calibrate.apply import calibrated, calibration_of
+    from acquire.calibrate.calibration import AlignmentFound, Calibration, Finding, Instrument, Measured
+    from acquire.calibrate.file import open_calibration, save_calibration
 
 __all__ = [
     "AlignmentFound",
@@ -27,3 +34,17 @@ __all__ = [
     "open_calibration",
     "save_calibration",
 ]
+
+_HOMES = {
+    "AlignmentFound": "calibration",
+    "Calibration": "calibration",
+    "Finding": "calibration",
+    "Instrument": "calibration",
+    "Measured": "calibration",
+    "calibrated": "apply",
+    "calibration_of": "apply",
+    "open_calibration": "file",
+    "save_calibration": "file",
+}
+
+__getattr__, __dir__ = lazily(__name__, _HOMES, __all__)

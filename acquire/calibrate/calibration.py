@@ -71,6 +71,16 @@ QUANTITIES = {
     "excess_dn": Quantity(CURVE, "DN", "by which samples are too high that read 0 … white, evenly"),
 }
 
+FOUND_BY = {
+    "dark": ("offset_dn", "noise_dn"),
+    "ambient": ("ambient_dn",),
+    "flat": ("gain", "balance"),
+    "transfer": ("dn_per_electron", "read_noise_e", "full_well_e"),
+    "linearity": ("linearity_error", "excess_dn"),
+    "delay": ("light_late_ticks",),
+}
+"""Step → the quantities that it measures."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Measured:
@@ -212,6 +222,28 @@ class Calibration:
             orientation=found.orientation or self.orientation,
             alignment=found.alignment or self.alignment,
             steps=steps,
+        )
+
+    def finding(self, step: str) -> Finding:
+        """What a step found, as far as no later one has found it anew.
+
+        Raises UsageError where it was not done.
+        """
+        if step not in self.steps:
+            raise UsageError(
+                f"the step {step!r} was not done", possible=", ".join(self.steps) or "none was done yet"
+            )
+        facts = self.steps[step]
+        usable = _usable({step: facts}, self.instrument.columns)
+        return Finding(
+            step,
+            self.instrument,
+            {name: self.quantities[name] for name in FOUND_BY.get(step, ()) if name in self.quantities},
+            usable,
+            self.orientation if step == "orientation" else None,
+            self.alignment if step == "align" else None,
+            facts,
+            tuple(facts.get("warnings", ())),
         )
 
     def to_attrs(self) -> dict[str, Any]:

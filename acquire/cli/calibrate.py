@@ -217,7 +217,7 @@ def show(
 
     Example: [bold]acquire calibrate show cal.zarr --out cal-page[/]
     """
-    from acquire.cli.calibrate_words import known_facts
+    from acquire.calibrate.words import known_facts
 
     known = _any(calibration)
     if json:
@@ -251,7 +251,7 @@ def check(
     Example: [bold]acquire calibrate check cal.zarr target-today.zarr[/]
     """
     from acquire.calibrate.check import check as compare
-    from acquire.cli.calibrate_words import compared_rows
+    from acquire.calibrate.words import compared_rows
 
     known, exposure = _known(calibration), _exposure(recording, first_line, lines, begin, end)
     with stage_progress("comparing"):
@@ -337,7 +337,7 @@ def _keep(place: str, found: Finding, *, json: bool, new: bool = False) -> None:
 
 
 def _tell(found: Finding, place: str | None, *, json: bool) -> None:
-    from acquire.cli.calibrate_words import found_facts
+    from acquire.calibrate.words import found_facts
 
     facts = found_facts(found)
     if json:

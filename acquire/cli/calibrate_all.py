@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from acquire.calibrate.guide import AT_ONCE, LINES, MOST_LINES, Step
 from acquire.cli.calibrate_live import instrument, kept, record, wait_for_enter
 from acquire.cli.control import SocketOption
 from acquire.cli.output import JsonFlag, note, print_facts, print_json, print_warning, say
@@ -19,39 +19,9 @@ if TYPE_CHECKING:
     from acquire.calibrate.calibration import Calibration, Finding
     from acquire.calibrate.exposure import Exposure
     from acquire.client import Client
-    from acquire.daemon.messages import LightCode
 
-LINES = 1024
-"""That each recording has; see `acquire calibrate dark --help` and its neighbours for what they give."""
 TRIES = 3
 """Of a step, where somebody can mend what was wrong."""
-
-
-@dataclass(frozen=True)
-class Step:
-    """One recording of the sequence: what to do before it, its light, and the steps that look at it."""
-
-    name: str
-    prepare: str
-    code: LightCode
-    finds: tuple[str, ...]
-
-
-STEPS = (
-    Step("dark", "Leave everything as in use; the light stays off.", "dark", ("dark",)),
-    Step(
-        "flat",
-        "Put a uniform white scene in, larger than the field; the light stays on, best at 50 to 70 % of it.",
-        "steady",
-        ("flat", "transfer"),
-    ),
-    Step(
-        "target",
-        "Put a target in, at rest, with sharp, irregular texture: dots or bars of 2 to 6 fine pixels.",
-        "rig",
-        ("orientation", "align"),
-    ),
-)
 
 
 def calibrate_all(
@@ -61,7 +31,9 @@ def calibrate_all(
     directory: Annotated[
         Path, typer.Option(metavar="DIR", help="Directory of the recordings, which stay; made if absent.")
     ] = Path("calibration-recordings"),
-    lines: Annotated[int, typer.Option(min=64, max=2**20, help="Number of lines of each recording.")] = LINES,
+    lines: Annotated[
+        int, typer.Option(min=64, max=MOST_LINES, help="Number of lines of each recording.")
+    ] = LINES,
     only: Annotated[
         list[str] | None,
         typer.Option(metavar="STEP", help="Only this step, dark, flat or target; repeatable; absent: all."),
@@ -79,10 +51,10 @@ def calibrate_all(
 
     Example: [bold]acquire calibrate all --out cal.zarr[/]
     """
-    names = [step.name for step in STEPS]
+    names = [step.name for step in AT_ONCE]
     if wrong := [each for each in only or () if each not in names]:
         raise UsageError(f"step {wrong[0]!r} is not known", possible=", ".join(names))
-    steps = [step for step in STEPS if not only or step.name in only]
+    steps = [step for step in AT_ONCE if not only or step.name in only]
     found: list[Finding] = []
     with instrument(socket, directory) as daemon:
         for step in steps:
@@ -136,7 +108,7 @@ def _looks(step: Step, exposure: Exposure, out: str) -> Iterator[Callable[[Calib
 
 
 def _tell(found: Finding) -> None:
-    from acquire.cli.calibrate_words import found_facts
+    from acquire.calibrate.words import found_facts
 
     print_facts(found_facts(found))
     for text in found.warnings:

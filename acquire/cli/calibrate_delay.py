@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from acquire.calibrate.guide import DELAY, MOST_LINES
 from acquire.cli.calibrate_live import instrument, kept, record, wait_for_enter
 from acquire.cli.control import SocketOption
 from acquire.cli.output import JsonFlag, note, print_facts, print_json, print_warning
+from acquire.errors import UsageError
 
 if TYPE_CHECKING:
     from acquire.calibrate.calibration import Finding
     from acquire.calibrate.exposure import Exposure
-
-PREPARE = "Put a bright scene in, at rest, larger than the field, as for the flat; it need not be uniform."
 
 
 def delay(
@@ -34,8 +34,8 @@ def delay(
     lines: Annotated[
         int | None,
         typer.Option(
-            min=1024,
-            max=2**20,
+            min=DELAY.least_lines,
+            max=MOST_LINES,
             help="Number of lines of each recording; absent: as many as half a tick takes.",
         ),
     ] = None,
@@ -54,24 +54,28 @@ def delay(
     from acquire.calibrate.exposure import open_exposure
 
     if recordings:
-        exposures = [open_exposure(each) for each in recordings]
+        exposures, whole = [open_exposure(each) for each in recordings], True
     else:
-        exposures = _swept(directory, lines, socket, ask=not yes)
-    found = _found(out, exposures)
+        exposures, whole = _swept(directory, lines, socket, ask=not yes)
+    found = _found(out, exposures, whole=whole)
     if json:
         print_json({"calibration": out, "facts": found.facts, "warnings": found.warnings, **_numbers(found)})
         return
     _tell(found, out)
 
 
-def _swept(directory: Path, lines: int | None, socket: Path | None, *, ask: bool) -> list[Exposure]:
-    """One recording to see where to look, and one for each setting around that, until Ctrl-C."""
+def _swept(
+    directory: Path, lines: int | None, socket: Path | None, *, ask: bool
+) -> tuple[list[Exposure], bool]:
+    """One recording to see where to look, and one for each setting around that, until Ctrl-C; whether it is
+    the whole sweep.
+    """
     from acquire.calibrate import delay_sweep as sweep
     from acquire.cli.interrupts import first_interrupt_asks
     from acquire.cli.progress import Progress
     from acquire.daemon.messages import TriggerDelays
 
-    note(f"delay: {PREPARE}")
+    note(f"delay: {DELAY.prepare}")
     if ask:
         wait_for_enter()
     with instrument(socket, directory) as daemon, first_interrupt_asks("ending with what there is") as asked:
@@ -90,15 +94,35 @@ def _swept(directory: Path, lines: int | None, socket: Path | None, *, ask: bool
                     break
                 delays = TriggerDelays(light_lead=each.light_lead_ticks, a=each.a_ticks, b=each.b_ticks)
                 exposures.append(record(daemon, "delay", directory, lines, delays=delays))
-    return exposures
+    return exposures, len(exposures) == 1 + len(settings)
 
 
-def _found(out: str, exposures: list[Exposure]) -> Finding:
+def _found(out: str, exposures: list[Exposure], *, whole: bool) -> Finding:
+    """A part of a sweep does not take the place of what is known better."""
     from acquire.calibrate.delay_sweep import delay as look
     from acquire.cli.progress import stage_progress
 
     with stage_progress("looking beyond the lines' sub-steps") as advance:
-        return kept(out, exposures[0], lambda _: look(exposures, progress=advance))
+        found = look(exposures, progress=advance)
+    if not whole and (known := _known_ticks(out)) is not None:
+        doubt = float(found.quantities["light_late_ticks"].uncertainty.max())
+        if known < doubt:
+            raise UsageError(
+                f"this part of a sweep is sure to {doubt:.1f} ticks only, and {out} knows it to {known:.1f}",
+                hint="the whole sweep; what was known stays",
+            )
+    return kept(out, exposures[0], lambda _: found)
+
+
+def _known_ticks(out: str) -> float | None:
+    """How surely the calibration at a place knows the delays already; None where it does not."""
+    from acquire.calibrate import open_calibration
+    from acquire.store.source import source_of
+
+    if not source_of(out).exists():
+        return None
+    late = open_calibration(out).quantities.get("light_late_ticks")
+    return None if late is None else float(late.uncertainty.max())
 
 
 def _numbers(found: Finding) -> dict[str, object]:
@@ -107,7 +131,7 @@ def _numbers(found: Finding) -> dict[str, object]:
 
 
 def _tell(found: Finding, out: str) -> None:
-    from acquire.cli.calibrate_words import found_facts
+    from acquire.calibrate.words import found_facts
 
     print_facts(found_facts(found) | {"kept in": out})
     for text in found.warnings:

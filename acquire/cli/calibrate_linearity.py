@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from acquire.calibrate.guide import LINEARITY, MOST_LINES, RAMP_LINES
 from acquire.cli.calibrate_live import instrument, kept, record, wait_for_enter
 from acquire.cli.control import SocketOption
 from acquire.cli.output import JsonFlag, note, print_facts, print_json, print_warning, say
@@ -14,10 +15,6 @@ from acquire.cli.output import JsonFlag, note, print_facts, print_json, print_wa
 if TYPE_CHECKING:
     from acquire.calibrate.calibration import Finding
     from acquire.calibrate.exposure import Exposure
-
-PREPARE = "Put a white scene in, at rest; steady light at 80 % of white or more, if need be just saturated."
-LINES = 512
-"""A mean over a camera's columns to a part in 10⁴, as steady as lamps are from one recording to the next."""
 
 
 def linearity(
@@ -34,7 +31,9 @@ def linearity(
     directory: Annotated[
         Path, typer.Option(metavar="DIR", help="Directory of the recordings, which stay; made if absent.")
     ] = Path("calibration-recordings"),
-    lines: Annotated[int, typer.Option(min=64, max=2**20, help="Number of lines of each recording.")] = LINES,
+    lines: Annotated[
+        int, typer.Option(min=64, max=MOST_LINES, help="Number of lines of each recording.")
+    ] = RAMP_LINES,
     yes: Annotated[bool, typer.Option("--yes", help="Ask nothing: everything is in place already.")] = False,
     socket: SocketOption = None,
     json: JsonFlag = False,
@@ -73,7 +72,7 @@ def _ramp(out: str, directory: Path, lines: int, socket: Path | None, *, ask: bo
     from acquire.daemon.messages import TriggerWindow
 
     offset = offset_of(open_calibration(out), "linearity")
-    note(f"linearity: {PREPARE}")
+    note(f"linearity: {LINEARITY.prepare}")
     if ask:
         wait_for_enter()
 
@@ -120,7 +119,7 @@ def _numbers(found: Finding) -> dict[str, object]:
 
 
 def _tell(found: Finding) -> None:
-    from acquire.cli.calibrate_words import found_facts
+    from acquire.calibrate.words import found_facts
 
     print_facts(found_facts(found))
     for text in found.warnings:

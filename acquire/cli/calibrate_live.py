@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 from acquire.cli.output import note, print_warning
+from acquire.daemon.who import LONGEST, WHO
 from acquire.errors import DataError, StateError, UsageError
 
 if TYPE_CHECKING:
@@ -21,6 +23,8 @@ if TYPE_CHECKING:
 SEALED_S = 120.0
 """Longest wait for a recording to be sealed, beside the time that its lines take."""
 TRIES = 3
+BY = "ACQUIRE_BY"
+"""Environment variable: who asked for this, where it is the page that carries it out for them."""
 MOST_LOST = 0.1
 """Of a recording's lines: a calibration does without some."""
 
@@ -31,6 +35,7 @@ def instrument(socket: Path | None, directory: Path) -> Iterator[Client]:
     from acquire.cli.progress import teller
     from acquire.client import Client
 
+    WHO.set(os.environ.get(BY, "")[:LONGEST])
     with Client(socket, teller()) as daemon:
         status = daemon.status()
         if status.state not in ("idle", "armed"):
@@ -42,7 +47,7 @@ def instrument(socket: Path | None, directory: Path) -> Iterator[Client]:
             yield daemon
         finally:
             if daemon.status().run_id != status.run_id:
-                _leave(daemon, armed=status.state == "armed")
+                _leave(daemon, directory, armed=status.state == "armed")
 
 
 def record(
@@ -113,11 +118,14 @@ def wait_for_enter() -> None:
         raise StateError("nobody is there to press Enter", hint="--yes, where everything is in place")
 
 
-def _leave(daemon: Client, *, armed: bool) -> None:
-    """The instrument as it was before."""
+def _leave(daemon: Client, directory: Path, *, armed: bool) -> None:
+    """The instrument as it was before; but what somebody else records meanwhile is theirs."""
     from acquire.client import SEALED
 
     status = daemon.status()
+    if status.recording is not None and status.recording.path.parent != directory.absolute():
+        print_warning(f"{status.recording.path} is somebody else's: the instrument is left to them")
+        return
     if status.state == "recording":
         daemon.stop()
         status = daemon.wait(SEALED, timeout_s=SEALED_S)

@@ -46,6 +46,9 @@ IDLE_S = 5
 """Between two requests on one connection."""
 GRACE_S = 2
 """Time that requests under way are given when the daemon ends, in whole seconds."""
+LAST_S = 0.7
+"""For whatever is under way when the server ends: a stream has no end of its own, and half a request may stay
+half. Left to be cancelled when the time is up, they would be answered with 500."""
 MOST_DESCRIPTORS = 65536
 
 log = logging.getLogger("acquire.daemon")
@@ -156,6 +159,10 @@ class Connection(H11Protocol):
     def resume_writing(self) -> None:
         super().resume_writing()
         self._cancel()
+
+    def shutdown(self) -> None:
+        super().shutdown()
+        self.loop.call_later(LAST_S, self.transport.abort)  # does nothing to one that has closed
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._cancel()

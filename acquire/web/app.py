@@ -19,11 +19,14 @@ from acquire.daemon.messages import ErrorMessage
 from acquire.daemon.routes import NO_STORE, routes
 from acquire.errors import UsageError
 from acquire.web.archive import Archive
+from acquire.web.calibrations import calibration_facts, place_of
 from acquire.web.guard import Guard
 from acquire.web.hub import Hub
 from acquire.web.jobs import Jobs
 from acquire.web.live import Live
 from acquire.web.messages import (
+    CalibrationFacts,
+    CalibrationRequest,
     HoldRequest,
     JobFacts,
     JobRequest,
@@ -89,7 +92,7 @@ def build_page(
     """
     hub = Hub(socket, Live)
     archive, reading = Archive(directory), Reading()
-    jobs = Jobs(directory, archive)
+    jobs = Jobs(directory, archive, socket)
     app = new_app(
         "The instrument's page: the daemon's API, recordings, videos and jobs.",
         openapi_url="/api/openapi.json",
@@ -100,6 +103,7 @@ def build_page(
     _add_stream(api, Pages(hub))
     _add_recordings(api, archive, reading)
     _add_jobs(api, jobs)
+    _add_calibration(api, hub, jobs, directory, reading)
     guard = Guard(app, tokens, names)
     _add_session(api, guard, tokens, secure=secure)
     app.include_router(api)
@@ -230,6 +234,17 @@ def _add_jobs(api: APIRouter, jobs: Jobs) -> None:
     @api.delete("/jobs/{number}", summary="End a job")
     async def stop(number: int) -> JobFacts:
         return await jobs.stop(number)
+
+
+def _add_calibration(api: APIRouter, hub: Hub, jobs: Jobs, directory: Path, reading: Reading) -> None:
+    @api.get("/calibration", summary="The calibration: its steps, and what they found")
+    async def calibration() -> CalibrationFacts:
+        place, named = place_of(directory, hub.setup)
+        return await reading(lambda: calibration_facts(place, named=named))
+
+    @api.post("/calibration", summary="Carry out a step of the calibration, as a job")
+    async def calibrate(asked: CalibrationRequest) -> JobFacts:
+        return jobs.calibrate(asked, place_of(directory, hub.setup)[0])
 
 
 def _add_files(app: FastAPI) -> None:

@@ -1,13 +1,17 @@
 """Work that takes its time, as commands of ours: one at a time, niced, each with what it said last.
 
-waiting ──▶ running ──▶ done | failed | stopped
+::
+
+    waiting ──▶ running ──▶ done | failed | stopped
+
+A step of a calibration does not stand in the queue: whoever has put a target in waits in front of it. It has
+the instrument, so there is one at most, and it is always asked to end, so that it leaves that as it was.
 """
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
-import json
 import logging
 import os
 import signal
@@ -15,9 +19,11 @@ import sys
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from acquire.errors import PlaceError, StateError, UsageError
-from acquire.text import shortened
-from acquire.web.messages import JobFacts, JobRequest
+from acquire.daemon.who import WHO
+from acquire.errors import AcquireError, PlaceError, StateError
+from acquire.web.calibrations import step_of
+from acquire.web.job_words import calibration_words, free_name, recording_words, told
+from acquire.web.messages import CalibrationRequest, JobFacts, JobRequest
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -28,6 +34,11 @@ MOST_WAITING = 16
 MOST_LISTED = 50
 END_S = 15.0
 """For a job that is to stop: it keeps the best it has."""
+CALIBRATION_END_S = 180.0
+"""A step seals what it records, looks at what it has, and leaves the instrument as it was."""
+LEAVE_S = 3.0
+"""For a step when the page ends: the daemon does not wait much longer for that."""
+STARTING_S = 0.02
 MOST_LINE_BYTES = 2**16
 
 log = logging.getLogger("acquire.web")
@@ -36,9 +47,12 @@ log = logging.getLogger("acquire.web")
 @dataclass(slots=True)
 class _Job:
     facts: JobFacts
-    request: JobRequest
+    request: JobRequest | CalibrationRequest
+    words: list[str]
+    by: str
+    end_s: float
     process: asyncio.subprocess.Process | None = None
-    stopped: bool = False
+    ending: asyncio.Task[None] | None = None
 
     def become(self, **facts: object) -> None:
         self.facts = self.facts.model_copy(update=facts)
@@ -47,12 +61,13 @@ class _Job:
 class Jobs:
     """For one event loop; `run` is its life."""
 
-    def __init__(self, directory: Path, archive: Archive) -> None:
-        self._directory = directory
+    def __init__(self, directory: Path, archive: Archive, socket: Path) -> None:
+        self._directory, self._socket = directory, socket
         self._archive = archive
         self._jobs: dict[int, _Job] = {}
         self._count = 0
         self._added = asyncio.Event()
+        self._step: asyncio.Task[None] | None = None
 
     def list(self) -> list[JobFacts]:
         """The newest first."""
@@ -63,21 +78,43 @@ class Jobs:
         self._archive.path_of(request.recording)
         if sum(job.facts.state == "waiting" for job in self._jobs.values()) >= MOST_WAITING:
             raise StateError(f"{MOST_WAITING} jobs are waiting already", hint="stop one of them")
-        self._count += 1
         facts = JobFacts(
-            id=self._count,
+            id=self._next(),
             kind=request.kind,
             recording=request.recording,
             first_line=request.first_line,
             lines=request.lines,
             state="waiting",
         )
-        self._jobs[self._count] = _Job(facts, request)
+        self._keep(_Job(facts, request, [], WHO.get(), END_S))
+        self._added.set()
+        return facts
+
+    def calibrate(self, request: CalibrationRequest, out: Path) -> JobFacts:
+        """Carry a step out at once, for the calibration at ``out``.
+
+        Raises UsageError for a step that there is not, StateError while another one is under way.
+        """
+        step = step_of(request)
+        if any(job.facts.state == "running" for job in self._jobs.values() if job.facts.kind == "calibrate"):
+            raise StateError("a step of the calibration is under way", hint="when it is done; or cancel it")
+        facts = JobFacts(
+            id=self._next(), kind="calibrate", step=step.name, lines=request.lines, state="running"
+        )
+        job = _Job(facts, request, calibration_words(request, out), WHO.get(), CALIBRATION_END_S)
+        self._keep(job)
+        self._step = asyncio.create_task(self._try(job))
+        return facts
+
+    def _next(self) -> int:
+        self._count += 1
+        return self._count
+
+    def _keep(self, job: _Job) -> None:
+        self._jobs[job.facts.id] = job
         over = [number for number, job in self._jobs.items() if job.facts.state not in ("waiting", "running")]
         for number in over[: max(0, len(self._jobs) - MOST_LISTED)]:
             del self._jobs[number]
-        self._added.set()
-        return facts
 
     async def stop(self, number: int) -> JobFacts:
         """End a job; one under way keeps the best that it has. Raises PlaceError."""
@@ -86,33 +123,45 @@ class Jobs:
             raise PlaceError(f"there is no job {number}", possible="/api/jobs")
         if job.facts.state == "waiting":
             job.become(state="stopped")
-        elif job.process is not None and job.process.returncode is None:
-            job.stopped = True
-            await _end(job.process)
+        elif job.facts.state == "running" and job.ending is None:
+            job.become(text="ending with what there is")
+            job.ending = asyncio.create_task(_end_of(job))
         return job.facts
 
     async def run(self) -> None:
         """Work until cancelled; what is under way then is ended."""
-        while True:
-            job = next((one for one in self._jobs.values() if one.facts.state == "waiting"), None)
-            if job is None:
-                self._added.clear()
-                await self._added.wait()
-                continue
-            try:
-                await self._do(job)
-            except OSError as error:
-                job.become(state="failed", text=str(error))
+        try:
+            while True:
+                job = next((one for one in self._jobs.values() if one.facts.state == "waiting"), None)
+                if job is None:
+                    self._added.clear()
+                    await self._added.wait()
+                    continue
+                await self._try(job)
+        finally:
+            if self._step is not None:
+                self._step.cancel()
+                await asyncio.gather(self._step, return_exceptions=True)
+
+    async def _try(self, job: _Job) -> None:
+        try:
+            await self._do(job)
+        except (OSError, AcquireError) as error:
+            job.become(state="failed", text=str(error))
 
     async def _do(self, job: _Job) -> None:
-        name = self._free_name(job.request)
+        name, words = "", job.words
+        if isinstance(job.request, JobRequest):
+            name = free_name(self._directory, job.request)
+            words = recording_words(job.request, name)
         job.become(state="running", text="starting")
         job.process = await asyncio.create_subprocess_exec(
             sys.executable,
             "-m",
             "acquire.web.worker",
-            *_words(job.request, name),
+            *words,
             cwd=self._directory,
+            env=os.environ | {"ACQUIRE_SOCKET": str(self._socket), "ACQUIRE_BY": job.by},
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.PIPE,
@@ -122,41 +171,21 @@ class Jobs:
         try:
             await _listen(job)
             code = await job.process.wait()
-        except BaseException:
+        except asyncio.CancelledError:
+            if job.facts.kind == "calibrate":
+                await _end(job.process, LEAVE_S, asked=job.ending is not None)
             _signal(job.process, signal.SIGKILL)
             await job.process.wait()
             raise
-        made = name if os.path.lexists(self._directory / name) else None
-        state = "stopped" if job.stopped else "failed" if code else "done"
-        text = job.facts.text if state == "failed" else "" if made or state == "done" else "nothing was kept"
+        made = name if name and os.path.lexists(self._directory / name) else None
+        state = "stopped" if job.ending is not None else "failed" if code else "done"
+        text = job.facts.text if state == "failed" else ""
+        if state == "stopped":
+            kept = made if name else not code
+            text = "what it had is kept" if kept else "nothing was kept"
         job.become(state=state, text=text, result=made)
-        log.info("job %d, %s of %s: %s", job.facts.id, job.facts.kind, job.facts.recording, state)
-
-    def _free_name(self, request: JobRequest) -> str:
-        """Of what is made: after recording, lines and voxels."""
-        stem = f"{request.recording.removesuffix('.zarr')}-{request.first_line}-{request.lines}"
-        if request.kind == "cut":
-            suffix = ".npz"
-        else:
-            voxels = f"{request.spatial_merge}x{request.temporal_merge}"
-            stem += "-preview" if request.kind == "preview" else f"-{voxels}"
-            suffix = ".zarr"
-        for number in range(1, 1000):
-            name = f"{stem}{f'-{number}' if number > 1 else ''}{suffix}"
-            if not os.path.lexists(self._directory / name):
-                return name
-        raise UsageError(f"there are a thousand of {stem} already", hint="remove some")
-
-
-def _words(request: JobRequest, name: str) -> list[str]:
-    """The command."""
-    lines = ["--first-line", str(request.first_line), "--lines", str(request.lines), "--out", name, "--json"]
-    if request.kind == "cut":
-        return ["cut", request.recording, *lines]
-    if request.kind == "preview":
-        return ["reconstruct", request.recording, *lines, "--preview", "--workers", "1"]
-    voxels = ["--nm", str(request.spatial_merge), "--tm", str(request.temporal_merge)]
-    return ["reconstruct", request.recording, *lines, *voxels, "--preset", request.preset, "--workers", "1"]
+        about = job.facts.step or job.facts.recording
+        log.info("job %d, %s of %s: %s", job.facts.id, job.facts.kind, about, state)
 
 
 async def _listen(job: _Job) -> None:
@@ -165,28 +194,23 @@ async def _listen(job: _Job) -> None:
     assert job.process.stderr is not None
     with contextlib.suppress(ValueError):  # a line without an end: the rest is not listened to
         async for line in job.process.stderr:
-            job.become(text=_told(line.decode(errors="replace")))
+            if job.ending is None:
+                job.become(**told(line.decode(errors="replace")))
 
 
-def _told(line: str) -> str:
-    """Of a line of JSON (`acquire.cli.progress`), or of anything else."""
+async def _end_of(job: _Job) -> None:
+    while job.process is None and job.facts.state == "running":
+        await asyncio.sleep(STARTING_S)
+    if job.process is not None:
+        await _end(job.process, job.end_s)
+
+
+async def _end(process: asyncio.subprocess.Process, end_s: float, *, asked: bool = False) -> None:
+    """By word, unless it was asked already, then by force."""
+    if not asked:  # a second word would mean: at once, and leave everything as it lies
+        _signal(process, signal.SIGINT)
     try:
-        facts = json.loads(line)
-    except ValueError:
-        return shortened(line.strip(), 300)
-    if isinstance(facts, dict) and isinstance(facts.get("error"), dict):
-        return shortened(facts["error"].get("message", ""), 300)
-    progress = facts.get("progress", facts) if isinstance(facts, dict) else facts
-    if isinstance(progress, dict):
-        return shortened(", ".join(f"{name} {value}" for name, value in progress.items()), 300)
-    return shortened(line.strip(), 300)
-
-
-async def _end(process: asyncio.subprocess.Process) -> None:
-    """By word, then by force."""
-    _signal(process, signal.SIGINT)
-    try:
-        async with asyncio.timeout(END_S):
+        async with asyncio.timeout(end_s):
             await process.wait()
     except TimeoutError:
         _signal(process, signal.SIGKILL)

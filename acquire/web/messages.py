@@ -115,14 +115,56 @@ class JobRequest(Message):
     preset: Literal["fast", "balanced", "best"] = "balanced"
 
 
+class CalibrationRequest(Message):
+    """A step of the calibration, with what it needs in place already."""
+
+    step: str = Field(max_length=64)
+    lines: int | None = Field(
+        default=None, strict=True, ge=1, le=2**20, description="of each recording; absent: as many as usual"
+    )
+
+
 class JobFacts(Message):
     """A job and what became of it."""
 
     id: int
-    kind: str
-    recording: Text
-    first_line: int
-    lines: int
+    kind: Literal["reconstruct", "preview", "cut", "calibrate"]
+    recording: Text = Field(default="", description="empty: it makes recordings of its own")
+    step: Text | None = Field(default=None, description="of the calibration")
+    first_line: int = 0
+    lines: int | None = Field(default=None, description="absent: as many as it takes")
     state: Literal["waiting", "running", "done", "failed", "stopped"]
-    text: Text = Field(default="", description="how far it is, or why it failed")
+    text: Text = Field(default="", description="what it does, or why it failed")
+    done: float | None = Field(default=None, description="so much of it")
+    total: float | None = Field(default=None, description="of so much")
     result: Text | None = Field(default=None, description="name of what it made")
+
+
+class FindingFacts(Message):
+    """What one step of a calibration found, in words."""
+
+    name: Text
+    made: Text
+    lines: int
+    facts: dict[str, Text] = Field(description="what → value and uncertainty")
+    warnings: list[Text]
+
+
+class StepFacts(Message):
+    """A step: what is to be done before it, and what it found the last time."""
+
+    name: str
+    prepare: str
+    lines: int | None = Field(description="of each recording, as usual; null: as many as it takes")
+    least_lines: int
+    after: str = Field(description="the step that it needs; empty: none")
+    found: list[FindingFacts]
+
+
+class CalibrationFacts(Message):
+    """The calibration of this instrument."""
+
+    path: Text
+    named: bool = Field(description="by the rig: recordings get a copy of it")
+    error: Text | None = Field(default=None, description="why it cannot be read")
+    steps: list[StepFacts]

@@ -6,13 +6,17 @@ import json
 import os
 import signal
 import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from live_daemon import COMMAND, Daemon
 from waiting import until
 
-from acquire.calibrate import open_calibration
+from acquire.calibrate import Measured, open_calibration, save_calibration
+from acquire.calibrate.exposure import open_exposure
+from acquire.cli.calibrate_delay import _found
+from acquire.errors import UsageError
 
 SCENE = """
 kind = "leds"
@@ -64,5 +68,21 @@ def test_a_sweep_that_is_interrupted_keeps_what_it_has(tmp_path: Path) -> None:
         places = [f"calibration-recordings/{name}" for name in taken]
         again = json.loads(daemon("calibrate", "delay", *places, "--out", "again.zarr", "--json").out)
         assert again["light_late_ticks"] == pytest.approx(late.value.tolist())
+        _is_not_replaced_by_less(tmp_path, places)
     finally:
         daemon.close()
+
+
+def _is_not_replaced_by_less(home: Path, places: list[str]) -> None:
+    """A part of a sweep beside one that was surer."""
+    cal, exposures = home / "again.zarr", [open_exposure(home / place) for place in places]
+    known = open_calibration(cal)
+    late = known.quantities["light_late_ticks"]
+    surer = Measured(late.value + 1.0, 0.01 * late.uncertainty)
+    save_calibration(cal, replace(known, quantities={**known.quantities, "light_late_ticks": surer}))
+    with pytest.raises(UsageError, match="ticks only"):
+        _found(str(cal), exposures, whole=False)
+    assert open_calibration(cal).quantities["light_late_ticks"].value == pytest.approx(surer.value)
+    assert _found(str(cal), exposures, whole=True).quantities["light_late_ticks"].value == pytest.approx(
+        late.value
+    )

@@ -4,23 +4,31 @@ import { Waterfall } from "./waterfall.js";
 import { $, make, percent } from "./words.js";
 
 export class Aim {
-  #fall; #peak = 0; #smooth = null; #profile; #focus = make("output"); #best = make("output"); #white = make("output");
+  #fall; #none = make("p", { className: "none" }); #run = null; #peak = 0; #smooth = null; #shown = new Float64Array(1); #profile; #focus = make("output"); #best = make("output"); #white = make("output");
 
   constructor() {
     const canvas = make("canvas", { role: "img", "aria-label": "The camera that is aimed" });
     this.#profile = make("canvas", { className: "histogram", role: "img", "aria-label": "Brightest value of each pixel" });
     this.#fall = new Waterfall(canvas, 480);
-    this.#fall.clear();
-    $("aim-view").replaceChildren(make("div", { className: "fall" }, make("div", { className: "scale", "aria-hidden": "true" }, make("span", {}, "−5 s"), make("span", {}, "now")), canvas), this.#profile);
+    $("aim-view").replaceChildren(make("div", { className: "fall" }, make("div", { className: "scale", "aria-hidden": "true" }, make("span", {}, "−5 s"), make("span", {}, "now")), canvas, this.#none), this.#profile);
     $("aim-numbers").replaceChildren(make("h2", {}, "Focus"), this.#focus, make("h2", {}, "Best so far"), this.#best, make("h2", {}, "Saturated pixels"), this.#white,
       make("p", { className: "hint" }, "Focus is the contrast between neighbouring pixels of the brightest light, in percent of it. Turn the lens until it falls again, and go back to the best."));
+    this.#forget();
     $("aim-arm").addEventListener("change", () => this.#forget());
     $("aim-reset").addEventListener("click", () => this.#forget());
+  }
+
+  show(status) {
+    if (status.run_id !== this.#run) { this.#run = status.run_id; if (status.run_id) this.#fall.clear(); }
+    this.#none.textContent = status.state === "idle" ? "No lines: arm the instrument." : "Waiting for lines.";
+    this.#none.hidden = !this.#fall.isEmpty;
+    if (!$("aim").hidden) this.#draw();
   }
 
   rows(header, body) {
     if ($("aim").hidden || header.arm !== $("aim-arm").value) return;
     this.#fall.add(header, body);
+    this.#none.hidden = true;
     const { rows, columns } = header, high = body.subarray(rows + rows * columns), profile = new Float64Array(columns);
     for (let row = 0; row < rows; row++) for (let x = 0; x < columns; x++) profile[x] = Math.max(profile[x], high[row * columns + x]);
     let steps = 0, light = 1e-9;
@@ -31,13 +39,18 @@ export class Aim {
     this.#focus.textContent = this.#smooth.toFixed(1);
     this.#best.textContent = this.#peak.toFixed(1);
     this.#white.textContent = percent(header.saturated / Math.max(1, header.histogram.reduce((sum, n) => sum + n, 0)));
-    this.#draw(profile);
+    this.#shown = profile;
+    this.#draw();
   }
 
-  #forget() { this.#peak = 0; this.#smooth = null; this.#fall.clear(); }
+  #forget() {
+    this.#peak = 0; this.#smooth = null; this.#fall.clear(); this.#shown = new Float64Array(1);
+    for (const output of [this.#focus, this.#best, this.#white]) output.textContent = "–";
+  }
 
-  #draw(profile) {
-    const canvas = this.#profile, width = (canvas.width = canvas.clientWidth || 300), height = (canvas.height = canvas.clientHeight || 70), context = canvas.getContext("2d");
+  /** Also with every state: the theme may be another by now. */
+  #draw() {
+    const profile = this.#shown, canvas = this.#profile, width = (canvas.width = canvas.clientWidth || 300), height = (canvas.height = canvas.clientHeight || 70), context = canvas.getContext("2d");
     context.fillStyle = getComputedStyle(canvas).color;
     profile.forEach((value, x) => context.fillRect((x * width) / profile.length, height - (value / 255) * height, Math.max(1, width / profile.length - 1), (value / 255) * height));
   }

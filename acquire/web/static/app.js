@@ -2,6 +2,7 @@
 
 import { Aim } from "./aim.js";
 import { Band } from "./band.js";
+import { Calibrate } from "./calibrate.js";
 import { showHealth, showSetup } from "./facts.js";
 import { Glimpse } from "./glimpse.js";
 import { Link, ask } from "./link.js";
@@ -10,13 +11,13 @@ import { Watch } from "./watch.js";
 import { $ } from "./words.js";
 
 const SCREENS = ["watch", "aim", "recordings", "health", "setup"];
-const link = new Link(), band = new Band(), watch = new Watch(fail), aim = new Aim(), recordings = new Recordings(fail);
+const link = new Link(), band = new Band(), watch = new Watch(fail), aim = new Aim(), calibrate = new Calibrate(fail), recordings = new Recordings(fail);
 new Glimpse(link);
 let operator = false, setup = null, latest = null;
 
 function fail(text) { $("error").textContent = text; $("error").hidden = !text; }
 
-function stale(why) { band.stale(why); watch.stale(why); }
+function stale(why) { band.stale(why); watch.stale(why); calibrate.stale(why); }
 
 async function enter(token) {
   await ask("POST", "session", { token });
@@ -27,7 +28,7 @@ async function admitted() {
   const { role } = await ask("GET", "whoami");
   operator = role === "operator";
   await ask("GET", "setup").then((facts) => { setup = facts; }, () => {});
-  watch.enter(operator, setup); recordings.enter(operator);
+  watch.enter(operator, setup); recordings.enter(operator); calibrate.enter(operator);
   $("enter").close();
   screen();
 }
@@ -38,6 +39,7 @@ function screen() {
   for (const name of SCREENS) $(name).hidden = name !== shown;
   for (const anchor of document.querySelectorAll("nav a")) if (anchor.dataset.screen === shown) anchor.setAttribute("aria-current", "page"); else anchor.removeAttribute("aria-current");
   if (shown === "recordings") recordings.show();
+  if (shown === "aim" && setup) calibrate.open();
   if (shown === "setup") ask("GET", "setup").then((facts) => { setup = facts; showSetup(setup, latest?.status); }, (error) => fail(error.message));
   if (latest) showHealth(latest.status, latest.health, fail, operator);
 }
@@ -56,6 +58,8 @@ link.addEventListener("state", ({ detail }) => {
   latest = detail.header.state;
   band.show(latest.status, latest.health);
   watch.show(latest.status);
+  aim.show(latest.status);
+  calibrate.show(latest.status);
   showHealth(latest.status, latest.health, fail, operator);
   if (!setup) admitted().catch(() => {});
 });

@@ -95,7 +95,8 @@ export class Recordings {
 
   #jobs(jobs) {
     fill($("jobs"), JSON.stringify([jobs, this.#operator]), () => jobs.length ? jobs.map((job) => make("li", {},
-      make("b", { className: job.state === "failed" ? "bad" : job.state === "done" ? "good" : "" }, job.state), ` ${job.kind} of ${job.recording}, ${count(job.lines)} lines from ${count(job.first_line)}`, job.text ? make("small", {}, job.text) : null,
+      make("b", { className: job.state === "failed" ? "bad" : job.state === "done" ? "good" : "" }, job.state), ` ${job.step ? `${job.kind} ${job.step}` : `${job.kind} of ${job.recording}, ${count(job.lines)} lines from ${count(job.first_line)}`}`, job.text ? make("small", {}, job.text) : null,
+      job.state === "running" && job.total ? make("progress", { max: job.total, value: job.done, "aria-label": `How far job ${job.id} is` }) : null,
       job.result?.endsWith(".npz") ? make("a", { href: `/api/cuts/${encodeURIComponent(job.result)}`, download: job.result }, job.result) : null,
       ["waiting", "running"].includes(job.state) ? make("button", { disabled: !this.#operator, onclick: () => ask("DELETE", `jobs/${job.id}`).then(() => this.#refresh(), (error) => this.#fail(error.message)) }, "Stop") : null)) : [make("li", {}, "None.")]);
   }

@@ -1,0 +1,130 @@
+// The steps of a calibration: what to put in front of the lens, one button each, what was found and how surely.
+
+import { ask } from "./link.js";
+import { $, count, day, fill, make } from "./words.js";
+
+const REFRESH_MS = 1000;
+const TITLES = { delay: "Delay", dark: "Dark", linearity: "Linearity", flat: "Flat", target: "Target" };
+/** In these states of the daemon a step can have the instrument. */
+const FREE = ["idle", "armed"];
+
+export class Calibrate {
+  #fail; #operator = null; #status = null; #unknown = ""; #cards = new Map(); #job = null; #timer = null; #steps = [];
+
+  constructor(fail) { this.#fail = fail; }
+
+  enter(operator) { this.#operator = operator; this.#enable(); }
+
+  show(status) { this.#status = status; this.#unknown = ""; this.#enable(); }
+
+  /** What is shown is old: nothing is begun on the strength of it. */
+  stale(why) { this.#unknown = why; this.#enable(); }
+
+  /** The screen is seen: read what there is, and follow a step that is under way. */
+  async open() {
+    clearTimeout(this.#timer);
+    try { this.#build(await ask("GET", "calibration")); await this.#follow(); }
+    catch (error) { if (!$("aim").hidden) this.#fail(error.message); }
+  }
+
+  async #follow() {
+    clearTimeout(this.#timer);
+    if ($("aim").hidden) return;
+    const [latest] = (await ask("GET", "jobs")).filter((job) => job.kind === "calibrate");
+    const ended = this.#job?.state === "running" && latest?.state !== "running";
+    this.#job = latest ?? null;
+    if (ended) this.#build(await ask("GET", "calibration"));
+    this.#tell();
+    if (this.#job?.state === "running") this.#timer = setTimeout(() => this.#follow().catch((error) => { this.#fail(error.message); this.#timer = setTimeout(() => this.open(), REFRESH_MS); }), REFRESH_MS);
+  }
+
+  #build(facts) {
+    this.#steps = facts.steps;
+    $("calibration-place").textContent = facts.error ?? `${facts.path}. ${facts.named ? "The rig names it: every recording gets a copy." : `Recordings get a copy once the rig file says calibration = "${facts.path}".`}`;
+    $("calibration-place").className = facts.error ? "bad" : "hint";
+    if (!this.#cards.size) {
+      for (const step of facts.steps) this.#cards.set(step.name, new Card(step, (lines) => this.#begin(step.name, lines), () => this.#cancel()));
+      $("steps").replaceChildren(...[...this.#cards.values()].map((card) => card.element));
+    }
+    for (const step of facts.steps) this.#cards.get(step.name).found(step.found);
+    this.#enable();
+  }
+
+  async #begin(step, lines) {
+    this.#fail("");
+    try { this.#job = await ask("POST", "calibration", lines === null ? { step } : { step, lines }); this.#tell(); await this.#follow(); }
+    catch (error) { this.#fail(error.message); }
+  }
+
+  async #cancel() {
+    try { await ask("DELETE", `jobs/${this.#job.id}`); await this.#follow(); }
+    catch (error) { this.#fail(error.message); }
+  }
+
+  #tell() {
+    for (const [name, card] of this.#cards) card.follow(this.#job?.step === name ? this.#job : null);
+    this.#enable();
+  }
+
+  /** Why a step cannot be begun now; nothing where it can. */
+  #why(step) {
+    if (this.#unknown) return this.#unknown;
+    if (this.#operator === null || !this.#status) return "The page is still connecting to the instrument.";
+    if (!this.#operator) return "This token is for looking only.";
+    if (this.#job?.state === "running") return this.#job.step === step.name ? "" : `The step ${TITLES[this.#job.step]} is under way.`;
+    if (!FREE.includes(this.#status.state)) return this.#status.state === "faulted" ? "The instrument has a fault: disarm it first." : "While something is recorded, the instrument is not to be had.";
+    const before = this.#steps.find((one) => one.name === step.after);
+    return before && !before.found.length ? `After the step ${TITLES[step.after]}.` : "";
+  }
+
+  #enable() { for (const step of this.#steps) this.#cards.get(step.name).enable(this.#why(step), this.#operator); }
+}
+
+class Card {
+  #state = make("span"); #text = make("p", { role: "status" }); #bar = make("progress", { hidden: true }); #found = make("div");
+  #lines; #begin; #cancel; #why = make("p", { className: "hint" }); #running = false;
+
+  constructor(step, begin, cancel) {
+    const title = TITLES[step.name] ?? step.name;
+    this.#lines = make("input", { type: "number", id: `lines-${step.name}`, min: step.least_lines, max: 2 ** 20, value: step.lines ?? "", placeholder: step.lines ? String(step.lines) : "automatic", className: "long", inputMode: "numeric" });
+    this.#begin = make("button", { className: "primary", id: `begin-${step.name}`, onclick: () => this.#ask(begin) }, `Measure ${title.toLowerCase()}`);
+    this.#cancel = make("button", { id: `cancel-${step.name}`, hidden: true, onclick: cancel, "aria-label": `Cancel ${title.toLowerCase()}` }, "Cancel");
+    this.#bar.setAttribute("aria-label", `How far ${title.toLowerCase()} is`);
+    this.#why.id = `why-${step.name}`;
+    this.#begin.setAttribute("aria-describedby", this.#why.id);
+    this.element = make("li", { id: `step-${step.name}` }, make("h3", {}, title, this.#state), make("p", {}, step.prepare),
+      make("div", { className: "fields" }, make("label", {}, "Lines ", this.#lines), this.#begin, this.#cancel), this.#why, this.#bar, this.#text, this.#found);
+  }
+
+  #ask(begin) { if (this.#lines.reportValidity()) begin(this.#lines.value === "" ? null : Number(this.#lines.value)); }
+
+  enable(why, operator) {
+    this.#begin.disabled = Boolean(why) || this.#running;
+    this.#cancel.disabled = !operator;
+    if (this.#why.textContent !== why) this.#why.textContent = why;
+    this.#why.hidden = !why;
+  }
+
+  follow(job) {
+    const running = job?.state === "running", handed = this.#running !== running;
+    const held = [this.#begin, this.#cancel].includes(document.activeElement);
+    this.#running = running;
+    this.#cancel.hidden = !running;
+    this.#begin.disabled = running;
+    if (handed && held) (running ? this.#cancel : this.#begin).focus();
+    this.#bar.hidden = !running;
+    if (running && job.total) { this.#bar.max = job.total; this.#bar.value = job.done; } else this.#bar.removeAttribute("value");
+    const text = { running: job?.text, failed: `Failed: ${job?.text}.`, stopped: `Cancelled: ${job?.text}.`, done: "Done." }[job?.state] ?? "";
+    if (this.#text.textContent !== text) this.#text.textContent = text;
+    this.#text.className = job?.state === "failed" ? "bad" : "";
+  }
+
+  found(found) {
+    const latest = found.map((one) => one.made).sort().at(-1);
+    this.#state.textContent = latest ? `✓ ${day(Date.parse(latest) * 1e6)}` : "not yet";
+    this.#state.className = latest ? "good" : "unknown";
+    fill(this.#found, JSON.stringify(found), () => found.map((one) => make("div", {}, found.length > 1 ? make("h4", {}, one.name) : null,
+      make("dl", {}, ...[["lines", count(one.lines)], ...Object.entries(one.facts)].flatMap(([what, text]) => [make("dt", {}, what), make("dd", {}, text)])),
+      ...one.warnings.map((text) => make("p", { className: "warning" }, `! ${text}`)))));
+  }
+}
