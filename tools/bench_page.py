@@ -1,9 +1,10 @@
 """What the operator's page costs the capture, and how quick it is: with clients and without, in one run.
 
 ``python tools/bench_page.py --out DIR`` runs a daemon with cameras of stored lines and the page's process. It
-records without any client, then with five that follow the live picture, of which one never reads; says what
-was lost, how late the grabbers' blocks were, and what the page's process took; then it opens the page in
-Debian's chromium, where that and playwright are installed: the first picture, and how late the state is told.
+records without any client, then with five that follow the live picture, of which one never reads, in turn,
+``--rounds`` times; says what was lost, how late the grabbers' blocks were, and what the page's process
+took; then it opens the page in Debian's chromium, where that and playwright are installed: the first picture,
+and how late the state is told. The clients are a process of the lowest priority: theirs are other computers.
 ``--small`` is 2 x 512 px x 33 klines/s, whose pictures are 2 x 1 MB/s; else it is 928 MB/s in all.
 """
 
@@ -13,14 +14,18 @@ import argparse
 import asyncio
 import contextlib
 import json
+import os
 import re
+import select
 import socket
+import statistics
 import subprocess
 import sys
 import tempfile
 import threading
 import time
 from collections.abc import Iterator
+from multiprocessing import get_context
 from pathlib import Path
 from shutil import rmtree, which
 from typing import Any
@@ -115,28 +120,33 @@ def page(socket_path: Path, directory: Path) -> Iterator[tuple[psutil.Process, s
     process.communicate()
 
 
-class Follower:
-    """Follows the live picture; ``reads``: or stands still from the first byte on."""
+def follow(address: str, bytes_read: Any, ending: Any) -> None:
+    """Clients of the live picture until the end; the last one stands still from the first byte on."""
+    os.nice(19)
+    port, token = re.findall(r":(\d+)/#token=(\S+)", address)[0]
+    head = f"GET /api/live HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nAuthorization: Bearer {token}\r\n\r\n"
+    with contextlib.ExitStack() as stack:
+        clients = [socket.create_connection(("127.0.0.1", int(port))) for _ in range(CLIENTS + 1)]
+        for client in clients:
+            stack.enter_context(client)
+            client.sendall(head.encode())
+        while not ending.is_set():
+            for client in select.select(clients[:CLIENTS], [], [], 0.2)[0]:
+                bytes_read.value += len(client.recv(2**18))
 
-    def __init__(self, address: str, *, reads: bool) -> None:
-        port, token = re.findall(r":(\d+)/#token=(\S+)", address)[0]
-        self.bytes = 0
-        self._socket = socket.create_connection(("127.0.0.1", int(port)))
-        head = f"GET /api/live HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nAuthorization: Bearer {token}\r\n\r\n"
-        self._socket.sendall(head.encode())
-        self._thread = threading.Thread(target=self._read, daemon=True)
-        if reads:
-            self._thread.start()
 
-    def _read(self) -> None:
-        with contextlib.suppress(OSError):
-            while part := self._socket.recv(2**18):
-                self.bytes += len(part)
-
-    def close(self) -> None:
-        with contextlib.suppress(OSError):
-            self._socket.shutdown(socket.SHUT_RDWR)
-        self._socket.close()
+@contextlib.contextmanager
+def followers(address: str) -> Iterator[Any]:
+    """The bytes that they have read so far, together."""
+    spawn = get_context("spawn")
+    bytes_read, ending = spawn.Value("q", 0), spawn.Event()
+    process = spawn.Process(target=follow, args=(address, bytes_read, ending))
+    process.start()
+    try:
+        yield bytes_read
+    finally:
+        ending.set()
+        process.join()
 
 
 def take(client: Client, rig: TimedRig, directory: Path, name: str, seconds: float) -> dict[str, Any]:
@@ -203,9 +213,57 @@ def browse(address: str, client: Client) -> dict[str, float]:
     return found | {"state_median_s": sorted(late)[5], "state_max_s": max(late)}
 
 
+def rounds(
+    client: Client,
+    rig: TimedRig,
+    directory: Path,
+    address: str,
+    process: psutil.Process,
+    options: Any,
+    run: Any,
+) -> tuple[list[float], list[float]]:
+    """The p99.9 of the grabbers' blocks in ms without clients, and with them, in turn."""
+    alone, followed = [], []
+    for number in range(options.rounds):
+        found = take(client, rig, directory, f"alone-{number}", options.seconds)
+        print("without clients:", found, flush=True)
+        run.add(f"recorded, no client, round {number + 1}", **found)
+        alone.append(found["p99.9_ms"])
+        with followers(address) as bytes_read:
+            until_read = time.monotonic() + 30
+            while not bytes_read.value and time.monotonic() < until_read:
+                time.sleep(0.1)
+            before, begun_s = bytes_read.value, time.monotonic()
+            spent_s = sum(process.cpu_times()[:2])
+            found = take(client, rig, directory, f"followed-{number}", options.seconds)
+            took_s = time.monotonic() - begun_s
+            share = (sum(process.cpu_times()[:2]) - spent_s) / took_s
+            mb_s = (bytes_read.value - before) / took_s / CLIENTS / 1e6
+        print(
+            f"with {CLIENTS + 1}, one of them stopped: {found}; {mb_s:.2f} MB/s of pictures to each,", end=" "
+        )
+        print(f"the page's process {share:.3f} cores", flush=True)
+        clients = f"{CLIENTS + 1} clients, one of them stopped, round {number + 1}"
+        run.add(f"recorded, {clients}", **found)
+        run.add(f"page's process, {clients}", cores=share, pictures_to_each_mb_s=mb_s)
+        followed.append(found["p99.9_ms"])
+    return alone, followed
+
+
+def compared(alone: list[float], followed: list[float]) -> str:
+    """Medians, and how far apart rounds of one kind are, without which the difference says nothing."""
+    without, beside = statistics.median(alone), statistics.median(followed)
+    spread = (max(alone) - min(alone)) / without
+    return (
+        f"p99.9 {without:.2f} ms without clients, {beside:.2f} with: {beside / without - 1:+.0%};"
+        f" rounds without clients are {spread:.0%} apart; load {os.getloadavg()[0]:.1f}"
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=10.0)
+    parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--out", type=Path, default=Path(tempfile.gettempdir()))
     parser.add_argument("--small", action="store_true")
     add_option(parser)
@@ -223,25 +281,11 @@ def main() -> None:
             client = Client(directory / "c.sock")
             client.arm(force=True)
             time.sleep(2)
-            alone = take(client, rig, directory, "alone", options.seconds)
-            print("without clients:", alone)
-            run.add("recorded, no client", **alone)
-            followers = [Follower(address, reads=k < CLIENTS) for k in range(CLIENTS + 1)]
-            time.sleep(2)
-            followed = take(client, rig, directory, "followed", options.seconds)
-            print(f"with {CLIENTS + 1}, one of them stopped:", followed)
-            run.add(f"recorded, {CLIENTS + 1} clients, one of them stopped", **followed)
-            mb_s = max(one.bytes for one in followers) / (options.seconds + 2) / 1e6
+            taken = rounds(client, rig, directory, address, process, options, run)
+            print(compared(*taken))
             used = cores(process, 5.0)
-            print(f"pictures: {mb_s:.2f} MB/s to each; page's process {used:.3f} cores")
-            run.add(f"page's process, {CLIENTS + 1} clients", cores=used, pictures_to_each_mb_s=mb_s)
-            for one in followers[1:]:
-                one.close()
-            time.sleep(1)
-            used = cores(process, 5.0)
-            print(f"with one client: {used:.3f} cores")
-            run.add("page's process, one client", cores=used, pictures_to_each_mb_s=None)
-            followers[0].close()
+            print(f"without clients: {used:.3f} cores of the page's process")
+            run.add("page's process, no client", cores=used, pictures_to_each_mb_s=None)
             if which("chromium"):
                 found = browse(address, client)
                 print("browser:", found)

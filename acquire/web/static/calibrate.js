@@ -9,7 +9,7 @@ const TITLES = { delay: "Delay", dark: "Dark", linearity: "Linearity", flat: "Fl
 const FREE = ["idle", "armed"];
 
 export class Calibrate {
-  #fail; #operator = null; #status = null; #unknown = ""; #cards = new Map(); #job = null; #timer = null; #steps = [];
+  #fail; #operator = null; #status = null; #unknown = ""; #cards = new Map(); #job = null; #timer = null; #steps = []; #told = "";
 
   constructor(fail) { this.#fail = fail; }
 
@@ -23,19 +23,31 @@ export class Calibrate {
   /** The screen is seen: read what there is, and follow a step that is under way. */
   async open() {
     clearTimeout(this.#timer);
-    try { this.#build(await ask("GET", "calibration")); await this.#follow(); }
-    catch (error) { if (!$("aim").hidden) this.#fail(error.message); }
+    if ($("aim").hidden) return;
+    try {
+      this.#build(await ask("GET", "calibration"));
+      await this.#follow();
+      if (this.#told && $("error").textContent === this.#told) this.#fail("");
+      this.#told = "";
+    } catch (error) { this.#again(error); }
+  }
+
+  /** What fails is told, and tried again, until it works: the page's server may just be starting. */
+  #again(error) {
+    if ($("aim").hidden) return;
+    this.#fail(this.#told = error.message);
+    this.#timer = setTimeout(() => this.open(), REFRESH_MS);
   }
 
   async #follow() {
     clearTimeout(this.#timer);
     if ($("aim").hidden) return;
     const [latest] = (await ask("GET", "jobs")).filter((job) => job.kind === "calibrate");
-    const ended = this.#job?.state === "running" && latest?.state !== "running";
-    this.#job = latest ?? null;
+    const was = this.#job, ended = was?.state === "running" && (latest?.id !== was.id || latest.state !== "running");
+    this.#job = latest ?? (ended ? { ...was, state: "failed", text: "the page's server was started anew and the step asked to end" } : was);
     if (ended) this.#build(await ask("GET", "calibration"));
     this.#tell();
-    if (this.#job?.state === "running") this.#timer = setTimeout(() => this.#follow().catch((error) => { this.#fail(error.message); this.#timer = setTimeout(() => this.open(), REFRESH_MS); }), REFRESH_MS);
+    if (this.#job?.state === "running") this.#timer = setTimeout(() => this.#follow().catch((error) => this.#again(error)), REFRESH_MS);
   }
 
   #build(facts) {
