@@ -116,10 +116,10 @@ class Capture:
 
         Returns the line. A recording that begins later can still hold it: see `Window`.
         """
-        self._running("note")
+        supervisor = self._running("note")
         if line is None:
             line = max(ring.newest_line for ring in self._rings.values())
-        self._workers[RECORDER].post(Note(line, kind, text))
+        supervisor.tell(Note(line, kind, text))
         return line
 
     def take_events(self) -> list[Note]:

@@ -81,6 +81,7 @@ class Supervisor:
         self._trigger_lost = False
         self._trigger_told_s = time.monotonic()
         self._events: deque[Note] = deque(maxlen=_MOST_EVENTS)
+        self._told: deque[Note] = deque(maxlen=_MOST_EVENTS)
         self._dead: set[str] = set()
         self._hung: str | None = None
         self._last_words: dict[str, str] = {}
@@ -187,6 +188,12 @@ class Supervisor:
         """
         self._events.append(note)
         if self._workers[RECORDER].unsent < _MOST_EVENTS:
+            self.tell(note)
+
+    def tell(self, note: Note) -> None:
+        """Tell the recorder; its successor hears it again, since this one may die before it is written."""
+        with self._news:
+            self._told.append(note)
             self._workers[RECORDER].post(note)
 
     def take_events(self) -> list[Note]:
@@ -344,7 +351,10 @@ class Supervisor:
         successor = self._succession.successor(name)
         if successor is None:
             return False
-        self._workers[name] = successor
+        with self._news:  # nobody may tell the one that is dead any more
+            self._workers[name] = successor
+            for note in self._told if name == RECORDER else ():
+                successor.post(note)
         worker.end(time.monotonic())
         self._hung = None
         for arm in self._arms_of.get(name, ()):

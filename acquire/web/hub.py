@@ -84,7 +84,8 @@ class Hub:
         """The latest status with its judgement; or that there is none."""
         if not self.connected or self.status is None:
             return message({"type": "link", "connected": False, "why": self.why})
-        facts = f'{{"status":{self.status.model_dump_json()},"health":{self.health().model_dump_json()}}}'
+        status, health = self.status.model_dump_json(), self.health().model_dump_json()
+        facts = f'{{"now_ms":{time.time_ns() // 1_000_000},"status":{status},"health":{health}}}'
         return json_message("state", facts)
 
     def health(self) -> Health:

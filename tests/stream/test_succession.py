@@ -143,6 +143,22 @@ def test_a_recorder_that_is_killed_is_replaced_and_no_line_is_lost(run, tmp_path
     assert any(event.kind == "resumed" and "SIGKILL" in event.text for event in two.events)
 
 
+def test_what_a_recorder_did_not_live_to_write_down_is_told_to_its_successor(run, tmp_path):
+    run.capture.start(Begin(tmp_path / "r.zarr", run.spec()))
+    until(lambda: run.capture.poll().committed_lines > 2000)
+    recorder = run.capture.pids["recorder"]
+    os.kill(recorder, signal.SIGSTOP)
+    line = run.capture.note("mark", "the valve opens")
+    os.kill(recorder, signal.SIGKILL)
+    until(lambda: run.capture.poll().path.endswith("r-2.zarr") and run.capture.poll().committed_lines > 0)
+    later = run.capture.note("mark", "and closes")
+    run.capture.stop("stopped")
+    until(lambda: run.capture.poll().done)
+    two = open_recording(tmp_path / "r-2.zarr")
+    marks = [(event.line, event.text) for event in two.events if event.kind == "mark"]
+    assert marks == [(line, "the valve opens"), (later, "and closes")]
+
+
 @pytest.mark.parametrize("begun", [True, False], ids=["once it has begun", "before it begins"])
 def test_a_successor_that_is_killed_as_well_is_replaced_and_the_budget_stays(run, tmp_path, begun):
     lines = 40_000

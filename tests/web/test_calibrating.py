@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -40,7 +41,9 @@ def bench(tmp_path: Path) -> Iterator[tuple[Daemon, Callable[[str], None]]]:
 
     put(WHITE)
     scene, cal = f"simulation.scene='{tmp_path}/scene.toml'", f"calibration='{tmp_path}/cal.zarr'"
-    with contextlib.closing(Daemon(tmp_path, *SETTINGS, scene, cal, "web.port=0")) as made:
+    with socket.create_server(("127.0.0.1", 0)) as free:  # the page that is started anew has the same address
+        port = free.getsockname()[1]
+    with contextlib.closing(Daemon(tmp_path, *SETTINGS, scene, cal, f"web.port={port}")) as made:
         yield made, put
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,7 @@ from fake_run import FakeRun, rig_config
 from page_server import PageServer
 from served import api
 from waiting import until
+from wire import Wire
 
 from acquire.client import Client
 from acquire.daemon.endpoint import Endpoint
@@ -202,6 +204,54 @@ def test_all_can_be_reached_and_done_by_key(page: Page, instrument: Instrument) 
     page.keyboard.up("s")
     page.keyboard.press("d")
     page.wait_for_selector("body[data-state=idle]", timeout=SEEN_MS)
+
+
+def test_keys_work_on_every_screen(page: Page, instrument: Instrument) -> None:
+    """A recording is stopped from wherever one is."""
+    record(instrument)
+    page.keyboard.press("3")
+    page.wait_for_selector("#recordings:not([hidden])")
+    page.wait_for_selector("#stop:enabled", state="attached", timeout=SEEN_MS)
+    page.keyboard.down("s")
+    until(lambda: "stop" in instrument.run.names)
+    page.keyboard.up("s")
+
+
+def test_a_clock_that_is_wrong_on_the_viewers_side_is_not_believed(
+    browser: Browser, instrument: Instrument
+) -> None:
+    with contextlib.closing(browser.new_context()) as context:
+        context.add_init_script("const now = Date.now; Date.now = () => now() - 10800000;")
+        page = context.new_page()
+        page.goto(instrument.server.link)
+        page.locator("#since", has_text="for ").wait_for(timeout=SEEN_MS)
+        told = page.inner_text("#since").replace("\u202f", " ")
+        assert re.fullmatch(r"for [\d.]+ (s|min)", told), told
+
+
+def test_who_works_by_key_keeps_the_place_in_a_list_that_changes(page: Page, instrument: Instrument) -> None:
+    page.keyboard.press("4")
+    page.focus("#measure")
+    page.evaluate("window.held = document.activeElement")
+    instrument.disk(seconds_to_full=5e5)
+    until(lambda: not page.evaluate("window.held.isConnected"))
+    assert page.evaluate("document.activeElement.id") == "measure"
+
+
+def test_a_connection_of_which_only_one_end_is_left_is_made_anew(
+    browser: Browser, instrument: Instrument
+) -> None:
+    """As after a night in which the viewer's computer slept: nobody tells it that the connection is gone."""
+    with (
+        contextlib.closing(Wire(instrument.server.address)) as wire,
+        contextlib.closing(browser.new_context()) as context,
+    ):
+        page = context.new_page()
+        page.goto(instrument.server.link.replace(instrument.server.address, wire.address))
+        page.wait_for_selector("#arm:enabled", timeout=SEEN_MS)
+        wire.cut()
+        page.wait_for_selector("body[data-stale]", timeout=SEEN_MS)
+        page.wait_for_selector("body:not([data-stale]) #arm:enabled", timeout=SEEN_MS)
 
 
 def test_everything_has_a_name_for_who_cannot_see_it(page: Page) -> None:

@@ -56,7 +56,7 @@ link.addEventListener("news", ({ detail }) => {
 link.addEventListener("rows", ({ detail }) => { watch.rows(detail.header, detail.body); aim.rows(detail.header, detail.body); });
 link.addEventListener("state", ({ detail }) => {
   latest = detail.header.state;
-  band.show(latest.status, latest.health);
+  band.show(latest.status, latest.health, latest.now_ms);
   watch.show(latest.status);
   aim.show(latest.status);
   calibrate.show(latest.status);
@@ -72,8 +72,8 @@ addEventListener("keydown", (event) => {
   if (number) { location.hash = `/${number}`; return; }
   const onButton = event.target.closest("button, a") && [" ", "Enter"].includes(event.key);
   if (onButton || event.repeat) return;
-  const taken = $("recordings").hidden ? watch.key(event.key.toLowerCase()) : recordings.key(event.key);
-  if (taken) event.preventDefault();
+  const played = !$("recordings").hidden && recordings.key(event.key);
+  if (played || watch.key(event.key.toLowerCase())) event.preventDefault();
 });
 addEventListener("keyup", (event) => { if (event.key.toLowerCase() === "s") watch.releaseStop(); });
 $("help").onclick = () => $("keys").showModal();

@@ -6,7 +6,8 @@ import { $, clock, count, duration, fill, make, quantity } from "./words.js";
 const table = (titles, rows) => make("div", { className: "scroll" }, make("table", {},
   make("tr", {}, ...titles.map((title) => make("th", { scope: "col" }, title))),
   ...rows.map((cells) => make("tr", {}, ...cells.map((cell) => make("td", {}, cell))))));
-const panel = (title, ...children) => make("section", { className: title.startsWith("Judged") ? "panel whole" : "panel", "aria-label": title }, make("h2", {}, title), ...children);
+const panel = (title, ...children) => make("section", { className: "panel", "aria-label": title }, make("h2", {}, title), ...children);
+const wide = (section) => { section.classList.add("whole"); return section; };
 const MARKS = { good: "✓ good", unknown: "· unknown", warning: "! warning", bad: "✗ bad" };
 
 export function showHealth(status, health, fail, operator) {
@@ -14,12 +15,12 @@ export function showHealth(status, health, fail, operator) {
   const capacity = status.capacity;
   const key = JSON.stringify([health, capacity, status.processes, status.uploads, status.recoveries, status.troubles, status.state, operator]);
   fill($("health"), key, () => [make("div", { className: "panels" },
-    panel("Judged by written thresholds", table(["what", "", "now", "thresholds"], health.checks.map((check) =>
-      [check.name, make("span", { className: check.level }, MARKS[check.level]), check.text, check.limit]))),
+    wide(panel("Judged by written thresholds", table(["what", "", "now", "thresholds"], health.checks.map((check) =>
+      [check.name, make("span", { className: check.level }, MARKS[check.level]), check.text, check.limit])))),
     panel("What this host sustains", capacity
       ? make("p", {}, capacity.warning ?? `${quantity(capacity.sustained_hz ?? 0, "lines/s")}; configured are ${quantity(capacity.line_rate_hz, "lines/s")}; the ${capacity.limit} allows least.`)
       : make("p", {}, "Not measured since the daemon began."),
-    make("button", { disabled: !operator || status.state !== "idle" || Boolean(status.busy), onclick: () => { fail(""); ask("POST", "capacity").catch((error) => fail(error.message)); } }, "Measure now"),
+    make("button", { id: "measure", disabled: !operator || status.state !== "idle" || Boolean(status.busy), onclick: () => { fail(""); ask("POST", "capacity").catch((error) => fail(error.message)); } }, "Measure now"),
     make("p", { className: "hint" }, "Only while nothing is armed.")),
     panel("Processes", table(["name", "number"], [["daemon", String(status.pid)], ...Object.entries(status.processes).map(([name, pid]) => [name, String(pid)])])),
     panel("Uploads", status.uploads.length ? table(["recording", "state", "lines there", "why"], status.uploads.map((one) => [one.path.split("/").at(-1), one.state, count(one.lines), one.error])) : make("p", {}, "None.")),

@@ -3,9 +3,11 @@
 import { $ } from "./words.js";
 
 const FRAME_MS = 80;
+/** Later than this after the one before, a glimpse is said to be late: its frames go on moving all the same. */
+const LATE_S = 3;
 
 export class Glimpse {
-  #header = null; #body = null; #frame = 0; #rate = []; #timer = null;
+  #header = null; #body = null; #frame = 0; #rate = []; #taken = 0; #words = ""; #timer = null;
 
   constructor(link) {
     $("glimpse-on").addEventListener("change", () => {
@@ -25,11 +27,15 @@ export class Glimpse {
     this.#header = header; this.#body = body.slice(); this.#frame = 0;
     const now = performance.now();
     this.#rate = [...this.#rate, now].filter((at) => at > now - 5000);
-    $("glimpse-text").textContent = `${header.tile ? `tile ${header.tile}, ` : ""}${header.columns} × ${header.rows} voxels, ${header.frames} frames, ${header.age_s.toFixed(1)} s old, ${(this.#rate.length / 5).toFixed(1)} per second`;
+    this.#taken = now;
+    this.#words = `${header.tile ? `tile ${header.tile}, ` : ""}${header.columns} × ${header.rows} voxels, ${header.frames} frames, ${header.age_s.toFixed(1)} s old, ${(this.#rate.length / 5).toFixed(1)} per second`;
+    $("glimpse-text").textContent = this.#words;
   }
 
   #draw() {
     if (!this.#header) return;
+    const late_s = (performance.now() - this.#taken) / 1000;
+    if (late_s > LATE_S) $("glimpse-text").textContent = `${this.#words}; none has come for ${Math.round(late_s)} s`;
     const { rows, columns, frames } = this.#header, canvas = $("glimpse"), size = rows * columns, image = new ImageData(columns, rows);
     const bytes = this.#body.subarray(this.#frame * size, (this.#frame + 1) * size);
     for (let i = 0; i < size; i++) image.data.set([bytes[i], bytes[i], bytes[i], 255], 4 * i);

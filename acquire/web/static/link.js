@@ -2,6 +2,10 @@
 
 const decoder = new TextDecoder();
 export const SILENT_MS = 2000;
+/** A connection that has been silent for so long may be one of which only this end is left: another one is made. */
+const DEAD_MS = 8000;
+/** The longest command is a recording that is sealed on a slow disk. */
+const ANSWER_MS = 600000;
 /** A hidden page asks so often, and browsers let it ask once a minute: its title may be as old. */
 const HIDDEN_MS = 1500, HIDDEN_SILENT_MS = 65000;
 
@@ -29,6 +33,7 @@ export class Messages {
 export class Link extends EventTarget {
   #heard = performance.now();
   #abort = null;
+  #opened = performance.now();
   glimpses = false;
 
   /** Follow for ever. A hidden page asks now and then, since browsers have six connections for all their tabs. */
@@ -48,6 +53,7 @@ export class Link extends EventTarget {
 
   async #follow() {
     this.#abort = new AbortController();
+    this.#opened = performance.now();
     const followed = document.visibilityState === "visible" ? `pictures=true&glimpses=${this.glimpses}` : "once=true";
     const answer = await fetch(`/api/live?${followed}`, { signal: this.#abort.signal });
     if (answer.status === 401) { this.dispatchEvent(new Event("locked")); return; }
@@ -65,8 +71,9 @@ export class Link extends EventTarget {
   }
 
   #watch() {
-    const silent = performance.now() - this.#heard;
+    const now = performance.now(), silent = now - this.#heard;
     if (silent > (document.visibilityState === "visible" ? SILENT_MS : HIDDEN_SILENT_MS)) this.dispatchEvent(new CustomEvent("silent", { detail: silent / 1000 }));
+    if (Math.min(silent, now - this.#opened) > DEAD_MS) this.#abort?.abort();
   }
 }
 
@@ -75,7 +82,7 @@ export async function ask(method, path, body) {
   const headers = { "Request-Id": `${Date.now()}-${Math.random().toString(36).slice(2)}` };
   if (body !== undefined) headers["Content-Type"] = "application/json";
   let answer;
-  try { answer = await fetch(`/api/${path}`, { method, headers, body: body === undefined ? undefined : JSON.stringify(body) }); }
+  try { answer = await fetch(`/api/${path}`, { method, headers, body: body === undefined ? undefined : JSON.stringify(body), signal: AbortSignal.timeout(ANSWER_MS) }); }
   catch { throw new Error("The page's server does not answer."); }
   const facts = (answer.headers.get("content-type") ?? "").includes("json") ? await answer.json() : null;
   if (answer.ok) return facts;

@@ -6,15 +6,19 @@ import { $, count, make, quantity } from "./words.js";
 const BATCH = 64, MOST_BATCHES = 8;
 
 export class Player {
-  #fail; #video = null; #frame = 0; #batches = new Map(); #timer = null; #canvas; #slider; #text; #play; #speed;
+  #fail; #asked = 0; #video = null; #frame = 0; #batches = new Map(); #timer = null; #canvas; #slider; #text; #play; #speed;
 
   constructor(fail) { this.#fail = fail; }
 
   async open(name) {
     this.#stop(); this.#batches.clear(); this.#fail("");
-    try { this.#video = await ask("GET", `videos/${encodeURIComponent(name)}`); }
+    const asked = ++this.#asked;
+    let video;
+    try { video = await ask("GET", `videos/${encodeURIComponent(name)}`); }
     catch (error) { this.#fail(error.message); return; }
-    const video = this.#video;
+    if (asked !== this.#asked) return;  // another one was opened meanwhile
+    this.#batches.clear();
+    this.#video = video;
     this.#canvas = make("canvas", { width: video.columns, height: video.rows, role: "img", "aria-label": name });
     this.#slider = make("input", { type: "range", min: 0, max: video.frames - 1, value: 0, "aria-label": "Frame", oninput: () => this.#show(Number(this.#slider.value)) });
     this.#text = make("p", { id: "frame-text" });
@@ -49,7 +53,8 @@ export class Player {
 
   async #show(frame) {
     const video = this.#video, size = video.rows * video.columns, batch = Math.floor(frame / BATCH);
-    try { await this.#load(batch); } catch (error) { this.#stop(); this.#fail(error.message); return; }
+    try { await this.#load(video, batch); } catch (error) { this.#stop(); this.#fail(error.message); return; }
+    if (video !== this.#video || !this.#batches.has(batch)) return;
     const bytes = this.#batches.get(batch).subarray((frame - batch * BATCH) * size, (frame - batch * BATCH + 1) * size);
     const image = new ImageData(video.columns, video.rows);
     for (let i = 0; i < size; i++) image.data.set([bytes[i], bytes[i], bytes[i], 255], 4 * i);
@@ -61,11 +66,13 @@ export class Player {
     this.#text.className = trusted ? "" : "warning";
   }
 
-  async #load(batch) {
+  async #load(video, batch) {
     if (this.#batches.has(batch)) return;
-    const answer = await fetch(`/api/videos/${encodeURIComponent(this.#video.name)}/frames?first=${batch * BATCH}&count=${BATCH}`);
+    const answer = await fetch(`/api/videos/${encodeURIComponent(video.name)}/frames?first=${batch * BATCH}&count=${BATCH}`);
     if (!answer.ok) throw new Error((await answer.json()).message);
-    this.#batches.set(batch, new Uint8Array(await answer.arrayBuffer()));
+    const frames = new Uint8Array(await answer.arrayBuffer());
+    if (video !== this.#video) return;  // they are another one's
+    this.#batches.set(batch, frames);
     while (this.#batches.size > MOST_BATCHES) this.#batches.delete(this.#batches.keys().next().value);
   }
 }

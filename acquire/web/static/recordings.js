@@ -7,7 +7,7 @@ import { $, count, day, duration, fill, make, quantity } from "./words.js";
 const REFRESH_MS = 3000;
 
 export class Recordings {
-  #fail; #operator = false; #chosen = null; #detail = null; #from = 0; #lines = 0; #player; #timer = null;
+  #fail; #operator = false; #chosen = null; #detail = null; #from = 0; #lines = 0; #player; #timer = null; #looking = false; #told = "";
 
   constructor(fail) { this.#fail = fail; this.#player = new Player(fail); }
 
@@ -17,17 +17,23 @@ export class Recordings {
 
   key(key) { return this.#player.key(key); }
 
+  /** One look at a time: a slow disk must not have them pile up. What failed is told until it works again. */
   async #refresh() {
+    if (this.#looking) return;
+    this.#looking = true;
     try {
       const [recordings, jobs, videos] = await Promise.all([ask("GET", "recordings"), ask("GET", "jobs"), ask("GET", "videos")]);
       this.#list(recordings); this.#jobs(jobs); this.#videos(videos);
-    } catch (error) { this.#fail(error.message); }
+      if (this.#told && $("error").textContent === this.#told) this.#fail("");
+      this.#told = "";
+    } catch (error) { this.#fail(this.#told = error.message); }
+    finally { this.#looking = false; }
   }
 
   #list(recordings) {
     fill($("recording-list"), JSON.stringify([recordings, this.#chosen]), () => recordings.length ? recordings.map((one) => {
       const lost = Object.values(one.lost_lines).reduce((sum, n) => sum + n, 0), state = one.error ? "DAMAGED" : one.condition ?? one.state;
-      return make("li", {}, make("button", { "aria-pressed": String(one.name === this.#chosen), onclick: () => this.#choose(one.name) },
+      return make("li", {}, make("button", { id: `recording-${one.name}`, "aria-pressed": String(one.name === this.#chosen), onclick: () => this.#choose(one.name) },
         make("img", { src: one.error ? "" : `/api/recordings/${encodeURIComponent(one.name)}/picture?${one.lines}`, alt: "", loading: "lazy" }),
         make("span", {}, make("b", {}, one.name),
           make("small", { className: one.error || one.damage || lost ? "bad" : "" }, `${state}${lost ? `, ${count(lost)} lines lost` : ""}${one.held ? ", held" : ""}`),
@@ -38,8 +44,11 @@ export class Recordings {
 
   async #choose(name) {
     this.#chosen = name; this.#fail("");
-    try { this.#detail = await ask("GET", `recordings/${encodeURIComponent(name)}`); }
+    let detail;
+    try { detail = await ask("GET", `recordings/${encodeURIComponent(name)}`); }
     catch (error) { this.#fail(error.message); return; }
+    if (this.#chosen !== name) return;  // another one was chosen meanwhile
+    this.#detail = detail;
     this.#from = this.#detail.first_line;
     this.#lines = Math.min(this.#detail.lines, 512);
     this.#build();
@@ -98,11 +107,11 @@ export class Recordings {
       make("b", { className: job.state === "failed" ? "bad" : job.state === "done" ? "good" : "" }, job.state), ` ${job.step ? `${job.kind} ${job.step}` : `${job.kind} of ${job.recording}, ${count(job.lines)} lines from ${count(job.first_line)}`}`, job.text ? make("small", {}, job.text) : null,
       job.state === "running" && job.total ? make("progress", { max: job.total, value: job.done, "aria-label": `How far job ${job.id} is` }) : null,
       job.result?.endsWith(".npz") ? make("a", { href: `/api/cuts/${encodeURIComponent(job.result)}`, download: job.result }, job.result) : null,
-      ["waiting", "running"].includes(job.state) ? make("button", { disabled: !this.#operator, onclick: () => ask("DELETE", `jobs/${job.id}`).then(() => this.#refresh(), (error) => this.#fail(error.message)) }, "Stop") : null)) : [make("li", {}, "None.")]);
+      ["waiting", "running"].includes(job.state) ? make("button", { id: `stop-${job.id}`, disabled: !this.#operator, "aria-label": `Stop job ${job.id}`, onclick: () => ask("DELETE", `jobs/${job.id}`).then(() => this.#refresh(), (error) => this.#fail(error.message)) }, "Stop") : null)) : [make("li", {}, "None.")]);
   }
 
   #videos(videos) {
     fill($("videos"), JSON.stringify(videos), () => videos.length ? videos.map((video) => make("li", {},
-      make("button", { onclick: () => this.#player.open(video.name), disabled: Boolean(video.error) }, video.name), video.error ?? `${count(video.frames)} frames of ${video.columns} × ${video.rows}, ${quantity(video.interval_ns / 1e9, "s")} apart`)) : [make("li", {}, "None yet: choose a recording and reconstruct a stretch.")]);
+      make("button", { id: `video-${video.name}`, onclick: () => this.#player.open(video.name), disabled: Boolean(video.error) }, video.name), video.error ?? `${count(video.frames)} frames of ${video.columns} × ${video.rows}, ${quantity(video.interval_ns / 1e9, "s")} apart`)) : [make("li", {}, "None yet: choose a recording and reconstruct a stretch.")]);
   }
 }

@@ -13,11 +13,16 @@ export function make(name, properties = {}, ...children) {
   return element;
 }
 
-/** Replace what is below an element, only where its text changes: a list that is read out stays where it is. */
+/**
+ * Replace what is below an element, only where its text changes: a list that is read out stays where it is.
+ * What had the focus has it again, if it has an id: who works by key is not sent to the beginning of the page.
+ */
 export function fill(element, key, build) {
   if (element.dataset.key === key) return;
   element.dataset.key = key;
+  const held = element.contains(document.activeElement) ? document.activeElement.id : "";
   element.replaceChildren(...build());
+  if (held) document.getElementById(held)?.focus({ preventScroll: true });
 }
 
 export const count = (value) => Number(value).toLocaleString("en").replaceAll(",", "\u202f");
