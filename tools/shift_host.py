@@ -55,6 +55,8 @@ SAMPLE_S = 2.0
 BACK_S = 60.0
 """systemd would wait longer than this for nobody."""
 END_S = 60.0
+LONG_S = 480.0
+"""A shorter life may still be loading modules and filling bounded caches: its growth is told, not judged."""
 CALM_S = 20.0
 """After the last stranger has gone: connections that nobody closed have had their time."""
 MOST_MORE = (4, 10)
@@ -167,7 +169,10 @@ class Host:
 
     def judge(self) -> list[str]:
         """Memory of long lives; descriptors and threads beside those of processes that are new."""
-        self._soak.judge()
+        for name, noted in self._soak.memory.items():
+            grown = self._soak.growth_mb(name)
+            if grown is not None and grown > MOST_GROWTH_MB and noted[-1][0] - noted[0][0] > LONG_S:
+                self._soak.wrong.append(f"{name}: grew by {grown:.1f} MB in the second half of its life")
         wrong = list(self._soak.wrong)
         time.sleep(CALM_S)
         old = self._used()

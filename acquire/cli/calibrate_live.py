@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -18,10 +19,11 @@ if TYPE_CHECKING:
     from acquire.calibrate.calibration import Calibration, Finding
     from acquire.calibrate.exposure import Exposure
     from acquire.client import Client
-    from acquire.daemon.messages import LightCode, TriggerDelays, TriggerWindow
+    from acquire.daemon.messages import LightCode, Status, TriggerDelays, TriggerWindow
 
 SEALED_S = 120.0
 """Longest wait for a recording to be sealed, beside the time that its lines take."""
+POLL_S = 0.1
 TRIES = 3
 BY = "ACQUIRE_BY"
 """Environment variable: who asked for this, where it is the page that carries it out for them."""
@@ -46,7 +48,7 @@ def instrument(socket: Path | None, directory: Path) -> Iterator[Client]:
         try:
             yield daemon
         finally:
-            if daemon.status().run_id != status.run_id:
+            if _settled(daemon).run_id != status.run_id:
                 _leave(daemon, directory, armed=status.state == "armed")
 
 
@@ -116,6 +118,14 @@ def wait_for_enter() -> None:
     note("Enter goes on, Ctrl-C ends; what was found so far is kept")
     if not sys.stdin.readline():
         raise StateError("nobody is there to press Enter", hint="--yes, where everything is in place")
+
+
+def _settled(daemon: Client) -> Status:
+    """The status once no command is under way: an interrupt does not call back an arm that has been sent."""
+    deadline = time.monotonic() + SEALED_S
+    while (status := daemon.status()).busy is not None and time.monotonic() < deadline:
+        time.sleep(POLL_S)
+    return status
 
 
 def _leave(daemon: Client, directory: Path, *, armed: bool) -> None:

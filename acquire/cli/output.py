@@ -6,6 +6,7 @@ of somebody else's recording can neither forge a line nor send an escape sequenc
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -30,8 +31,9 @@ _IN_JSON = re.compile(r"[^ -~\n]")
 
 
 def say(text: str = "", *, err: bool = False) -> None:
-    """One line."""
-    typer.echo(visible(text), err=err)
+    """One line. What is said on stderr to nobody any more, as to a page that was killed, ends no work."""
+    with contextlib.suppress(*(BrokenPipeError,) if err else ()):
+        typer.echo(visible(text), err=err)
 
 
 def print_json(value: Any) -> None:
@@ -158,7 +160,7 @@ def note(text: str) -> None:
 
 def note_json(facts: Any) -> None:
     """The same for programs: one line of JSON on stderr."""
-    typer.echo(json_text(facts), err=True)
+    say(json_text(facts), err=True)
 
 
 def quantity(value: float, unit: str) -> str:

@@ -18,7 +18,6 @@ from waiting import until
 
 from acquire.calibrate import open_calibration
 from acquire.client import SEALED
-from acquire.store import open_recording
 from acquire.web.tokens import load_tokens
 
 if TYPE_CHECKING:
@@ -106,8 +105,8 @@ def test_dark_flat_target_and_a_sweep_that_is_cancelled(
         measure(page, "target", 384)
         page.locator("#step-target [role=status].bad", has_text="Failed: ").wait_for(timeout=SEEN_MS)
         put(target())
-        measure(page, "target", 384)
-        page.locator("#step-target", has_text="turn 90").wait_for(timeout=SEEN_MS)
+        measure(page, "target", 1024)
+        page.locator("#step-target dl", has_text="turn 90").wait_for(timeout=SEEN_MS)
 
         put(WHITE)
         measure(page, "delay", 1024)
@@ -139,9 +138,8 @@ def test_dark_flat_target_and_a_sweep_that_is_cancelled(
             client.wait(SEALED, timeout_s=120)
         page.wait_for_selector("#begin-dark:enabled", timeout=SEEN_MS)
     known = open_calibration(cal)
-    assert list(known.steps)[:5] == ["dark", "flat", "transfer", "orientation", "align"]
+    assert {"dark", "flat", "transfer", "orientation", "align"} <= set(known.steps)
     assert known.alignment is not None
     assert known.alignment.alignment.rows == pytest.approx(1.4, abs=0.15)
     assert known.steps["dark"]["lines"] == 384
-    taken = open_recording(daemon.home / "calibration-recordings" / "dark-1.zarr")
-    assert "start by operator at 127.0.0.1" in [event.text for event in taken.events]
+    assert "arm by operator at 127.0.0.1" in daemon.log.read_text()
