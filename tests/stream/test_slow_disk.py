@@ -163,7 +163,7 @@ def test_a_disk_that_fails_acknowledges_nothing_more(
 ) -> None:
     """Sealed as aborted with what is there; on a disk that takes nothing any more, left as committed last."""
     path = tmp_path / "r.zarr"
-    disk = FailingDisk(number, 4 * 2**20, tmp_path / "failed", wholly, share * LOAD.bytes_per_s)
+    disk = FailingDisk(number, 16 * 2**20, tmp_path / "failed", wholly, share * LOAD.bytes_per_s)
     with capturing(disk) as capture:
         capture.start(Begin(path, recording_spec(LOAD, capture.clock)))
         seen, acknowledged = until_done(capture, path)
