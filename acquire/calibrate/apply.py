@@ -88,7 +88,8 @@ def calibrated(segment: Segment, calibration: Calibration) -> Segment:
 
 
 def _of_columns(calibration: Calibration, segment: Segment) -> Calibration:
-    """Behind a fibre: what is known of the columns that see the segment's tile. UsageError beside them."""
+    """Behind a fibre: what is known of the segment's tile and of the columns that see it. UsageError beside
+    them."""
     if max(segment.first_column) + segment.geometry.stages > calibration.instrument.columns:
         raise UsageError(
             f"a calibration of {calibration.instrument.columns} columns does not reach those of the lines, "
@@ -114,6 +115,7 @@ def _of_columns(calibration: Calibration, segment: Segment) -> Calibration:
             for name, each in calibration.quantities.items()
         },
         usable=None if calibration.usable is None else seen(calibration.usable),
+        alignment=next((e.found for e in calibration.tiles if e.columns == segment.first_column), None),
     )
 
 

@@ -129,6 +129,15 @@ class AlignmentFound:
     uncertainty: dict[str, float]
 
 
+@dataclass(frozen=True, slots=True)
+class TileAlignment:
+    """That of a ``tile`` behind a fibre, which is seen from ``columns`` of arms A and B on."""
+
+    tile: str
+    columns: tuple[int, int]
+    found: AlignmentFound
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Finding:
     """What one step found.
@@ -141,6 +150,7 @@ class Finding:
     usable : (arm, column), False for columns that say nothing; None where the step does not tell
     orientation : name of arm B's view of the scene, where the step tells; see `acquire.calibrate.orientation`
     alignment : where the step tells
+    tiles : alignments behind a fibre, where the step tells
     facts : JSON: recordings, lines, and what else is worth knowing
     warnings : what is wrong with it, in sentences
     """
@@ -153,6 +163,7 @@ class Finding:
     alignment: AlignmentFound | None = None
     facts: dict[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
+    tiles: tuple[TileAlignment, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,6 +176,7 @@ class Calibration:
     orientation: str | None = None
     alignment: AlignmentFound | None = None
     steps: Mapping[str, dict[str, Any]] = field(default_factory=dict)
+    tiles: tuple[TileAlignment, ...] = ()
 
     def __repr__(self) -> str:
         sizes = self.instrument
@@ -173,7 +185,7 @@ class Calibration:
             geometry=f"M = {sizes.stages}, S = {sizes.substeps}, {sizes.layout}",
             steps=" ".join(self.steps) or "none yet",
             quantities=" ".join(self.quantities) or "none yet",
-            arm_b=None if self.alignment is None else "aligned",
+            arm_b="aligned" if self.alignment or self.tiles else None,
         )
 
     def __post_init__(self) -> None:
@@ -222,6 +234,7 @@ class Calibration:
             orientation=found.orientation or self.orientation,
             alignment=found.alignment or self.alignment,
             steps=steps,
+            tiles=found.tiles or self.tiles,
         )
 
     def finding(self, step: str) -> Finding:
@@ -262,8 +275,9 @@ class Calibration:
             "instrument": self.instrument.model_dump(mode="json"),
             "usable": None if self.usable is None else self.usable.tolist(),
             "orientation": self.orientation,
-            "alignment": found and {**found.alignment.facts(), "uncertainty": found.uncertainty},
+            "alignment": found and _facts(found),
             "steps": dict(self.steps),
+            "tiles": [{"tile": e.tile, "seen_from": list(e.columns), **_facts(e.found)} for e in self.tiles],
         }
 
     @classmethod
@@ -288,6 +302,12 @@ class Calibration:
                 orientation=attrs["orientation"],
                 alignment=None if found is None else _alignment(found),
                 steps={name: dict(step) for name, step in attrs["steps"].items()},
+                tiles=tuple(
+                    TileAlignment(
+                        str(e["tile"]), (int(e["seen_from"][0]), int(e["seen_from"][1])), _alignment(e)
+                    )
+                    for e in attrs.get("tiles", ())
+                ),
             )
         except (LookupError, TypeError, ValueError, AttributeError, ValidationError, UsageError) as error:
             raise DataError(f"the calibration is damaged: {error}", hint="measure it again") from error
@@ -308,6 +328,10 @@ def _usable(steps: Mapping[str, dict[str, Any]], columns: int) -> NDArray[np.boo
         for row, arm in zip(usable, ARMS, strict=True):
             row[each.get(arm, [])] = False
     return usable
+
+
+def _facts(found: AlignmentFound) -> dict[str, Any]:
+    return {**found.alignment.facts(), "uncertainty": found.uncertainty}
 
 
 def _alignment(attrs: Mapping[str, Any]) -> AlignmentFound:

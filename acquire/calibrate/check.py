@@ -11,6 +11,7 @@ from acquire.calibrate.apply import check_fits
 from acquire.calibrate.columns import dark, flat
 from acquire.calibrate.field import mended
 from acquire.calibrate.target import alignment, orientation
+from acquire.errors import UsageError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -75,6 +76,11 @@ def check(exposure: Exposure, known: Calibration, *, covered: bool = False) -> C
             corrected = mended(known.with_step(found), known.alignment.alignment)
             seen = replace(found, quantities={**found.quantities, **corrected})
         return Check((*_columns(seen, known, "gain", "1"), *_balance(found, known)), doubts)
+    if exposure.recording.fibre is not None:
+        raise UsageError(
+            f"{exposure.recording} shows a target behind a fibre, which is not compared tile by tile",
+            possible="a dark or a flat; or `acquire calibrate align`, which tells where each tile lies now",
+        )
     seen = orientation(exposure, known)
     believed = known.orientation or "turn 90"
     if seen.orientation is None or seen.orientation != believed:

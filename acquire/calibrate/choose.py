@@ -62,7 +62,7 @@ def corrected(known: Calibration) -> list[str]:
     if known.orientation is not None and (view := view_named(known.orientation)) != MODEL:
         seen = " (the video is what camera B sees)" if view.swapped else ""
         found.append(f"the orientation: {view.name}{seen}")
-    if known.alignment is not None:
+    if known.alignment is not None or known.tiles:
         found.append("arm B laid on arm A")
     return found
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from acquire.calibrate.align import Match, align
 from acquire.calibrate.apply import calibrated
-from acquire.calibrate.calibration import Finding, Measured
+from acquire.calibrate.calibration import Finding, Measured, TileAlignment
 from acquire.calibrate.field import mended
 from acquire.calibrate.orientation import (
     CLEAR,
@@ -32,6 +32,8 @@ MOVES = 3.0
 """Misfit beside the lines' own noise from which on a target is not at rest."""
 MOST_LINES = 4096
 """That are looked at; more do not make an alignment better than its model."""
+UNLIKE = 0.5
+"""Misfit of the arms' images, of their variation, beyond which they are not taken to show the same."""
 SAME_BALANCE = 0.002
 BALANCE_ERROR = 0.001
 """Of the ratio of the arms' light over the field that both see."""
@@ -130,6 +132,38 @@ def alignment(exposure: Exposure, known: Calibration) -> Finding:
         facts=facts,
         warnings=tuple(warnings),
     )
+
+
+def tile_alignments(exposure: Exposure, known: Calibration) -> Finding:
+    """Where arm B's image lies on arm A's in each tile behind a fibre, whose bands lie a little beside their
+    places. A tile in which the target does not tell is left out, and named.
+
+    Raises UsageError where it tells in none.
+    """
+    recording, bare = exposure.recording, replace(known, orientation=None, alignment=None, tiles=())
+    assert recording.fibre is not None
+    lines, found, warnings = min(exposure.lines, MOST_LINES), [], []
+    for tile in recording.fibre.tiles:
+        segment = calibrated(recording.cut(exposure.first_line, lines, tile), bare)
+        S = segment.geometry.substeps
+        try:
+            still_a, still_b = stills(segment)
+            shift = correlations(still_a.blocks(S), still_b.blocks(S))[MODEL][1]
+            match = align(still_a, still_b, segment.geometry, (S * shift[0], S * shift[1]))
+        except UsageError as error:
+            warnings.append(f"tile {tile}: {error.message}")
+            continue
+        if match.misfit > UNLIKE:
+            warnings.append(f"tile {tile}: the arms' images differ by {match.misfit:.0%} of their variation")
+            continue
+        found.append(TileAlignment(str(tile), segment.first_column, match.found))
+    if not found:
+        raise UsageError(
+            f"{recording}: the target tells in no tile how arm B lies on arm A",
+            possible="sharp dots or a binary pattern of 2 to 6 fine pixels all over",
+        )
+    facts = {**exposure.facts(), "lines": lines, "tiles": len(found)}
+    return Finding("align", exposure.instrument, facts=facts, warnings=tuple(warnings), tiles=tuple(found))
 
 
 def _balance(known: Calibration, match: Match) -> dict[str, Measured]:

@@ -9,7 +9,9 @@ import numpy as np
 from acquire.calibrate.calibration import Measured
 
 if TYPE_CHECKING:
-    from acquire.calibrate.calibration import AlignmentFound, Calibration, Finding
+    from collections.abc import Sequence
+
+    from acquire.calibrate.calibration import AlignmentFound, Calibration, Finding, TileAlignment
     from acquire.calibrate.check import Check
 
 PER_ARM = {
@@ -51,7 +53,7 @@ def found_facts(found: Finding) -> dict[str, Any]:
     if found.alignment is not None:
         facts |= _alignment(found.alignment)
         facts["left over"] = f"{found.facts['misfit']:.1%} of the images' variation"
-    return facts
+    return facts | _tiles(found.tiles)
 
 
 def known_facts(known: Calibration) -> dict[str, Any]:
@@ -68,6 +70,7 @@ def known_facts(known: Calibration) -> dict[str, Any]:
         facts["arm B sees the scene with"] = known.orientation
     if known.alignment is not None:
         facts |= _alignment(known.alignment)
+    facts |= _tiles(known.tiles)
     for name, step in known.steps.items():
         facts[name] = f"{step.get('lines', 0)} lines, {step['made']}" + "".join(
             f"; {text}" for text in step.get("warnings", ())
@@ -158,6 +161,11 @@ def _alignment(found: AlignmentFound) -> dict[str, str]:
         "turned": f"{numbers.turn_deg:+.4f} ± {errors['turn_deg']:.4f} degrees counter-clockwise",
         "magnified": f"{numbers.magnification:.5f} ± {errors['magnification']:.5f}",
     }
+
+
+def _tiles(found: Sequence[TileAlignment]) -> dict[str, str]:
+    """Where arm B lies in each tile behind a fibre."""
+    return {f"in tile {each.tile} arm B lies": _alignment(each.found)["arm B lies"] for each in found}
 
 
 def _columns(listed: dict[str, list[int]]) -> str | None:

@@ -192,7 +192,7 @@ def align(
 
     Put in a target at rest with sharp texture all over the field, dots or bars of 2 to 6 fine pixels, and
     record with the usual pseudo-random code. 1024 lines give 0.02 fine pixels; 263 are too few. Best after
-    dark and flat.
+    dark and flat. Behind a fibre each tile is aligned by itself, as its bands lie.
 
     Example: [bold]acquire calibrate align target.zarr --out cal.zarr[/]
     """
@@ -200,7 +200,8 @@ def align(
 
     known, exposure = _known_or_new(out, recording), _exposure(recording, first_line, lines, begin, end)
     with stage_progress("laying the arms' images on each other"):
-        found = target.alignment(exposure, known)
+        behind = exposure.recording.fibre is not None
+        found = (target.tile_alignments if behind else target.alignment)(exposure, known)
     _keep(out, found, json=json, new=True)
 
 

@@ -104,5 +104,5 @@ def _without(known: Calibration) -> Iterator[tuple[str, Calibration]]:
         yield "columns left out", replace(known, usable=None)
     if known.orientation is not None and view_named(known.orientation) != MODEL:
         yield "the orientation", replace(known, orientation=None)
-    if known.alignment is not None:
-        yield "arm B laid on arm A", replace(known, alignment=None)
+    if known.alignment is not None or known.tiles:
+        yield "arm B laid on arm A", replace(known, alignment=None, tiles=())

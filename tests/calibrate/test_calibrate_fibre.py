@@ -9,15 +9,20 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from acquire.calibrate import Calibration, calibrated
 from acquire.calibrate.columns import dark, flat
 from acquire.calibrate.exposure import open_exposure
 from acquire.calibrate.file import save_calibration
+from acquire.calibrate.target import tile_alignments
 from acquire.cli import main
 from acquire.config import load_rig
 from acquire.config.rig import ConstantCodeConfig
+from acquire.config.scene import SceneFile
 from acquire.errors import UsageError
+from acquire.fibre import Tile
+from acquire.recon import reconstruct
 from acquire.sim.leds import LedSceneConfig
 from acquire.simulate import simulate
 from acquire.store import Recording, open_recording
@@ -110,3 +115,28 @@ def test_what_it_gives_is_told_of_one_tile(
     by_part = {each["part"]: each for each in told["parts"]}
     assert by_part["all of it"]["prediction"] < 0.9 * by_part["nothing"]["prediction"]
     assert by_part["gains per column"]["gain_db"] > 0.3
+
+
+def test_bands_beside_their_places_are_found_tile_by_tile_and_corrected(tmp_path: Path) -> None:
+    changes = {**SETTINGS, "geometry.stages": 32, "fibre.rows": 64, "fibre.columns": 96}
+    rig = load_rig("rig-demo", {**changes, "fibre.sensor_pixels": 200})
+    dots = np.random.default_rng(3).random((32, 32)).repeat(3, axis=0).repeat(3, axis=1) > 0.6
+    Image.fromarray((200 * dots).astype(np.uint8)).save(tmp_path / "dots.png")
+    table = {"kind": "video", "path": str(tmp_path / "dots.png")}
+    table |= {"effects": [{"kind": "fibre_bands", "shift_pixels": 1.0}]}
+    simulate(rig, SceneFile.model_validate(table).root, tmp_path / "dots.zarr", 600)
+    exposure = open_exposure(tmp_path / "dots.zarr", 64, 500)
+    found = tile_alignments(exposure, Calibration(exposure.instrument))
+    assert [each.tile for each in found.tiles] == ["0,0", "0,1", "0,2", "1,0", "1,1", "1,2"]
+    numbers = [each.found.alignment for each in found.tiles]
+    shifts = np.array([(each.rows, each.columns) for each in numbers]).reshape(2, 3, 2)
+    # B's bands beside A's: as many differences as there are tiles, of which bands explain all
+    odd = shifts - shifts.mean(0, keepdims=True) - shifts.mean(1, keepdims=True) + shifts.mean((0, 1))
+    assert np.abs(odd).max() < 0.1 < 0.5 < shifts.std()
+    known = Calibration(exposure.instrument).with_step(found)
+    assert Calibration.from_attrs(known.to_attrs()).tiles == known.tiles
+    lines = exposure.recording.cut(64, 150, Tile(1, 2))
+    aligned = calibrated(lines, known)
+    assert aligned.alignment == known.tiles[-1].found.alignment
+    raw, better = (reconstruct(each, 1, 181, "fast", check=False).quality for each in (lines, aligned))
+    assert better.prediction < 0.5 * raw.prediction
