@@ -60,7 +60,8 @@ class Admm:
     """Holds the iterates; `step` is one iteration, `theta` the current estimate (K, n′, n′).
 
     ``samples`` are 0 where the operator's weight is. ``start`` is a first estimate, ``emphasis`` (K,)
-    multiplies λ per coefficient frame, ``denoiser`` takes the place of total variation.
+    multiplies λ per coefficient frame, ``denoiser`` takes the place of total variation. ``beside``
+    (K, n′, n′) is light that is there already: the sum with it is not negative.
     """
 
     def __init__(
@@ -74,8 +75,9 @@ class Admm:
         start: Array | None = None,
         emphasis: Array | float = 1.0,
         denoiser: Denoiser | None = None,
+        beside: Array | None = None,
     ) -> None:
-        self._samples, self._parameters = samples, parameters
+        self._samples, self._parameters, self._beside = samples, parameters, beside
         self._denoiser = Checked(denoiser) if denoiser else FrameTv(parameters.tv_iterations)
         self._xp, arrays = namespace(samples), basis.arrays
         self._emphasis = arrays.asarray(emphasis)
@@ -83,7 +85,7 @@ class Admm:
         self._w = arrays.zeros(samples.shape)
         self.rebase(operator, basis, arrays.zeros(theta_shape) if start is None else start)
         self._tv_multiplier = arrays.zeros(theta_shape)
-        self._sign = self._xp.maximum(self._xp.tensordot(self._grid.T, self.theta, axes=1), 0)
+        self._sign = self._xp.maximum(self._xp.tensordot(self._grid.T, self.theta, axes=1), self._least)
         self._sign_multiplier = arrays.zeros(self._sign.shape)
 
     def rebase(self, operator: MaskedOperator, basis: Basis, theta: Array) -> None:
@@ -94,6 +96,8 @@ class Admm:
         self._operator, self.theta = operator, basis.arrays.asarray(theta)
         grid = min(basis.frames, self._parameters.grid_per_coefficient * basis.cosines)
         self._grid = basis.arrays.asarray(basis.matrix(grid))
+        beside = self._beside
+        self._least = 0 if beside is None else -self._xp.tensordot(self._grid.T, beside, axes=1)
         self._lifted = operator.adjoint(self._w)  # BᵀW·w
         self._prepare()
 
@@ -144,7 +148,7 @@ class Admm:
         self.theta = self._denoiser.prox(relaxed + self._tv_multiplier, self._strength)
         self._tv_multiplier += relaxed - self.theta
         values = self._xp.tensordot(self._grid.T, relaxed, axes=1) + self._sign_multiplier
-        self._sign = self._xp.maximum(values, 0)
+        self._sign = self._xp.maximum(values, self._least)
         self._sign_multiplier = values - self._sign
 
     def _data_step(self) -> Array:

@@ -14,6 +14,7 @@ begin.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, ClassVar
 
 from acquire.arrays import host
@@ -22,8 +23,18 @@ from acquire.recon.estimates import Preferred
 from acquire.recon.handed import follow
 from acquire.recon.holdout import HeldOut
 from acquire.recon.patterns import find_patterns
+from acquire.recon.rest import best_still, changing, told_by
 from acquire.recon.solver import Preset, Solver
-from acquire.recon.workbench import CALM, FIRST_ITERATIONS, SEARCH_SHARE, SMOOTH, STILL, VOLUME, Workbench
+from acquire.recon.workbench import (
+    CALM,
+    FIRST_ITERATIONS,
+    LEAST_GAIN,
+    SEARCH_SHARE,
+    SMOOTH,
+    STILL,
+    VOLUME,
+    Workbench,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -37,14 +48,17 @@ if TYPE_CHECKING:
 
 ITERATIONS_PER_TRIAL = 10
 """Of a preset's iterations, for each trial of a search."""
+REST_SHARE = 0.3
+"""Of a budget, by which the search for a better still ends where it is for a video."""
 OUTDONE = 0.6
 """Of the others' held-out error, what cosines must stay below to spare the search for a better volume."""
 FAR = 1.25
-"""Of a volume's error, beyond which a smooth one is not searched."""
+"""Of a volume's error, beyond which a smooth one or a still is not searched."""
 SMOOTHER = 0.85
 """Of a volume's error, what a smooth one must reach: a quadratic prior lets more noise through unseen."""
 CLEARLY = 0.97
-"""Of a still's error, what a volume must reach to be preferred."""
+"""Of a still's error, what a volume must reach to be preferred; one of what changes beside it, which is the
+still where its prior is strong, need only be better."""
 CLOSE, DOUBTFUL = 1.1, 2.0
 """Of the best trial's error: where cosines are gone on with, and where they are if patterns stand out."""
 
@@ -74,20 +88,23 @@ def solve_admm(segment: Segment, problem: Problem, options: SolveOptions, clock:
         if followed is not None:
             return followed
     if bench.frames == 1:
-        return bench.finish(bench.climb(bench.attempt(STILL, FIRST_ITERATIONS), trials))
+        still = bench.attempt(STILL, FIRST_ITERATIONS)
+        return bench.finish(best_still(still, trials, merge=options.spatial_merge))
     volume = bench.attempt(bench.fitting(VOLUME), FIRST_ITERATIONS)
     if clock.spent(SEARCH_SHARE):
         clock.shortcuts.append("the budget left no time to try more than one kind of motion")
         return bench.finish(volume)
-    still = bench.attempt(bench.fitting(STILL), FIRST_ITERATIONS)
+    plain = bench.attempt(bench.fitting(STILL), FIRST_ITERATIONS)
+    explains = plain.error < min(EXPLAINED, FAR * volume.error)
+    still = best_still(plain, trials, merge=options.spatial_merge, share=REST_SHARE) if explains else plain
     rests = still.error < EXPLAINED and not held_out.clearly_less(volume.errors, still.errors)
-    first = look_in_cosines(segment, problem, options, clock, still.admm.theta if rests else None)
+    first = look_in_cosines(segment, problem, options, clock, still.coefficients if rests else None)
     bench.note({"prior": "cosines"} | first.facts(), first.predict())
     best = _better(volume, still)
     if bench.error(first.predict()) > OUTDONE * best.error:
-        best = _search(bench, still, volume, first, trials)
+        best = _search(bench, plain, still, volume, first, trials)
     elif not clock.spent(SEARCH_SHARE) and not _in_patterns(first):
-        best = _challenge(bench, still, first, trials) or best
+        best = _challenge(bench, plain, first, trials) or best
     if _worth_going_on(bench, first, still, best):
         blinking = go_on(segment, problem, options, clock, first)
         errors = bench.note({"prior": "patterns"} | blinking.facts(), blinking.predict())
@@ -97,18 +114,25 @@ def solve_admm(segment: Segment, problem: Problem, options: SolveOptions, clock:
 
 
 def _better(moving: Trial, still: Trial) -> Trial:
-    return moving if moving.error < CLEARLY * still.error else still
+    most = 1 - LEAST_GAIN if moving.candidate.change else CLEARLY
+    return moving if moving.error < most * still.error else still
 
 
-def _search(bench: Workbench, still: Trial, volume: Trial, first: InBand, trials: int) -> Trial:
+def _change(bench: Workbench, still: Trial) -> Trial:
+    candidate = replace(told_by(still, bench.fitting(VOLUME)), change=True)
+    return changing(bench, still).attempt(candidate, FIRST_ITERATIONS)
+
+
+def _search(bench: Workbench, plain: Trial, still: Trial, volume: Trial, first: InBand, trials: int) -> Trial:
     """The best of stills, volumes, smooth ones and those of changing brightness."""
-    if still.error < FAR * volume.error:
-        still = bench.climb(still, trials)
+    if still is plain and still.error < FAR * volume.error:
+        plain = still = bench.climb(still, trials)
     calm = bench.attempt(bench.fitting(CALM), FIRST_ITERATIONS, still)
-    bright = bench.brighten(still, first.basis.count)
-    volume = min([volume, calm, bright or calm], key=lambda trial: trial.error)
+    bright = bench.brighten(plain, first.basis.count)
+    change = calm if still is plain else _change(bench, still)
+    volume = min([volume, calm, bright or calm, change], key=lambda trial: trial.error)
     smooth = bench.attempt(bench.fitting(SMOOTH), FIRST_ITERATIONS)
-    volume = bench.climb(volume, trials)
+    volume = volume.bench.climb(volume, trials)
     if smooth.error < FAR * volume.error:
         smooth = bench.climb(smooth, trials)
     flows = smooth.error < SMOOTHER * volume.error and bench.held_out.clearly_less(
@@ -117,11 +141,11 @@ def _search(bench: Workbench, still: Trial, volume: Trial, first: InBand, trials
     return _better(smooth if flows else volume, still)
 
 
-def _challenge(bench: Workbench, still: Trial, first: InBand, trials: int) -> Trial | None:
+def _challenge(bench: Workbench, plain: Trial, first: InBand, trials: int) -> Trial | None:
     """A scene that flickers as a whole, or one that flows, where cosines are far ahead of a still and of a
     volume and yet no patterns; None where neither predicts better than they."""
     rival = bench.error(first.predict())
-    bright = bench.brighten(still, first.basis.count, DOUBTFUL * rival)
+    bright = bench.brighten(plain, first.basis.count, DOUBTFUL * rival)
     smooth = bench.attempt(bench.fitting(SMOOTH), FIRST_ITERATIONS)
     found = smooth if bright is None or smooth.error < SMOOTHER * bright.error else bright
     flows = found is smooth

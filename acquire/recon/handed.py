@@ -55,18 +55,20 @@ class Choice:
     error: float
     noise: float
     brightness: int = 0
+    fine: bool = False
 
     @classmethod
     def of(cls, result: Reconstruction) -> Self | None:
-        """That of a reconstruction; None where nothing was chosen."""
+        """That of a reconstruction; None where nothing was chosen, or what was hangs on what passes there."""
         found = result.parameters
-        if "candidates" not in found:
+        if "candidates" not in found or found.get("robust") or found.get("change"):
             return None
         curve = [each["temporal_coefficients"] for each in found["candidates"] if each["prior"] == COSINES]
         weight, pace = (0.0, 0.0) if found["prior"] == COSINES else (found["weight"], found["pace"])
         prior, count, quality = found["prior"], found["temporal_coefficients"], result.quality
         brightness = curve[0] if found.get("brightness") and curve else 0
-        return cls(prior, count, weight, pace, quality.prediction, quality.noise, brightness)
+        told = quality.prediction, quality.noise, brightness, bool(found.get("fine"))
+        return cls(prior, count, weight, pace, *told)
 
     def fits(self, error: float, noise: float) -> bool:
         """Whether samples are predicted as closely as where it was chosen, of noise where that is known."""
@@ -84,7 +86,8 @@ class Choice:
     def candidate(self, frames: int) -> Candidate:
         """As it is tried on so many frames."""
         cosines = min(self.coefficients, frames)
-        return Candidate(self.prior, cosines, self.weight, self.pace, bool(self.brightness))  # type: ignore[arg-type]  # not cosines
+        bright, fine = bool(self.brightness), self.fine
+        return Candidate(self.prior, cosines, self.weight, self.pace, bright, fine=fine)  # type: ignore[arg-type]  # not cosines
 
 
 def follow(
@@ -99,12 +102,15 @@ def follow(
     choice, frames = options.choice, bench.frames
     assert choice is not None
     noise, resting = problem.noise(segment), choice.prior == STILL.prior
-    still = bench.attempt(choice.candidate(frames) if resting else bench.fitting(STILL), FIRST_ITERATIONS)
+    if resting:
+        still = bench.on(bench.problem, fine=choice.fine).attempt(choice.candidate(frames), FIRST_ITERATIONS)
+    else:
+        still = bench.attempt(bench.fitting(STILL), FIRST_ITERATIONS)
     fits = resting and choice.fits(still.error, noise)
     if fits or still.error <= AS_CLOSELY * noise or clock.spent(SEARCH_SHARE):
-        return bench.finish(_strengthened(bench, still, clock))
+        return bench.finish(_strengthened(still, clock))
     if resting:
-        return bench.finish(bench.climb(still, trials)) if frames == 1 else None
+        return bench.finish(still.bench.climb(still, trials)) if frames == 1 else None
     if choice.prior == COSINES:
         return _in_cosines(bench, still, segment, problem, options, clock)
     lit = bench.brighten(still, choice.brightness) if choice.brightness else None
@@ -112,14 +118,14 @@ def follow(
         return None
     moving = bench.attempt(choice.candidate(frames), FIRST_ITERATIONS, lit)
     best = moving if bench.held_out.clearly_less(moving.errors, still.errors) else still
-    return bench.finish(_strengthened(bench, best, clock)) if choice.fits(best.error, noise) else None
+    return bench.finish(_strengthened(best, clock)) if choice.fits(best.error, noise) else None
 
 
-def _strengthened(bench: Workbench, best: Trial, clock: IterationClock) -> Trial:
+def _strengthened(best: Trial, clock: IterationClock) -> Trial:
     """With a larger weight, as far as the prediction gets no worse by it."""
     while not clock.spent(SEARCH_SHARE) and best.candidate.weight * WEIGHT_STEP <= LARGEST_WEIGHT:
         weight = float(f"{best.candidate.weight * WEIGHT_STEP:.3g}")
-        found = bench.attempt(replace(best.candidate, weight=weight), NEXT_ITERATIONS, best)
+        found = best.bench.attempt(replace(best.candidate, weight=weight), NEXT_ITERATIONS, best)
         if not found.error < best.error:
             break
         best = found

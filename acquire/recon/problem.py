@@ -27,6 +27,11 @@ if TYPE_CHECKING:
     from acquire.lines import Segment
 
 
+HUBER, NORMAL = 1.345, 1.4826
+"""Standard deviations from which residuals are doubted (95 % efficient where all is normal noise: Huber,
+Robust Statistics), and one of them over the median of normal noise's size."""
+
+
 class Operator(Protocol):
     """A linear map to lines (2, L_R, M) with its transpose."""
 
@@ -49,6 +54,8 @@ class Problem:
     coverage : share of the samples that are usable
     masked_by : samples left out, by cause
     arrays : library, device and dtype of the solvers' arrays
+    known : lines of light that is known already, as ``samples``; solved for is what comes to it
+    doubt : share of its weight that each sample keeps, in what is solved for; None: all of it
     """
 
     samples: NDArray[Any]
@@ -59,6 +66,8 @@ class Problem:
     coverage: float
     masked_by: dict[str, int] = field(default_factory=dict)
     arrays: Arrays = HOST
+    known: NDArray[Any] | None = None
+    doubt: NDArray[Any] | None = None
 
     @property
     def usable(self) -> NDArray[np.bool_]:
@@ -68,11 +77,35 @@ class Problem:
     @property
     def used_samples(self) -> Array:
         """``weight·samples``: what the solvers are given."""
-        return self.arrays.asarray(self.samples * self.weight)
+        left = self.samples if self.known is None else self.samples - self.known
+        return self.arrays.asarray(left * self._believed)
+
+    @property
+    def _believed(self) -> NDArray[Any]:
+        return self.weight if self.doubt is None else self.weight * self.doubt
+
+    def lines_of(self, seen: NDArray[Any]) -> NDArray[Any]:
+        """All lines, as ``samples``, where ``seen`` = B·x is of what is solved for."""
+        lines = seen / self.norm
+        return lines if self.known is None else lines + self.known
 
     def masked(self, operator: Operator) -> MaskedOperator:
         """The solvers' operator: weighted, of norm at most 1."""
-        return MaskedOperator(operator, self.arrays.asarray(self.weight / self.norm))
+        return MaskedOperator(operator, self.arrays.asarray(self._believed / self.norm))
+
+    def doubting(self, predicted: NDArray[Any]) -> Problem:
+        """The same where samples that ``predicted`` misses by far count for less.
+
+        Huber's weights with his constant: what passes before a still, or flashes, is no normal noise and
+        would pull at all of it. As roots, since a weight is squared in the least squares.
+        """
+        off = np.abs(predicted - self.samples)
+        usable = (self.weight > 0) | self.held_out
+        usual = HUBER * NORMAL * float(np.median(off[usable]))
+        if not usual > 0:
+            return self
+        doubt = np.sqrt(usual / np.maximum(off, usual)).astype(self.weight.dtype)
+        return replace(self, doubt=doubt)
 
     def whole(self) -> Problem:
         """The same with all usable samples in use."""

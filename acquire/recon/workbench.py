@@ -6,13 +6,14 @@ begins where the best ended. A scene whose brightness changes as a whole is trie
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from acquire.arrays import host
+from acquire.forward import merge_video
 from acquire.recon.admm import Admm, AdmmParameters
 from acquire.recon.band import band_operator
 from acquire.recon.basis import TemporalBasis, resized
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from acquire.arrays import Array
     from acquire.lines import Segment
     from acquire.recon.clock import IterationClock
     from acquire.recon.denoisers import Denoiser
@@ -57,13 +59,20 @@ USUAL_FRAMES, USUAL_ENERGY = 980, 7.1e-3
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A prior and how much of it: K cosines, weight λ, pace μ of a volume's time."""
+    """A prior and how much of it: K cosines, weight λ, pace μ of a volume's time.
+
+    ``change``: of what changes beside the best still; ``fine``: solved at N_m = 1, and merged; ``robust``:
+    samples that are missed by far count for less.
+    """
 
     prior: Literal["still", "smooth", "volume"]
     coefficients: int
     weight: float
     pace: float = 0.0
     brightness: bool = False
+    change: bool = False
+    fine: bool = False
+    robust: bool = False
 
 
 STILL = Candidate("still", 1, 2e-3)
@@ -74,8 +83,12 @@ CALM = Candidate("volume", 24, 2e-3, 16.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trial:
-    """A candidate as far as it has been solved; ``errors`` are those of the held-out blocks."""
+    """A candidate as far as it has been solved; ``errors`` are those of the held-out blocks.
 
+    ``coefficients`` (K, n′, n′) are those of the voxels that were asked for, ``bench`` is where it was tried.
+    """
+
+    bench: Workbench
     candidate: Candidate
     admm: Admm
     denoiser: Denoiser
@@ -85,9 +98,22 @@ class Trial:
     errors: NDArray[np.float64]
     error: float
 
+    @property
+    def coefficients(self) -> Array:
+        theta, beside = self.bench.merged(self.admm.theta), self.bench.beside
+        return theta if beside is None else theta + resized(beside, self.basis)
+
+
+@dataclass(slots=True)
+class Notes:
+    """What all workbenches of one problem have in common: a record of candidates, and the best so far."""
+
+    record: list[dict[str, Any]] = field(default_factory=list)
+    best: Trial | None = None
+
 
 class Workbench:
-    """Tries candidates on one problem and keeps a record of them."""
+    """Tries candidates on one problem and keeps a record of them; ``fine``: at N_m = 1, and merged."""
 
     def __init__(
         self,
@@ -96,22 +122,52 @@ class Workbench:
         options: SolveOptions,
         clock: IterationClock,
         held_out: HeldOut,
+        notes: Notes | None = None,
+        *,
+        fine: bool = False,
+        beside: Array | None = None,
+        share: float = SEARCH_SHARE,
     ) -> None:
-        self._segment, self._problem, self._clock, self.held_out = segment, problem, clock, held_out
-        self._merges = (options.spatial_merge, options.temporal_merge)
+        self._segment, self.problem, self.clock, self.held_out = segment, problem, clock, held_out
+        self._options, self._notes = options, notes or Notes()
+        self.fine, self.beside, self._share = fine, beside, share
+        self._merges = (1 if fine else options.spatial_merge, options.temporal_merge)
+        self.merge = options.spatial_merge if fine else 1
         self.frames, self._side, _ = segment.geometry.video_shape(*self._merges)
         self._brightness: NDArray[Any] | None = None
         self._operators: dict[tuple[int, bool], Operator] = {}  # neighbours mostly share one
-        self.record: list[dict[str, Any]] = []
-        self._best: Trial | None = None
         self._response = self._energy_of_a_voxel() / USUAL_ENERGY
+
+    @property
+    def record(self) -> list[dict[str, Any]]:
+        return self._notes.record
+
+    def on(
+        self,
+        problem: Problem,
+        *,
+        fine: bool | None = None,
+        beside: Array | None = None,
+        share: float | None = None,
+    ) -> Workbench:
+        """Another for the same lines: with other weights, ``fine``, for what changes ``beside`` light, or
+        with another share of the budget."""
+        kept = self._segment, problem, self._options, self.clock, self.held_out, self._notes
+        fine, share = self.fine if fine is None else fine, self._share if share is None else share
+        return Workbench(*kept, fine=fine, beside=beside, share=share)
+
+    def merged(self, theta: Array) -> Array:
+        """Coefficients of the voxels that were asked for."""
+        if self.merge == 1:
+            return theta
+        return self.problem.arrays.asarray(merge_video(host(theta), self.merge, 1))
 
     def brighten(self, still: Trial, cosines: int, most: float = np.inf) -> Trial | None:
         """A calm volume times the brightness of the whole scene, found in turn; None where there is none.
 
         It is not followed up from an error of more than ``most``.
         """
-        if self._clock.spent(SEARCH_SHARE):
+        if self.clock.spent(self._share):
             return None
         lit = still
         for _ in range(BRIGHT_STILLS):
@@ -134,7 +190,7 @@ class Workbench:
         """The brightness that goes with a trial's video from now on."""
         video = np.maximum(self.video(trial), 0)
         light = np.ones(self.frames) if trial.brightness is None else trial.brightness
-        found = light * fit_brightness(self._segment, self._problem, video, self._merges, cosines)
+        found = light * fit_brightness(self._segment, self.problem, video, self._merges, cosines)
         self._brightness = found / found.mean()
         self._operators = {key: kept for key, kept in self._operators.items() if not key[1]}
 
@@ -150,32 +206,34 @@ class Workbench:
 
     def attempt(self, candidate: Candidate, iterations: int, start: Trial | None = None) -> Trial:
         """Solve a candidate for so many iterations, or as many as there is time for, from ``start``."""
-        basis = TemporalBasis(self.frames, candidate.coefficients, self._problem.arrays)
+        basis = TemporalBasis(self.frames, candidate.coefficients, self.problem.arrays)
         brightness = self._brightness if candidate.brightness else None
         operator = self._operator(basis, brightness)
         shape, denoiser = (basis.count, self._side, self._side), _denoiser(candidate)
         admm = Admm(
-            self._problem.masked(operator),
-            self._problem.used_samples,
+            self.problem.masked(operator),
+            self.problem.used_samples,
             shape,
             basis,
             parameters(candidate, self.frames, self._response),
-            start=None if start is None else resized(start.admm.theta, basis),
+            start=None if start is None else resized(self._start(start), basis),
             denoiser=denoiser,
+            beside=self._beside(basis),
         )
-        if start is not None and start.candidate.coefficients == candidate.coefficients:
+        same = start is not None and start.bench.fine == self.fine and start.bench.beside is self.beside
+        if start is not None and same and start.candidate.coefficients == candidate.coefficients:
             admm.resume(start.admm)
             if isinstance(denoiser, VolumeTv) and isinstance(start.denoiser, VolumeTv):
                 denoiser.resume(start.denoiser)
-        trial = Trial(candidate, admm, denoiser, basis, operator, brightness, np.zeros(0), np.inf)
-        began = self._clock.seconds
-        for _ in self._clock.attempt(iterations, "choose", SEARCH_SHARE):
+        trial = Trial(self, candidate, admm, denoiser, basis, operator, brightness, np.zeros(0), np.inf)
+        began = self.clock.seconds
+        for _ in self.clock.attempt(iterations, "choose", self._share):
             admm.step()
         errors = self.note(asdict(trial.candidate), self.predict(trial), began)
         trial = replace(trial, errors=errors, error=self.held_out.relative(errors))
-        if self._best is None or trial.error < self._best.error:
-            self._best = trial
-            self._clock.show("choose", partial(self.video, trial))
+        if self._notes.best is None or trial.error < self._notes.best.error:
+            self._notes.best = trial
+            self.clock.show("choose", partial(self.video, trial))
         return trial
 
     def note(
@@ -183,7 +241,7 @@ class Workbench:
     ) -> NDArray[np.float64]:
         """The errors of a prediction, and a record of it."""
         errors = self.held_out.errors(predicted)
-        seconds = {} if began is None else {"seconds": self._clock.seconds - began}
+        seconds = {} if began is None else {"seconds": self.clock.seconds - began}
         self.record.append(candidate | {"error": self.held_out.relative(errors)} | seconds)
         return errors
 
@@ -193,13 +251,26 @@ class Workbench:
 
     def video(self, trial: Trial) -> NDArray[Any]:
         """Of a trial, dimensionless."""
-        video = host(trial.basis.synthesize(trial.admm.theta))
+        video = host(trial.basis.synthesize(trial.coefficients))
         light = trial.brightness
         return video if light is None else video * light[:, None, None].astype(video.dtype)
 
     def predict(self, trial: Trial) -> NDArray[Any]:
         """The lines of a trial, as `Problem.samples`."""
-        return host(trial.operator.forward(trial.admm.theta)) / self._problem.norm
+        return self.problem.lines_of(host(trial.operator.forward(trial.admm.theta)))
+
+    def _start(self, trial: Trial) -> Array:
+        """A trial's coefficients in the voxels of this bench."""
+        theta = trial.coefficients
+        if self.beside is not None:
+            return theta - resized(self.beside, trial.basis)
+        if not self.fine:
+            return theta
+        if trial.bench.fine:
+            return trial.admm.theta
+        n, merge = self._side, self._options.spatial_merge
+        held = host(theta).repeat(merge, axis=1).repeat(merge, axis=2)[:, :n, :n]
+        return self.problem.arrays.asarray(held)
 
     def climb(self, best: Trial, trials: int) -> Trial:
         """Change one thing of a candidate at a time, in steps, for as long as the prediction gets better."""
@@ -209,7 +280,7 @@ class Workbench:
             moving = False
             for step in self._steps(best.candidate):
                 while (candidate := step(best.candidate)) is not None and candidate not in seen:
-                    if len(seen) > trials or self._clock.spent(SEARCH_SHARE):
+                    if len(seen) > trials or self.clock.spent(self._share):
                         return best
                     seen.add(candidate)
                     found = self.attempt(candidate, NEXT_ITERATIONS, best)
@@ -235,8 +306,10 @@ class Workbench:
         return replace(candidate, coefficients=sizes[at]) if 0 <= at < len(sizes) else None
 
     def finish(self, best: Trial) -> Chosen:
-        """The best with all samples, which none were kept back for."""
-        whole = self._problem.whole()
+        """The best with all samples, which none were kept back for; on the bench where it was tried."""
+        if best.bench is not self:
+            return best.bench.finish(best)
+        whole = self.problem.whole()
         admm = Admm(
             whole.masked(best.operator),
             whole.used_samples,
@@ -244,23 +317,27 @@ class Workbench:
             best.basis,
             parameters(best.candidate, self.frames, self._response),
             denoiser=best.denoiser,
+            beside=self._beside(best.basis),
         )
         admm.resume(best.admm)
         last = replace(best, admm=admm)
-        self._clock.begin_anew()
-        for _ in self._clock.run(LAST_ITERATIONS, "solve", video=partial(self.video, last)):
+        self.clock.begin_anew()
+        for _ in self.clock.run(LAST_ITERATIONS, "solve", video=partial(self.video, last)):
             admm.step()
-        if self._clock.ended == "done":
-            self._clock.converged()
+        if self.clock.ended == "done":
+            self.clock.converged()
         return Chosen(self, last)
+
+    def _beside(self, basis: TemporalBasis) -> Array | None:
+        return None if self.beside is None else resized(self.beside, basis)
 
     def _energy_of_a_voxel(self) -> float:
         """Σ of squares of the lines' response to a voxel in the middle, as the solvers have it."""
-        still = TemporalBasis(self.frames, 1, self._problem.arrays)
+        still = TemporalBasis(self.frames, 1, self.problem.arrays)
         point = np.zeros((1, self._side, self._side))
         point[0, self._side // 2, self._side // 2] = 1
-        lines = host(self._operator(still, None).forward(self._problem.arrays.asarray(point)))
-        return float(np.square(lines / self._problem.norm, dtype=np.float64).sum()) or USUAL_ENERGY
+        lines = host(self._operator(still, None).forward(self.problem.arrays.asarray(point)))
+        return float(np.square(lines / self.problem.norm, dtype=np.float64).sum()) or USUAL_ENERGY
 
     def _operator(self, basis: TemporalBasis, brightness: NDArray[Any] | None) -> Operator:
         key, segment = (basis.count, brightness is not None), self._segment
@@ -293,6 +370,8 @@ class Chosen:
         return chosen | {"candidates": self._bench.record}
 
     def gone_on(self, problem: Problem, steps: Iterable[object]) -> NDArray[Any]:
+        own = self._bench.problem
+        problem = replace(problem, known=own.known, doubt=own.doubt)
         solver = self._trial.admm.on(problem.masked(self._trial.operator), problem.used_samples)
         for _ in steps:
             solver.step()
@@ -310,8 +389,13 @@ def _stronger(one: Candidate, other: Candidate) -> bool:
     return one.weight > other.weight or one.pace > other.pace or one.coefficients < other.coefficients
 
 
+def rounded(weight: float) -> float:
+    """To three digits, so that a search knows where it has been."""
+    return float(f"{weight:.3g}")
+
+
 def _weighed(by: float, candidate: Candidate) -> Candidate | None:
-    weight = float(f"{candidate.weight * by:.3g}")
+    weight = rounded(candidate.weight * by)
     return replace(candidate, weight=weight) if LEAST_WEIGHT <= weight <= LARGEST_WEIGHT else None
 
 
