@@ -61,6 +61,7 @@ CALM_S = 20.0
 """After the last stranger has gone: connections that nobody closed have had their time."""
 MOST_MORE = (4, 10)
 """Descriptors and threads beyond those of a process that is new; pools of threads fill once."""
+_SHARED = re.compile(r"/dev/shm/(\S+)")
 PART = re.compile(r"-\d+$")
 
 
@@ -216,7 +217,9 @@ class Host:
         while (left := self._processes()) and time.monotonic() < deadline:
             time.sleep(0.2)
         wrong = [f"process {each.pid} is left: {_words(each)}" for each in left]
-        return wrong + [f"shared memory is left: {name}" for name in _shared_memory() - self._shared]
+        return wrong + [
+            f"shared memory is left: {name}" for name in _shared_memory() - self._shared - _mapped()
+        ]
 
     def _processes(self) -> list[psutil.Process]:
         found = []
@@ -252,6 +255,15 @@ def _words(process: psutil.Process) -> str:
         return " ".join(process.cmdline())[-120:]
     except psutil.Error:
         return "?"
+
+
+def _mapped() -> set[str]:
+    """Names of shared memory that somebody on this host is using: it is theirs."""
+    found = set()
+    for maps in Path("/proc").glob("[0-9]*/maps"):
+        with contextlib.suppress(OSError):
+            found |= {name for line in maps.read_text().splitlines() for name in _SHARED.findall(line)}
+    return found
 
 
 def _shared_memory() -> set[str]:

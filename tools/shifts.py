@@ -149,6 +149,8 @@ class Operator:
             yield
         except AcquireError as error:
             self._night.refused[f"{what}: {type(error).__name__}"] += 1
+            if type(error) is AcquireError:  # of no kind that a user can do anything about
+                self._night.wrong.append(f"{what}: {error}")
             time.sleep(0.5)
         except Exception as error:  # noqa: BLE001 - it is told
             self._night.wrong.append(f"{what}: {type(error).__name__}: {error}")
