@@ -52,7 +52,7 @@ port = {port}
 scene = "{scene}"
 """
 SAMPLE_S = 2.0
-BACK_S = 60.0
+BACK_S = 120.0
 """systemd would wait longer than this for nobody."""
 END_S = 60.0
 LONG_S = 480.0
@@ -136,8 +136,9 @@ class Host:
             return False
 
     def _until_answers(self) -> None:
+        """Or is dead once more, which `keep` sees."""
         deadline = time.monotonic() + BACK_S
-        while not self.answers():
+        while self._daemon.poll() is None and not self.answers():
             if time.monotonic() > deadline:
                 raise TimeoutError(f"the daemon did not come back within {BACK_S:g} s: {self._log}")
             time.sleep(0.1)
