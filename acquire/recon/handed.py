@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from acquire.recon.blinking import EXPLAINED, go_on, look_in_cosines
 from acquire.recon.estimates import Preferred
+from acquire.recon.result import EXPLAINED as EXPLAINED_NOISE
 from acquire.recon.workbench import (
     FIRST_ITERATIONS,
     LARGEST_WEIGHT,
@@ -71,9 +72,10 @@ class Choice:
         return cls(prior, count, weight, pace, *told)
 
     def fits(self, error: float, noise: float) -> bool:
-        """Whether samples are predicted as closely as where it was chosen, of noise where that is known."""
+        """Whether samples are predicted as closely as where it was chosen, of noise where that is known; a
+        choice that did not explain its own is no measure."""
         if self.noise > 0 and noise > 0:
-            return error / noise <= AS_CLOSELY * self.error / self.noise
+            return error / noise <= AS_CLOSELY * min(self.error / self.noise, EXPLAINED_NOISE)
         return error <= AS_CLOSELY * self.error
 
     def kept(self, parameters: dict[str, Any]) -> bool:
