@@ -40,7 +40,7 @@ WIDER_SHARE = 0.5
 """Of a budget, after which nothing is made again in a wider band."""
 TENTATIVE_SHARE = 0.15
 """Of a budget, after which the search for the bandwidth hurries."""
-UNSEARCHED_SHARE = 0.2
+UNSEARCHED_SHARE = 0.4
 """Of a budget: where posing the problem alone took more, the bandwidth is not looked for."""
 PLAIN_ITERATIONS = 90
 """Of scenes that are not a few patterns: from here on, more iterations fit what voxels cannot hold."""

@@ -48,8 +48,6 @@ if TYPE_CHECKING:
 
 ITERATIONS_PER_TRIAL = 10
 """Of a preset's iterations, for each trial of a search."""
-REST_SHARE = 0.3
-"""Of a budget, by which the search for a better still ends where it is for a video."""
 OUTDONE = 0.6
 """Of the others' held-out error, what cosines must stay below to spare the search for a better volume."""
 FAR = 1.25
@@ -94,16 +92,32 @@ def solve_admm(segment: Segment, problem: Problem, options: SolveOptions, clock:
     if clock.spent(SEARCH_SHARE):
         clock.shortcuts.append("the budget left no time to try more than one kind of motion")
         return bench.finish(volume)
-    plain = bench.attempt(bench.fitting(STILL), FIRST_ITERATIONS)
-    explains = plain.error < min(EXPLAINED, FAR * volume.error)
-    still = best_still(plain, trials, merge=options.spatial_merge, share=REST_SHARE) if explains else plain
-    rests = still.error < EXPLAINED and not held_out.clearly_less(volume.errors, still.errors)
-    first = look_in_cosines(segment, problem, options, clock, still.coefficients if rests else None)
+    return _beside_cosines(bench, segment, options, volume, trials)
+
+
+def _beside_cosines(
+    bench: Workbench, segment: Segment, options: SolveOptions, volume: Trial, trials: int
+) -> Estimate:
+    """A still, cosines and whatever else may win beside a first volume.
+
+    Cosines come before the better stills: what blinks needs most of a budget for itself, and a still of it
+    may explain the lines to 10 % all the same.
+    """
+    problem, clock, held_out = bench.problem, bench.clock, bench.held_out
+    still = plain = bench.attempt(bench.fitting(STILL), FIRST_ITERATIONS)
+    rests = plain.error < EXPLAINED and not held_out.clearly_less(volume.errors, plain.errors)
+    first = look_in_cosines(segment, problem, options, clock, plain.coefficients if rests else None)
     bench.note({"prior": "cosines"} | first.facts(), first.predict())
-    best = _better(volume, still)
-    if bench.error(first.predict()) > OUTDONE * best.error:
+    best, error = _better(volume, plain), bench.error(first.predict())
+    ahead = error <= OUTDONE * best.error
+    blinks = ahead and _in_patterns(first)
+    if plain.error < min(EXPLAINED, FAR * volume.error) and not blinks:
+        still = best_still(plain, trials, merge=options.spatial_merge)
+        best = _better(volume, still)
+        ahead = error <= OUTDONE * best.error
+    if not ahead:
         best = _search(bench, plain, still, volume, first, trials)
-    elif not clock.spent(SEARCH_SHARE) and not _in_patterns(first):
+    elif not clock.spent(SEARCH_SHARE) and not blinks:
         best = _challenge(bench, plain, first, trials) or best
     if _worth_going_on(bench, first, still, best):
         blinking = go_on(segment, problem, options, clock, first)

@@ -21,20 +21,19 @@ FINER_WEIGHT = 2
 long in pixels, and its lines' response to one N_m to the third or fourth power less."""
 
 
-def best_still(still: Trial, trials: int, *, merge: int, share: float = SEARCH_SHARE) -> Trial:
+def best_still(still: Trial, trials: int, *, merge: int) -> Trial:
     """The best of a still in voxels of ``merge`` fine pixels, in fine pixels, and in either made robust.
 
-    Looked for until ``share`` of a budget is spent.
+    Looked for until the search's share of a budget is spent.
     """
-    bench = still.bench.on(still.bench.problem, share=share)
-    best = replace(still, bench=bench)
-    if merge > 1 and not bench.clock.spent(share):
+    bench, best = still.bench, still
+    if merge > 1 and not bench.clock.spent(SEARCH_SHARE):
         weight = rounded(still.candidate.weight * merge)  # lower: it has no error of its own to hold back
         finer = replace(still.candidate, fine=True, weight=weight)
         fine = bench.on(bench.problem, fine=True).attempt(finer, FIRST_ITERATIONS, still)
         best = fine if fine.error < still.error else best
     best = best.bench.climb(best, trials)
-    if bench.clock.spent(share):
+    if bench.clock.spent(SEARCH_SHARE):
         return best
     doubting = best.bench.on(best.bench.problem.doubting(best.bench.predict(best)))
     robust = doubting.attempt(replace(best.candidate, robust=True), NEXT_ITERATIONS, best)

@@ -126,11 +126,10 @@ class Workbench:
         *,
         fine: bool = False,
         beside: Array | None = None,
-        share: float = SEARCH_SHARE,
     ) -> None:
         self._segment, self.problem, self.clock, self.held_out = segment, problem, clock, held_out
         self._options, self._notes = options, notes or Notes()
-        self.fine, self.beside, self._share = fine, beside, share
+        self.fine, self.beside = fine, beside
         self._merges = (1 if fine else options.spatial_merge, options.temporal_merge)
         self.merge = options.spatial_merge if fine else 1
         self.frames, self._side, _ = segment.geometry.video_shape(*self._merges)
@@ -142,19 +141,10 @@ class Workbench:
     def record(self) -> list[dict[str, Any]]:
         return self._notes.record
 
-    def on(
-        self,
-        problem: Problem,
-        *,
-        fine: bool | None = None,
-        beside: Array | None = None,
-        share: float | None = None,
-    ) -> Workbench:
-        """Another for the same lines: with other weights, ``fine``, for what changes ``beside`` light, or
-        with another share of the budget."""
+    def on(self, problem: Problem, *, fine: bool | None = None, beside: Array | None = None) -> Workbench:
+        """Another for the same lines: with other weights, ``fine``, or for what changes ``beside`` light."""
         kept = self._segment, problem, self._options, self.clock, self.held_out, self._notes
-        fine, share = self.fine if fine is None else fine, self._share if share is None else share
-        return Workbench(*kept, fine=fine, beside=beside, share=share)
+        return Workbench(*kept, fine=self.fine if fine is None else fine, beside=beside)
 
     def merged(self, theta: Array) -> Array:
         """Coefficients of the voxels that were asked for."""
@@ -167,7 +157,7 @@ class Workbench:
 
         It is not followed up from an error of more than ``most``.
         """
-        if self.clock.spent(self._share):
+        if self.clock.spent(SEARCH_SHARE):
             return None
         lit = still
         for _ in range(BRIGHT_STILLS):
@@ -227,7 +217,7 @@ class Workbench:
                 denoiser.resume(start.denoiser)
         trial = Trial(self, candidate, admm, denoiser, basis, operator, brightness, np.zeros(0), np.inf)
         began = self.clock.seconds
-        for _ in self.clock.attempt(iterations, "choose", self._share):
+        for _ in self.clock.attempt(iterations, "choose", SEARCH_SHARE):
             admm.step()
         errors = self.note(asdict(trial.candidate), self.predict(trial), began)
         trial = replace(trial, errors=errors, error=self.held_out.relative(errors))
@@ -280,7 +270,7 @@ class Workbench:
             moving = False
             for step in self._steps(best.candidate):
                 while (candidate := step(best.candidate)) is not None and candidate not in seen:
-                    if len(seen) > trials or self.clock.spent(self._share):
+                    if len(seen) > trials or self.clock.spent(SEARCH_SHARE):
                         return best
                     seen.add(candidate)
                     found = self.attempt(candidate, NEXT_ITERATIONS, best)
