@@ -20,7 +20,6 @@ from acquire.cli.recordings import PlaceArgument
 from acquire.cli.stretch import FirstLineOption, FromOption, LinesOption, ToOption
 from acquire.cli.tiles import TilesOption, tiles_of
 from acquire.errors import EXIT_INTERRUPTED, UsageError
-from acquire.showing import error_in_words
 
 if TYPE_CHECKING:
     from acquire.cli.reconstruct_request import Asked, Prepared
@@ -339,6 +338,8 @@ def _report(outcomes: list[Outcome], *, json: bool, brief: bool) -> None:
 
 
 def _readable(outcome: Outcome) -> dict[str, Any]:
+    from acquire.showing import error_in_words
+
     facts = outcome.provenance
     first, end = facts["trusted"]
     quality, prediction = facts["quality"], facts["quality"]["prediction"]
