@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 SEALED_S = 120.0
 """Longest wait for a recording to be sealed, beside the time that its lines take."""
 POLL_S = 0.1
+CALM_S = 1.0
+"""Without a command under way: time for one to begin that was sent just before this was interrupted."""
 TRIES = 3
 BY = "ACQUIRE_BY"
 """Environment variable: who asked for this, where it is the page that carries it out for them."""
@@ -45,10 +47,12 @@ def instrument(socket: Path | None, directory: Path) -> Iterator[Client]:
                 f"the daemon is {status.state}", possible="idle or armed", hint="acquire stop, or disarm"
             )
         directory.mkdir(parents=True, exist_ok=True)
+        calm_s = CALM_S
         try:
             yield daemon
+            calm_s = 0.0  # every command has been answered
         finally:
-            if _settled(daemon).run_id != status.run_id:
+            if _settled(daemon, calm_s).run_id != status.run_id:
                 _leave(daemon, directory, armed=status.state == "armed")
 
 
@@ -120,12 +124,21 @@ def wait_for_enter() -> None:
         raise StateError("nobody is there to press Enter", hint="--yes, where everything is in place")
 
 
-def _settled(daemon: Client) -> Status:
-    """The status once no command is under way: an interrupt does not call back an arm that has been sent."""
-    deadline = time.monotonic() + SEALED_S
-    while (status := daemon.status()).busy is not None and time.monotonic() < deadline:
+def _settled(daemon: Client, calm_s: float) -> Status:
+    """The status once no command has been under way for so long.
+
+    An interrupt does not call back an arm that has been sent.
+    """
+    begun = busy_at = time.monotonic()
+    while True:
+        status, now = daemon.status(), time.monotonic()
+        if status.busy is not None:
+            busy_at = now
+        elif now - busy_at >= calm_s:
+            return status
+        if now - begun >= SEALED_S:
+            return status
         time.sleep(POLL_S)
-    return status
 
 
 def _leave(daemon: Client, directory: Path, *, armed: bool) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import sys
 import threading
+import time
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
@@ -18,6 +20,27 @@ if TYPE_CHECKING:
 END_NOW = "acquire-end-now"
 GRACE_S = 3.0
 """After the second Ctrl-C, for what is half-made to be removed."""
+SAME_S = 1.0
+"""Interrupts this close together are one Ctrl-C: where a parent of many threads is killed, the kernel sends
+its death signal once for each of them, and some wrappers hand on what the terminal has sent already."""
+
+
+class _Presses:
+    """Of Ctrl-C, as a person presses it, whoever answers at the time."""
+
+    def __init__(self) -> None:
+        self._counted_at = -math.inf
+
+    def another(self) -> bool:
+        """Whether this interrupt is another one, not the last one's echo."""
+        now = time.monotonic()
+        counts = now - self._counted_at >= SAME_S
+        if counts:
+            self._counted_at = now
+        return counts
+
+
+_presses = _Presses()
 
 
 @contextmanager
@@ -29,6 +52,8 @@ def first_interrupt_asks(finishing: str) -> Iterator[threading.Event]:
     asked = threading.Event()
 
     def interrupted(_number: int, _frame: object) -> None:
+        if not _presses.another():
+            return
         if asked.is_set():
             _end_now()
         asked.set()
@@ -44,6 +69,8 @@ def interrupts_answered() -> Iterator[None]:
     asked = threading.Event()
 
     def interrupted(_number: int, _frame: object) -> None:
+        if not _presses.another():
+            return
         if asked.is_set():
             _end_now()
         asked.set()

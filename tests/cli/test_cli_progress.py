@@ -16,7 +16,7 @@ from collections.abc import Callable
 import pytest
 
 from acquire.cli import progress as module
-from acquire.cli.interrupts import END_NOW, first_interrupt_asks, interrupts_answered
+from acquire.cli.interrupts import END_NOW, _Presses, first_interrupt_asks, interrupts_answered
 from acquire.cli.progress import Progress, span
 
 LIMIT_S = 30.0
@@ -115,7 +115,11 @@ def test_a_terminal_gets_a_bar() -> None:
     assert "30 of 40" in said
 
 
-def test_ctrl_c_is_answered_before_anything_ends(capsys: pytest.CaptureFixture[str]) -> None:
+def test_ctrl_c_is_answered_before_anything_ends(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("acquire.cli.interrupts.SAME_S", 0.0)
+
     def interrupted() -> None:
         with interrupts_answered():
             try:
@@ -129,7 +133,11 @@ def test_ctrl_c_is_answered_before_anything_ends(capsys: pytest.CaptureFixture[s
     assert said == ["acquire: interrupted, ending; Ctrl-C once more to end now\n"]
 
 
-def test_the_first_ctrl_c_finishes_and_the_second_ends(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_first_ctrl_c_finishes_and_the_second_ends(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("acquire.cli.interrupts.SAME_S", 0.0)
+
     def interrupted_twice() -> None:
         with interrupts_answered(), first_interrupt_asks("finishing the segment") as asked:
             signal.raise_signal(signal.SIGINT)
@@ -145,3 +153,14 @@ def test_the_first_ctrl_c_finishes_and_the_second_ends(capsys: pytest.CaptureFix
         if thread.name == END_NOW:
             thread.join(LIMIT_S)
             assert not thread.is_alive()
+
+
+def test_interrupts_close_together_are_one_ctrl_c(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("acquire.cli.interrupts.SAME_S", LIMIT_S)
+    monkeypatch.setattr("acquire.cli.interrupts._presses", _Presses())
+    with interrupts_answered():
+        with first_interrupt_asks("finishing the segment") as asked:
+            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)  # the echo may come after the work has ended in good order
+    assert asked.is_set()

@@ -6,11 +6,13 @@ import json
 import os
 import signal
 import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
+import psutil
 import pytest
-from live_daemon import COMMAND, Daemon
+from live_daemon import COMMAND, Daemon, until_gone
 from waiting import until
 
 from acquire.calibrate import Measured, open_calibration, save_calibration
@@ -69,6 +71,45 @@ def test_a_sweep_that_is_interrupted_keeps_what_it_has(tmp_path: Path) -> None:
         again = json.loads(daemon("calibrate", "delay", *places, "--out", "again.zarr", "--json").out)
         assert again["light_late_ticks"] == pytest.approx(late.value.tolist())
         _is_not_replaced_by_less(tmp_path, places)
+    finally:
+        daemon.close()
+
+
+PAGE = """
+import subprocess, sys, threading
+
+step = subprocess.Popen([sys.executable, "-m", "acquire.web.worker", *sys.argv[1:]], process_group=0)
+print(step.pid, flush=True)
+for _ in range(16):
+    threading.Thread(target=threading.Event().wait).start()
+"""
+"""Of many threads, as the page has: the kernel tells the step of the death of each of them."""
+
+
+def test_a_step_whose_page_is_killed_leaves_the_instrument_as_it_was(tmp_path: Path) -> None:
+    (tmp_path / "scene.toml").write_text(SCENE)
+    daemon = Daemon(tmp_path, "trigger.substep_ticks=900", f"simulation.scene='{tmp_path}/scene.toml'")
+    try:
+        words = ["calibrate", "delay", "--out", "cal.zarr", "--yes", "--lines", "1024"]
+        with subprocess.Popen(
+            [sys.executable, "-c", PAGE, *words],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            cwd=tmp_path,
+            env=os.environ | {"ACQUIRE_SOCKET": str(daemon.socket)},
+        ) as page:
+            assert page.stdout is not None
+            step = psutil.Process(int(page.stdout.readline()))
+            second = tmp_path / "calibration-recordings" / "delay-2.zarr"
+            until(lambda: second.exists() or not step.is_running())
+            with daemon.client() as client:
+                until(lambda: client.status().busy is not None or not step.is_running())  # often an arm
+            page.kill()
+            until_gone([step])
+        with daemon.client() as client:
+            status = client.status()
+            assert (status.state, status.busy) == ("idle", None)
     finally:
         daemon.close()
 
