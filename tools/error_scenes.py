@@ -1,10 +1,16 @@
-"""Scenes on which the estimate of a video's error was not calibrated (`tools/bench_error.py`).
+"""Scenes for the estimate of a video's error (`tools/bench_error.py`): it is fitted to those of `SCENES`, and
+judged by those that were kept (`KEPT`), which nothing was fitted to or chosen by.
 
     leds goldfish digits usaf   the paper's, from configs/
     pan zoom turn               a photograph that moves, grows, turns
     curtain dissolve            one photograph slides over another, fades into it
     lamps                       two photographs that blink at 0.8 and 3.1 kHz, side by side
     rain bubbles                streaks that fall fast, discs that rise on a slope of light
+
+    swing fan shadow pulse      kept: a rod that swings, blades that turn, a soft shadow that passes, a spot
+                                whose brightness beats, before a photograph
+    ripples smoke               kept: waves of two sources; what drifts before a photograph, half transparent
+    typing flashes              kept: squares that appear one by one, and lights that flare and fade
 
 The photographs are scikit-image's. Sizes are shares of the picture and times shares of the span.
 """
@@ -133,8 +139,101 @@ def bubbles(s: Stage) -> Frame:
     return frame
 
 
+def swing(s: Stage) -> Frame:
+    photo, far, turns = _photograph(s), s.rng.uniform(0.3, 0.8), s.rng.uniform(0.5, 1.2)
+
+    def frame(_t: int, tau: float) -> NDArray[np.float32]:
+        rod = s.limb(0.05, 0.5, far * np.cos(2 * np.pi * turns * tau), 0.7, 0.07)
+        return np.asarray(photo * (1 - rod) + 0.9 * rod, np.float32)
+
+    return frame
+
+
+def fan(s: Stage) -> Frame:
+    photo, turns = _photograph(s), s.rng.uniform(0.2, 0.5)
+    angle, far = np.arctan2(s.y - 0.5, s.x - 0.5), np.hypot(s.y - 0.5, s.x - 0.5)
+
+    def frame(_t: int, tau: float) -> NDArray[np.float32]:
+        blade = s.inside(0.1 * (0.3 - np.cos(3 * (angle - 2 * np.pi * turns * tau)))) * s.inside(far - 0.4)
+        return np.asarray(photo * (1 - 0.9 * blade), np.float32)
+
+    return frame
+
+
+def ripples(s: Stage) -> Frame:
+    (ys, xs), periods = s.rng.uniform(0.2, 0.8, (2, 2)), s.rng.uniform(1.5, 4, 2)
+    far = [np.hypot(s.y - y, s.x - x) for y, x in zip(ys, xs, strict=True)]
+
+    def frame(_t: int, tau: float) -> NDArray[np.float32]:
+        both = sum(np.cos(2 * np.pi * (r / 0.15 - p * tau)) for r, p in zip(far, periods, strict=True))
+        return np.asarray(0.5 + 0.22 * both, np.float32)
+
+    return frame
+
+
+def smoke(s: Stage) -> Frame:
+    layers, photo = [s.texture(0.03, 0.1, 0.2) for _ in range(2)], _photograph(s)
+    ways = s.rng.uniform(-0.4, 0.4, (2, 2))
+
+    def frame(_t: int, tau: float) -> NDArray[np.float32]:
+        moved = [
+            affine_transform(layer, np.eye(2), -tau * way * s.n, (s.n, s.n), order=1, mode="grid-wrap")
+            for layer, way in zip(layers, ways, strict=True)
+        ]
+        thick = moved[0] * moved[1]
+        return np.asarray(photo * (1 - thick) + 0.8 * thick, np.float32)
+
+    return frame
+
+
+def typing(s: Stage) -> Frame:
+    ground, keys = 0.25 * _photograph(s), s.rng.random((5, 6))
+    cells = [(s.box(0.15 + 0.16 * r, 0.12 + 0.15 * c, 0.1, 0.09), keys[r, c]) for r, c in np.ndindex(5, 6)]
+
+    def frame(_t: int, tau: float) -> NDArray[np.float32]:
+        image = ground
+        for cell, begins in cells:
+            image = np.maximum(image, 0.8 * cell * (tau > begins))
+        return np.asarray(image, np.float32)
+
+    return frame
+
+
+def pulse(s: Stage) -> Frame:
+    photo, (y, x), times = _photograph(s), s.rng.uniform(0.3, 0.7, 2), s.rng.uniform(3, 8)
+    spot = np.exp(-(np.square(s.y - y) + np.square(s.x - x)) / 0.05)
+
+    def frame(_t: int, tau: float) -> NDArray[np.float32]:
+        return np.asarray(
+            photo * (1 - 0.6 * spot * (0.5 - 0.5 * np.cos(2 * np.pi * times * tau))), np.float32
+        )
+
+    return frame
+
+
+def shadow(s: Stage) -> Frame:
+    photo, angle = _photograph(s), s.rng.uniform(0, 2 * np.pi)
+    along = (s.x - 0.5) * np.cos(angle) + (s.y - 0.5) * np.sin(angle)
+    return lambda _t, tau: np.asarray(
+        photo * (0.3 + 0.7 / (1 + np.exp((along + 0.6 - 1.2 * tau) / 0.06))), np.float32
+    )
+
+
+def flashes(s: Stage) -> Frame:
+    ground, found = 0.4 * _photograph(s), s.rng.uniform([0.1, 0.1, 0.1, 0.02], [0.9, 0.9, 0.9, 0.08], (8, 4))
+
+    def frame(_t: int, tau: float) -> NDArray[np.float32]:
+        image = ground
+        for y, x, at, lasts in found:
+            image = image + 0.6 * s.ball(y, x, 0.06) * float(np.exp(-(((tau - at) / lasts) ** 2)))
+        return np.asarray(image, np.float32)
+
+    return frame
+
+
 OF_OUR_OWN = {each.__name__: each for each in (pan, zoom, turn, curtain, dissolve, lamps, rain, bubbles)}
 SCENES = (*OF_THE_PAPER, *OF_OUR_OWN)
+KEPT = {each.__name__: each for each in (swing, fan, ripples, smoke, typing, pulse, shadow, flashes)}
 
 
 def record(name: str, seed: int, *, stages: int, substeps: int, lines: int, camera: Camera) -> Recorded:
@@ -145,8 +244,8 @@ def record(name: str, seed: int, *, stages: int, substeps: int, lines: int, came
         scene = build_scene(load_scene(OF_THE_PAPER[name]), geometry.size, 1 / SUBSTEP_HZ)
         light = truth(scene, FIRST_SUBSTEP * seed, geometry.span, 1, 1)
     else:
-        drawn = 1000 * seed + SCENES.index(name)  # or all would show the same photograph
-        frame = OF_OUR_OWN[name](Stage(geometry.size, geometry.span, drawn))
+        drawn = 1000 * seed + [*SCENES, *KEPT].index(name)  # or all would show the same photograph
+        frame = (OF_OUR_OWN | KEPT)[name](Stage(geometry.size, geometry.span, drawn))
         light = np.stack([frame(t, t / (geometry.span - 1)) for t in range(geometry.span)])
     light = np.asarray(light, np.float32)
     exact = DualArm(geometry, code).forward(light).astype(np.float64)

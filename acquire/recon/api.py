@@ -14,7 +14,7 @@ from acquire.cores import idle_cores, limit_threads
 from acquire.recon.balance import balance_of, divided
 from acquire.recon.clock import IterationClock
 from acquire.recon.denoisers import open_denoiser
-from acquire.recon.error import estimate_error
+from acquire.recon.error import AS_LONG_AS, estimate_error
 from acquire.recon.faster import tell_faster_light
 from acquire.recon.judge import frame_error, judge
 from acquire.recon.least import check_budget, least_seconds
@@ -93,8 +93,8 @@ def reconstruct(
     stop : asked after every iteration; once set, the best so far is returned
     refuse : a budget that cannot be kept here; else as little as possible is done
     check : where the lines are not explained, ask what would explain them (a second); see `recon.told`
-    error : estimate how far the video is from the truth, which takes a tenth of the time and is left out
-        where a budget has none; see `recon.error`
+    error : estimate how far the video is from the truth, for which up to 15 % of a budget are kept; see
+        `recon.error`
     look : called after iterations, with what the answer would be if it ended there; its time does not count
 
     Raises
@@ -132,6 +132,8 @@ def reconstruct(
             least_s = least_seconds(segment.geometry, spatial_merge, temporal_merge, solver)
             check_budget(clock, budget_s, least_s)
         problem = build_problem(segment, spatial_merge, temporal_merge, hold_out=held_out, arrays=arrays)
+        if error and chosen.goes_on and static_image is None:
+            clock.reserve(AS_LONG_AS)
         if look is not None:
             clock.looks = _looking(look, problem, chosen)
         estimate = _solve(segment, problem, options, chosen, clock)

@@ -65,6 +65,7 @@ class AdmmSolver(Solver):
     """Ridge ADMM with whichever prior predicts best; ends sooner when the held-out samples say so."""
 
     iterations: ClassVar[Mapping[Preset, int]] = {"fast": 40, "balanced": 150, "best": 300}
+    goes_on: ClassVar[bool] = True
     takes: ClassVar[frozenset[str]] = frozenset({"initial", "denoiser", "choice"})
 
     def solve(

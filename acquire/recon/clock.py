@@ -28,6 +28,10 @@ FINISH_ITERATIONS = 1.5
 REMEMBERED = 20
 """Iterations of which the longest is what the next may take; some do more than others, as every 20th of a
 refinement."""
+RESERVED_SHARE = 0.15
+"""Of a budget, the most that is kept for iterations after the last."""
+SLOWER = 1.1
+"""Than the longest before it an iteration of these may be."""
 FIRST_OF_STAGE = 4.0
 """The first of another stage may take so many times the longest before it."""
 
@@ -60,6 +64,7 @@ class IterationClock:
         self._compiled_before, self._aside_s = compiled_s(), 0.0
         self._processor_began_s = time.process_time()
         self._lately_s: deque[float] = deque(maxlen=REMEMBERED)
+        self._reserved = 0.0
 
     @property
     def seconds(self) -> float:
@@ -85,6 +90,26 @@ class IterationClock:
         """The longest iteration of late; 0 before the first."""
         return max(self._lately_s, default=0.0)
 
+    @property
+    def mean_s(self) -> float:
+        """An iteration of late in the mean; 0 before the first."""
+        return sum(self._lately_s) / max(1, len(self._lately_s))
+
+    def reserve(self, iterations: float) -> None:
+        """Keep time for so many after the last of the solver's (`afterwards`), as long as those of late."""
+        self._reserved = iterations
+
+    def afterwards(self, most: int) -> Iterator[int]:
+        """Yields before each iteration that time was kept for: nothing is kept from now on."""
+        self._reserved = 0.0
+        lately = self._lately_s = deque(maxlen=REMEMBERED)
+        for made in range(most):
+            if self.asked or not self.affords(SLOWER * self.longest_s):
+                return
+            begun = self.seconds
+            yield made
+            lately.append(self.seconds - begun)
+
     def run(
         self, most: int, stage: str, share: float = 1.0, video: Callable[[], NDArray[Any]] | None = None
     ) -> Iterator[int]:
@@ -96,7 +121,8 @@ class IterationClock:
         """
         last = min(self.done + most, self.iterations)
         expected = FIRST_OF_STAGE * self.longest_s
-        lately = self._lately_s = deque(maxlen=REMEMBERED)
+        before, lately = self._lately_s, deque[float](maxlen=REMEMBERED)
+        self._lately_s = lately
         while self.done < last and self._may_go_on(expected, share):
             begun = self.seconds
             yield self.done
@@ -109,7 +135,7 @@ class IterationClock:
             if video is not None:
                 self.show(stage, video)
         if not lately:
-            lately.append(expected / FIRST_OF_STAGE)
+            self._lately_s = before
 
     def attempt(self, most: int, stage: str, share: float = 1.0) -> Iterator[int]:
         """As `run`, for iterations beside the limit, of a trial that may come to nothing; one is made.
@@ -143,6 +169,7 @@ class IterationClock:
         if self._budget_s is None:
             return True
         finish_s = FINISH_SHARE * self._budget_s + FINISH_ITERATIONS * self.longest_s
+        finish_s += min(self._reserved * self.mean_s, RESERVED_SHARE * self._budget_s)
         return self.seconds + seconds <= min(share * self._budget_s, self._budget_s - finish_s)
 
     def begin_anew(self) -> None:

@@ -34,6 +34,8 @@ class Solver(FrozenModel, ABC):
         that is shorter is refused
     signed : it may find light below zero; else that is cut off at the end
     holds_out : samples are kept from it, by which its prediction is judged
+    goes_on : its estimates can be gone on with (`acquire.recon.estimates.GoesOn`): of a budget, time is kept
+        for the error of the video, which is estimated by that
     takes : which of ``initial`` and ``denoiser`` it knows
     """
 
@@ -41,6 +43,7 @@ class Solver(FrozenModel, ABC):
     passes: ClassVar[float] = 14.0
     signed: ClassVar[bool] = False
     holds_out: ClassVar[bool] = True
+    goes_on: ClassVar[bool] = False
     takes: ClassVar[frozenset[str]] = frozenset()
 
     @abstractmethod

@@ -84,6 +84,22 @@ def test_the_first_iteration_is_made_even_too_late(wall: Wall) -> None:
     assert list(clock.run(10, "solve")) == [0]
 
 
+def test_time_is_kept_for_what_goes_on_after_the_last_iteration(wall: Wall) -> None:
+    clock = IterationClock(1000, 10.0)
+    clock.reserve(10)
+    for _ in clock.run(1000, "solve"):
+        wall.now += 0.1
+    assert 8.3 < clock.seconds <= 9.0
+    for _ in clock.afterwards(1000):
+        wall.now += 0.1
+    assert 9.3 < clock.seconds <= 10.0
+    clock = IterationClock(1000, 10.0)
+    clock.reserve(1000)
+    for _ in clock.run(1000, "solve"):
+        wall.now += 0.01
+    assert clock.seconds == pytest.approx(8.3, abs=0.1)  # no more than 15 % are kept
+
+
 def test_compiling_is_no_part_of_the_time() -> None:
     began = time.monotonic()
     clock = IterationClock(10, 1.0)

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import threading
+import time
 from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
-from acquire.recon import Reconstruction, reconstruct
+from acquire.recon import Reconstruction, api, reconstruct
+from acquire.recon import clock as clocks
 from acquire.recon.error import (
     REGIONS,
     Clues,
@@ -84,6 +87,20 @@ def test_nothing_is_claimed_where_nothing_can_be_known() -> None:
     assert np.isnan(in_frames(wrong.error, 5)).all()
 
 
+@pytest.mark.parametrize("scene", ["splash", "leds", "still"])
+def test_a_budget_leaves_time_to_tell_it(scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By processor time, since a busy machine leaves a wall clock's budget with one iteration."""
+    own = SimpleNamespace(monotonic=time.process_time, process_time=time.process_time)
+    monkeypatch.setattr(clocks, "time", own)
+    monkeypatch.setattr(api, "time", own)
+    whole_s = solved(scene).processor_s
+    for share in (0.4, 0.7):
+        began_s = time.process_time()
+        result = reconstruct(recorded(scene).segment, 3, 1, budget_s=share * whole_s, refuse=False)
+        assert isinstance(result.error, VideoError), result.error
+        assert time.process_time() - began_s < 1.1 * share * whole_s + 0.3
+
+
 @pytest.mark.parametrize("side", [1, 5, 8, 20, 33])
 def test_regions_hold_all_voxels_alike(side: int) -> None:
     frames = np.random.default_rng(side).random((3, side, side))
@@ -101,6 +118,7 @@ def test_an_error_has_degree_one_in_its_clues() -> None:
     assert np.allclose(twice.regions, 2 * once.regions)
     unsure = from_clues(Clues(0.2, 2.0, 2 * moved, change, edge), EVERY)
     assert unsure.rms > once.rms
+    assert np.sqrt(np.square(once.frames).mean()) == pytest.approx(once.rms)
 
 
 def test_sub_segments_are_told_together() -> None:
