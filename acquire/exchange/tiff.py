@@ -6,6 +6,7 @@ The image lies in one piece behind the header, so that it is written as it is re
 from __future__ import annotations
 
 import json
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -85,4 +86,6 @@ def _ome(content: Content) -> dict[str, Any]:
     for axis in (y, x):
         letter, unit = axis.name.upper(), "µm" if axis.unit == "um" else axis.unit
         facts |= {f"PhysicalSize{letter}": axis.step, f"PhysicalSize{letter}Unit": unit}
+    began = datetime.fromtimestamp(content.facts["first_frame_utc_ns"] // 10**9, UTC).replace(tzinfo=None)
+    facts["AcquisitionDate"] = began.isoformat()  # of OME: UTC, without saying so
     return {**facts, "TimeIncrement": time.step, "TimeIncrementUnit": "s"}

@@ -64,7 +64,9 @@ def test_ome_tiff_says_the_same(cli: Cli, video: Path, tmp_path: Path) -> None:
         assert file.is_bigtiff
         assert file.series[0].axes == "TYX"
         np.testing.assert_array_equal(file.asarray(), open_video(video).video[3:17])
-        pixels = tifffile.xml2dict(file.ome_metadata)["OME"]["Image"]["Pixels"]
+        image = tifffile.xml2dict(file.ome_metadata)["OME"]["Image"]
+    pixels, began = image["Pixels"], np.datetime64(int(open_video(video).time_ns[3]), "ns")
+    assert np.datetime64(str(image["AcquisitionDate"]).removesuffix("Z")) == began.astype("datetime64[s]")
     assert (pixels["PhysicalSizeX"], pixels["PhysicalSizeXUnit"]) == (2.5, "µm")
     assert float(pixels["TimeIncrement"]) == pytest.approx(1e-5)
 
