@@ -236,7 +236,7 @@ class Client:
                 connection.request("GET", path, headers=headers)
                 response = connection.getresponse()
                 if response.status >= core.BAD:
-                    content = response.read(core.MOST_BYTES)
+                    content = _content(response)
                     core.fact("events", Status).read(response.status, content, self._target)
                 while line := response.readline(core.MOST_LINE_BYTES):
                     yield from reader.take(line.decode().rstrip("\r\n"))
@@ -264,7 +264,7 @@ class Client:
                 if call.method == "POST" and connection.sock is not None:
                     self._await_answer(connection.sock, call.timeout_s)
                 response = connection.getresponse()
-                return call.read(response.status, response.read(core.MOST_BYTES), self._target)
+                return call.read(response.status, _content(response), self._target)
             except TimeoutError as error:
                 raise NoDaemonError(
                     f"the daemon on {self._target} gave no answer to {call.name} within {call.timeout_s:g} s"
@@ -318,6 +318,14 @@ class Client:
 
 class _BrokenError(NoDaemonError):
     """The connection broke after the request was sent: whether it was carried out is not known."""
+
+
+def _content(response: http.client.HTTPResponse) -> bytes:
+    """All of it. Raises IncompleteRead where it broke off, which a bounded read hides."""
+    content = response.read(core.MOST_BYTES)
+    if response.length:
+        raise http.client.IncompleteRead(content, response.length)
+    return content
 
 
 def connect_to_page(target: Target) -> socket.socket:

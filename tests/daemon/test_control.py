@@ -9,7 +9,7 @@ import logging
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import httpx
@@ -17,7 +17,7 @@ import pytest
 from fake_run import FakeRun, rig_config
 
 from acquire import errors
-from acquire.client import Client, core
+from acquire.client import AsyncClient, Client, core
 from acquire.daemon import connections
 from acquire.daemon import server as server_module
 from acquire.daemon.endpoint import Endpoint
@@ -181,10 +181,22 @@ def test_daemon_that_does_not_answer(path: Path, monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.parametrize(
-    ("answer", "kind"),
-    [(b"", NoDaemonError), (b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\n{}", AcquireError)],
+    ("answer", "told"),
+    [
+        (b"", "went away"),
+        (b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\n", "went away"),
+        (b"HTTP/1.1 200 OK\r\nContent-Length: 200\r\n\r\n{}", "went away"),
+        (b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\n{}", "another version"),
+    ],
 )
-def test_daemon_that_answers_strangely(path: Path, answer: bytes, kind: type[AcquireError]) -> None:
+@pytest.mark.parametrize(
+    "ask",
+    [lambda socket: Client(socket).status(), lambda socket: asyncio.run(AsyncClient(socket).status())],
+    ids=["blocking", "async"],
+)
+def test_daemon_that_answers_strangely(
+    path: Path, answer: bytes, told: str, ask: Callable[[Path], object]
+) -> None:
     odd = path.with_name("odd.sock")
     odd.unlink(missing_ok=True)
     with socket.socket(socket.AF_UNIX) as listener:
@@ -198,8 +210,8 @@ def test_daemon_that_answers_strangely(path: Path, answer: bytes, kind: type[Acq
 
         thread = threading.Thread(target=reply)
         thread.start()
-        with Client(odd) as client, pytest.raises(kind):
-            client.status()
+        with pytest.raises(AcquireError, match=told):
+            ask(odd)
         thread.join(300)
 
 
