@@ -81,11 +81,13 @@ def export(
     """Write a video, or the lines of a recording, as TIFF, HDF5 (NeXus), NumPy file or MP4.
 
     Of a video the trusted frames alone are written, unless you ask for all of them. The file says where it
-    comes from; .npy holds the numbers alone.
+    comes from; .npy holds the numbers alone. The error that a video tells of its regions is taken along but
+    for .npy and .mp4, which have no place for it.
 
     Example: [bold]acquire export video.zarr video.tif --from 2ms --to 5ms[/]
     """
     from acquire.exchange import export as write
+    from acquire.exchange import left_out
     from acquire.exchange.export import format_for
     from acquire.store import format_of, open_recording, open_video
     from acquire.store.files import check_new_path
@@ -104,11 +106,15 @@ def export(
         content = _of_recording(opened, _Part(first_line, lines, begin, end), average)
     with stage_progress(f"writing {out.name}, MB") as advance:
         size = write(content, out, lambda done, total: advance(done / 1e6, total / 1e6), fps=fps, peak=peak)
+    missing = left_out(content, out)
     if json:
-        print_json({"path": str(out), "bytes": size, "shape": content.image.shape, **content.facts})
+        told = {"path": str(out), "bytes": size, "shape": content.image.shape, **content.facts}
+        print_json(told | ({"left_out": missing} if missing else {}))
     else:
         shape = " × ".join(map(str, content.image.shape))
         say(f"{out}: {shape} ({', '.join(content.image.dims)}), {quantity(size, 'B')}")
+    if missing:
+        print_warning(f"{out.name} has no place for the estimated error of regions: .tif, .h5 and .npz have")
     if content.untrusted:
         print_warning(
             f"{content.untrusted} of {content.image.shape[0]} frames are not trusted: sampled in part"

@@ -12,7 +12,7 @@ these files need are imported when one is asked for; the extra ``[export]`` brin
 
 from acquire.exchange.code_words import parse_code
 from acquire.exchange.content import Content
-from acquire.exchange.export import SUFFIXES, check_export, export
+from acquire.exchange.export import SUFFIXES, check_export, export, left_out
 from acquire.exchange.foreign import Layout, LineFile, open_lines
 from acquire.exchange.from_recording import recording_content
 from acquire.exchange.from_video import video_content
@@ -30,6 +30,7 @@ __all__ = [
     "clock_of",
     "export",
     "import_lines",
+    "left_out",
     "open_lines",
     "parse_code",
     "recording_content",

@@ -1,4 +1,5 @@
-"""NumPy's own files: ``.npy`` is the image alone, ``.npz`` has its columns and the facts (JSON), too."""
+"""NumPy's own files: ``.npy`` is the image alone, ``.npz`` has its columns, what lies beside it, and the
+facts (JSON), too."""
 
 from __future__ import annotations
 
@@ -23,9 +24,9 @@ def write_npy(path: Path, content: Content, advance: Callable[[int], object]) ->
 
 
 def write_npz(path: Path, content: Content, advance: Callable[[int], object]) -> None:
-    """The image, its columns, and ``facts``: JSON in a text. Raises OSError as the disk gives it."""
+    """All arrays by name, and ``facts``: JSON in a text. Raises OSError as the disk gives it."""
     with zipfile.ZipFile(path, "w", zipfile.ZIP_STORED, allowZip64=True) as archive:
-        for array in (content.image, *content.columns):
+        for array in (content.image, *content.columns, *content.beside):
             with archive.open(f"{array.name}.npy", "w", force_zip64=True) as file:
                 _write(file, array, advance)
         with archive.open("facts.npy", "w") as file:

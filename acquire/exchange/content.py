@@ -28,7 +28,7 @@ class Axis:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Array:
-    """An array that is read in blocks; ``dims`` name its axes, a part of those of the image."""
+    """An array that is read in blocks; ``dims`` name its axes."""
 
     name: str
     dims: tuple[str, ...]
@@ -46,6 +46,7 @@ class Array:
 class Content:
     """What is exported, a ``kind`` of ``video`` or ``lines``.
 
+    ``columns`` lie along axes of the image; ``beside`` have its first axis and others of their own.
     ``facts`` is JSON: where it comes from, and what of it can be trusted. ``untrusted`` counts the frames
     among those that are written which are not sampled in full.
     """
@@ -57,6 +58,7 @@ class Content:
     columns: tuple[Array, ...]
     facts: dict[str, Any]
     untrusted: int = 0
+    beside: tuple[Array, ...] = ()
 
 
 def little(dtype: np.dtype[Any]) -> np.dtype[Any]:

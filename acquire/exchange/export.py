@@ -59,6 +59,11 @@ def check_export(content: Content, path: Path) -> None:
         check_movie(content)
 
 
+def left_out(content: Content, path: Path) -> tuple[str, ...]:
+    """Names of what lies beside the image that such a file does not hold."""
+    return tuple(each.name for each in content.beside) if format_for(path) in {"npy", "movie"} else ()
+
+
 def export(
     content: Content,
     path: Path,
@@ -74,7 +79,9 @@ def export(
     then nothing is left.
     """
     check_export(content, path)
-    kind, total, done = format_for(path), content.image.bytes, 0
+    kind, done = format_for(path), 0
+    written = () if left_out(content, path) else content.beside
+    total = sum(array.bytes for array in (content.image, *written))
 
     def advance(count: int) -> None:
         nonlocal done

@@ -10,11 +10,14 @@ import numpy as np
 from acquire import __version__
 from acquire.errors import DataError, UsageError
 from acquire.exchange.content import Array, Axis, Block, Content, block, little
+from acquire.showing import error_in_words
 from acquire.store.layout import DAMAGE
+from acquire.store.video_layout import ERROR_ATTRIBUTES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    import zarr
     from numpy.typing import NDArray
 
     from acquire.store import VideoFile
@@ -51,7 +54,7 @@ def video_content(
         dims=("time", "y", "x"),
         shape=(len(kept), *video.video.shape[1:]),
         dtype=little(video.video.dtype),
-        blocks=partial(_frames, video, kept),
+        blocks=partial(_frames, video.video, kept, "frames"),
         attributes={"long_name": "reconstructed light"},
     )
     inside = kept if trusted is None else _common(kept, trusted)
@@ -62,6 +65,7 @@ def video_content(
         image=image,
         columns=tuple(_columns(video, kept)),
         facts=_facts(video, title, kept, None if trusted is None else inside),
+        beside=_errors(video, kept),
         untrusted=len(kept) - len(inside),
     )
 
@@ -88,8 +92,10 @@ def _axes(video: VideoFile, kept: range) -> tuple[Axis, ...]:
 
 
 def _facts(video: VideoFile, title: str, kept: range, inside: range | None) -> dict[str, Any]:
-    """``frames`` are numbers in the source, ``trusted_frames`` in the file: the first, and after the last."""
+    """``frames`` are numbers in the source, ``trusted_frames`` in the file: the first, and after the last.
+    ``estimated_error`` is of all trusted frames of the source, in words."""
     interval_s, *pixel = video.scale
+    error = (video.attrs.get("provenance") or {}).get("error")
     return {
         "source": title,
         "frames": [kept.start, kept.stop],
@@ -99,6 +105,7 @@ def _facts(video: VideoFile, title: str, kept: range, inside: range | None) -> d
         "frame_interval_s": interval_s,
         "pixel_size": pixel,
         "pixel_unit": _unit(video),
+        **({"estimated_error": error_in_words(error)} if error else {}),
         "provenance": video.attrs.get("provenance"),
         "exported_by": f"acquire {__version__}",
     }
@@ -114,6 +121,22 @@ def _columns(video: VideoFile, kept: range) -> Iterator[Array]:
         yield _column("quality", quality, "relative RMS residual of the lines that see the frame")
 
 
+def _errors(video: VideoFile, kept: range) -> tuple[Array, ...]:
+    """The estimated error of regions, where the video has it."""
+    if video.error is None:
+        return ()
+    return (
+        Array(
+            name="error",
+            dims=("time", "region_y", "region_x"),
+            shape=(len(kept), *video.error.shape[1:]),
+            dtype=little(video.error.dtype),
+            blocks=partial(_frames, video.error, kept, "errors of frames"),
+            attributes=dict(ERROR_ATTRIBUTES),
+        ),
+    )
+
+
 def _column(name: str, values: NDArray[Any], words: str) -> Array:
     """A value for each frame, in memory."""
     piece = block((slice(0, len(values)),), values)
@@ -127,14 +150,14 @@ def _column(name: str, values: NDArray[Any], words: str) -> Array:
     )
 
 
-def _frames(video: VideoFile, kept: range) -> Iterator[Block]:
-    """Whole chunks of the video, so that none is unpacked twice."""
-    size, start = int(video.video.chunks[0]), kept.start
+def _frames(array: zarr.Array[Any], kept: range, what: str) -> Iterator[Block]:
+    """Whole chunks, so that none is unpacked twice."""
+    size, start = int(array.chunks[0]), kept.start
     while start < kept.stop:
         stop = min(kept.stop, (start // size + 1) * size)
         try:
-            frames = np.asarray(video.video[start:stop])
+            values = np.asarray(array[start:stop])
         except DAMAGE as error:
-            raise DataError(f"frames {start} to {stop - 1} of the video cannot be read: {error}") from error
-        yield block((slice(start - kept.start, stop - kept.start),), frames)
+            raise DataError(f"{what} {start} to {stop - 1} of the video cannot be read: {error}") from error
+        yield block((slice(start - kept.start, stop - kept.start),), values)
         start = stop

@@ -4,6 +4,7 @@
 
     /entry            NXentry    default = "data"
       data            NXdata     signal = "video" | "lines"; axes and columns along them
+      error           NXdata     of a video: its estimated error over frames and regions, where it is known
       process         NXprocess  program, version, and in note/data the facts as JSON
 """
 
@@ -44,6 +45,12 @@ def write_hdf5(path: Path, content: Content, advance: Callable[[int], object]) -
         for array in content.columns:
             _write(data, array, advance)
             data.attrs[f"{array.name}_indices"] = [names.index(dim) for dim in array.dims]
+        for array in content.beside:
+            group = _group(entry, array.name, "NXdata", signal=array.name)
+            first, *others = array.dims
+            group.attrs["axes"], group.attrs[f"{first}_indices"] = [first, *("." for _ in others)], 0
+            group[first] = data[first]  # the same dataset, linked
+            _write(group, array, advance)
         process = _group(entry, "process", "NXprocess")
         process["program"], process["version"] = "acquire", __version__
         note = _group(process, "note", "NXnote")

@@ -48,7 +48,8 @@ def write_movie(
     white = peak or _white(content)
     times = max(1, USUAL_SIDE // max(content.image.shape[1:]))
     height, width = (side * times for side in content.image.shape[1:])
-    facts = content.facts | {"white": white, "shown_fps": fps, "enlarged": times}
+    known = {"left_out": [each.name for each in content.beside]} if content.beside else {}
+    facts = content.facts | known | {"white": white, "shown_fps": fps, "enlarged": times}
     with av.open(str(path), "w", format="mp4", options={"movflags": "use_metadata_tags"}) as container:
         container.metadata["title"] = content.title
         container.metadata["comment"] = json.dumps(facts)

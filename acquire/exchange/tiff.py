@@ -1,6 +1,8 @@
 """TIFF: an ImageJ hyperstack, or, as ``.ome.tif``, an OME-TIFF of any size.
 
-The image lies in one piece behind the header, so that it is written as it is read, block by block.
+The image lies in one piece behind the header, so that it is written as it is read, block by block. What lies
+beside it is a second image of an OME-TIFF. A hyperstack can have none: it is one more page behind those that
+ImageJ looks at, frames below one another.
 """
 
 from __future__ import annotations
@@ -29,9 +31,10 @@ AXES = {"video": "TYX", "lines": "CYX"}
 def check_tiff(content: Content, *, ome: bool) -> None:
     """UsageError for an image that no such file can hold."""
     library("tifffile", "export", "a TIFF file")
-    if not ome and content.image.bytes > MOST_BYTES:
+    needed = sum(array.bytes for array in (content.image, *content.beside))
+    if not ome and needed > MOST_BYTES:
         raise UsageError(
-            f"a TIFF file for ImageJ cannot hold {content.image.bytes} bytes of pixels",
+            f"a TIFF file for ImageJ cannot hold {needed} bytes of pixels",
             possible=f"up to {MOST_BYTES}",
             hint="NAME.ome.tif, which can, or NAME.h5; or a part: --from and --to",
         )
@@ -51,13 +54,26 @@ def write_tiff(path: Path, content: Content, advance: Callable[[int], object], *
             resolution=_resolution(content),
             resolutionunit="NONE",
         )
+        for array in content.beside if ome else ():
+            about = {"axes": "TYX", "Name": array.name, "Description": json.dumps(array.attributes)}
+            empty = {"shape": array.shape, "dtype": array.dtype, "photometric": "minisblack"}
+            writer.write(None, **empty, metadata=about)
+    for array in () if ome else content.beside:
+        with tifffile.TiffWriter(path, byteorder="<", append="force") as writer:  # it has an image already
+            shape = (array.shape[0] * array.shape[1], array.shape[2])
+            described = json.dumps({"name": array.name, "shape": array.shape} | array.attributes)
+            empty = {"shape": shape, "dtype": array.dtype, "photometric": "minisblack"}
+            writer.write(None, **empty, metadata=None, description=described)
     with tifffile.TiffFile(path) as reader:
-        offset = reader.series[0].dataoffset
+        places = [each.dataoffset for each in reader.series]
+        if not ome:
+            places[1:] = [page.dataoffsets[0] for page in reader.pages[content.image.shape[0] :]]
     with path.open("r+b") as file:
-        file.seek(offset)
-        for _, block in content.image.blocks():
-            file.write(np.ascontiguousarray(block).data)
-            advance(block.nbytes)
+        for place, array in zip(places, (content.image, *content.beside), strict=True):
+            file.seek(place)
+            for _, block in array.blocks():
+                file.write(np.ascontiguousarray(block).data)
+                advance(block.nbytes)
 
 
 def _resolution(content: Content) -> tuple[float, float]:

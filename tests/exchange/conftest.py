@@ -11,6 +11,8 @@ from acquire.clock import ClockFit
 from acquire.codes import PrbsCode
 from acquire.lines import ARMS, LineBlock, LineFlag
 from acquire.store import RecordingSpec, RecordingWriter, RunCondition, write_video
+from acquire.store.video_layout import VideoGrid
+from acquire.store.video_writer import VideoWriter
 from acquire.stream.tagger import Tagger
 from acquire.trigger.base import TriggerRun
 
@@ -56,4 +58,22 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
     time_ns = TIME + INTERVAL_NS * np.arange(20, dtype=np.int64)
     provenance = {"recording": "run.zarr", "trusted": [TRUSTED.start, TRUSTED.stop]}
     write_video(path, frames, time_ns, 2.5, INTERVAL_NS, provenance)
+    return path
+
+
+@pytest.fixture(scope="session")
+def told(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A video of 20 frames of 9 x 5 pixels that tells its error."""
+    path, generator = tmp_path_factory.mktemp("told") / "told.zarr", np.random.default_rng(7)
+    error = {"rms": 0.02, "low": 0.01, "high": 0.05, "full_scale": 0.5}
+    with VideoWriter(
+        path, (9, 5), np.dtype(np.float32), VideoGrid((1e-5, 2.5, 2.5)), quality=True, regions=(8, 8)
+    ) as writer:
+        writer.append(
+            generator.random((20, 9, 5)).astype(np.float32),
+            TIME + INTERVAL_NS * np.arange(20, dtype=np.int64),
+            generator.random(20).astype(np.float32),
+            generator.random((20, 8, 8)).astype(np.float32),
+        )
+        writer.finish({"trusted": [TRUSTED.start, TRUSTED.stop], "error": error})
     return path

@@ -92,6 +92,55 @@ def test_nexus_plots_the_video_by_default(cli: Cli, video: Path, tmp_path: Path)
     assert facts["provenance"]["recording"] == "run.zarr"
 
 
+IN_WORDS = "about 4 % of full scale (2 to 10 % in nine of ten)"
+
+
+def test_the_error_that_a_video_tells_is_taken_along(cli: Cli, told: Path, tmp_path: Path) -> None:
+    source = open_video(told)
+    assert source.error is not None
+    error, frames = source.error[3:17], source.video[3:17]
+    for name in ("v.tif", "v.ome.tif", "v.h5", "v.npz"):
+        assert cli("export", told, tmp_path / name)[2] == ""
+    with tifffile.TiffFile(tmp_path / "v.tif") as file:
+        np.testing.assert_array_equal(file.series[0].asarray(), frames)
+        assert file.series[0].axes == "TYX"
+        np.testing.assert_array_equal(file.pages[-1].asarray().reshape(-1, 8, 8), error)
+        assert json.loads(file.pages[-1].description)["shape"] == [14, 8, 8]
+        assert file.imagej_metadata is not None
+        assert json.loads(file.imagej_metadata["Info"])["estimated_error"] == IN_WORDS
+    with tifffile.TiffFile(tmp_path / "v.ome.tif") as file:
+        for series, values in zip(file.series, (frames, error), strict=True):
+            np.testing.assert_array_equal(series.asarray(), values)
+        images = tifffile.xml2dict(file.ome_metadata)["OME"]["Image"]
+        assert [image["Name"] for image in images] == [str(told), "error"]
+        assert json.loads(images[0]["Description"])["estimated_error"] == IN_WORDS
+        assert "NaN where it cannot be told" in images[1]["Description"]
+    with h5py.File(tmp_path / "v.h5") as file:
+        data, beside = file["entry/data"], file["entry/error"]
+        np.testing.assert_array_equal(beside[beside.attrs["signal"]], error)
+        assert beside.attrs["NX_class"] == "NXdata"
+        assert list(beside.attrs["axes"]) == ["time", ".", "."]
+        assert beside["time"] == data["time"]
+        np.testing.assert_array_equal(data["quality"], source.quality[3:17])
+        assert json.loads(file["entry/process/note/data"][()])["provenance"]["error"]["rms"] == 0.02
+    with np.load(tmp_path / "v.npz") as saved:
+        np.testing.assert_array_equal(saved["error"], error)
+        assert json.loads(str(saved["facts"]))["estimated_error"] == IN_WORDS
+
+
+def test_a_file_without_a_place_for_the_error_is_told_of(cli: Cli, told: Path, tmp_path: Path) -> None:
+    for name in ("v.mp4", "v.npy"):
+        assert (
+            f"{name} has no place for the estimated error of regions"
+            in cli("export", told, tmp_path / name)[2]
+        )
+    _, out, _ = cli("export", told, tmp_path / "w.mp4", "--json")
+    assert json.loads(out)["left_out"] == ["error"]
+    with av.open(str(tmp_path / "v.mp4")) as file:
+        facts = json.loads(file.metadata["comment"])
+    assert (facts["estimated_error"], facts["left_out"]) == (IN_WORDS, ["error"])
+
+
 def test_frames_that_are_not_trusted_are_left_out_or_named(cli: Cli, video: Path, tmp_path: Path) -> None:
     code, out, err = cli("export", video, tmp_path / "a.npy")
     assert (code, err, np.load(tmp_path / "a.npy").shape) == (0, "", (14, 7, 5))
