@@ -79,6 +79,7 @@ class Child:
 
     def kill(self) -> None:
         """End it by force."""
+        # By pidfd and not by number: the number may be another process's by now.
         if self._pidfd >= 0:
             with contextlib.suppress(ProcessLookupError):
                 signal.pidfd_send_signal(self._pidfd, signal.SIGKILL)
@@ -98,9 +99,12 @@ class Child:
             if self._status.fileno() in ready:
                 self._listen()
                 return True
-            if self._pidfd in ready and self._is_overdue():
-                self._exit_code = UNTOLD
-                return True
+            if self._pidfd in ready:
+                # The process has ended; a nursery that is dead, or stopped, will not say how.
+                self._dead_since_s = self._dead_since_s or time.monotonic()
+                if self._status.fileno() < 0 or time.monotonic() - self._dead_since_s > _REAP_S:
+                    self._exit_code = UNTOLD
+                    return True
             if not ready or time.monotonic() >= deadline:
                 return False
             time.sleep(_REAP_S / 100)  # it has ended: the nursery will say how
@@ -119,11 +123,6 @@ class Child:
             self._exit_code = int(word)
         elif self._pidfd < 0:
             self._exit_code = UNTOLD  # the nursery died before this process was born
-
-    def _is_overdue(self) -> bool:
-        """The process ended a while ago, and the nursery, dead or stopped, has not said how."""
-        self._dead_since_s = self._dead_since_s or time.monotonic()
-        return self._status.fileno() < 0 or time.monotonic() - self._dead_since_s > _REAP_S
 
 
 class Nursery:
@@ -156,6 +155,8 @@ class Nursery:
         """A process that calls ``target(*args)``. Raises what pickling raises, and OSError."""
         parcel = _Parcel()
         job = _pack(parcel, name, target, args)
+        # The job goes as an anonymous file, since a packet is limited by the socket's buffer, and a plan with
+        # its arrays may be larger.
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         page = os.memfd_create("acquire-job")
         try:
@@ -258,6 +259,8 @@ def is_worker() -> bool:
 
 def _pack(parcel: _Parcel, name: str, target: Callable[..., None], args: tuple[Any, ...]) -> bytes:
     buffer = io.BytesIO()
+    # multiprocessing pickles a pipe or a lock only while it believes to be spawning: `parcel` is what it then
+    # hands descriptors to.
     set_spawning_popen(parcel)  # type: ignore[arg-type]
     try:
         ForkingPickler(buffer, pickle.HIGHEST_PROTOCOL).dump((name, target, args))
@@ -289,14 +292,16 @@ def main(fd: int, modules: list[str]) -> None:
     for module in modules:
         with contextlib.suppress(ImportError):  # of a driver that is not installed: its worker says so
             importlib.import_module(module)
+    # A collection in a worker would write to the head of every object, and so copy the pages that are shared.
     gc.collect()
-    gc.freeze()  # what was imported stays shared between the workers
+    gc.freeze()
     page = _keep(socket.socket(fileno=fd))
     if page is None:
         return
     with open(page, "rb") as file:  # noqa: PTH123 - a descriptor
         file.seek(0)
         place, environment, job = pickle.load(file)  # noqa: S301 - from the owner
+    # The owner's as of now: the nursery has the environment of the moment when it was started.
     os.environ.clear()
     os.environ.update(environment)
     spawn.prepare(place)
@@ -315,7 +320,11 @@ def _keep(channel: socket.socket) -> int | None:
         for ready, _ in waiting.poll():
             if ready in children:
                 waiting.unregister(ready)
-                _tell_end(ready, *children.pop(ready))
+                pid, status = children.pop(ready)
+                _, ended = os.waitpid(pid, 0)
+                os.close(ready)
+                with status, contextlib.suppress(OSError):  # an owner that has gone does not ask
+                    status.send(str(os.waitstatus_to_exitcode(ended)).encode())
                 continue
             _, fds, _, _ = socket.recv_fds(channel, 16, _MOST_FDS, socket.MSG_CMSG_CLOEXEC)
             if not fds:
@@ -344,10 +353,3 @@ def _begin(channel: socket.socket, children: dict[int, tuple[int, socket.socket]
     os.close(fds[0])
     _received[:] = fds[2:]
     return fds[1]
-
-
-def _tell_end(pidfd: int, pid: int, status: socket.socket) -> None:
-    _, ended = os.waitpid(pid, 0)
-    os.close(pidfd)
-    with status, contextlib.suppress(OSError):
-        status.send(str(os.waitstatus_to_exitcode(ended)).encode())

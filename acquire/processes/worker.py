@@ -126,6 +126,7 @@ class Worker:
             state = Path(f"/proc/{self.pid}/stat").read_text(encoding="utf-8", errors="replace")
         except OSError:
             return False  # it has ended
+        # The name stands in parentheses before the state, and may itself hold a parenthesis or a space.
         return state.rpartition(") ")[2][:1] in ("T", "t")
 
     def post(self, message: object) -> None:
@@ -143,6 +144,8 @@ class Worker:
             if self.pipe.closed:
                 self._outbox.clear()
             try:
+                # A Unix socket counts as writable while a quarter of its buffer is in use at most; what is
+                # left takes any of our messages whole, so that `send` does not wait.
                 while self._outbox and self._has_room.poll(0):
                     self.pipe.send(self._outbox.popleft())
             except (BrokenPipeError, ConnectionResetError):
@@ -173,6 +176,7 @@ class Worker:
         if isinstance(message, Failed):
             raise message.error
         if isinstance(message, kind):
+            # The nursery tells the number in a socket of its own: it may come later than the child's word.
             self._child.pid(max(0.0, deadline - time.monotonic()))
             return message
         # A process that dies closes its pipe a moment before `death` can tell how it ended.
@@ -240,6 +244,7 @@ def become_important() -> bool:
 def _live(pipe: Connection[Any, Any], name: str, target: Callable[..., None], *args: Any) -> None:
     """The life of a child, from its first to its last instruction."""
     mailbox = Mailbox(pipe)
+    # Ctrl-C goes to the whole foreground group: the owner ends its children in order, by word.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, mailbox.terminate)
     # Locks that libraries make, as blosc's does, have a name in /dev/shm where children are spawned, which a

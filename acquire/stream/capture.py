@@ -1,4 +1,4 @@
-"""The owner of one armed run: three processes, one thread, and the order in which they begin and end.
+"""The owner of one armed run: its processes, one thread, and the order in which they begin and end.
 
 ::
 
@@ -175,7 +175,12 @@ class Capture:
     def _begin(self, timeout_s: float, tell: Callable[[str], object]) -> None:
         tell("memory for the rings")
         self._make_memory()
-        self._spawn()
+        # None is waited for before all are on their way: a camera takes seconds to open.
+        self._workers[RECORDER] = self._new_recorder()
+        if self._plan.watch is not None:
+            self._workers[WATCHER] = self._new_watcher()
+        for name in self._plan.grabbers:
+            self._workers[name] = self._new_grabber(name)
         facts: dict[str, dict[str, Any]] = {}
         for name, worker in self._workers.items():
             cameras = self._plan.grabbers.get(name, ())
@@ -184,6 +189,7 @@ class Capture:
         self.cameras = facts
         tell("trigger")
         self._trigger_used = True  # from now on it has to be stopped, whatever `prepare` comes to
+        # The trigger is last: both cameras wait for it by now, and count from its first pulse.
         self._trigger.prepare(self._plan.run)
         self.clock = self._trigger.start()
         self._workers[RECORDER].post(RunStarted(self.clock))
@@ -211,13 +217,6 @@ class Capture:
             self._rings[arm] = Ring(arm, self._plan.ring_shape)
             self._counters[arm] = Counters(grabber.COUNTERS)
 
-    def _spawn(self) -> None:
-        self._workers[RECORDER] = self._new_recorder()
-        if self._plan.watch is not None:
-            self._workers[WATCHER] = self._new_watcher()
-        for name in self._plan.grabbers:
-            self._workers[name] = self._new_grabber(name)
-
     def _new_recorder(self) -> Worker:
         plan = self._plan
         what = recorder_plan.RecorderPlan(
@@ -242,20 +241,34 @@ class Capture:
 
     def _new_watcher(self) -> Worker:
         counters = self._counters[WATCHER]
+        # A successor finds the counters as its forerunner left them, and has not judged anything yet.
         for arm in ARMS:
             counters[f"verdict_{arm}"] = 0
         return Worker(WATCHER, watcher.watch, self._plan.watch, self._rings, counters)
 
     def _new_grabber(self, name: str, *, successor: bool = False) -> Worker:
-        tasks = [
-            (replace(self._grabber_plan(arm), successor=successor), self._rings[arm], self._counters[arm])
-            for arm in self._plan.grabbers[name]
-        ]
+        plan, tasks = self._plan, []
+        for arm in plan.grabbers[name]:
+            what = grabber.GrabberPlan(
+                arm=arm,
+                opener=plan.openers[arm],
+                depth_lines=plan.depth_lines,
+                white_dn=plan.white_dn,
+                max_jump_lines=plan.max_skew_lines,
+                reopen_timeout_s=plan.reopen_timeout_s,
+                line_period_ns=plan.line_period_ns,
+                columns=plan.columns.get(arm),
+                realtime=plan.realtime,
+                successor=successor,
+            )
+            tasks.append((what, self._rings[arm], self._counters[arm]))
         return Worker(f"grabber {name}", grabber.grab, *tasks)
 
     def _next_recorder(self) -> Worker:
         """What the one before had released and not counted was stored: see `Session.take`."""
         counters = self._counters[RECORDER]
+        # The ring's own count is exact at any instant. The dead recorder may have counted a block that it did
+        # not live to release: this one takes it, and counts it, again.
         for arm, ring in self._rings.items():
             others = counters[f"discarded_{arm}"] + counters[f"unsaved_{arm}"]
             counters[f"stored_{arm}"] = ring.released_lines - others
@@ -272,20 +285,6 @@ class Capture:
         if not all(self._counters[arm]["stamp_ns"] for arm in arms):
             return None
         return self._new_grabber(name, successor=True)
-
-    def _grabber_plan(self, arm: str) -> grabber.GrabberPlan:
-        plan = self._plan
-        return grabber.GrabberPlan(
-            arm=arm,
-            opener=plan.openers[arm],
-            depth_lines=plan.depth_lines,
-            white_dn=plan.white_dn,
-            max_jump_lines=plan.max_skew_lines,
-            reopen_timeout_s=plan.reopen_timeout_s,
-            line_period_ns=plan.line_period_ns,
-            columns=plan.columns.get(arm),
-            realtime=plan.realtime,
-        )
 
     def _running(self, command: str) -> Supervisor:
         if self._supervisor is None or self._closed:
@@ -375,7 +374,9 @@ class Capture:
         return recorded[f"discarded_{arm}"] + self._left_over[arm] + dropped
 
     def _account(self, arm: str, supervisor: Supervisor) -> ArmLedger:
-        """Counts are read against the way of the lines: what one knows of, the next has counted."""
+        """Counts are read against the way of the lines (recorder, ring, grabber): they go on being counted
+        meanwhile, and read in this order a line can seem to wait, but never to come from nowhere.
+        """
         recorded, ring, began = self._counters[RECORDER], self._rings[arm], supervisor.life.began
         stored, discarded = recorded[f"stored_{arm}"], self._discarded(arm)
         lost = self._lost(arm)
@@ -397,23 +398,19 @@ class Capture:
         )
         return account(counted, closed=self._emptied)
 
-    def _check(self, arm: str) -> dict[str, Any]:
-        if WATCHER not in self._counters:
-            return {}
-        seen = self._counters[WATCHER]
-        return {
-            "verdict": str(watcher.VERDICTS[seen[f"verdict_{arm}"]]),
-            **{name: seen[f"{name}_{arm}"] for name in ("shift", "checked_line", "lapped")},
-        }
-
     def _line_counts(self, arm: str, *, began: bool) -> dict[str, Any]:
         grabbed, recorded = self._counters[arm], self._counters[RECORDER]
+        check: dict[str, Any] = {}
+        if WATCHER in self._counters:
+            seen = self._counters[WATCHER]
+            check = {name: seen[f"{name}_{arm}"] for name in ("shift", "checked_line", "lapped")}
+            check["verdict"] = str(watcher.VERDICTS[seen[f"verdict_{arm}"]])
         return {
             "delivered": grabbed["delivered"],
             "preroll": grabbed["preroll"],
             "discarded": self._discarded(arm),
             "lost": self._lost(arm),
-            "check": self._check(arm),
+            "check": check,
             "recorded": recorded[f"rows_{arm}"] if began else 0,
             "missing": recorded[f"missing_{arm}"] if began else 0,
             "saturated": grabbed["saturated"],
@@ -428,6 +425,8 @@ class Capture:
         if supervisor is None or not supervisor.recording:
             return
         supervisor.interrupt_recording("the capture was closed")
+        # A recorder may have seconds of lines in the rings to write yet: it is given up only when a whole
+        # timeout has passed without a commit.
         committed = self._counters[RECORDER]["committed"]
         while not supervisor.wait_sealed(time.monotonic() + timeout_s):
             if committed == (committed := self._counters[RECORDER]["committed"]):
@@ -448,7 +447,9 @@ class Capture:
             deadlines[RECORDER] = least  # it has had its time to seal
         for worker in self._workers.values():
             worker.post(Quit())
-        order = sorted(self._workers, key=RECORDER.__eq__)  # the recorder comes last
+        # All are told first and then waited for, so that they end side by side. The recorder comes last: it
+        # empties the rings that the grabbers fill.
+        order = sorted(self._workers, key=RECORDER.__eq__)
         _run_all(*(partial(self._workers[name].end, deadlines[name]) for name in order))
 
     def _settle_books(self, arms: tuple[str, ...]) -> None:
@@ -472,6 +473,7 @@ class Capture:
     def _end_memory(self) -> None:
         if self._supervisor is not None:
             self._supervisor.mark_unsealed()
+        # Under the lock that `poll` takes, from another thread: it must not read memory that is unmapped.
         with self._memory:
             self._final = self._look(self._supervisor) if self._supervisor else CaptureStatus()
             for counters in self._counters.values():

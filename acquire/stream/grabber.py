@@ -79,19 +79,20 @@ def grab(mailbox: Mailbox, *arms: tuple[GrabberPlan, Ring, Counters]) -> None:
 
     Several ``arms`` fall on one camera, each on columns of its own.
     """
-    plan = arms[0][0]
+    plan = arms[0][0]  # the first arm's opener opens the camera that they share
     urgent = plan.realtime and become_urgent()  # first: threads of a driver are as urgent as who starts them
     camera = _open_again(mailbox, plan, "its grabber died") if plan.successor else plan.opener()
     intakes = [Intake(*arm) for arm in arms]
     try:
         facts = {**camera.settings(), "identity": asdict(camera.identify()), "realtime": urgent}
-        if not plan.successor:
+        if not plan.successor:  # `_open_again` has armed it: a camera is there again once it can be armed
             camera.arm()
         mailbox.post(Ready(facts))
         while True:
             try:
                 _pump(mailbox, camera, intakes)
             except CameraLostError as lost:
+                # Closed first, as far as it can be: most devices are opened by one handle at a time.
                 with contextlib.suppress(AcquireError):
                     _let_go(camera)
                 camera = _open_again(mailbox, plan, lost.message)
@@ -155,6 +156,7 @@ def _pump(mailbox: Mailbox, camera: Camera, intakes: list[Intake]) -> None:
 
 def settle_books(ring: Ring, counters: Counters) -> None:
     """For a grabber that died: lines that it had counted, and did not commit, were not delivered."""
+    # `take` counts a block before it puts it: killed in between, the block is in the count and nowhere else.
     counters["delivered"] = counters["preroll"] + ring.statistics().dropped_lines + ring.committed_lines
 
 
@@ -208,6 +210,7 @@ class Intake:
             block = replace(block, losses=())  # these are among what it missed
         first = block.first_line + self._shift
         self._note_jump(first, block.losses)
+        # Before the lines are put: whoever sees them, and a successor, finds a stamp that is not older.
         if block.time_ns is not None:
             self._clock.note(first, block.time_ns)
             stamp = {"stamp_line": first, "stamp_ns": block.time_ns, "drift_ppb": self._clock.drift_ppb}
@@ -248,6 +251,8 @@ class Intake:
                 f"{self._next - self._shift} to {first - self._shift}",
                 possible=f"the next line, or up to {self._plan.max_jump_lines} lost ones",
             )
+        # Where the camera told fewer losses than its count jumped by, the rest has no reason of its own; the
+        # sum of the causes must be the jump, or the ledger would not balance.
         unexplained = jump - sum(loss.count for loss in losses)
         self._lose(self._next, unexplained, Cause.CAMERA)
         at = self._next + max(unexplained, 0)

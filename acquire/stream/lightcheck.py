@@ -134,6 +134,8 @@ class Judge:
     def _judge(
         self, sight: Sight, rows: NDArray[np.float64], bits: NDArray[np.uint8], nominal: int
     ) -> Finding:
+        # Darkness is judged first: noise correlates with anything. A code that leaves the light off for all
+        # of these lines expects it.
         least = _DARK_SHARE * self.white_dn
         light = float(sight.energy.mean())
         if light < least and bits.any():
@@ -142,6 +144,7 @@ class Judge:
             return Finding(Verdict.UNKNOWN)
         predicted = predict(rows, bits, self.substeps)
         predicted *= light / predicted.mean()
+        # From line to line: what changes slowly, a lamp or the scene, drops out, and the code remains.
         steps = predicted[self.substeps :] - predicted[: -self.substeps]
         seen = np.diff(sight.energy)
         contrast = float(steps.std() / max(seen.std(), _NEVER_ZERO))
@@ -175,6 +178,7 @@ def _correlate(seen: NDArray[Any], steps: NDArray[Any], substeps: int) -> NDArra
 def _read(peaks: NDArray[np.float64], nominal: int, contrast: float, lines: int) -> Finding:
     """``contrast``: how much the light should vary with the code, of how much it does."""
     at = int(np.abs(peaks).argmax())
+    # Noise alone puts the largest peak anywhere: another delay must explain clearly more than the nominal.
     if peaks[at] ** 2 - peaks[nominal] ** 2 < _BETTER:
         at = nominal
     peak, shift = float(peaks[at]), nominal - at

@@ -36,7 +36,7 @@ from acquire.stream.recorder_states import BUSY, STATES, TABLE, RecorderEvent, R
 from acquire.stream.session import OPEN_END, Session
 from acquire.stream.stalls import HELD_UP_S, Arm, Backlog, DiskWaits, HoldUps, Lent, find_stall
 from acquire.stream.tagger import Tagger
-from acquire.stream.window import Span, hold, span
+from acquire.stream.window import hold, span
 
 if TYPE_CHECKING:
     from acquire.processes.shared import Counters
@@ -201,7 +201,14 @@ class Recorder:
         """Lines go on being discarded until the recording can take them."""
         try:
             after(self._state, RecorderEvent.BEGIN)  # before anything is touched
-            span = None if begin.window.is_now else self._hold(begin)
+            lines = None
+            if not begin.window.is_now:
+                # Taken back from the rings' history at once, before the cameras come round to it.
+                held = hold(begin.window, {name: arm.ring for name, arm in self._arms.items()})
+                for name, blocks in held.taken.items():
+                    for block in blocks:
+                        self._count(name, block.start, block.stop, -1)
+                lines = span(begin.window, begin.lines, held, self._line_rate_hz)
         except (StateError, UsageError) as error:
             self._mailbox.post(Refused(error))
             return
@@ -210,16 +217,8 @@ class Recorder:
         writer = self._disk.submit(
             self._waits.elsewhere, RecordingWriter.prepare, begin.path, begin.spec, self._plan.disk
         )
-        self._opening = Opening(begin, span, writer)
+        self._opening = Opening(begin, lines, writer)
         self._go(RecorderEvent.BEGIN)
-
-    def _hold(self, begin: Begin) -> Span:
-        """Keep from being discarded what the recording begins with."""
-        held = hold(begin.window, {name: arm.ring for name, arm in self._arms.items()})
-        for name, blocks in held.taken.items():
-            for lines in blocks:
-                self._count(name, lines.start, lines.stop, -1)
-        return span(begin.window, begin.lines, held, self._line_rate_hz)
 
     def _count(self, name: str, first: int, end: int, sign: int = 1) -> None:
         """Lines of a block that leaves the ring; with ``sign`` -1, of one that was taken back."""
@@ -245,11 +244,6 @@ class Recorder:
     def _newest_line(self) -> int:
         """The line before which everything has come, from one arm at least."""
         return max(arm.ring.newest_line for arm in self._arms.values())
-
-    def _next_line(self) -> int:
-        """The line that both arms have still to deliver, and for which they have room."""
-        dropped_end = max(arm.ring.dropped_end for arm in self._arms.values())
-        return max(self._newest_line(), dropped_end)
 
     def _common_line(self) -> int:
         """The line up to which both arms have delivered."""
@@ -296,11 +290,20 @@ class Recorder:
 
     def _opened(self, opening: Opening) -> None:
         """From the newest line on: both arms have still to deliver what comes after it; or from the past."""
-        first_line = self._next_line() if opening.span is None else opening.span.first_line
+        if opening.span is not None:
+            first_line = opening.span.first_line
+        else:
+            # Past what found a ring full, too: a recording must not begin with lines that are lost already.
+            dropped_end = max(arm.ring.dropped_end for arm in self._arms.values())
+            first_line = max(self._newest_line(), dropped_end)
         try:
             writer = opening.writer.result()
             with self._waits.loop():
-                self._check_wanted(opening, writer, first_line)
+                # Nobody wants it any more, or it would begin where it should have ended.
+                if self._state is RecorderState.CANCELLED or opening.is_over(first_line):
+                    writer.abandon()
+                    past = f"line {first_line} is past the recording's end"
+                    raise UsageError(f"start: {past}; nothing was recorded")
                 writer.begin(first_line)
         except AcquireError as error:
             self._refuse(error)
@@ -315,6 +318,7 @@ class Recorder:
             arm.revive(time.monotonic())
             arm.backlog = Backlog()
             arm.kept.begin(arm.ring.history_line)
+        # The counters first: whoever hears that it began must not find those of the recording before.
         self._publish(self._session)
         end_line = self._session.end_line
         self._mailbox.post(Began(first_line, None if end_line == OPEN_END else end_line))
@@ -325,12 +329,6 @@ class Recorder:
         if self._state is not RecorderState.CANCELLED:  # else nobody waits for the answer
             self._mailbox.post(Refused(error))
         self._go(RecorderEvent.REFUSED)
-
-    def _check_wanted(self, opening: Opening, writer: RecordingWriter, first_line: int) -> None:
-        """Raises UsageError for a recording that nobody wants any more, once nothing of it is left."""
-        if self._state is RecorderState.CANCELLED or opening.is_over(first_line):
-            writer.abandon()
-            raise UsageError(f"start: line {first_line} is past the recording's end; nothing was recorded")
 
     def _new_session(self, writer: RecordingWriter, opening: Opening, first_line: int) -> Session:
         assert self._tagger is not None
@@ -351,6 +349,7 @@ class Recorder:
         return session
 
     def _close(self, session: Session, error: Exception | None = None) -> None:
+        # Lent blocks lie in the rings: they are given back before another thread has the writer.
         for name, arm in self._arms.items():
             try:
                 self._release(name, arm)
@@ -380,7 +379,7 @@ class Recorder:
     def _move(self, name: str, arm: Arm) -> bool:
         """Let go of the arm's last block and take the next, if there is one that may go."""
         self._release(name, arm)
-        self._listen_to(name, arm)
+        arm.watch(time.monotonic(), self._counters[f"awaited_{name}"])
         self._hold_ups.update()
         if self._opening is not None and self._opening.span is not None:
             return False  # it waits for the recording
@@ -393,9 +392,6 @@ class Recorder:
         else:
             self._take(name, arm, block, self._session)
         return True
-
-    def _listen_to(self, name: str, arm: Arm) -> None:
-        arm.watch(time.monotonic(), self._counters[f"awaited_{name}"])
 
     def _take(self, name: str, arm: Arm, block: RingBlock, session: Session) -> None:
         """Write the block; end while all lines are still there, should the disk be too slow for them.
@@ -471,7 +467,8 @@ class Recorder:
         session.trigger, session.cameras = self._external.trigger(), self._external.cameras()
         session.verified = self._external.verified()
         for name, arm in self._arms.items():
-            self._listen_to(name, arm)  # what came while this was held up by the disk is no silence
+            # Once more: what came while this was held up by the disk is no silence.
+            arm.watch(time.monotonic(), self._counters[f"awaited_{name}"])
             if name in session.lost and not arm.ring.fill:
                 session.give_up(name)
         if session.done:
@@ -487,6 +484,7 @@ class Recorder:
                 session.commit()
             ended = time.monotonic()
             self._commit_s = ended + max(_COMMIT_INTERVAL_S, (_COMMIT_SHARE - 1) * (ended - begun))
+        # After the commit: what is published as committed is what survives a kill.
         self._publish(session)
 
     def _publish(self, session: Session) -> None:

@@ -192,6 +192,7 @@ class Ring:
         header[_FIRST_LINE], header[_COUNT] = first_line, count
         header[_TIME_NS], header[_TOTAL] = time.monotonic_ns(), total
         _write_losses(header, losses)
+        # After the header's words: whoever finds it even finds what belongs to it.
         header[_SEQUENCE] = 2 * head + 2
         self._control[_NEWEST] = first_line + count
         self._control[_PEAK] = max(self._control[_PEAK], head + 1 - self._control[_TAIL])
@@ -231,6 +232,7 @@ class Ring:
         tail = self._control[_TAIL]
         oldest = min(tail, self._oldest())
         self._control[_TAIL] = oldest  # first keep the producer away, then look what has been kept
+        # It may have claimed the oldest slots between our look at the head and this store.
         while oldest < tail and not (self.is_whole(oldest) and self._end_line(oldest) > first_line):
             oldest += 1
             self._control[_TAIL] = oldest
@@ -251,6 +253,7 @@ class Ring:
 
     def hush(self) -> None:
         """Take note of the doorbell, after a wait on `fileno`."""
+        # Asked first: to read a bell that has not been rung is an error (EAGAIN).
         if self._ringing.poll(0):
             os.eventfd_read(self._bell)
 
@@ -288,6 +291,8 @@ class Ring:
     @property
     def committed_lines(self) -> int:
         """Lines that were committed so far; right after a producer's death at any instant, too."""
+        # From the last whole block's header: a counter of its own would be stored before or after the head,
+        # and a kill in between would leave the two apart.
         head = self._control[_HEAD]
         return int(self._header(head - 1)[_TOTAL]) if head else 0
 
@@ -384,6 +389,7 @@ class Ring:
 
     def _wait(self, timeout_s: float) -> bool:
         deadline = time.monotonic() + timeout_s
+        # The counts decide and not the bell, which may have been rung for a block that is gone already.
         while self._control[_HEAD] == self._control[_TAIL]:
             remaining_s = deadline - time.monotonic()
             if remaining_s <= 0 or not self._ringing.poll(remaining_s * 1000):

@@ -215,9 +215,14 @@ class Session:
         part = slice(book.next_line - block.first_line, self.end_line - block.first_line)
         if part.stop <= part.start:
             return 0
-        taken = LineBlock(arm, book.next_line, block.pixels[part], block.flags[part])
-        self._append(taken, hurry=hurry)
-        return len(taken)
+        tagged = self._tagger.tag(LineBlock(arm, book.next_line, block.pixels[part], block.flags[part]))
+        if arm in self.doubted:
+            tagged = replace(tagged, flags=tagged.flags | np.uint16(LineFlag.CODE_CONTRADICTED))
+            book.doubted += len(tagged)
+        # Packing takes longer than writing: it is done beside this, while the other arm's lines are taken.
+        (self._writer.lend if hurry or self._writer.packs else self._writer.append)(tagged)
+        book.store(tagged.flags)
+        return len(tagged)
 
     def overrun(self, arm: str, block: RingBlock) -> int | None:
         """The first line before the block that this recording lacks because its ring was full."""
@@ -250,6 +255,7 @@ class Session:
 
     def end(self, line: int, reason: str, condition: RunCondition = RunCondition.GOOD) -> None:
         """End before ``line``, or after what is written already; the condition is at best ``condition``."""
+        # Both arms get every row up to the last: what one has written already, the other must reach.
         reach = max(book.next_line for book in self.books.values())
         last = min(self.end_line, max(reach, line))
         if last < self.end_line or _worse(self._floor, condition) is not self._floor:
@@ -282,6 +288,7 @@ class Session:
     def commit(self) -> None:
         """Make what is written visible to readers; a disk that is nearly full ends the recording."""
         self._writer.commit()
+        # Gaps are kept for `close` after a write error: what the disk did not take is taken out of the books.
         committed = self.first_line + self._writer.committed_lines
         self._gaps = [gap for gap in self._gaps if gap[1].stop > committed]
         if (reason := self._writer.nearly_full) is not None and not self._told_to_end:
@@ -337,21 +344,13 @@ class Session:
             return
         self._writer.add_gap(arm, book.next_line, count, cause)
         self._gaps.append((arm, range(book.next_line, book.next_line + count), cause))
+        # In pieces of one block: a gap may be many rings long, and the blank rows are memory.
         while count:
             pixels = self._blank[:count]
             flags = np.full(len(pixels), LineFlag.MISSING, np.uint16)
             self._writer.append(self._tagger.tag(LineBlock(arm, book.next_line, pixels, flags)))
             book.miss(len(pixels), cause)
             count -= len(pixels)
-
-    def _append(self, block: LineBlock, *, hurry: bool) -> None:
-        tagged = self._tagger.tag(block)
-        book = self.books[block.arm]
-        if block.arm in self.doubted:
-            tagged = replace(tagged, flags=tagged.flags | np.uint16(LineFlag.CODE_CONTRADICTED))
-            book.doubted += len(tagged)
-        (self._writer.lend if hurry or self._writer.packs else self._writer.append)(tagged)
-        book.store(tagged.flags)
 
     def _condition(self) -> RunCondition:
         books = self.books.values()

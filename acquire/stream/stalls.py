@@ -167,6 +167,7 @@ class Heartbeat:
 
     def update(self, now_s: float) -> float:
         """Seconds without a beat; of a time between two looks, only so much as a look can take counts."""
+        # A host that did not let *us* run for seconds has probably stopped the other one as well.
         self.still_s += min(now_s - self._looked_s, _LONGEST_LOOK_S)
         self._looked_s = now_s
         if (count := self._counters[self._name]) != self._count:
@@ -213,6 +214,7 @@ def find_stall(session: Session, arms: dict[str, Arm], limit_s: float, max_skew_
         # Arms that fall silent together do so to within a block: half the limit tells both from one.
         silent = tuple(name for name in ARMS if silent_s[name] > limit_s / 2)
         return _stall(silent, f"no line for {limit_s:g} s")
+    # An arm may deliver, and never catch up: the rows that it lacks would be written in one go at the end.
     if session.skew > max_skew_lines:
         late = min(waited_for, key=lambda name: session.books[name].next_line)
         return _stall((late,), f"{session.skew} lines behind the other")
@@ -220,6 +222,7 @@ def find_stall(session: Session, arms: dict[str, Arm], limit_s: float, max_skew_
 
 
 def _stall(arms: tuple[str, ...], text: str) -> Stall:
+    # Both at once is the trigger's, or the host's: nothing is missing between the arms, it only ended early.
     if len(arms) == len(ARMS):
         return Stall(arms, f"both arms stalled: {text}", RunCondition.INTERRUPTED)
     return Stall(arms, f"arm {arms[0]} stalled: {text}", RunCondition.INCOMPLETE)

@@ -74,6 +74,7 @@ class Resumption:
     def ended(self, now_s: float, why: str) -> None:
         """A segment ended, or could not begin."""
         self.why = why
+        # The first goes on at once, the next after 1 s, 2 s, 4 s … for as long as segments stay short.
         self._failures = 0 if now_s - self._began_s > _SHORT_S else self._failures + 1
         self._began_s = now_s
         wait_s = 2.0 ** (self._failures - 2) if self._failures > 1 else 0.0

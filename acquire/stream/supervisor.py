@@ -244,7 +244,14 @@ class Supervisor:
             self.happened(Note(event.line, event.kind, f"tick {event.tick}"))
         rows = self._tags.shape.rows
         for at in range(0, len(tags), rows):
-            self._pass_on(tags[at : at + rows])
+            some = tags[at : at + rows]
+            slot = self._tags.claim()
+            if slot is None:
+                # The recorder is too late to take them. Nobody waits: later tags confirm the same lines.
+                self._tags.drop(some[0].line, len(some))
+                continue
+            slot.pixels[: len(some)] = tag_rows(some)
+            self._tags.commit(0, len(some))
         return tags
 
     def _ask_trigger(self, now_s: float) -> None:
@@ -259,21 +266,16 @@ class Supervisor:
             if "link_lost" not in counts:
                 self._trigger_told_s = time.monotonic()
 
-    def _pass_on(self, tags: list[LineTag]) -> None:
-        """To the recorder; should it be too late to take them, later tags confirm the same lines."""
-        slot = self._tags.claim()
-        if slot is None:
-            self._tags.drop(tags[0].line, len(tags))
-            return
-        slot.pixels[: len(tags)] = tag_rows(tags)
-        self._tags.commit(0, len(tags))
-
     def _watch(self, now_s: float) -> None:
         """A silent arm is a fault; in a recording, the recorder judges it."""
         limit_s = self._plan.stall_timeout_s
         self._bear_with_successors()
         self._watch_recorder(now_s)
-        self._watch_counts(now_s)
+        pulse = self._newest_pulse
+        for arm, excess in self._excess.items() if pulse is not None else ():
+            if line := excess.update(pulse or 0, now_s):
+                ahead = f"line {line} came with the trigger at line {pulse}"
+                self._fail(f"arm {arm}: {ahead}: the camera does not wait for it")
         if self.recording:
             for camera in self._cameras.values():
                 camera.revive()
@@ -306,19 +308,12 @@ class Supervisor:
             if self._succession.is_late(name):
                 self._fail(f"{self._workers[name].name}: its successor was not ready in time", name)
             elif self._succession.is_starting(name):
+                # A camera takes seconds to come back. Neither its arm nor the recorder, which waits for it
+                # in an open recording, is to be called stalled meanwhile.
                 self._loop.revive()
                 for arm in self._arms_of.get(name, ()):
                     self._cameras[arm].revive()
                     self._counters[RECORDER].add(f"awaited_{arm}", 1)
-
-    def _watch_counts(self, now_s: float) -> None:
-        pulse = self._newest_pulse
-        for arm, excess in self._excess.items() if pulse is not None else ():
-            if line := excess.update(pulse or 0, now_s):
-                self._fail(
-                    f"arm {arm}: line {line} came with the trigger at line {pulse}: "
-                    "the camera does not wait for it"
-                )
 
     def _hear(self, name: str, worker: Worker) -> None:
         death = worker.death  # looked at before the messages: what a process said last counts
@@ -327,6 +322,7 @@ class Supervisor:
         while (message := worker.message()) is not None:
             self._note(name, message)
         if death and name not in self._dead:
+            # One that said why it ends cannot go on; a successor would meet the same error.
             if name not in self._last_words and self._succeed(name, worker, death):
                 return
             self._dead.add(name)
@@ -334,15 +330,13 @@ class Supervisor:
                 with self._news:
                     self.life.on_died()
             if name == WATCHER:
-                self._lose_watcher(self._last_words.get(name, death))
+                # Lines come and are recorded all the same; what it said last does not hold for them.
+                for arm in ARMS:
+                    self._counters[WATCHER][f"verdict_{arm}"] = 0
+                why = self._last_words.get(name, death)
+                self.happened(Note((self._newest_pulse or 0) + 1, "unwatched", f"watcher: {why}"))
                 return
             self._fail(f"{worker.name}: {self._last_words.get(name, death)}", name)
-
-    def _lose_watcher(self, why: str) -> None:
-        """Lines come and are recorded all the same; what it said last does not hold for them."""
-        for arm in ARMS:
-            self._counters[WATCHER][f"verdict_{arm}"] = 0
-        self.happened(Note((self._newest_pulse or 0) + 1, "unwatched", f"watcher: {why}"))
 
     def _succeed(self, name: str, worker: Worker, death: str) -> bool:
         """Put another process in the place of one that was killed."""
@@ -351,7 +345,9 @@ class Supervisor:
         successor = self._succession.successor(name)
         if successor is None:
             return False
-        with self._news:  # nobody may tell the one that is dead any more
+        # Under the lock, since nobody may tell the one that is dead any more. A mark that was acknowledged
+        # and not yet written is told again: in a night with 48 kills, 11 of 254 were lost otherwise.
+        with self._news:
             self._workers[name] = successor
             for note in self._told if name == RECORDER else ():
                 successor.post(note)
@@ -403,7 +399,7 @@ class Supervisor:
 
     def _fail(self, text: str, name: str | None = None) -> None:
         """Keep the first fault, and have the recording sealed if the recorder lives."""
-        with self._news:
+        with self._news:  # all commands wait on it: one that waits for a start hears of the fault at once
             self.fault = self.fault or text
             self._cancel_if(begins=self.life.on_fault())
             self._news.notify_all()

@@ -90,14 +90,16 @@ class Tagger:
         A trigger that is right by itself but goes back in lines has started again: nothing after that is
         confirmed any more.
         """
-        expected = self._expected(rows[:, 0])
+        lines = rows[:, 0]
+        code_index = lines * np.uint64(self._run.substeps)
+        expected = np.stack([lines, code_index, code_index * np.uint64(self._run.substep_ticks)], axis=1)
         if self._all_right(rows, expected):
             return []
         wrong = (rows != expected).any(axis=1)
         right = np.flatnonzero(~wrong)
-        lines = rows[right, 0].astype(np.int64)  # signed, as is the line before the first
-        back = np.diff(lines, prepend=self._last_line) <= 0
-        ahead = lines[~np.logical_or.accumulate(back)]
+        counted = rows[right, 0].astype(np.int64)  # signed, as is the line before the first
+        back = np.diff(counted, prepend=self._last_line) <= 0
+        ahead = counted[~np.logical_or.accumulate(back)]
         if len(ahead) and not self._restarted:
             self._last_line = int(ahead[-1])
             self.confirmed_end = self._last_line + 1
@@ -121,7 +123,7 @@ class Tagger:
         flags = block.flags
         confirmed = max(0, self.confirmed_end - block.first_line)
         if confirmed < len(block):
-            flags = flags.copy()
+            flags = flags.copy()  # they are the ring's, and others look at them
             flags[confirmed:] |= UNCONFIRMED
         return TaggedBlock(
             arm=block.arm,
@@ -154,7 +156,3 @@ class Tagger:
         for substep in range(substeps):  # packbits of rows this short takes several times as long
             code |= bits[substep::substeps] << np.uint8(substep)
         return LineTable(code_index, code, tick, self._clock.time_ns(tick))
-
-    def _expected(self, lines: NDArray[np.uint64]) -> NDArray[np.uint64]:
-        code_index = lines * np.uint64(self._run.substeps)
-        return np.stack([lines, code_index, code_index * np.uint64(self._run.substep_ticks)], axis=1)

@@ -96,6 +96,7 @@ class Watcher:
         """As it was told last; None: not yet."""
         self._next_s = self._now_s = self._tell_s = 0.0
         self._untold = 0
+        # A watcher that replaces another begins with what comes: it must not judge a ring's whole history.
         for observer in self._observers.values():
             observer.skip()
 
@@ -160,7 +161,9 @@ class Watcher:
             self._counters[f"shift_{arm}"] = finding.shift
             self._counters[f"checked_line_{arm}"] = first_line + self._plan.lines
             self._counters.add(f"checks_{arm}", 1)
-        if any(_differ(finding, self._told[arm]) for arm, finding in found.items()):
+        # Told when a verdict changes, not when its certainty does, which differs from check to check.
+        told = {arm: (finding.verdict, finding.shift) for arm, finding in self._told.items()}
+        if any((finding.verdict, finding.shift) != told[arm] for arm, finding in found.items()):
             self._told = found
             doubtful = any(finding.verdict.doubtful for finding in found.values())
             self._mailbox.post(Checked(first_line, doubtful, explain(found, judge.substeps)))
@@ -209,6 +212,8 @@ class Intake:
             self.broken = True
             return
         pixels = block.pixels[expected - block.first_line :][: len(self._energy) - self._count]
+        # Evenly spaced columns and lines: the mean of all would cost a processor at 100 kHz, and the code
+        # shows in any part of the line.
         energy = pixels[:, :: -(-pixels.shape[1] // _MOST_COLUMNS)].mean(axis=1)
         self._energy[self._count : self._count + len(energy)] = energy
         self._count += len(energy)
@@ -218,7 +223,3 @@ class Intake:
         """What was taken, above the black level."""
         profile = np.mean(self._profile, axis=0)
         return Sight(self._energy - self._black_dn, profile - self._black_dn)
-
-
-def _differ(one: Finding, other: Finding) -> bool:
-    return (one.verdict, one.shift) != (other.verdict, other.shift)
