@@ -108,6 +108,7 @@ class Device:
 
     def configure(self, values: Mapping[Register, int]) -> None:
         """Write the config registers in one block, read them back, compare."""
+        # One frame, so that the device has the old configuration or the new one, and no mixture.
         first, last = r.CONFIGURATION[0], r.CONFIGURATION[-1]
         words = [0] * (last.address + last.words - first.address)
         for register in r.CONFIGURATION:
@@ -126,6 +127,8 @@ class Device:
 
     def command(self, command: Command, number: int = 0) -> None:
         """One command, about run ``number``. It may be repeated on a bad link without harm."""
+        # Run id and command in one frame: two clients cannot put their commands between each other's. What a
+        # lost answer has sent twice meets the same run, and changes nothing.
         self.link.write(r.RUN_ID.address, [*r.RUN_ID.to_words(number), command])
 
     def load_code(self, bits: NDArray[np.uint8]) -> int:
@@ -136,7 +139,7 @@ class Device:
                 f"the code memory cannot hold a code of {len(bits)} bits", possible=f"1 to {room}"
             )
         packed = np.packbits(bits, bitorder="little").tobytes()
-        packed += bytes(-len(packed) % 4)
+        packed += bytes(-len(packed) % 4)  # the device computes its CRC over whole words
         self.link.write_block(r.CODE_MEMORY, np.frombuffer(packed, "<u4").tolist())
         self.link.write(r.CODE_LENGTH.address, [len(bits)])
         self.command(Command.CHECK_CODE)

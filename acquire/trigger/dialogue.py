@@ -185,6 +185,7 @@ class Dialogue:
         room_bytes = self._room_bytes
         while self._queued and self._fits(self._queued[0], room_bytes):
             call = self._queued.popleft()
+            # Every attempt has a number of its own: a late answer to the one before is not taken for its.
             call.frame = Frame(call.kind, self._sequence, call.payload)
             call.begun_s, call.sent_s = call.begun_s if call.attempts else now_s, now_s
             call.attempts += 1
@@ -212,6 +213,7 @@ class Dialogue:
         if call is None or not answers(call.frame, frame):
             self._counts["unexpected"] += 1
             return
+        # The device answers in order: what was sent before and has no answer yet will get none.
         lost = []
         # Those of a dict come in the order in which they were put in: here, sent.
         for number, earlier in list(self._on_the_way.items()):
@@ -250,8 +252,15 @@ def results(calls: Sequence[Call]) -> list[Frame]:
             raise call.failure
     found = [call.answer for call in calls if call.answer is not None]
     for answer in found:
-        if answer.type == FrameType.NAK:
-            raise _refusal(answer)
+        if answer.type != FrameType.NAK:
+            continue
+        error, address = parse_nak(answer.payload)
+        if error == ErrorCode.BAD_VERSION:  # the only refusal that says nothing about the request itself
+            raise TriggerError(
+                f"the trigger speaks protocol {answer.version}, this program {PROTOCOL_VERSION}",
+                hint="load the firmware that belongs to this program",
+            )
+        raise RefusedError(error, address)
     return found
 
 
@@ -262,13 +271,3 @@ def _size_bytes(kind: FrameType, payload: bytes) -> int:
         return request
     _, count = parse_read(payload)
     return max(request, _EMPTY_DATA_BYTES + 4 * count)
-
-
-def _refusal(answer: Frame) -> TriggerError:
-    error, address = parse_nak(answer.payload)
-    if error == ErrorCode.BAD_VERSION:
-        return TriggerError(
-            f"the trigger speaks protocol {answer.version}, this program {PROTOCOL_VERSION}",
-            hint="load the firmware that belongs to this program",
-        )
-    return RefusedError(error, address)

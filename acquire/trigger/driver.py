@@ -109,7 +109,15 @@ class TriggerDriver:
             if not status.at_rest and status.run == run_number(run.run_id):
                 self._take_over(run, status, values)
                 return
-            self._demand_rest(run, status)
+            if not status.at_rest:
+                # End what a stop of ours did not reach; refuse to end what nobody here has asked to.
+                if status.run != self._owed:
+                    raise TriggerError(
+                        f"run {run.run_id!r} prepared while another one runs: "
+                        f"number {status.run:#018x} is {status}",
+                        hint="stop it first: acquire trigger stop",
+                    )
+                self.stop()
             device.configure(values)
             device.command(Command.ARM, run_number(run.run_id))
             self._prepared, self._run, self._tags = run, None, None
@@ -128,13 +136,23 @@ class TriggerDriver:
                 device.command(Command.START, run_number(run.run_id))
         # Without the lock from here on: `stop` must be able to end the wait for an edge that never comes.
         limit_s = self._config.external_timeout_s if external else ANSWER_S
-        start_tick = self._await_line_0(device, run, limit_s)
+        status = device.await_status(
+            lambda status: status.lines > 0 or status.state == State.ENDED, limit_s, "start"
+        )
+        if not status.lines:
+            raise TriggerError(f"run {run.run_id!r} was stopped before its first line")
+        start_tick = device.read(r.START_TIME)
         if external:  # the edge may have come long after the first comparison, and clocks drift
             compared = device.compare_clocks()
         with self._lock:
             self._tags = TagReader(run, run_number(run.run_id), start_tick)
             self._run, self._prepared = run, None
-        return _clock_fit(device.capabilities.clock_hz, start_tick, *compared)
+        # UTC of the start follows from a comparison some time before it or after. How far the oscillator may
+        # have been off in between is added to what the comparison leaves open.
+        (utc_ns, tick, uncertainty_ns), hz = compared, device.capabilities.clock_hz
+        elapsed = signed_ticks(start_tick - tick)
+        drift_ns = int(abs(elapsed) * NS_PER_S / hz * _DRIFT)
+        return ClockFit(hz, utc_ns + elapsed * NS_PER_S // hz, uncertainty_ns + drift_ns + 1)
 
     def tags(self, timeout_s: float) -> list[LineTag]:
         """Tags of lines since the last call; a stop ends the wait, a watchdog shortens it."""
@@ -160,9 +178,11 @@ class TriggerDriver:
             run, self._prepared = self._run or self._prepared, None
             if self._device is None:
                 return 0
+            # Noted before the link is tried: where it fails, the next `prepare` ends this run first.
             self._owed = run_number(run.run_id) if run else 0
             device = self._living()
             device.command(Command.STOP, 0)
+            # The device ends after a whole line, which may take longer than any answer.
             period_ticks = run.line_period_ticks if run else 0
             limit_s = ANSWER_S + period_ticks / device.capabilities.clock_hz
             status = device.await_status(lambda status: status.at_rest, limit_s, "end")
@@ -237,6 +257,7 @@ class TriggerDriver:
 
     def _take_over(self, run: TriggerRun, status: DeviceStatus, values: dict[r.Register, int]) -> None:
         """The run is armed or running: as this driver has done it, or as another program has."""
+        # A daemon that was killed and started again finds its run alive, and may go on with it.
         if run in (self._prepared, self._run):
             return
         if self.device().configuration() != values:
@@ -245,44 +266,18 @@ class TriggerDriver:
             )
         self._prepared, self._run, self._tags = run, None, None
 
-    def _demand_rest(self, run: TriggerRun, status: DeviceStatus) -> None:
-        """End what a stop did not reach; refuse to end what nobody here has asked to."""
-        if status.at_rest:
-            return
-        if status.run == self._owed:
-            self.stop()
-            return
-        raise TriggerError(
-            f"run {run.run_id!r} prepared while another one runs: number {status.run:#018x} is {status}",
-            hint="stop it first: acquire trigger stop",
-        )
-
-    def _await_line_0(self, device: Device, run: TriggerRun, limit_s: float) -> int:
-        def begun(status: DeviceStatus) -> bool:
-            return status.lines > 0 or status.state == State.ENDED
-
-        if not device.await_status(begun, limit_s, "start").lines:
-            raise TriggerError(f"run {run.run_id!r} was stopped before its first line")
-        return device.read(r.START_TIME)
-
     def _show_life(self, device: Device) -> float:
         """Keep the watchdog quiet while somebody asks for tags; for how long it is now."""
         if not self._config.watchdog_s:
             return float("inf")
         patience_s = min(self._config.watchdog_s / _SIGNS_OF_LIFE_PER_WATCHDOG, _SIGN_OF_LIFE_S)
         if time.monotonic() > self._sign_of_life_s + patience_s:
-            device.read(r.STATUS)
+            device.read(r.STATUS)  # any request that the device understands will do
             self._sign_of_life_s = time.monotonic()
         return patience_s
 
 
 def run_number(run_id: str) -> int:
     """The device's 64-bit number of a run, never 0."""
+    # A hash and not a count: it survives restarts of host and device, and 0 is the device's word for no run.
     return int.from_bytes(blake2b(run_id.encode(), digest_size=8).digest(), "little") or 1
-
-
-def _clock_fit(hz: int, start_tick: int, utc_ns: int, tick: int, uncertainty_ns: int) -> ClockFit:
-    """UTC of the run's start, from a comparison some time before or after it."""
-    elapsed = signed_ticks(start_tick - tick)
-    drift_ns = int(abs(elapsed) * NS_PER_S / hz * _DRIFT)
-    return ClockFit(hz, utc_ns + elapsed * NS_PER_S // hz, uncertainty_ns + drift_ns + 1)

@@ -80,6 +80,7 @@ def decode(encoded: bytes) -> Frame:
         raise FrameStuffingError(f"{len(encoded)} bytes are not COBS: {error}") from error
     if len(whole) < _OVERHEAD:
         raise FrameLengthError(f"a frame cannot have {len(whole)} bytes", possible=f"{_OVERHEAD} or more")
+    # CRC-32: with 16 bits, a false tag passed among bytes of which 5 % were wrong.
     body, (crc,) = whole[: -_CRC.size], _CRC.unpack(whole[-_CRC.size :])
     if zlib.crc32(body) != crc:
         raise FrameChecksumError(f"CRC {crc:#010x} where the bytes have {zlib.crc32(body):#010x}")
@@ -175,6 +176,7 @@ def answers(request: Frame, answer: Frame) -> bool:
     """Whether ``answer`` has the form of an answer to ``request``: type, address and count belong to it."""
     if answer.sequence != request.sequence:
         return False
+    # The number alone is not enough: every program begins at 0, and the answer to the one before may be late.
     try:
         return answer.type == FrameType.NAK or _matches(request, answer)
     except FrameLengthError:

@@ -98,6 +98,8 @@ class Link:
         come or the link is dead.
         """
         dialogue = self._dialogue
+        # Whoever waits also sends and repeats what others have queued: there is no thread for it, and the one
+        # that asked may be waiting for the lock.
         with self._news:
             calls = dialogue.ask(requests)
         try:
@@ -143,6 +145,7 @@ class Link:
 
     def close(self) -> None:
         """End the reader and the transport; everyone who waits gets TriggerError. Idempotent."""
+        # The reader ends before its transport does: a descriptor that is closed may be another file's next.
         self._ending.set()
         self._die(TriggerError(f"{self.transport.name} was closed"))
         self._reader.join(_END_S)
@@ -150,6 +153,8 @@ class Link:
 
     def _send(self) -> None:
         """What the window has room for, whoever asked for it."""
+        # The write itself holds no lock that the reader needs: a device whose answers nobody takes may stop
+        # taking requests, and each side would wait for the other.
         with self._sending:
             with self._news:
                 if self._dead:
@@ -168,6 +173,7 @@ class Link:
                 if data := self.transport.read():
                     with self._news:
                         self._tags += self._dialogue.receive(data, time.monotonic())
+                        # The oldest go: a tag confirms every line up to its own.
                         while len(self._tags) > _TAGS_KEPT:
                             self._tags.popleft()
                             self._tags_dropped += 1

@@ -130,7 +130,7 @@ def register_values(
             mode=r.LineMode.PER_SUBSTEP if config.line_start == "per-substep" else r.LineMode.PER_LINE,
             direction=config.a.direction == "reverse",
         ),
-        r.PHASE_CLOCKS: run.line_period_ticks // 6,
+        r.PHASE_CLOCKS: run.line_period_ticks // 6,  # six sub-phases a line, whatever S is
         **_light(config.light, run.substep_ticks, device),
         **_output(config.a, "A", distance, device),
         **_output(config.b, "B", distance, device),

@@ -72,14 +72,16 @@ class TagReader:
 
     def _take(self, arrival: TagArrival) -> LineTag | None:
         number, tag = arrival
-        if tag.run != self._number:
+        if tag.run != self._number:  # of the run before: it was still under way in link or queue
             return None
+        # Numbers of 16 bits come round: what seems more than half a turn ahead is behind.
         ahead = (number - self._next) % _NUMBERS
         if ahead >= _NUMBERS // 2:
             self._counts["tags_repeated"] += 1
             return None
         self._next = (number + 1) % _NUMBERS
         self._counts["tags_missing"] += ahead
+        # Two counters of the device that must agree: a check of the gateware, beside the frame's CRC.
         if tag.code_index != tag.line * self._run.substeps:
             self._counts["tags_wrong"] += 1
             return None

@@ -26,9 +26,7 @@ class PortLock:
             self._descriptor = _open_for_all(path)
         except OSError as error:
             raise TriggerError(f"{port} cannot be locked: {path}: {error.strerror}") from error
-        self._take(port)
-
-    def _take(self, port: str) -> None:
+        # flock, not a file with a number in it: the kernel lets go of it with the process, however that ends.
         try:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
@@ -37,6 +35,7 @@ class PortLock:
             raise TriggerError(
                 f"{port} is in use by process {_describe(holder)}", hint="stop it, or ask its daemon"
             ) from error
+        # Who it is, for those that are refused.
         os.ftruncate(self._descriptor, 0)
         os.pwrite(self._descriptor, f"{os.getpid()}\n".encode(), 0)
 

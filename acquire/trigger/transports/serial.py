@@ -8,7 +8,6 @@ from pathlib import Path
 
 import serial
 from serial.tools.list_ports import comports
-from serial.tools.list_ports_common import ListPortInfo
 
 from acquire.errors import TriggerError
 from acquire.trigger.transports.base import READ_WAIT_S, UDEV_HINT
@@ -32,7 +31,12 @@ class FoundPort:
 
 def list_ports() -> list[FoundPort]:
     """The ports that are there; none is opened."""
-    return [_describe(port) for port in sorted(comports())]
+    found = []
+    for port in sorted(comports()):
+        description = "" if port.description == "n/a" else port.description  # pyserial's word for nothing
+        held_by = holder_of(_lock_name(port.device))
+        found.append(FoundPort(port.device, description, port.serial_number or "", held_by))
+    return found
 
 
 class SerialTransport:
@@ -46,12 +50,13 @@ class SerialTransport:
         self.name = url
         self._local = local = "://" not in url
         self.bytes_per_s = baud / BITS_PER_BYTE if local else float("inf")
+        # Locked before it is opened: who opens a port that another reads already takes some of its bytes.
         self._lock = PortLock(_lock_name(url) if local else url)
         try:
             self._port = serial.serial_for_url(
                 url, baudrate=baud, timeout=READ_WAIT_S, write_timeout=_WRITE_S, rtscts=rts_cts
             )
-            self._port.reset_input_buffer()
+            self._port.reset_input_buffer()  # answers to whoever had the port before
         except (OSError, ValueError) as error:  # SerialException is an OSError
             self._lock.release()
             raise _not_opened(url, error, local) from error
@@ -87,12 +92,6 @@ class SerialTransport:
 
     def _gone(self, error: OSError) -> TriggerError:
         return TriggerError(f"{self.name} is gone: {error}", hint="check cable and power")
-
-
-def _describe(port: ListPortInfo) -> FoundPort:
-    """pyserial writes "n/a" where the system says nothing."""
-    description = "" if port.description == "n/a" else port.description
-    return FoundPort(port.device, description, port.serial_number or "", holder_of(_lock_name(port.device)))
 
 
 def _lock_name(path: str) -> str:

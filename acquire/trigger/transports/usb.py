@@ -98,6 +98,7 @@ class UsbTransport:
             raise TriggerError(f"{self.name} took no byte for {_WRITE_S:g} s") from error
         except usb.core.USBError as error:
             raise self._gone(error) from error
+        # A transfer may end short without an error; what is left, sent later, would be no frame.
         if sent != len(data):
             raise TriggerError(f"{self.name} took {sent} of {len(data)} bytes")
 
