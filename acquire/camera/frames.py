@@ -136,7 +136,13 @@ class FrameCount:
         assert frame.frame_id is not None
         lost = self._lost_frames(frame, frame.frame_id, unnumbered)
         if lost is None:
-            self._note_stale(frame.frame_id)
+            self._stale += 1
+            # A few are late or were sent twice; a camera that restarted stays behind for ever.
+            if self._stale > _MOST_STALE:
+                raise CameraLostError(
+                    f"the camera counts its frames anew: after id {self._last_id} came {self._stale} frames "
+                    f"with ids behind it, the last one {frame.frame_id}"
+                )
             return None
         self._stale = 0
         missed = self._missed_before(frame, lost)
@@ -170,6 +176,7 @@ class FrameCount:
         """Frames from the last one to this one, over a wrap; None when this one is behind it, or the same."""
         if not self._id_bits and number >= self._last_id:
             return number - self._last_id or None
+        # Ids wrap where the narrowest counter that can have made them does.
         bits = self._id_bits or next(bits for bits in _ID_BITS if self._largest_id < 1 << bits)
         ahead = (number - self._last_id) % (1 << bits)
         # More than half of all numbers ahead is less than half behind: late, rather than a day of losses.
@@ -198,14 +205,6 @@ class FrameCount:
                     self._skips_zero = frames < ahead - _CERTAIN
         return self._skips_zero
 
-    def _note_stale(self, number: int) -> None:
-        self._stale += 1
-        if self._stale > _MOST_STALE:
-            raise CameraLostError(
-                f"the camera counts its frames anew: after id {self._last_id} came {self._stale} frames "
-                f"with ids behind it, the last one {number}"
-            )
-
     def _missed_before(self, frame: FrameFacts, lost: int) -> int:
         """Missed triggers of the frames before this one, of those that the counter has announced."""
         last = self._last
@@ -217,6 +216,7 @@ class FrameCount:
         elapsed_ns = frame.time_ns - last.time_ns
         lines = (1 + lost) * self._height
         if not self._pending or self._period_ns is None:
+            # The line period is measured where nothing is missing, so that it means what it says.
             if not self._pending and not lost:
                 self._period_ns = elapsed_ns / lines
             missed = self._pending

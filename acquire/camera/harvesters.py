@@ -103,18 +103,15 @@ class HarvestersCamera:
         self._held: dict[CameraBlock, Any] = {}
         self._ready: deque[tuple[CameraBlock, Any]] = deque()
         try:
-            self._open()
+            self._found = self._library.pick(spec.serial, spec.model)
+            self._acquirer = self._library.create(self._found)
+            self._features = _modules(self._acquirer)
+            apply_settings(spec.settings, self._features)
+            # After the settings: they may have changed width, height and pixel format.
+            check_format(frame_format(self._features), spec)
         except BaseException:
             self.close()
             raise
-
-    def _open(self) -> None:
-        spec = self._spec
-        self._found = self._library.pick(spec.serial, spec.model)
-        self._acquirer = self._library.create(self._found)
-        self._features = _modules(self._acquirer)
-        apply_settings(spec.settings, self._features)
-        check_format(frame_format(self._features), spec)
 
     def identify(self) -> CameraIdentity:
         found = self._found
@@ -189,9 +186,13 @@ class HarvestersCamera:
         """Put a filled buffer in its place among the frames."""
         complete = bool(buffer.is_complete())
         time_ns = _or(lambda: int(buffer.timestamp_ns), 0) or None
+        # Buffers are announced once and come round: each is made an array once, without a copy.
+        key = buffer.context
+        if key not in self._views:
+            self._views[key] = np.frombuffer(buffer.raw_buffer, np.uint8)
         frame = Frame(
             buffer,
-            self._memory(buffer),
+            self._views[key],
             int(buffer.size_filled),
             FrameFacts(  # producers differ in what they say of a frame that is not complete
                 int(buffer.frame_id) if complete else None,
@@ -208,13 +209,6 @@ class HarvestersCamera:
         self._ready += blocks
         for idle in free:
             self._stream.module.queue_buffer(idle, False)
-
-    def _memory(self, buffer: Any) -> Any:
-        """The announced bytes as an array; made once per buffer."""
-        key = buffer.context
-        if key not in self._views:
-            self._views[key] = np.frombuffer(buffer.raw_buffer, np.uint8)
-        return self._views[key]
 
     def _read_underruns(self) -> int:
         return _or_zero(lambda: self._stream.module.num_underrun)
@@ -265,6 +259,7 @@ class _Library:
             self._harvester = Harvester(config=ParameterSet({ParameterKey.LOGGER: logger}))
             for path in self._producers:
                 self._harvester.add_file(str(path))
+            # Once, before a camera is opened: it must not be called while one streams.
             self._harvester.update()
 
     def found(self) -> list[FoundCamera]:
@@ -303,6 +298,7 @@ class _Library:
 
     def close(self) -> None:
         """Idempotent; what a camera that is gone refuses does not matter any more."""
+        # `reset` and not the acquirer's `destroy` alone: harvesters keeps what was destroyed until then.
         with suppress(CameraError), told("close"), _signals_kept():
             self._harvester.reset()
 

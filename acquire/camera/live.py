@@ -79,23 +79,17 @@ def _look(mailbox: Mailbox, opener: CameraOpener, views: dict[str, View]) -> Non
         due_s = time.monotonic() + TURN_S
         while True:
             mailbox.take()  # raises OwnerGone at the end
-            _take_block(camera, views, gauges)
+            if (block := camera.next_block(_WAIT_S)) is not None:
+                lost = sum(loss.count for loss in block.losses)
+                for name, view in views.items():
+                    pixels = block.pixels if view.columns is None else block.pixels[:, slice(*view.columns)]
+                    gauges[name].keep(gauges[name].look(pixels, block.flags, lost))
+                camera.release(block)
             if time.monotonic() >= due_s:
                 mailbox.post(Readings({name: gauge.take() for name, gauge in gauges.items()}))
                 due_s = max(due_s + TURN_S, time.monotonic())
     finally:
         camera.close()
-
-
-def _take_block(camera: Camera, views: dict[str, View], gauges: dict[str, Gauge]) -> None:
-    block = camera.next_block(_WAIT_S)
-    if block is None:
-        return
-    lost = sum(loss.count for loss in block.losses)
-    for name, view in views.items():
-        pixels = block.pixels if view.columns is None else block.pixels[:, slice(*view.columns)]
-        gauges[name].keep(gauges[name].look(pixels, block.flags, lost))
-    camera.release(block)
 
 
 def _white(view: View, settings: dict[str, Any]) -> int:

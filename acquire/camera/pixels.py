@@ -101,6 +101,7 @@ class LineReader:
         cls, layout: PixelLayout, width: int, padding: int, height: int, filled: int
     ) -> LineReader:
         """The reader for a camera of whose frames one of ``height`` lines fills ``filled`` bytes."""
+        # Standards leave open whether a packed line begins at a byte; how much a whole frame fills tells.
         joined, aligned = cls(layout, width, joined=True), cls(layout, width, padding)
         return joined if filled == joined.size(height) != aligned.size(height) else aligned
 
@@ -130,7 +131,7 @@ def _mono10p(rows: NDArray[np.uint8], width: int) -> NDArray[np.uint16]:
 
 
 def _mono12packed(rows: NDArray[np.uint8], width: int) -> NDArray[np.uint16]:
-    b = _groups(rows, 3)
+    b = _groups(rows, 3)  # the byte between: low bits of the first pixel below, of the second above
     return _join([b[..., 0] << 4 | b[..., 1] & 0xF, b[..., 2] << 4 | b[..., 1] >> 4], width)
 
 

@@ -128,7 +128,11 @@ def coerce(setting: Setting, node: Node) -> Value:
     if value is None:
         raise CameraError(f"{setting}: the feature cannot have this value", possible=describe(node))
     if node.kind in ("integer", "float"):
-        _check_range(setting, node, float(value))
+        low, high, step = node.limits()
+        inside = low <= float(value) <= high
+        # Steps of floats are what the camera rounds to; those of integers it insists on.
+        if not inside or (step and node.kind == "integer" and (float(value) - low) % step):
+            raise CameraError(f"{setting}: the value is out of range", possible=describe(node))
     elif node.kind == "enumeration" and value not in node.entries():
         raise CameraError(f"{setting}: the feature has no such entry", possible=describe(node))
     return value
@@ -150,13 +154,6 @@ def describe(node: Node) -> str:
 def _number(value: float) -> str:
     whole = abs(value) < _LONG and value == round(value)
     return f"{value:.0f}" if whole else f"{value:g}"
-
-
-def _check_range(setting: Setting, node: Node, value: float) -> None:
-    low, high, step = node.limits()
-    inside = low <= value <= high
-    if not inside or (step and node.kind == "integer" and (value - low) % step):
-        raise CameraError(f"{setting}: the value is out of range", possible=describe(node))
 
 
 def _compare(setting: Setting, node: Node, when: str) -> None:

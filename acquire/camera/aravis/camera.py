@@ -32,8 +32,6 @@ from acquire.camera.settings import apply_settings
 from acquire.errors import CameraError, CameraLostError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     from acquire.camera.settings import Features
     from acquire.camera.spec import GenicamSpec
 
@@ -134,6 +132,7 @@ class AravisCamera:
         stream = self._prepare()
         for _ in range(buffers):
             self._give(stream, library.arv_buffer_new_allocate(self._payload))
+        # Before the start, so that one that fails half-way is stopped as well.
         self._armed = True
         with errors(what) as error:
             library.arv_camera_start_acquisition(self._camera, error)
@@ -178,7 +177,13 @@ class AravisCamera:
 
     def _fetch(self, timeout_s: float) -> None:
         """Put the buffers that have been filled in their places among the frames."""
-        buffers = list(self._pop(timeout_s))
+        # The next one, and those that wait already: the camera's counter of missed triggers is read over the
+        # network, and once for all of them. Read for each, a busy host had no buffer left in the end.
+        buffers: list[int] = []
+        buffer = self._library.arv_stream_timeout_pop_buffer(self._stream, round(timeout_s * 1e6))
+        while buffer:
+            buffers.append(buffer)
+            buffer = self._library.arv_stream_try_pop_buffer(self._stream)
         if not buffers:
             self._ask_alive()
             return
@@ -196,15 +201,6 @@ class AravisCamera:
             for idle in free:
                 self._taken.remove(idle)
                 self._give(self._stream, idle)
-
-    def _pop(self, timeout_s: float) -> Iterator[int]:
-        """The next filled buffer, and those that wait already: a counter of the camera is read over the
-        network, once for all of them.
-        """
-        buffer = self._library.arv_stream_timeout_pop_buffer(self._stream, round(timeout_s * 1e6))
-        while buffer:
-            yield buffer
-            buffer = self._library.arv_stream_try_pop_buffer(self._stream)
 
     def _missed_triggers(self) -> int:
         try:
@@ -321,6 +317,7 @@ def _text(features: AravisFeatures, name: str) -> str:
 
 
 def _check_identity(found: CameraIdentity, spec: GenicamSpec) -> None:
+    # An address may have become another camera's, and cameras that are swapped show in the video only.
     if found.serial != spec.serial:
         raise CameraError(f"the camera at {spec.cti} has serial number {found.serial!r}, not {spec.serial!r}")
     if spec.model and found.model != spec.model:

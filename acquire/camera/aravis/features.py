@@ -119,6 +119,7 @@ class AravisNode:
         with errors(f"read {self.name}") as error:
             get = getattr(self._library, f"arv_device_get_{self._word}_feature_value")
             value = get(self._device, self._key, error)
+        # ctypes gives a text that is empty, or not there, as None.
         return value.decode() if isinstance(value, bytes) else value or (0 if value is not None else "")
 
     def write(self, value: Value) -> None:
@@ -160,5 +161,5 @@ class AravisNode:
                 self._device, self._key, byref(count), error
             )
         names = [found[k].decode() for k in range(count.value)]
-        self._library.g_free(found)
+        self._library.g_free(found)  # the list alone: its texts are the node's
         return names
