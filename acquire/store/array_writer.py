@@ -211,7 +211,7 @@ class ArrayWriter:
         """The oldest chunk that is being encoded."""
         payload, buffer = self._encoding.popleft()
         if buffer is not None:
-            self._free.append(buffer)
+            self._free.append(buffer)  # nobody but this thread takes it, and not before the result is here
         return payload.result()
 
     def _write(self, payloads: Sequence[NDArray[np.uint8]]) -> None:
@@ -244,15 +244,12 @@ class ArrayWriter:
         self.directory.stat()  # one that was taken away is a failure, and not made again
         self._disk.make_directory(path.parent, parents=True)
         self._shard = ShardWriter(self._disk, path, self.shape.shard_chunks, direct=self._is_large)
-        if self._durable:
-            self._sync_directories(path.parent)
-        return self._shard
-
-    def _sync_directories(self, directory: Path) -> None:
-        """Force the way to a new shard to the medium."""
-        while directory != self.directory.parent:
+        # A file that is on the medium can still have no name there: each directory above it is forced, too.
+        directory = path.parent
+        while self._durable and directory != self.directory.parent:
             self._disk.sync_directory(directory)
             directory = directory.parent
+        return self._shard
 
 
 def _buffer(shape: ArrayShape) -> NDArray[Any]:

@@ -246,7 +246,7 @@ def measure_disk(directory: Path, size: int = 2**27) -> float:
     for path in directory.glob(_MEASURED.format("*")):  # where a file cannot be made without a name
         if not Path("/proc", path.stem.removeprefix(".acquire-")).exists():
             path.unlink(missing_ok=True)
-    block = aligned_bytes(2**22)
+    block = aligned_bytes(2**22)  # as large as a write of the recorder's, which hides each write's own cost
     file = _nameless(directory)
     try:
         begun = time.perf_counter()
@@ -294,6 +294,7 @@ def locked(path: Path, doing: str, *, surely: bool = False) -> Iterator[None]:
 
 def lock(path: Path, doing: str, *, surely: bool = False) -> int:
     """A descriptor that holds the directory ``path`` until it is closed; see `locked`."""
+    # On the directory itself: a file for it could be left behind, and its name be somebody's array.
     fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -321,6 +322,7 @@ def _walk(path: Path) -> Iterator[tuple[Path, list[Path]]]:
 
 
 def _sync(path: Path, flags: int = 0) -> None:
+    # Neither a link out of the recording nor a pipe that somebody has put there may hold the writer up.
     fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK | flags)
     try:
         os.fsync(fd)
@@ -341,6 +343,7 @@ class Publisher:
 
     def replace(self, path: Path, data: Buffer, *, durable: bool = False) -> None:
         """Replace ``path``; ``durable`` forces bytes and name to the medium before it returns."""
+        # The bytes first: after a power failure a name may otherwise lead to an empty file.
         self.disk.write_file(self.scratch, data, durable=durable)
         self.disk.rename(self.scratch, path)
         if durable:

@@ -56,6 +56,8 @@ def _grow(reader: ChunkReader, first: int, entries: list[tuple[int, int]]) -> No
 
 def rewrite_chunk(disk: Disk, path: Path, reader: ChunkReader, chunk: int, rows: NDArray[Any]) -> None:
     """Put ``rows`` in the place of a chunk: at the end of its file, which is made where there is none."""
+    # The chunk, then its entry: whoever reads meanwhile finds the old one or the new one, and a recovery that
+    # is interrupted has lost nothing. What the old one took stays unused.
     file = path / reader.file(chunk)
     entries, _ = reader.index(chunk // reader.shape.shard_chunks)
     payload = encode(rows, reader.shape.codec).tobytes()

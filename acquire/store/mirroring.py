@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
-    from acquire.errors import AcquireError
     from acquire.store.files import Disk
     from acquire.store.layout import Document
     from acquire.store.reader import Recording
@@ -94,7 +93,24 @@ def mirror(
     refuse_link(path, path)
     open_recording(path)  # which says what else it may be
     with only_copy(path):
-        return _mirror(_Steps(Mirror(path, url), progress), path, follow, idle_s, report)
+        copying = _Steps(Mirror(path, url), progress)
+        done = copying.step()
+        moved = time.monotonic()
+        while follow and not done.sealed:
+            time.sleep(LOOK_S)
+            before, done = done, copying.step()
+            if done != before:
+                moved = time.monotonic()
+            if done.bytes != before.bytes:
+                report(done)
+            # Its writer may be gone; one that lives commits ten times a second.
+            if time.monotonic() - moved > idle_s:
+                raise DataError(
+                    f"{path} has not grown for {idle_s:g} s and is not sealed",
+                    possible=f"{done.lines} lines are in {copying.target}",
+                    hint=f"acquire recover {path}, then copy again",
+                )
+        return done
 
 
 class _Steps:
@@ -114,27 +130,6 @@ class _Steps:
         return done
 
 
-def _mirror(
-    copying: _Steps, path: Path, follow: bool, idle_s: float, report: Callable[[Mirrored], None]
-) -> Mirrored:
-    done = copying.step()
-    moved = time.monotonic()
-    while follow and not done.sealed:
-        time.sleep(LOOK_S)
-        before, done = done, copying.step()
-        if done != before:
-            moved = time.monotonic()
-        if done.bytes != before.bytes:
-            report(done)
-        if time.monotonic() - moved > idle_s:
-            raise DataError(
-                f"{path} has not grown for {idle_s:g} s and is not sealed",
-                possible=f"{done.lines} lines are in {copying.target}",
-                hint=f"acquire recover {path}, then copy again",
-            )
-    return done
-
-
 @contextmanager
 def only_copy(path: Path) -> Iterator[None]:
     """Keep other processes from copying the recording at ``path``; StateError while one does."""
@@ -147,16 +142,6 @@ def only_copy(path: Path) -> Iterator[None]:
         except OSError as error:
             raise refusal(path, error, "copied") from error
         yield
-
-
-def _not_copied(copying: Mirror, error: OSError) -> AcquireError:
-    """A copy fails for what is read here, or for what is written there."""
-    here = error.filename is not None and str(error.filename).startswith(str(copying.path))
-    return refusal(copying.path, error, "read") if here else refusal(copying.target, error, "written", _HINT)
-
-
-def _nothing() -> None:
-    pass
 
 
 def _identity(attributes: dict[str, Any]) -> tuple[str, int]:
@@ -181,7 +166,9 @@ class Mirror:
     ``pause`` is called before anything is put; what it raises ends the copy, and another goes on with it.
     """
 
-    def __init__(self, path: Path, url: str, disk: Disk = DISK, pause: Callable[[], None] = _nothing) -> None:
+    def __init__(
+        self, path: Path, url: str, disk: Disk = DISK, pause: Callable[[], None] = lambda: None
+    ) -> None:
         self.path = path
         self.target = RemoteSource(url)
         self._disk = disk
@@ -237,7 +224,10 @@ class Mirror:
             if whole or not sealed:
                 self._publish(recording, lines)
         except OSError as error:
-            raise _not_copied(self, error) from error
+            # A copy fails for what is read here, or for what is written there; the error's file tells.
+            here = error.filename is not None and str(error.filename).startswith(str(self.path))
+            what = (self.path, error, "read") if here else (self.target, error, "written", _HINT)
+            raise refusal(*what) from error
         # Retention may have what is copied: lines before this one; all of a recording that is sealed.
         line = None if sealed else recording.first_line + lines
         if line is None:
@@ -257,6 +247,7 @@ class Mirror:
 
     def _copy_shards(self, recording: Recording, end: int, most: int | None) -> None:
         before = self._shards
+        size = recording.arms[ARMS[0]].reader("lines").shape.shard_rows
         if self._next < end and not self._root and MARK not in self._there:
             # Say whose copy this is, before its root can.
             run_id, number = self._identity
@@ -264,7 +255,9 @@ class Mirror:
             self._put(MARK, to_json({"attributes": facts}))
             self._there[MARK] = 0
         while self._next < end and (most is None or self._shards - before < most):
-            if (kept := self._next_kept(recording)) != self._next:
+            # What retention has dropped is passed over in one go: of an endless recording that is very much.
+            dropped = (rows for rows in recording.dropped_rows() if self._next * size in rows)
+            if (kept := max((rows.stop // size for rows in dropped), default=self._next)) != self._next:
                 self._next = kept
                 continue
             if not self._sealed:
@@ -273,21 +266,15 @@ class Mirror:
             copied = False
             for file in shard_files(self.path, self._next):
                 key = file.relative_to(self.path).as_posix()
-                size = file.stat().st_size
-                if self._there.get(key) != size:
+                length = file.stat().st_size
+                if self._there.get(key) != length:
                     self._make_way(key)
                     self.target.put_file(key, file)
-                    self._there[key] = size
-                    self._bytes += size
+                    self._there[key] = length
+                    self._bytes += length
                     copied = True
             self._shards += copied
             self._next += 1
-
-    def _next_kept(self, recording: Recording) -> int:
-        """The next shard that retention has not dropped: of endless recordings there may be very many."""
-        size = recording.arms[ARMS[0]].reader("lines").shape.shard_rows
-        dropped = (rows for rows in recording.dropped_rows() if self._next * size in rows)
-        return max((rows.stop // size for rows in dropped), default=self._next)
 
     def _refuse_shortfall(self, recording: Recording, shards: range | None) -> None:
         """What is said to be here, and is not, must not be said there."""

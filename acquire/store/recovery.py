@@ -122,7 +122,7 @@ def recover(
     """
     refuse_links(path)
     if not root_is_lost(path):
-        open_recording(path)
+        open_recording(path)  # what is no recording is refused before it is locked
     with refused(path, "recovered"), locked(path, "recovering", surely=not known.alone):
         if lost := root_is_lost(path):
             rebuild_root(path, disk)
@@ -195,6 +195,8 @@ class _Recoverer:
 
     def _grown(self) -> int:
         """Rows with those that are whole on disk in every array, though no commit lists them."""
+        # Chunk after chunk of the arrays of tags: the first that is not whole, in any array of either arm, is
+        # where the writer was.
         rows, grown = self.recording.lines, self.tag_rows
         while rows % self.tag_rows == 0 and grown:
             beyond = range(rows, rows + self.tag_rows)

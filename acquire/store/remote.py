@@ -106,7 +106,12 @@ class RemoteSource:
         for an object store without credentials in the environment.
         """
         self.url = url.rstrip("/")
-        self._fs, self._root = _file_system(self.url)
+        check_url(self.url)
+        _check_credentials(self.url)
+        import fsspec
+
+        with _told(self.url):
+            self._fs, self._root = fsspec.core.url_to_fs(self.url, **_options(self.url))
 
     def __str__(self) -> str:
         return self.url
@@ -231,16 +236,6 @@ def _check_credentials(url: str) -> None:
         possible=f"{usual}; or one of {', '.join(others)}",
         hint=f"export {usual.replace(' and ', '=… ')}=…",
     )
-
-
-def _file_system(url: str) -> tuple[Any, str]:
-    check_url(url)
-    _check_credentials(url)
-    import fsspec
-
-    with _told(url):
-        system, root = fsspec.core.url_to_fs(url, **_options(url))
-    return system, root
 
 
 @contextmanager

@@ -101,6 +101,7 @@ def _segments_beside(first: Path) -> list[str]:
             attributes = read_root(LocalSource(path))["attributes"]
         except (DataError, PlaceError):
             continue  # no recording, or none that could say what it is
+        # A name alone proves nothing: somebody may have called another recording NAME-2.
         segment = segment_of(attributes)
         if segment and (segment[0], attributes.get("run_id")) == (first.name, run_id):
             found.append((segment[1], path.name))

@@ -157,6 +157,7 @@ class Keeper:
             before, after = self.policy.hold_lines
             first, end = max(self.first_line, line - before), line + after + 1
             last = self.holds[-1] if self.holds else None
+            # One hold for events that follow each other closely: all of them are in the recording's root.
             if last and last.why == kind and last.first_line <= first <= last.lines.stop:
                 self.holds.pop()
                 first, end = last.first_line, max(end, last.lines.stop)
@@ -167,7 +168,10 @@ class Keeper:
 
         ``missing_bytes`` more than the limits ask for, where the disk is nearly full.
         """
-        self._measure(rows)
+        # A whole shard does not change any more: each is measured once.
+        known = max([-1, *self.sizes, *(stretch.stop - 1 for stretch in self.gone)])
+        for shard in range(known + 1, rows // self.shard_rows):
+            self.sizes[shard] = shard_bytes(self.path, shard)
         self.marked = self._marks()
         held = [hold.lines for hold in (*self.holds, *self.marked)]
         newest = self.first_line + rows
@@ -177,12 +181,13 @@ class Keeper:
         if self.policy.max_bytes is not None:
             excess = max(excess, sum(self.sizes.values()) + partly - self.policy.max_bytes)
         going = []
+        age = self.policy.max_age_lines
         for shard in sorted(self.sizes):
             if self._lines(shard).stop > newest - self.policy.margin_lines:
                 break
             if shard in self.odd or self._held(shard, held):
                 continue
-            if excess > 0 or self._old(shard, newest):
+            if excess > 0 or (age is not None and self._lines(shard).stop <= newest - age):
                 going.append(shard)
                 excess -= self.sizes.pop(shard)
                 self.gone = _with(self.gone, shard)
@@ -227,18 +232,9 @@ class Keeper:
             marks.append(Hold(self.first_line, ALL_LINES, _NOT_COPIED))
         return marks
 
-    def _measure(self, rows: int) -> None:
-        known = max([-1, *self.sizes, *(rows.stop - 1 for rows in self.gone)])
-        for shard in range(known + 1, rows // self.shard_rows):
-            self.sizes[shard] = shard_bytes(self.path, shard)
-
     def _lines(self, shard: int) -> range:
         start = self.first_line + shard * self.shard_rows
         return range(start, start + self.shard_rows)
-
-    def _old(self, shard: int, newest: int) -> bool:
-        age = self.policy.max_age_lines
-        return age is not None and self._lines(shard).stop <= newest - age
 
     def _held(self, shard: int, held: list[range]) -> bool:
         lines, margin = self._lines(shard), self.policy.margin_lines

@@ -81,6 +81,7 @@ class RecordingWriter:
         if threads:
             keep_freed_memory()
         self._pool = ThreadPoolExecutor(threads, "encoder") if threads else None
+        # One thread for both arms: a disk takes one large write after the other as fast as two at once.
         self._behind = ThreadPoolExecutor(1, "disk")
         once = {name: EncodeOnce() for name in layout.SAME_IN_BOTH_ARMS}
         self._arms = {arm: ArmWriter(path / arm, spec, disk, self._pool, once) for arm in ARMS}
@@ -117,6 +118,7 @@ class RecordingWriter:
         StoreError when the disk refuses; then nothing is left behind.
         """
         check_new_path(path)
+        # Made by us, or refused: of two recorders that are given one name, one is.
         try:
             disk.make_directory(path)
         except FileExistsError as error:  # somebody was faster
@@ -259,7 +261,7 @@ class RecordingWriter:
                 # Rows count once they are on disk, so what is on its way is waited for.
                 arm.settle()
             rows = self._whole_rows()
-            room = self._watch.look(self.bytes_written)
+            room = self._watch.look(self.bytes_written)  # others fill the disk, too, while nothing comes
             if rows == self._committed and not any(table.dirty for table in self._tables):
                 return
             if self._durable:
@@ -329,6 +331,7 @@ class RecordingWriter:
         with self._failing("closing files"):
             for arm in self._arms.values():
                 arm.close()
+            # The lock last: whoever gets it may recover the recording, which nobody may write any more then.
             if self._lock >= 0:
                 held, self._lock = self._lock, -1
                 os.close(held)
@@ -442,15 +445,10 @@ class RecordingWriter:
             yield
         except OSError as error:
             what = f"{doing}: {error.strerror or error}"
-            self._failure = self._failure or what
+            self._failure = self._failure or what  # the first: others follow from it
+            hint = "check that the directory still exists and the kernel's log for errors of the disk"
+            if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+                hint = "free space there, or record to another disk"
             raise kind(
-                f"{self.path}: the disk failed while {what}",
-                possible=self._safe(),
-                hint=_advice(error),
+                f"{self.path}: the disk failed while {what}", possible=self._safe(), hint=hint
             ) from error
-
-
-def _advice(error: OSError) -> str:
-    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        return "free space there, or record to another disk"
-    return "check that the directory still exists and the kernel's log for errors of the disk"
