@@ -254,6 +254,8 @@ class Client:
         except _BrokenError:
             if call.request_id is None:
                 raise
+        # Once more, under the same id: if the first one arrived, this gets its answer and nothing is done
+        # twice. A third would only keep a caller waiting whose daemon is gone.
         return self._once(call)
 
     def _once(self, call: Call[T]) -> T:
@@ -261,6 +263,7 @@ class Client:
             try:
                 path = self._target.path(call.name)
                 connection.request(call.method, path, call.content, call.headers(self._target))
+                # No fixed time is right for a command, since arming may take a minute: the daemon is asked.
                 if call.method == "POST" and connection.sock is not None:
                     self._await_answer(connection.sock, call.timeout_s)
                 response = connection.getresponse()

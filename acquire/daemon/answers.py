@@ -26,7 +26,7 @@ LONGEST_ID = 128
 @dataclass(slots=True)
 class _Kept:
     asked: str
-    answer: asyncio.Task[Status]
+    answer: asyncio.Future[Status]
 
 
 class Answers:
@@ -49,26 +49,19 @@ class Answers:
                 hint="a new id for every request",
             )
         if known is None:
-            known = _Kept(asked, asyncio.create_task(_run(work)))
+            known = _Kept(asked, asyncio.ensure_future(work()))
             known.answer.add_done_callback(_heard)
             if request_id is not None:
                 self._kept[request_id] = known
-                self._forget()
+                # What is still under way is not forgotten: it would be carried out twice.
+                over = [key for key, kept in self._kept.items() if kept.answer.done()]
+                for key in over[: max(0, len(self._kept) - self._most)]:
+                    del self._kept[key]
+        # A client that goes away cancels its request, and not the command that is being carried out.
         return await asyncio.shield(known.answer)
 
-    def _forget(self) -> None:
-        """What is still under way is not forgotten: it would be carried out twice."""
-        for key in [key for key, kept in self._kept.items() if kept.answer.done()]:
-            if len(self._kept) <= self._most:
-                return
-            del self._kept[key]
 
-
-async def _run(work: Callable[[], Awaitable[Status]]) -> Status:
-    return await work()
-
-
-def _heard(answer: asyncio.Task[Status]) -> None:
+def _heard(answer: asyncio.Future[Status]) -> None:
     """An error whose client has gone is not asyncio's matter: the service has logged it."""
     if not answer.cancelled():
         answer.exception()

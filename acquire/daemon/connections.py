@@ -56,6 +56,7 @@ log = logging.getLogger("acquire.daemon")
 
 def raise_descriptor_limit() -> int:
     """As many descriptors as this user may have, within reason; the limit from now on."""
+    # The usual 1024 is for programs that call select(2), which cannot take more. Nothing here does.
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = MOST_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, MOST_DESCRIPTORS)
     if soft == resource.RLIM_INFINITY or soft >= wanted:
@@ -143,7 +144,7 @@ class Connection(H11Protocol):
         super().data_received(data)
         if self.is_working:
             self._cancel()
-        elif self._timer is None:
+        elif self._timer is None:  # else it runs already: a byte now and then does not prolong it
             self._wait(REQUEST_S)
 
     def on_response_complete(self) -> None:

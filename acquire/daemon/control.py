@@ -76,7 +76,7 @@ class BoundedBody:
         async def bounded() -> Message:
             nonlocal left
             message = await receive()
-            left -= len(message.get("body", b""))
+            left -= len(message.get("body", b""))  # what has come: a length that is told may be no truth
             if left < 0:
                 raise HTTPException(413, f"more than {MAX_BODY_BYTES} bytes")
             return message
@@ -106,7 +106,7 @@ def _add_errors(app: FastAPI) -> None:
 
     @app.exception_handler(Exception)
     async def defect(_: Request, error: Exception) -> JSONResponse:
-        # The server logs the traceback; the user gets one line and a way to tell us.
+        # The server logs the traceback; the user gets one line, and is told where the rest is.
         told = f"defect in the daemon: {shortened(repr(error), 400)}"
         return _answer(AcquireError(told, hint="see the daemon's log"))
 

@@ -128,6 +128,7 @@ class Copier:
         now_s = time.monotonic()
         due = [job for job in self._jobs.values() if job.not_before_s <= now_s]
         if due:
+            # The one that grows goes first: it is the one that retention waits for.
             self._serve(min(due, key=lambda job: not (job.ours and job.grows)))
             return
         until_s = min([now_s + IDLE_S, *(job.not_before_s for job in self._jobs.values())])
@@ -185,6 +186,8 @@ class Copier:
             else:
                 self._put_off(job, "" if young else f"{job.path.parent} is not there")
             return False
+        # Open and not ours: what a crash has done to it is known once it is recovered. Copied now, it would
+        # have to be copied again.
         if not job.ours and read_root(LocalSource(job.path))["attributes"].get("state") != "sealed":
             self._put_off(job, "it is open, and not recovered yet", f"acquire recover {job.path}")
             return False
@@ -219,7 +222,9 @@ class Copier:
         job.let_go()
         job.not_before_s = time.monotonic() + wait_s(job.tries)
         job.tries += 1
-        here = _lines_of(job.path)
+        here: int | None = None
+        with contextlib.suppress(AcquireError):
+            here = open_recording(job.path).lines
         waiting = None if here is None else max(0, here - job.said.lines)
         self._tell(job, state="waiting", error=error, hint=hint, waiting_lines=waiting)
 
@@ -227,11 +232,3 @@ class Copier:
         before, job.said = job.said, job.said.model_copy(update=facts)
         if job.said != before:
             self._mailbox.post(job.said)
-
-
-def _lines_of(path: Path) -> int | None:
-    """That a reader finds here."""
-    try:
-        return open_recording(path).lines
-    except AcquireError:
-        return None

@@ -106,6 +106,7 @@ def _own(directory: Path) -> None:
 
 
 def _lock(path: Path) -> int:
+    # In a directory that others write to, a link would have us empty a file of theirs, a pipe wait for ever.
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
     try:
         lock = os.open(lock_path(path), flags, 0o600)
@@ -135,6 +136,7 @@ def _lock(path: Path) -> int:
 def _listen(path: Path) -> Listener:
     path.unlink(missing_ok=True)  # left by a daemon that was killed: the lock was free
     listener = Listener(socket.AF_UNIX, socket.SOCK_STREAM)
+    # By umask, and not by chmod afterwards: in between anybody could connect.
     before = os.umask(0o177)
     try:
         listener.bind(str(path))

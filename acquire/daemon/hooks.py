@@ -82,7 +82,7 @@ class Hooks:
                 stdout=subprocess.DEVNULL,
                 timeout=limit_s,
                 check=False,
-                start_new_session=True,
+                start_new_session=True,  # Ctrl-C on the daemon's terminal is not meant for it
             )
         except (OSError, subprocess.TimeoutExpired) as error:
             log.warning("hook %s: %s", words[0], error)

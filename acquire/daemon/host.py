@@ -122,6 +122,7 @@ def _scene_bytes(config: RigConfig) -> int:
 
 def memory_bytes() -> int:
     """Of this host, or what its control group leaves of it."""
+    # A container sees the host's memory in /proc, and is killed at its group's limit.
     host = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     with contextlib.suppress(OSError, ValueError):  # no control group, or "max"
         return min(host, int(_CGROUP_LIMIT.read_text(encoding="ascii")))

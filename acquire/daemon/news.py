@@ -71,7 +71,14 @@ class NewsLog:
             seen = int(number) if ours else 0
             first = self._count - len(self._kept) + 1
             news = [one for k, one in enumerate(self._kept, first) if k > seen]
-            return self._told_missing(last_id, seen, first, ours=ours) + news
+            if last_id is None or (ours and seen >= first - 1):
+                return news
+            # Who asks for what came after a news that is gone has to hear that something is missing.
+            text = "the daemon was started anew: what happened before is in its log and in the recordings"
+            if ours:
+                text = f"{first - 1 - seen} news are not kept any more"
+            made, now = f"{self.life}-{first - 1}", datetime.now(UTC)
+            return [News(id=made, time=now, kind="missed", text=text, state=self._state), *news]
 
     @property
     def last_id(self) -> str:
@@ -87,24 +94,13 @@ class NewsLog:
 
     def wake(self) -> None:
         """Have the listeners look."""
-        for wake in tuple(self._listeners):
+        for wake in tuple(self._listeners):  # one of another thread may come or go meanwhile
             wake()
 
     def close(self) -> None:
         """End the streams: nothing more will happen."""
         self.closed = True
         self.wake()
-
-    def _told_missing(self, last_id: str | None, seen: int, first: int, *, ours: bool) -> list[News]:
-        if last_id is None or (ours and seen >= first - 1):
-            return []
-        text = (
-            f"{first - 1 - seen} news are not kept any more"
-            if ours
-            else "the daemon was started anew: what happened before is in its log and in the recordings"
-        )
-        made = f"{self.life}-{first - 1}"
-        return [News(id=made, time=datetime.now(UTC), kind="missed", text=text, state=self._state)]
 
 
 class Changes:
@@ -119,6 +115,7 @@ class Changes:
     def of(self, status: Status) -> list[dict[str, Any]]:
         """Facts for `NewsLog.tell`. The daemon's own state is told by whoever changes it."""
         before, self._before = self._before, status
+        # Counts begin anew with a run: a difference to those of the run before means nothing.
         same_run = before is not None and before.run_id == status.run_id
         if not same_run:
             self._lost.clear()

@@ -50,7 +50,7 @@ class Page:
                 self._leaving, self._left_s = self._process, now_s
                 self._forget()
             self._words, self._not_before_s, self._wait_s = words, now_s, FIRST_WAIT_S
-        if self._leaving is not None and self._leaving.poll() is None:  # it has the address yet
+        if self._leaving is not None and self._leaving.poll() is None:  # it still has the address
             if now_s - self._left_s > END_S:
                 self._leaving.kill()
             return

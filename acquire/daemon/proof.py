@@ -35,10 +35,6 @@ TIGHT = 0.7
 log = logging.getLogger("acquire.daemon")
 
 
-def _say_nothing(text: str) -> None:
-    """Nobody wants to know."""
-
-
 class Proof:
     """What one rig's recordings need, and what the host has to offer."""
 
@@ -53,11 +49,11 @@ class Proof:
         now_s = time.monotonic()
         if self._chosen is None or now_s - self._chosen[0] > VALID_S:
             self._chosen = now_s, choose_for(config)
-            self._measured = None
+            self._measured = None  # it was of the codec before
         return self._chosen[1]
 
     def __call__(
-        self, *, force: bool = False, tell: Callable[[str], object] = _say_nothing, anew: bool = False
+        self, *, force: bool = False, tell: Callable[[str], object] = lambda _: None, anew: bool = False
     ) -> CapacityStatus:
         """What is sustained, ``anew`` whatever was measured lately.
 
@@ -74,7 +70,9 @@ class Proof:
         load = parts.load
         tight = parts.line_rate_hz * TIGHT < load.line_rate_hz
         warning = f"{_configured(load)}; {_sustained(parts)}" if tight else None
-        if self._refuses(parts) and not force:
+        # Simulated cameras wait for a host that is busy, but not for one that has too few processors.
+        limit_hz = parts.limits["processors"] if self._config.simulates_cameras else parts.line_rate_hz
+        if limit_hz < load.line_rate_hz and not force:
             raise UsageError(
                 f"arm: {_configured(load)} is more than this host sustains",
                 possible=f"{_sustained(parts)}; the best of {TRIES} measurements at a load of {_load()}",
@@ -90,11 +88,6 @@ class Proof:
             limits_hz={name: round(rate) for name, rate in parts.limits.items()},
             warning=warning,
         )
-
-    def _refuses(self, parts: Parts) -> bool:
-        """Simulated cameras wait for a host that is busy, but not for one that has too few processors."""
-        limit_hz = parts.limits["processors"] if self._config.simulates_cameras else parts.line_rate_hz
-        return limit_hz < parts.load.line_rate_hz
 
     def _parts(self, tell: Callable[[str], object]) -> Parts:
         """What was measured lately, or is now; what is too little is measured again, and not remembered."""

@@ -74,6 +74,7 @@ class Reloading:
         if changed:
             service.reconfigure(new, shortened(told, LONGEST_MARK))
             self._hooks.reconfigure(new.hooks)
+        # Told at the more talkative of the two levels, so that the change itself is in the log.
         root, level = logging.getLogger(), new.service.level
         root.setLevel(min(root.level, level))
         self._tell(told)

@@ -53,6 +53,7 @@ class Rates:
         quiet_s = self._looked_s - last_s
         if quiet_s >= RATE_WINDOW_S:
             return 0.0
+        # A change that is overdue lowers the rate; one that is merely not due yet must not.
         over_s = last_s - first_s + (quiet_s if quiet_s > 2 * usual_s else 0.0)
         return (last - first) / over_s
 
@@ -86,7 +87,7 @@ def arm_statuses(seen: CaptureStatus, rates: Rates) -> dict[str, ArmStatus]:
             saturated=counts.get("saturated", 0),
             saturated_part=rates.saturated_part(arm),
             drift_ppb=counts.get("clock", {}).get("drift_ppb", 0),
-            ring=_ring(seen.ring[arm]),
+            ring=RingStatus(**{k: n for k, n in seen.ring[arm].items() if k in RingStatus.model_fields}),
             ledger=LedgerStatus(**seen.accounts[arm].to_dict()) if arm in seen.accounts else None,
             check=CheckStatus(**counts["check"]) if counts.get("check") else None,
         )
@@ -98,7 +99,3 @@ def _lost(seen: CaptureStatus, arm: str) -> dict[str, int]:
     """The ledger's losses, once there is a ledger: it alone knows what never came."""
     counted = {str(cause): lines for cause, lines in seen.lines[arm]["lost"].items()}
     return counted | (seen.accounts[arm].lost if arm in seen.accounts else {})
-
-
-def _ring(counts: dict[str, int]) -> RingStatus:
-    return RingStatus(**{name: counts[name] for name in RingStatus.model_fields if name in counts})

@@ -74,6 +74,7 @@ class Salvage:
     def search(self) -> None:
         """Look for recordings that a killed daemon has left; `poll` will find them."""
         self._not_sealed = dict.fromkeys(self._journal.read())
+        # In a thread: a directory of thousands, or on a slow disk, does not keep the daemon from beginning.
         thread = ThreadPoolExecutor(1, "salvage")
         self._searching = thread.submit(search, self._directory, list(self._not_sealed))
         thread.shutdown(wait=False)
@@ -187,7 +188,7 @@ class Salvage:
         worker, task = self._worker, self._under_way
         if worker is None or task is None:
             return []
-        death = worker.death
+        death = worker.death  # asked first: what a process said last is still in its pipe then
         said = worker.message()
         if said is None and death is None:
             return []

@@ -71,7 +71,9 @@ def serve(config: RigConfig, origin: str = "", reread: Callable[[], RigConfig] |
     troubles = Troubles()
     threading.excepthook = troubles.in_thread
     with contextlib.closing(Endpoint(config.control.socket.absolute())) as endpoint, Rig(config) as rig:
-        warm_up(*worker_modules(rig))
+        warm_up(
+            *worker_modules(rig)
+        )  # first: it imports while the rest begins, and the first arm finds it warm
         salvage = Salvage(config.recording.directory.absolute(), _journal(config, "recordings"))
         salvage.search()
         uploads = Uploads(config.recording.upload_to, _journal(config, "uploads"))
@@ -136,9 +138,13 @@ class Daemon:
 
     async def run(self) -> int:
         """Serve until a signal; the exit code."""
-        self._take_signals()
-        asyncio.get_running_loop().set_exception_handler(self._troubles.in_loop)
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            loop.add_signal_handler(number, self._on_signal, number)
+        loop.set_exception_handler(self._troubles.in_loop)
         serving = asyncio.create_task(self._server.answer())
+        # READY=1 only once requests are answered: a daemon that has told systemd that it is ready, and then
+        # cannot load what it needs, would never be restarted.
         if await self._is_answering(serving):
             log.info("listening on %s (process %d)", self._endpoint.path, os.getpid())
             notify("READY=1")
@@ -229,11 +235,6 @@ class Daemon:
                 self._begun_s = None
 
         return await asyncio.get_running_loop().run_in_executor(self._devices, timed)
-
-    def _take_signals(self) -> None:
-        loop = asyncio.get_running_loop()
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            loop.add_signal_handler(number, self._on_signal, number)
 
     async def _reload(self) -> None:
         WHO.set(signal.SIGHUP.name)

@@ -306,6 +306,7 @@ class Service:
 
     def _begin(self, begin: Begin, *, by_event: bool = False) -> None:
         assert self._run is not None
+        # Before anything is written down of it: a start that is refused leaves no trace.
         self._run.capture.start(begin)
         path, lines = begin.path, begin.budget_lines
         self._salvage.began(path)
@@ -354,7 +355,10 @@ class Service:
         if aborted:
             self._fail(f"the recording was aborted: {self._seen.end_reason}")
             return
-        self._go(Event.SEALED if stays else Event.RELEASED, self._last_words())
+        last = self._last
+        why = f"{last.path}, {last.lines} lines, {last.condition}, {last.end_reason}" if last else ""
+        self._go(Event.SEALED if stays else Event.RELEASED, why)
+        # An event that came while its predecessor's recording was being sealed was put off, not forgotten.
         if stays and take.late is not None:
             self._heed_unasked(take.late)
 
@@ -380,6 +384,7 @@ class Service:
         """Close the run and remember its recording. Raises what closing raises, OSError as DeviceError."""
         if self._run is None:
             return
+        # Forgotten first: whatever closing comes to, it is not tried a second time.
         run, self._run = self._run, None
         try:
             run.capture.close()
@@ -388,6 +393,7 @@ class Service:
         finally:
             self._seen, self._rates = run.capture.poll(), Rates()
             self._salvage.add(self._seen.orphans)
+            # Nothing can be done about it any more, and nobody may find out a year later.
             for arm, account in self._seen.accounts.items():
                 if not account.balanced:
                     log.error("the ledger of arm %s does not balance: %s", arm, account)
@@ -410,10 +416,6 @@ class Service:
                 self._last = self._last.model_copy(update=update)
         if self._salvage.recoveries != self._status.recoveries:
             self._publish()
-
-    def _last_words(self) -> str:
-        last = self._last
-        return "" if last is None else f"{last.path}, {last.lines} lines, {last.condition}, {last.end_reason}"
 
     # ---- state
 

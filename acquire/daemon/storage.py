@@ -61,6 +61,7 @@ def shot_noise(config: RigConfig) -> NDArray[Any]:
     """(line, pixel) lines of even light at half the range, with the noise of photons."""
     camera, pixels = config.cameras.a, config.pixels
     count = max(1, SAMPLE_BYTES // (pixels * np.dtype(camera.dtype).itemsize))
+    # Noise hardly packs: a codec that keeps up with it keeps up with a scene, too.
     light = np.random.default_rng(0).poisson(camera.white_dn / 2, (count, pixels))
     return np.minimum(light, camera.white_dn).astype(camera.dtype)
 

@@ -50,6 +50,7 @@ class Streams:
             raise StateError(
                 f"{MOST_STREAMS} clients follow the news already", possible="status", hint="close one of them"
             )
+        # As of the request, not of the stream's first step: what happens in between is not missed.
         if last_id is None and not history:
             last_id = self._log.last_id
         return self._stream(last_id, status_s)
@@ -78,13 +79,14 @@ class Streams:
                     yield status_text(self._status())
                 elif not news:
                     yield ": alive\n\n"
-                await _wait(woken, ALIVE_S if status_s is None else min(ALIVE_S, max(0.0, due_s - now_s)))
+                await wait(woken, ALIVE_S if status_s is None else min(ALIVE_S, max(0.0, due_s - now_s)))
         finally:
             self._open -= 1
             self._log.forget(wake)
 
 
-async def _wait(woken: asyncio.Event, seconds: float) -> None:
+async def wait(woken: asyncio.Event, seconds: float) -> None:
+    """Until the event is set, at most so long."""
     try:
         async with asyncio.timeout(seconds):
             await woken.wait()

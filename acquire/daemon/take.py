@@ -35,6 +35,7 @@ class Take:
 
     def idle_s(self, seen: CaptureStatus) -> float:
         """Seconds since more of it was last seen to reach the recorder or the disk."""
+        # Either: what is recorded may wait for its commit, and what is committed was recorded long before.
         progress = seen.recorded_lines, seen.committed_lines
         if progress != self._progress:
             self._progress, self._moved_s = progress, time.monotonic()

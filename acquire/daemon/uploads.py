@@ -147,7 +147,7 @@ class Uploads:
             if time.monotonic() >= self._not_before_s:
                 self._spawn()
             return
-        death = worker.death
+        death = worker.death  # asked first: what a process said last is still in its pipe then
         why = self._hear(worker)
         if death is not None or why is not None:
             self._worker = None
@@ -262,6 +262,7 @@ class Uploads:
         self._post(Reach(self._questions))
         deadline = time.monotonic() + START_S
         asked = False
+        # The store's time counts from when the process that asks is there: it may be only starting.
         while self._answer is None or self._answer.number != self._questions:
             if self._awake and not asked:
                 asked, deadline = True, min(deadline, time.monotonic() + ANSWER_S)

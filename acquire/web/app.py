@@ -120,6 +120,7 @@ def _life(hub: Hub, jobs: Jobs) -> Any:
         finally:
             for task in tasks:
                 task.cancel()
+            # Waited for: a job under way ends its process in its own end.
             await asyncio.gather(*tasks, return_exceptions=True)
 
     return life
@@ -132,6 +133,7 @@ def _add_session(api: APIRouter, guard: Guard, tokens: Tokens, *, secure: bool) 
         role = guard.role_of_token(asked.token, address)
         if role is None:
             raise UsageError("the token is wrong, or too many wrong ones came", hint="acquire web --link")
+        # No script can read it, no other site can have it sent, and it is good below /api alone.
         response.set_cookie(
             COOKIE, tokens.cookie(role), httponly=True, samesite="strict", secure=secure, path="/api"
         )

@@ -62,6 +62,7 @@ class Archive:
 
     def path_of(self, name: str, suffix: str = ".zarr") -> Path:
         """Raises PlaceError for what is no entry of the directory, or a link."""
+        # By `lstat`: a link would lead out of the directory.
         path = self._directory / name
         odd = not name.endswith(suffix) or "\0" in name or name in (".", "..") or Path(name).name != name
         try:
@@ -108,7 +109,11 @@ class Archive:
         opened = open_recording(path)
         key = (name, opened.state, opened.lines, opened.attrs.get("run_id"))
         if key not in self._pictures:
-            _remember(self._pictures, key, _png(_overview(opened)), MOST_PICTURES)
+            parts = [_arm_overview(opened, arm) for arm in ARMS]
+            between = np.full((parts[0].shape[0], 4, 3), 128, np.uint8)
+            file = BytesIO()
+            Image.fromarray(np.concatenate([parts[0], between, parts[1]], axis=1)).save(file, "PNG")
+            _remember(self._pictures, key, file.getvalue(), MOST_PICTURES)
         return self._pictures[key]
 
     def videos(self) -> list[VideoFacts]:
@@ -163,7 +168,7 @@ class Archive:
                 return RecordingFacts(name=path.name, error=shortened(error.message, 300))
             except (*DAMAGE, MemoryError) as error:
                 return RecordingFacts(name=path.name, error=f"cannot be read: {shortened(error, 300)}")
-            if known.state == "sealed":
+            if known.state == "sealed":  # another one changes between two looks, and more often than its root
                 _remember(self._facts, key, known, 2 * MOST_LISTED)
         return known
 
@@ -211,13 +216,6 @@ def _facts(path: Path, opened: Recording) -> RecordingFacts:
     )
 
 
-def _overview(opened: Recording) -> NDArray[np.uint8]:
-    """(row, column, colour): arm a, a line between, arm b."""
-    parts = [_arm_overview(opened, arm) for arm in ARMS]
-    between = np.full((parts[0].shape[0], 4, 3), 128, np.uint8)
-    return np.concatenate([parts[0], between, parts[1]], axis=1)
-
-
 def _arm_overview(opened: Recording, arm: str) -> NDArray[np.uint8]:
     stream, white = opened.camera(arm), float(opened.attrs["cameras"][arm]["white_dn"])
     rows = min(PICTURE_ROWS, max(1, opened.lines))
@@ -239,12 +237,6 @@ def _arm_overview(opened: Recording, arm: str) -> NDArray[np.uint8]:
         brightest = np.maximum.reduceat(lines[~missing].max(axis=0).astype(np.float64), edges)
         picture[row] = np.clip(brightest * (255 / white), 0, 255).astype(np.uint8)[:, None]
     return picture[: max(rows, 1)]
-
-
-def _png(picture: NDArray[np.uint8]) -> bytes:
-    file = BytesIO()
-    Image.fromarray(picture).save(file, "PNG")
-    return file.getvalue()
 
 
 def _of_video(name: str, video: VideoFile) -> VideoFacts:

@@ -123,12 +123,12 @@ class Decimator:
             return None
         black = np.zeros(self.columns, np.uint8)
         found = Rows(
-            done.first,
-            np.array(done.kinds, np.uint8),
-            np.stack([black if row is None else self._eight_bits(row) for row in done.lows]),
-            np.stack([black if row is None else self._eight_bits(row) for row in done.highs]),
-            self._histogram,
-            self._saturated,
+            first=done.first,
+            kind=np.array(done.kinds, np.uint8),
+            low=np.stack([black if row is None else self._eight_bits(row) for row in done.lows]),
+            high=np.stack([black if row is None else self._eight_bits(row) for row in done.highs]),
+            histogram=self._histogram,
+            saturated=self._saturated,
         )
         self._histogram, self._saturated = np.zeros(BINS, np.int64), 0
         return found
@@ -140,7 +140,11 @@ class Decimator:
         lines = np.concatenate([lines for lines, _ in self._waiting])
         sampled = np.concatenate([pixels for _, pixels in self._waiting])
         self._waiting.clear()
-        self._count(sampled)
+        # By value first, and then by bin: there are few values, and many pixels.
+        white = self._scale.white_dn
+        values = np.bincount(sampled.ravel(), minlength=white + 1)[: white + 1]
+        self._histogram += np.bincount(self._bins, values, BINS).astype(np.int64)
+        self._saturated += int(values[white])
         low, high = sampled, sampled
         if len(self._edges) < sampled.shape[1]:
             low = np.minimum.reduceat(sampled, self._edges, axis=1)
@@ -149,22 +153,13 @@ class Decimator:
         at = np.flatnonzero(np.diff(rows, prepend=rows[0] - 1))
         lows, highs = np.minimum.reduceat(low, at, axis=0), np.maximum.reduceat(high, at, axis=0)
         for number, one_low, one_high in zip(rows[at], lows, highs, strict=True):
-            self._merge(int(number), one_low, one_high)
+            row = self._begin(int(number))  # which an earlier call may have begun
+            row.low = one_low if row.low is None else np.minimum(row.low, one_low)
+            row.high = one_high if row.high is None else np.maximum(row.high, one_high)
 
     def _eight_bits(self, row: NDArray[Any]) -> NDArray[np.uint8]:
         scaled: NDArray[np.uint8] = (row.astype(np.uint32) * 255 // self._scale.white_dn).astype(np.uint8)
         return scaled
-
-    def _count(self, sampled: NDArray[Any]) -> None:
-        white = self._scale.white_dn
-        values = np.bincount(sampled.ravel(), minlength=white + 1)[: white + 1]
-        self._histogram += np.bincount(self._bins, values, BINS).astype(np.int64)
-        self._saturated += int(values[white])
-
-    def _merge(self, number: int, low: NDArray[Any], high: NDArray[Any]) -> None:
-        row = self._begin(number)
-        row.low = low if row.low is None else np.minimum(row.low, low)
-        row.high = high if row.high is None else np.maximum(row.high, high)
 
     def _begin(self, number: int) -> _Row:
         """The row ``number``; the one before it is complete."""

@@ -82,7 +82,7 @@ class Glimpser:
             while True:
                 head = await process.stdout.readexactly(HEAD.size)
                 size = sum(HEAD.unpack(head))
-                if size > MOST_BYTES:
+                if size > MOST_BYTES:  # no message of ours: the stream is out of step, and another begins
                     return
                 self.latest = head + await process.stdout.readexactly(size)
                 self.number += 1

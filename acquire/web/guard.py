@@ -125,6 +125,7 @@ class Guard:
         address = request.client.host if request.client else ""
         if _host_of(request.headers.get("host", "")) not in self._names:
             return _refuse(421, f"this is not {shortened(request.headers.get('host', ''))}", "web.names")
+        # A bucket of its own for those with a token: strangers behind the same proxy cannot lock them out.
         asked = self._requests if self.role_of(request) is None else self._admitted
         if not asked.take(address):
             return _refuse(429, "too many requests", "a second")
@@ -141,6 +142,7 @@ class Guard:
             return _refuse(429, "too many wrong tokens", "some seconds")
         role = self.role_of(request)
         if role is None:
+            # Only what was tried counts as a guess: a page whose cookie has expired asks on its own.
             if "authorization" in request.headers:
                 self.note_wrong(address)
             return _refuse(401, "the token is missing or wrong", "acquire web --link")
@@ -180,6 +182,7 @@ def _host_of(header: str) -> str:
 
 def _is_ours(request: Request) -> bool:
     """What a browser says of the page that sends this; a script says nothing."""
+    # Two witnesses: browsers that do not send the first yet send the second with all that changes something.
     site = request.headers.get("sec-fetch-site", "same-origin")
     origin = request.headers.get("origin")
     same = origin is None or origin.partition("://")[2].lower() == request.headers.get("host", "").lower()

@@ -125,7 +125,7 @@ class Hub:
             log.info("connected to the daemon (process %d)", status.pid)
         self.connected, self.status = True, status
         self._version += 1
-        if status.run_id != self._run_id:
+        if status.run_id != self._run_id:  # each run has rings of its own
             self._run_id = status.run_id
             self._armed_s = time.monotonic()
             self.live.show(None if status.run_id is None else await self.client.rings(), self.setup)
@@ -151,7 +151,7 @@ class Hub:
             event.set()
 
     def _wake_from_thread(self) -> None:
-        if not self._loop.is_closed():
+        if not self._loop.is_closed():  # the looking thread may outlive it by a turn
             self._loop.call_soon_threadsafe(self._wake)
 
     @property

@@ -166,12 +166,13 @@ class Jobs:
             stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.PIPE,
             limit=MOST_LINE_BYTES,
-            process_group=0,
+            process_group=0,  # its workers are ended with it, and a Ctrl-C on our terminal is not theirs
         )
         try:
             await _listen(job)
             code = await job.process.wait()
         except asyncio.CancelledError:
+            # The page ends. A step of a calibration may have changed the instrument, and is asked first.
             if job.facts.kind == "calibrate":
                 await _end(job.process, LEAVE_S, asked=job.ending is not None)
             _signal(job.process, signal.SIGKILL)

@@ -108,7 +108,9 @@ class Live:
                 began_s = time.monotonic()
                 for eye in eyes.values():
                     if (told := eye.look()) is not None:
-                        self._keep(told)
+                        with self._lock:
+                            self._messages.append((self._count, told))
+                            self._count += 1
                 self._wake()
                 left_s = TURN_S - (time.monotonic() - began_s)
                 if left_s > 0:
@@ -116,11 +118,6 @@ class Live:
         finally:
             for eye in eyes.values():
                 eye.close()
-
-    def _keep(self, told: bytes) -> None:
-        with self._lock:
-            self._messages.append((self._count, told))
-            self._count += 1
 
 
 class _Eye:
@@ -149,7 +146,7 @@ class _Eye:
             lines = self._decimator.sampled_lines(first_line, count)
             pixels = block.pixels[lines - first_line]  # a copy: the block may be overwritten at any moment
             newest_ns = block.time_ns
-            del block
+            del block  # a view of the ring keeps its memory mapped
             if self._peek.took():
                 self._decimator.add(first_line, count, lines, pixels, lost=lost)
         rows = self._decimator.take()

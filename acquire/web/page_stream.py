@@ -10,6 +10,7 @@ import asyncio
 import time
 from typing import TYPE_CHECKING
 
+from acquire.daemon.stream import wait
 from acquire.errors import StateError
 
 if TYPE_CHECKING:
@@ -46,6 +47,7 @@ class Pages:
         self._open += 1
         woken = hub.listen()
         place = hub.live.watch() if pictures else 0
+        # From the first news that is kept: a page that is opened later shows what has happened before.
         heard, version, told_s, seen = 0, -1, 0.0, hub.glimpser.number
         if glimpses:
             hub.glimpser.watch()
@@ -68,7 +70,7 @@ class Pages:
                 if parts:
                     yield b"".join(parts)
                 await asyncio.sleep(LEAST_S)
-                await _wait(woken, STATE_S - LEAST_S)
+                await wait(woken, STATE_S - LEAST_S)
         finally:
             self._open -= 1
             hub.forget(woken)
@@ -76,11 +78,3 @@ class Pages:
                 hub.live.leave()
             if glimpses:
                 hub.glimpser.leave()
-
-
-async def _wait(woken: asyncio.Event, seconds: float) -> None:
-    try:
-        async with asyncio.timeout(seconds):
-            await woken.wait()
-    except TimeoutError:
-        return

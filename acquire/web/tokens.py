@@ -51,7 +51,7 @@ class Tokens:
     def _find(self, given: str, right: object) -> Role | None:
         """In constant time for each role."""
         found: Role | None = None
-        for role in ROLES:
+        for role in ROLES:  # both, whichever fits; as bytes, since text that is not ASCII is refused
             if hmac.compare_digest(given.encode(), right(role).encode()):  # type: ignore[operator]
                 found = role
         return found
@@ -59,6 +59,7 @@ class Tokens:
 
 def load_tokens(path: Path) -> Tokens:
     """The tokens in ``path``, made where there is no file. Raises UsageError where others may read it."""
+    # Its owner's alone from the first moment, and never written over: O_EXCL does not follow a link either.
     try:
         file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
     except FileExistsError:
