@@ -94,10 +94,6 @@ class Study:
     effects: tuple[Worth, ...]
 
 
-def _unseen(done: int, total: int) -> None:
-    """Nobody watches the progress."""
-
-
 def bench_of(config: RigConfig, scene: SceneConfig) -> Bench:
     """The simulated optics and cameras of a rig before a scene."""
     cameras = {arm: config.cameras.arm(arm) for arm in ARMS}
@@ -124,7 +120,7 @@ def simulate(
     scene: SceneConfig,
     path: Path,
     lines: int,
-    progress: Callable[[int, int], object] = _unseen,
+    progress: Callable[[int, int], object] = lambda _done, _total: None,
 ) -> Simulated:
     """Write a recording of ``lines`` lines of both arms, from line 0 on.
 

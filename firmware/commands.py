@@ -102,8 +102,10 @@ class Commands(wiring.Component):
     def _arm(self, m: Module, named: Value, same: Value, active: Value) -> None:
         with m.If(~named):
             m.d.sync += self.error.eq(ErrorCode.BAD_RUN_ID)
+        # ARM of the run that is armed or runs already is the same request once more: its answer was lost.
         with m.Elif(active | self.busy):
             m.d.sync += self.error.eq(Mux(same & active, 0, ErrorCode.BUSY))
+        # An ARM that is late must not begin a run anew that has ended: a run id is used once.
         with m.Elif(same):
             m.d.sync += self.error.eq(ErrorCode.RUN_OVER)
         with m.Else():
@@ -127,6 +129,7 @@ class Commands(wiring.Component):
             m.d.sync += self.error.eq(ErrorCode.NOT_ARMED)
         with m.Elif(~same):
             m.d.sync += self.error.eq(ErrorCode.WRONG_RUN)
+        # In any other state it has been carried out before, and changes nothing.
         with m.Elif(armed & self.clock_locked):
             m.d.comb += self.start.eq(1)
             m.d.sync += self.state.eq(State.RUNNING)
@@ -171,6 +174,7 @@ class Commands(wiring.Component):
     def _wind_down(self, m: Module, reason: EndReason) -> None:
         m.d.comb += self.stop.eq(1)
         m.d.sync += self.state.eq(State.STOPPING)
+        # The first reason stays: what comes while the last line runs is its consequence, or too late.
         with m.If(self.reason == EndReason.NONE):
             m.d.sync += self.reason.eq(reason)
 

@@ -213,7 +213,7 @@ def library(build: Build) -> Path:
             if not path.exists():
                 with tempfile.TemporaryDirectory(dir=path.parent) as scratch:
                     _compile(_translate(build, Path(scratch)), Path(scratch) / path.name)
-                    (Path(scratch) / path.name).rename(path)
+                    (Path(scratch) / path.name).rename(path)  # who finds it finds all of it
     return path
 
 

@@ -61,6 +61,7 @@ class Deframer(wiring.Component):
             m.d.sync += self.frame.eq(0)
         with m.If(self.bytes.valid & self.bytes.ready):
             with m.If(byte == 0):
+                # The CRC runs over the frame's own CRC as well, and is the same constant for every whole one.
                 good = ~broken & (left == 0) & (count >= HEADER_BYTES + CRC_BYTES) & (crc.value == RESIDUE)
                 m.d.comb += crc.reset.eq(1)
                 m.d.sync += [

@@ -50,7 +50,13 @@ class RtlDevice:
         limit_s = time.monotonic() + _WORK_S
         with self._lock:
             while True:
-                self._pass(_SLICE_CLOCKS if self.busy else _IDLE_CLOCKS)
+                clocks = _SLICE_CLOCKS if self.busy else _IDLE_CLOCKS
+                while (
+                    clocks > 0
+                ):  # it stops where a run begins or ends, so that who watches sees each of them
+                    clocks -= self.twin.advance(clocks)
+                    if self._watch is not None:
+                        self._watch(self.twin)
                 data = self.twin.take()
                 if data or not self.busy or time.monotonic() > limit_s:
                     return data
@@ -64,9 +70,3 @@ class RtlDevice:
         """Idempotent; nobody may use it any more."""
         with self._lock:
             self.twin.close()
-
-    def _pass(self, clocks: int) -> None:
-        while clocks > 0:
-            clocks -= self.twin.advance(clocks)
-            if self._watch is not None:
-                self._watch(self.twin)

@@ -152,6 +152,8 @@ class Host(wiring.Component):
         version, kind, asked = self._head[:8], self._head[8:16], self._head[48:56]
         payload = self.length - deframer.HEADER_BYTES
         words = (payload - 2)[2:8]
+        # Registers of several words are caught now, all in one clock: read one after the other they would be
+        # of different moments.
         m.d.comb += self.sample.eq(1)
         m.d.sync += [
             self._address.eq(self._head[32:48]),
@@ -177,7 +179,7 @@ class Host(wiring.Component):
             self._refuse(m, ErrorCode.BAD_LENGTH, 0)
 
     def _check_read(self, m: Module) -> None:
-        end, beyond = Signal(17), Signal()
+        end, beyond = Signal(17), Signal()  # a bit more than addresses have: the sum must not wrap
         limit = Mux(self._in_code, CODE_MEMORY + self._code_words, 1 << ADDRESS_BITS)
         m.d.sync += [end.eq(self._address + self._count), beyond.eq(end > limit)]
         with m.If(self._step == 2):

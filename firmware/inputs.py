@@ -25,6 +25,7 @@ class Input(wiring.Component):
     def elaborate(self, platform: object) -> Elaboratable:
         m = Module()
         raw, before = Signal(), Signal()
+        # Two registers: the first may be neither 0 nor 1 for a while, if the pin changes at a clock edge.
         m.submodules.sync = FFSynchronizer(self.pin, raw, stages=LATENCY)
         m.d.comb += [self.level.eq(raw ^ self.inverted), self.edge.eq(self.level & ~before)]
         m.d.sync += before.eq(self.level)

@@ -42,7 +42,7 @@ class Phases(wiring.Component):
         m.d.comb += on.eq(self.running & (self.phase_clocks != 0))
         m.d.sync += self.phases.eq(Mux(moving, Mux(self.backwards, mirrored[phase], levels[phase]), 0))
         with m.If(~on):
-            m.d.sync += [phase.eq(5), more.eq(0), moving.eq(0)]
+            m.d.sync += [phase.eq(5), more.eq(0), moving.eq(0)]  # the one before the first of a line
         with m.Elif(self.substep):
             m.d.sync += [left.eq(self.phase_clocks - 1), more.eq(ahead[self.substeps]), moving.eq(1)]
             self._next(m, phase, self.line)

@@ -33,6 +33,7 @@ class Pulse(wiring.Component):
         wait, hold, waiting, active = Signal(WIDTH), Signal(WIDTH), Signal(), Signal()
         m.d.sync += self.level.eq(active ^ self.inverted)
         m.d.comb += self.begin.eq(active & (hold == self.width))
+        # A request first: what an earlier pulse still had to do is given up for it.
         with m.If(self.fire & self.enable):
             m.d.sync += [wait.eq(self.delay - 1), waiting.eq(self.delay != 0), active.eq(self.delay == 0)]
             m.d.sync += hold.eq(self.width)

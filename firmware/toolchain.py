@@ -63,6 +63,7 @@ def run_tool(name: str, *arguments: str, cwd: Path, processor_s: float, fails: b
             stderr=subprocess.STDOUT,
         )
         try:
+            # From outside, since code between fork and exec is not safe in a process with threads.
             with contextlib.suppress(ProcessLookupError):  # it has ended already
                 resource.prlimit(process.pid, resource.RLIMIT_CPU, (limit_s, limit_s))
             late = _wait(process, name, limit_s)

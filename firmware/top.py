@@ -295,7 +295,8 @@ class SyncTrigger(wiring.Component):
             self.phases.eq(phases.phases),
         ]
         line, substep = Signal(), Signal()
-        m.d.sync += [line.eq(timing.line), substep.eq(timing.substep)]  # PIN_CLOCKS
+        # As late as the other pins (PIN_CLOCKS), so that an oscilloscope shows them in step.
+        m.d.sync += [line.eq(timing.line), substep.eq(timing.substep)]
         m.d.sync += [self.line.eq(line), self.substep.eq(substep)]
 
     def _strobes(self, m: Module) -> None:
@@ -352,6 +353,7 @@ class SyncTrigger(wiring.Component):
             value(r.PPS_TIME).eq(timestamp.pps_time),
             value(r.PPS_COUNT).eq(timestamp.pps_count),
         ]
+        # Counted: a loss that is over by the time when somebody looks has spoilt the run all the same.
         losses = field(r.STATUS, "clock_losses")
         was_locked = Signal()
         m.d.sync += was_locked.eq(self.locked.level)

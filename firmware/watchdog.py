@@ -32,6 +32,7 @@ class Watchdog(wiring.Component):
         left, watching = Signal(32), Signal()
         m.d.sync += watching.eq(self.period != 0)  # configuration: it does not change during a run
         m.d.sync += self.bark.eq(self.enable & watching & (left == 0) & ~self.feed)
+        # Filled while nothing runs, so that the first clock of a run has the whole period before it.
         with m.If(self.feed | ~self.enable):
             m.d.sync += left.eq(self.period)
         with m.Elif(left != 0):

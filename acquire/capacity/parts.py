@@ -136,7 +136,10 @@ def _pace_of_codec(load: Load, blocks: list[NDArray[Any]]) -> Pace:
 
 
 def _pace_of_recorder(load: Load, blocks: list[NDArray[Any]], directory: Path) -> Pace:
-    _clear(directory)
+    # What processes that were killed while they measured have left; their number is in its name.
+    for left in directory.glob(f"{_PREFIX}*.zarr"):
+        if not Path("/proc", left.stem.removeprefix(_PREFIX)).exists():
+            shutil.rmtree(left, ignore_errors=True)
     path = directory / f"{_PREFIX}{os.getpid()}.zarr"
     tagger = Tagger(trigger_run(load), load.stages, _CLOCK)
     flags = np.zeros(load.block_lines, np.uint16)
@@ -153,11 +156,4 @@ def _pace_of_recorder(load: Load, blocks: list[NDArray[Any]], directory: Path) -
             return _pace(append, writer.commit)
         finally:
             writer.close()
-            shutil.rmtree(path, ignore_errors=True)
-
-
-def _clear(directory: Path) -> None:
-    """Remove what processes that were killed while they measured have left."""
-    for path in directory.glob(f"{_PREFIX}*.zarr"):
-        if not Path("/proc", path.stem.removeprefix(_PREFIX)).exists():
             shutil.rmtree(path, ignore_errors=True)

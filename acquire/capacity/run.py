@@ -127,6 +127,7 @@ def _measure(
         _check(seen, begun + seconds)
         time.sleep(_POLL_S)
     worst = max((one.percentiles_ms() for one in latencies.values()), key=lambda found: found["p99.9"])
+    # The books balance once nothing is under way any more, not before.
     capture.close()
     seen = capture.poll()
     assert seen.condition is not None

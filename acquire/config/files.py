@@ -79,18 +79,15 @@ def load_rig(
     for key, value in (overrides or {}).items():
         _set(table, key, value)
     rig = _validate(RigConfig, table, path)
-    if rig.calibration is not None:
-        rig = rig.model_copy(update={"calibration": _beside(rig.calibration, path)})
+    if (named := rig.calibration) is not None:
+        # From here on, as on a command line, or else from where the file is.
+        place = named if os.path.lexists(named) else path.parent / named
+        rig = rig.model_copy(update={"calibration": place.resolve()})
     if not rig.needs_scene:
         return rig
-    named = scene if scene is not None and rig.simulation.scene is None else rig.scene_file()
-    seen = find(named, beside=path, kind="scene").resolve()
+    scene = scene if scene is not None and rig.simulation.scene is None else rig.scene_file()
+    seen = find(scene, beside=path, kind="scene").resolve()
     return rig.model_copy(update={"simulation": rig.simulation.model_copy(update={"scene": str(seen)})})
-
-
-def _beside(named: Path, file: Path) -> Path:
-    """What a file names: from here on, or else from where the file is."""
-    return named.resolve() if os.path.lexists(named) else (file.parent / named).resolve()
 
 
 def check_directory(rig: RigConfig) -> None:
@@ -176,6 +173,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 def _check_kind(table: dict[str, Any], wanted: str, path: Path) -> None:
     """Raise ConfigError for a file that shows that it describes something else than what is ``wanted``."""
+    # Only where it is clear: of a table that could be either, pydantic says what is wrong with it.
     found = [kind for kind, keys in _MARKS.items() if keys & table.keys()]
     if len(found) == 1 and found != [wanted]:
         raise ConfigError(

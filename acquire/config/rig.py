@@ -60,7 +60,7 @@ class PrbsConfig(FrozenModel):
 
     @model_validator(mode="after")
     def _degree_known(self) -> PrbsConfig:
-        if self.degree not in TAPS:
+        if self.degree not in TAPS:  # of others, no taps are known here that make the longest sequence
             raise ValueError(f"degree {self.degree} is not one of {', '.join(map(str, TAPS))}")
         return self
 
@@ -289,6 +289,7 @@ class RigConfig(FrozenModel):
         seconds = self.stream.ring_seconds
         if seconds is None:
             return self.stream.ring_slots
+        # One more for the slot that is being filled; and the reserve, which is a share of all slots, on top.
         past = math.ceil(seconds * self.line_rate_hz / self.stream.block_lines) + 1
         return past + max(2, math.ceil(past / (RING_RESERVE_SHARE - 1)))
 

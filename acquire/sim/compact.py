@@ -56,9 +56,6 @@ class SideBySide:
                 return None
             self._ready.append(block)
         blocks, self._ready = self._ready, []
-        return self._join(blocks)
-
-    def _join(self, blocks: list[CameraBlock]) -> CameraBlock:
         count = len(blocks[0].flags)
         pixels: NDArray[Any] = np.zeros((count, self._given.width), blocks[0].pixels.dtype)
         for first, block in zip(self._given.first_columns, blocks, strict=True):

@@ -136,6 +136,7 @@ class SimulatedCamera:
         }
 
     def arm(self) -> None:
+        # As with a real one: armed while pulses come, it counts from the next of them.
         reading = self._wire.read()
         self._train = reading.run if reading.running else reading.run + 1
         self._first_pulse = reading.issued if reading.running else 0
@@ -156,8 +157,9 @@ class SimulatedCamera:
             raise CameraError("a block was asked of a camera that is not armed", hint="arm it")
         if self._ready:
             return self._ready.popleft()
-        if self._finished(self._wire.read()):
-            self._wire.clock.sleep(timeout_s)
+        reading = self._wire.read()
+        if reading.run == self._train and reading.stopped and not self._behind(reading):
+            self._wire.clock.sleep(timeout_s)  # a camera that waits for triggers that will not come
             return None
         pulses = self._first_pulse + self._delivered + self._block_lines
         reading = self._wire.wait(self._train, pulses, timeout_s)
@@ -203,10 +205,8 @@ class SimulatedCamera:
             return 0
         return reading.issued - self._first_pulse - self._delivered
 
-    def _finished(self, reading: Reading) -> bool:
-        return reading.run == self._train and reading.stopped and not self._behind(reading)
-
     def _read_out(self, reading: Reading, count: int) -> CameraBlock | None:
+        # Not when it is armed: code and timing come with the pulses.
         if self._light is None:
             assert reading.train is not None
             code = self._wire.code(reading.train)

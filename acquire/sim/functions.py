@@ -61,7 +61,8 @@ class FunctionScene:
     def frames_at(self, substeps: NDArray[np.int64]) -> NDArray[np.float32]:
         """(count, row, column) float32."""
         light = self._function((substeps + 0.5) * self._substep_s, self._row, self._column)
-        return checked_light(light, (len(substeps), self.size, self.size), _name(self._function))
+        name = f"function {getattr(self._function, '__name__', repr(self._function))}"
+        return checked_light(light, (len(substeps), self.size, self.size), name)
 
 
 def checked_light(light: Any, shape: tuple[int, ...], what: str) -> NDArray[np.float32]:
@@ -92,7 +93,3 @@ def load_function(name: str) -> LightFunction:
     if not callable(found):
         raise UsageError(f"scene function {name!r}: {place} has no function {attribute}")
     return found  # type: ignore[no-any-return]
-
-
-def _name(function: LightFunction) -> str:
-    return f"function {getattr(function, '__name__', repr(function))}"

@@ -177,10 +177,12 @@ class Sensor(Camera):
     def _tile(self, index: int) -> Readout:
         if index not in self._tiles:
             tile = self._delivered(index)
+            # The last two: a block of lines may begin in one and end in the next.
             self._tiles = {key: self._tiles[key] for key in list(self._tiles)[-1:]} | {index: tile}
         return self._tiles[index]
 
     def _delivered(self, index: int) -> Readout:
+        # Whole tiles at fixed places: what an effect draws must not depend on how lines are asked for.
         first_line = index * TILE_LINES
         pixels, missing = self._digital(index), np.zeros(TILE_LINES, np.bool_)
         for stage in self._by_place["stream"]:

@@ -153,38 +153,32 @@ class ReplayCamera:
         A camera that fell behind catches up, but no faster than a recorder can take: reading is so much
         faster than the pulses come that the ring would overflow.
         """
-        now_ns, count = self._wire.clock.monotonic_ns(), self._due()
-        if now_ns < self._not_before_ns or (count < self._opener.block_lines and not self._ended()):
+        now_ns, count, reading = self._wire.clock.monotonic_ns(), self._due(), self._wire.read()
+        # The last block may be a short one: what is missing of it will not come.
+        last = not self._opener.loop and self._delivered + count >= self._last
+        whole = count >= self._opener.block_lines or last or reading.stopped
+        if now_ns < self._not_before_ns or not whole:
             return 0
         count = min(count, self._opener.block_lines)
-        train = self._wire.read().train
+        train = reading.train
         if train is not None:
             self._not_before_ns = now_ns + int(count * train.line_period_ns / train.speed / _CATCH_UP)
         return count
 
     def _due(self) -> int:
         """Lines whose pulses have come, and which are not delivered; none while the gate is closed."""
-        reading = self._wire.read()
-        if reading.train is None or reading.run != self._run or not self._is_open():
+        reading, gate = self._wire.read(), self._opener.gate
+        self._open = self._open or gate is None or gate.exists()  # it is opened once
+        if reading.train is None or reading.run != self._run or not self._open:
             return 0
         issued = reading.train.issued(self._wire.clock.monotonic_ns())
         last = issued if self._opener.loop else min(issued, self._last)
         return last - self._delivered
 
-    def _is_open(self) -> bool:
-        gate = self._opener.gate
-        self._open = self._open or gate is None or gate.exists()
-        return self._open
-
     @property
     def _last(self) -> int:
         """Lines in all, unless they are repeated: what comes before line 0, the rows, and the dark tail."""
         return self._depth_lines + self._rows + self._tail_lines
-
-    def _ended(self) -> bool:
-        reading = self._wire.read()
-        finished = not self._opener.loop and self._delivered + self._due() >= self._last
-        return finished or reading.stopped
 
     def _blocks(self, count: int) -> Iterator[CameraBlock]:
         """The next ``count`` lines, without those that were missing."""

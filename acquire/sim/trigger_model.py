@@ -112,8 +112,14 @@ class TriggerModel:
         """Bytes from the host."""
         with self._lock:
             for frame in self._decoder.feed(data):
-                self._advance()
-                self._out.append(encode(self._answer(frame)))
+                self._advance()  # what was due before the request has happened before it
+                try:
+                    kind, payload = self._obey(frame)
+                except FrameLengthError:
+                    kind, payload = FrameType.NAK, nak_payload(ErrorCode.BAD_LENGTH, 0)
+                except Refusal as refusal:
+                    kind, payload = FrameType.NAK, nak_payload(refusal.code, refusal.address)
+                self._out.append(encode(Frame(kind, frame.sequence, payload)))
 
     def take(self) -> bytes:
         """Bytes for the host: all that is due."""
@@ -157,15 +163,6 @@ class TriggerModel:
 
     # Requests.
 
-    def _answer(self, frame: Frame) -> Frame:
-        try:
-            kind, payload = self._obey(frame)
-        except FrameLengthError:
-            kind, payload = FrameType.NAK, nak_payload(ErrorCode.BAD_LENGTH, 0)
-        except Refusal as refusal:
-            kind, payload = FrameType.NAK, nak_payload(refusal.code, refusal.address)
-        return Frame(kind, frame.sequence, payload)
-
     def _obey(self, frame: Frame) -> tuple[FrameType, bytes]:
         if frame.version != r.PROTOCOL_VERSION:
             raise Refusal(ErrorCode.BAD_VERSION, 0)
@@ -175,7 +172,7 @@ class TriggerModel:
             return FrameType.DATA, write_payload(address, self.registers.read(address, count))
         if frame.type == FrameType.WRITE:
             address, words = parse_write(frame.payload)
-            self._hear(self._tick())
+            self._hear(self._tick())  # before the words: one that is refused came from a living host, too
             for i, word in enumerate(words):
                 self.registers.write(address + i, word)
             return FrameType.ACK, frame.payload[:2] + bytes([len(words)])
@@ -201,7 +198,7 @@ class TriggerModel:
         if number == run.number and run.state != State.IDLE:
             if run.state == State.ENDED:
                 raise Refusal(ErrorCode.RUN_OVER, at)
-            return
+            return  # its answer was lost, and it was sent again
         self._demand_rest(at)
         try:
             check_configuration(self.registers.get, self._locked, self.registers.code_checked)
@@ -251,7 +248,7 @@ class TriggerModel:
         latency = START_LATENCY + self._lead()
         run.start_tick, run.state, run.external = now_tick + latency, State.RUNNING, external
         rate = self._clock_hz * self._speed / NS_PER_S
-        start_ns = now_ns + -(-latency * rate.denominator // rate.numerator)
+        start_ns = now_ns + -(-latency * rate.denominator // rate.numerator)  # up: not before its tick
         self._zero = (start_ns, run.start_tick, self._speed)
         self._hear(run.start_tick - self._lead() - RUN_CLOCKS)
         period_ns = Fraction(run.line_clocks * NS_PER_S, self._clock_hz)
@@ -264,7 +261,15 @@ class TriggerModel:
         begin, end = self.registers.get(r.WINDOW_OPEN), self.registers.get(r.WINDOW_CLOSE)
         clocks = self.registers.get(r.SUBSTEP_CLOCKS)
         lit_part = begin / clocks, end / clocks
-        self._wire.start(period_ns, self._speed, attrs, start_ns, self._lines_allowed(), settled_s, lit_part)
+        self._wire.start(
+            line_period_ns=period_ns,
+            speed=self._speed,
+            code=attrs,
+            start_ns=start_ns,
+            budget=self._lines_allowed(),
+            settled_s=settled_s,
+            lit_part=lit_part,
+        )
 
     def _hear(self, tick: int) -> None:
         """The host lived at ``tick``: that is what it may be silent from.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import threading
@@ -97,12 +98,7 @@ class PtyTwin:
             if readable:
                 self._twin.feed(os.read(self._master, 4096))
             if writable:
-                out = out[self._write(out) :]
+                with contextlib.suppress(BlockingIOError):  # the terminal's 20 KB are full
+                    out = out[os.write(self._master, out) :]
             if not out:  # else the device's own queues have to wait, and to lose
                 out = self._twin.take()
-
-    def _write(self, data: bytes) -> int:
-        try:
-            return os.write(self._master, data)
-        except BlockingIOError:  # its 20 KB are full
-            return 0

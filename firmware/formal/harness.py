@@ -86,7 +86,15 @@ class Harness:
         text = rtlil.convert(self.m, ports=[self._sync.clk, *inputs])
         text = _CHECK.sub(lambda found: f"cell $check \\check.{found[2]}\n{found[1]}", text)
         lemmas = len(self._names) - len(self.claims) - len(self.covers) - self._facts
-        return Proof(name, text, tuple(self.claims), lemmas, tuple(self.covers), cover_depth, depth)
+        return Proof(
+            name=name,
+            rtlil=text,
+            claims=tuple(self.claims),
+            lemmas=lemmas,
+            covers=tuple(self.covers),
+            cover_depth=cover_depth,
+            depth=depth,
+        )
 
     def _take(self, name: str) -> None:
         if name in self._names or not name.isidentifier():

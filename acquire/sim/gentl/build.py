@@ -45,8 +45,11 @@ def build() -> Path:
             possible="cc, gcc or clang on PATH, or CC in the environment",
             hint="the system's compiler package, or the simulated cameras without GenTL",
         )
+    # All that the result depends on is in its name, so that another version's is left alone.
     digest = hashlib.sha256("\0".join((SOURCE.read_text(), header(), found, *OPTIONS)).encode()).hexdigest()
-    target = _cache() / f"acquire-simulated-{digest[:16]}.cti"
+    base = os.environ.get("XDG_CACHE_HOME")
+    cache = (Path(base) if base else Path.home() / ".cache") / "tdi-acquire"
+    target = cache / f"acquire-simulated-{digest[:16]}.cti"
     if not target.is_file():
         target.parent.mkdir(parents=True, exist_ok=True)
         # Into a directory beside the target, then moved: two builds at once both end well.
@@ -62,11 +65,6 @@ def build() -> Path:
                 raise DeviceError(f"{found} refused the producer: {done.stderr.strip()[-2000:]}")
             made.replace(target)
     return target
-
-
-def _cache() -> Path:
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "tdi-acquire"
 
 
 if __name__ == "__main__":

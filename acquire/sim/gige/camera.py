@@ -120,7 +120,11 @@ class GigeCamera:
         if request is None:
             return
         if request.command == protocol.Command.RESEND:
-            self._send_again(*protocol.parse_resend(request))
+            # Of a frame that is not kept any more nothing is answered: the host gives it up.
+            number, first, last = protocol.parse_resend(request)
+            for kept, packets in self._sent if self.transmission.resends else ():
+                if kept == number:
+                    self._put(packets[first : last + 1])
             return
         if (sender, request) != self._answered[:2]:  # else the host has not seen the answer in time
             self._answered = (sender, request, self._registers.handle(request))
@@ -154,18 +158,19 @@ class GigeCamera:
         data = _pack(lines[:, offset : offset + width], self._bits, code)
         sent = self.transmission
         number = sent.frame_id(self._frames)
-        frame = protocol.Frame(number, time_ns, code, width, len(lines), data, sent.extended)
+        frame = protocol.Frame(
+            number=number,
+            time_ns=time_ns,
+            pixel_format=code,
+            width=width,
+            height=len(lines),
+            data=data,
+            extended=sent.extended,
+        )
         packets = list(protocol.packets(frame, self._registers.get(protocol.PACKET_SIZE) & 0xFFFF))
         self._sent.append((number, packets))
         self._put(packets if sent.link is None else sent.link(self._frames, packets))
         self._frames += 1
-
-    def _send_again(self, number: int, first: int, last: int) -> None:
-        """Packets of a frame that is not kept any more are not worth an answer: the host gives them up."""
-        if self.transmission.resends:
-            for kept, packets in self._sent:
-                if kept == number:
-                    self._put(packets[first : last + 1])
 
     def _put(self, packets: Iterable[bytes]) -> None:
         port = self._registers.get(protocol.STREAM_PORT) & 0xFFFF
