@@ -78,7 +78,14 @@ def measure(scene: str, seed: int, camera: str, voxels: tuple[int, int], make: M
     off = result.video[result.trusted] - made.truth(*voxels)
     took = 0.0 if isinstance(result.error, str) else result.error.processor_s / result.processor_s
     name = f"{scene}, {camera}, {voxels[0]} × {voxels[1]}"
-    return Case(name, scene, np.sqrt(in_regions(np.square(off))), result.error, result.trusted, took)
+    return Case(
+        name=name,
+        scene=scene,
+        true=np.sqrt(in_regions(np.square(off))),
+        error=result.error,
+        shown=result.trusted,
+        share=took,
+    )
 
 
 def show(case: Case, run: Run) -> tuple[bool, np.ndarray, np.ndarray] | None:

@@ -92,15 +92,15 @@ def measure(stages: int, seed: int, full_well_e: float, limit_s: float) -> Row:
     first = case.geometry.substeps * case.first_line
     voxels = truth(scene, first, case.geometry.span, *case.merges)
     return Row(
-        psnr(result.video[result.trusted], voxels[result.trusted]),
-        curves(case, scene, result).strip(),
-        str(result.parameters.get("prior")),
-        int(result.parameters.get("temporal_coefficients", 0)),
-        int(result.parameters.get("patterns", 0)),
-        result.quality.prediction,
-        processor_s,
-        memory_gb,
-        result.ended,
+        psnr_db=psnr(result.video[result.trusted], voxels[result.trusted]),
+        curves=curves(case, scene, result).strip(),
+        prior=str(result.parameters.get("prior")),
+        cosines=int(result.parameters.get("temporal_coefficients", 0)),
+        patterns=int(result.parameters.get("patterns", 0)),
+        prediction=result.quality.prediction,
+        processor_s=processor_s,
+        memory_gb=memory_gb,
+        ended=result.ended,
     )
 
 

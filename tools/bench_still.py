@@ -62,12 +62,12 @@ def measure(scene: str, seed: int, full_well_e: float, voxels: Voxels, asked: ar
     facts = result.parameters
     patterns = f", {facts['patterns']} patterns" if "patterns" in facts else ""
     return Row(
-        psnr(np.broadcast_to(truth.mean(0), truth.shape), truth),
-        psnr(np.broadcast_to(still, truth.shape), truth),
-        psnr(result.video[result.trusted], truth),
-        facts["prior"] + (" × brightness" if facts.get("brightness") else "") + patterns,
-        100 * result.quality.prediction,
-        processor_s,
+        mean_db=psnr(np.broadcast_to(truth.mean(0), truth.shape), truth),
+        still_db=psnr(np.broadcast_to(still, truth.shape), truth),
+        default_db=psnr(result.video[result.trusted], truth),
+        prior=facts["prior"] + (" × brightness" if facts.get("brightness") else "") + patterns,
+        held_out_error_percent=100 * result.quality.prediction,
+        processor_s=processor_s,
     )
 
 

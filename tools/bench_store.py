@@ -251,7 +251,8 @@ def _stretch(path: Path, first_line: int) -> None:
 def cut_case(directory: Path, run: Run) -> None:
     path = hour(directory)
     try:
-        times = [_cut_cold(path, line) for line in _places()]
+        starts = np.random.default_rng(1).integers(0, SHARD_LINES - CUT_LINES, 9)
+        times = [_cut_cold(path, MIDDLE + int(start)) for start in starts]
     finally:
         DISK.remove_tree(path)
     names = ("open and cut", "cut alone", "the same, warm", "others, cold", "bare O_DIRECT read of chunks")
@@ -259,11 +260,6 @@ def cut_case(directory: Path, run: Run) -> None:
         found = f"median {np.median(values):.1f} ms, worst {max(values):.1f} ms"
         print(f"{CUT_LINES} lines of an hour, a fresh process, {name}: {found}")
         run.add(f"{CUT_LINES} lines of an hour, {name}", median_ms=np.median(values), worst_ms=max(values))
-
-
-def _places() -> list[int]:
-    starts = np.random.default_rng(1).integers(0, SHARD_LINES - CUT_LINES, 9)
-    return [MIDDLE + int(start) for start in starts]
 
 
 def _cut_cold(path: Path, line: int) -> list[float]:

@@ -25,7 +25,7 @@ import numpy as np
 from acquire.cores import limit_threads
 from acquire.evaluate.metrics import psnr, ssim
 from acquire.recon import reconstruct
-from acquire.sim.procedural import CLEAN, SCENES, Camera, Recorded, record
+from acquire.sim.procedural import CLEAN, SCENES, Camera, record
 from tools.results import add_option, recorded
 
 VOXEL = 3
@@ -57,23 +57,19 @@ def measure(scene: str, seed: int, camera: Camera, *, twist: bool) -> Row:
     begun = time.process_time()
     result = reconstruct(segment, VOXEL, 1)
     processor_s = time.process_time() - begun
+    by_twist = reconstruct(segment, VOXEL, 1, solver="twist") if twist else None
     return Row(
-        scene,
-        psnr(np.broadcast_to(truth.mean(0), truth.shape), truth),
-        psnr(np.broadcast_to(still, truth.shape), truth),
-        psnr(cosines.video[cosines.trusted], truth),
-        _twist(recorded, truth) if twist else float("nan"),
-        psnr(result.video[result.trusted], truth),
-        ssim(result.video[result.trusted], truth),
-        result.parameters["prior"] + (" × brightness" if result.parameters.get("brightness") else ""),
-        result.quality.prediction,
-        processor_s,
+        scene=scene,
+        mean=psnr(np.broadcast_to(truth.mean(0), truth.shape), truth),
+        still=psnr(np.broadcast_to(still, truth.shape), truth),
+        cosines=psnr(cosines.video[cosines.trusted], truth),
+        twist=psnr(by_twist.video[by_twist.trusted], truth) if by_twist else float("nan"),
+        default=psnr(result.video[result.trusted], truth),
+        ssim=ssim(result.video[result.trusted], truth),
+        prior=result.parameters["prior"] + (" × brightness" if result.parameters.get("brightness") else ""),
+        error=result.quality.prediction,
+        processor_s=processor_s,
     )
-
-
-def _twist(recorded: Recorded, truth: np.ndarray) -> float:
-    result = reconstruct(recorded.segment, VOXEL, 1, solver="twist")
-    return psnr(result.video[result.trusted], truth)
 
 
 def figures(row: Row) -> dict[str, float | str]:

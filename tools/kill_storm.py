@@ -242,11 +242,10 @@ def _open_parts(path: Path) -> list[str]:
         return [path.name]
     listed = [path.name, *open_recording(path).attrs.get("segments", [])]
     parts = [path, *path.parent.glob(f"{path.stem}-*.zarr")]
-    return [part.name for part in parts if part.name not in listed or not _is_sealed(part)]
-
-
-def _is_sealed(path: Path) -> bool:
-    return (path / "zarr.json").exists() and open_recording(path).state == "sealed"
+    sealed = [
+        part for part in parts if (part / "zarr.json").exists() and open_recording(part).state == "sealed"
+    ]
+    return [part.name for part in parts if part.name not in listed or part not in sealed]
 
 
 def check_recording(path: Path) -> list[str]:

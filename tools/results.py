@@ -94,12 +94,12 @@ def add_option(parser: argparse.ArgumentParser) -> None:
 def recorded(benchmark: str, *, keep: bool, file: Path = FILE) -> Iterator[Run]:
     """A run to add figures to, appended to the file when it ends; if that is early, as far as it came."""
     run = Run(
-        benchmark,
-        _command(sys.argv),
-        datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
-        commit(),
-        acquire.__version__,
-        Machine.here(),
+        benchmark=benchmark,
+        command=_command(sys.argv),
+        date=datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
+        commit=commit(),
+        version=acquire.__version__,
+        machine=Machine.here(),
     )
     try:
         yield run

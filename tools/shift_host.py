@@ -260,7 +260,7 @@ def _words(process: psutil.Process) -> str:
 
 def _mapped() -> set[str]:
     """Names of shared memory that somebody on this host is using: it is theirs."""
-    found = set()
+    found = set()  # others test here at the same time, and their memory is no leak of ours
     for maps in Path("/proc").glob("[0-9]*/maps"):
         with contextlib.suppress(OSError):
             found |= {name for line in maps.read_text().splitlines() for name in _SHARED.findall(line)}
