@@ -56,6 +56,8 @@ def encode(rows: NDArray[Any], codec: Codec) -> NDArray[np.uint8]:
     """Bytes of one chunk before its checksum; ``rows`` is C-contiguous and little-endian."""
     if codec == "none":
         return rows.reshape(-1).view(np.uint8)
+    # Bit shuffle lays bits of one weight together: the upper ones hardly change along a line, though the
+    # lowest are noise.
     return np.frombuffer(blosc.compress(rows, codec.encode(), 1, blosc.BITSHUFFLE), np.uint8)
 
 
@@ -67,6 +69,7 @@ class EncodeOnce:
 
     def __call__(self, chunk: int, rows: NDArray[Any], codec: Codec) -> NDArray[np.uint8]:
         """`encode` of the rows of chunk number ``chunk``."""
+        # By checksum as well: arms that lost different lines do not have the same rows.
         key = chunk, crc32c(rows.data)
         packed = self._packed.pop(key, None)
         if packed is None:
@@ -86,6 +89,7 @@ def decode(payload: Buffer, codec: Codec) -> NDArray[np.uint8]:
 
 def check_size(payload: memoryview, size: int, codec: Codec) -> None:
     """Raise ValueError unless ``payload`` is of the length that it says, and unpacks to ``size`` bytes."""
+    # Before it is unpacked: a header that lies would have us ask the system for whatever it says.
     have, stored = len(payload), len(payload)
     if codec != "none" and have >= BLOSC_HEADER:
         have, stored = struct.unpack_from("<4xI4xI", payload)

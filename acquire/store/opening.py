@@ -32,6 +32,7 @@ def opened(source: Source, kind: type[Kind]) -> Kind:
     Raises PlaceError where there is no recording, DataError for a damaged one, and StoreError where that
     cannot be found out.
     """
+    # The format before the rest: what is no recording is a wrong path, and not damage.
     document = read_root(source)
     _check_format(source, _format(document))
     try:

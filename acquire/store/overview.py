@@ -108,6 +108,7 @@ def write_overview(
     documents = {name: _document(rows, ("line", "pixel"), ROWS) for name, rows in arrays.items()}
     arrays["line"] = (spec.first_line + step * np.arange(count)).astype("<u8")
     documents["line"] = _document(arrays["line"], ("line",), NUMBERS)
+    # Twice: what does not pack well, and metadata. A full disk must still take the end of the recording.
     spare = publisher.disk.free_bytes(path) - 2 * sum(rows.nbytes for rows in arrays.values())
     if spare < SPARE_BYTES:
         raise OSError(errno.ENOSPC, "the disk has room for the recording's end alone")

@@ -204,6 +204,8 @@ class Recording(Outline):
             for arm, stream in self.arms.items()
         }
         stretches = [stretch for arm in found.values() for stretch in arm.values()]
+        # All indices first, then all chunks: a disk does best, and a store far away answers soonest, when it
+        # has been asked for everything before anything is waited for.
         for stretch in stretches:
             stretch.expect_index()
         for stretch in stretches:
@@ -270,13 +272,12 @@ class Recording(Outline):
         packed = np.packbits(bits[: S * lines].reshape(lines, S), axis=1, bitorder="little")[:, 0]
         for (arm, columns), arm_flags in zip(stretches.items(), flags, strict=True):
             wrong = (columns["code"].read() != packed) | (columns["code_index"].read() != index)
-            self._refuse_code(self.arms[arm], first_line, wrong & ((arm_flags & LineFlag.MISSING) == 0))
+            wrong &= (arm_flags & LineFlag.MISSING) == 0  # filled with 0, as the rest of a missing line is
+            if wrong.any():
+                line = first_line + int(wrong.argmax())
+                raise DataError(
+                    f"{self.arms[arm]}: the code recorded with line {line} is not what the recording's "
+                    f"attributes describe ({wrong.sum()} of {len(wrong)} lines disagree)",
+                    hint="lines from before or after; the lines themselves are intact",
+                )
         return bits
-
-    def _refuse_code(self, stream: CameraStream, first_line: int, wrong: NDArray[np.bool_]) -> None:
-        if wrong.any():
-            raise DataError(
-                f"{stream}: the code recorded with line {first_line + int(wrong.argmax())} is not what "
-                f"the recording's attributes describe ({wrong.sum()} of {len(wrong)} lines disagree)",
-                hint="lines from before or after; the lines themselves are intact",
-            )

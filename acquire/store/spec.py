@@ -223,13 +223,11 @@ class Ending:
 
 def root_attributes(spec: RecordingSpec, ending: Ending | None = None) -> dict[str, Any]:
     """Attributes of the recording's root group; ``ending`` makes it sealed."""
-    segment = {"segment": _segment(spec, spec.continues)} if spec.continues else {}
+    segment: dict[str, Any] = {}
+    if spec.continues:  # how long the outage was is known only now, with the first line
+        readout = readout_ns(spec, spec.first_line)
+        segment = {"segment": spec.continues.to_attrs(spec.first_line, readout)}
     return {**spec.extra, **segment, **_own_attributes(spec, ending)}
-
-
-def _segment(spec: RecordingSpec, continues: Continuation) -> dict[str, Any]:
-    """What the recording continues, now that its first line is known."""
-    return continues.to_attrs(spec.first_line, readout_ns(spec, spec.first_line))
 
 
 def readout_ns(spec: RecordingSpec, line: int) -> int:

@@ -72,6 +72,7 @@ class _Table:
             data = self._chunk(column)
             if data_type == "string":
                 return _texts(data, rows)
+            # By struct: whoever lists recordings need not wait for numpy.
             return list(struct.unpack_from(f"<{rows}{NUMBERS[data_type]}", data))
         except (*PARSE_ERRORS, struct.error, OSError) as error:
             raise DataError(f"{self.source}: table {self.name}/{column} cannot be read: {error!r}") from error

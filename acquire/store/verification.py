@@ -138,6 +138,7 @@ def _read_tags(recording: Recording, found: ArmScan) -> tuple[int | None, int]:
         if chunk in found.troubles["flags"] or chunk in found.troubles["code_index"]:
             return None, misnumbered
         rows = min(size, recording.lines - chunk * size)
+        # Chunk by chunk: the tags of a recording of days do not fit into memory.
         missing = missing_rows(found.stream.reader("flags").chunk(chunk)[:rows])
         flagged += int(missing.sum())
         first = recording.first_line + chunk * found.stream.reader("flags").shape.chunk_rows
@@ -165,7 +166,7 @@ def _unbalanced(recording: Recording, arm: str, listed: int | None) -> Iterator[
 
 def _metadata(recording: Recording) -> Iterator[str]:
     """Arrays' own metadata, which readers meet that do not begin at the root."""
-    if recording.state != "sealed":
+    if recording.state != "sealed":  # while it grows, they are renewed once a second only
         return
     nodes = recording.document["consolidated_metadata"]["metadata"]
     for path, document in nodes.items():
