@@ -71,7 +71,14 @@ def bench(
     with stage_progress("measuring ring, codec and disk"):
         parts = measure_parts(load, directory)
     if not json:
-        _show_parts(load, parts, directory)
+        limits = ", ".join(f"{name} {quantity(rate, 'Hz')}" for name, rate in parts.limits.items())
+        print_facts(
+            {
+                "lines": f"2 x {load.pixels} px {load.dtype}, codec {load.codec}",
+                "recorded to": str(directory),
+                "parts allow": limits,
+            }
+        )
     with stage_progress(f"recording at most {runs} times") as advance:
         told = _Told(advance, runs, aloud=not json)
         trials = search_rate(load, directory, parts.line_rate_hz, seconds=seconds, tell=told, most_runs=runs)
@@ -79,24 +86,16 @@ def bench(
     if json:
         print_json(_facts(load, parts, trials, found))
     elif found is not None:
-        _show(load, trials, found)
+        columns = ("lines/s", "MB/s", "lost", "ring peak", "cores", "latency p99.9", "")
+        slowest_first = sorted(trials, key=lambda trial: trial.line_rate_hz)
+        say()
+        print_table(columns, [_row(load, trial, found) for trial in slowest_first])
     if found is None:
         slowest = min(trial.line_rate_hz for trial in trials)
         raise DeviceError(
             f"this host held none of the line rates that were tried, down to {quantity(slowest, 'Hz')}",
             hint="another disk (--out), recording.codec, a longer ring (stream.ring_slots), or an idle host",
         )
-
-
-def _show_parts(load: Load, parts: Parts, directory: Path) -> None:
-    limits = ", ".join(f"{name} {quantity(rate, 'Hz')}" for name, rate in parts.limits.items())
-    print_facts(
-        {
-            "lines": f"2 x {load.pixels} px {load.dtype}, codec {load.codec}",
-            "recorded to": str(directory),
-            "parts allow": limits,
-        }
-    )
 
 
 class _Told:
@@ -111,13 +110,6 @@ class _Told:
         self._advance(self._done, self._runs)
         if self._aloud:
             say(f"  {quantity(trial.line_rate_hz, 'Hz')}: {'held' if trial.held else 'not held'}", err=True)
-
-
-def _show(load: Load, trials: list[Trial], found: Trial) -> None:
-    columns = ("lines/s", "MB/s", "lost", "ring peak", "cores", "latency p99.9", "")
-    rows = [_row(load, trial, found) for trial in sorted(trials, key=lambda trial: trial.line_rate_hz)]
-    say()
-    print_table(columns, rows)
 
 
 def _row(load: Load, trial: Trial, found: Trial) -> tuple[str, ...]:

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from acquire.calibrate.guide import AT_ONCE, LINES, MOST_LINES, Step
-from acquire.cli.calibrate_live import instrument, kept, record, wait_for_enter
+from acquire.cli.calibrate_live import instrument, kept, record, tell_finding, wait_for_enter
 from acquire.cli.control import SocketOption
-from acquire.cli.output import JsonFlag, note, print_facts, print_json, print_warning, say
+from acquire.cli.output import JsonFlag, note, print_json, print_warning, say
 from acquire.errors import UsageError
 
 if TYPE_CHECKING:
@@ -79,7 +79,8 @@ def _step(
             for look in _looks(step, exposure, out):
                 found.append(kept(out, exposure, look))
                 if not quiet:
-                    _tell(found[-1])
+                    tell_finding(found[-1])
+                    say()
         except UsageError as error:
             if not (ask and left):
                 raise
@@ -105,12 +106,3 @@ def _looks(step: Step, exposure: Exposure, out: str) -> Iterator[Callable[[Calib
     for name in step.finds:
         if name != "transfer" or "linearity" not in open_calibration(out).steps:
             yield looks[name]
-
-
-def _tell(found: Finding) -> None:
-    from acquire.calibrate.words import found_facts
-
-    print_facts(found_facts(found))
-    for text in found.warnings:
-        print_warning(text)
-    say()

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from acquire.calibrate.guide import DELAY, MOST_LINES
-from acquire.cli.calibrate_live import instrument, kept, record, wait_for_enter
+from acquire.cli.calibrate_live import instrument, kept, record, tell_finding, wait_for_enter
 from acquire.cli.control import SocketOption
-from acquire.cli.output import JsonFlag, note, print_facts, print_json, print_warning
+from acquire.cli.output import JsonFlag, note, print_json
 from acquire.errors import UsageError
 
 if TYPE_CHECKING:
@@ -59,9 +59,12 @@ def delay(
         exposures, whole = _swept(directory, lines, socket, ask=not yes)
     found = _found(out, exposures, whole=whole)
     if json:
-        print_json({"calibration": out, "facts": found.facts, "warnings": found.warnings, **_numbers(found)})
+        late = found.quantities["light_late_ticks"]
+        facts = {"calibration": out, "facts": found.facts, "warnings": found.warnings}
+        ticks = {"light_late_ticks": late.value.tolist(), "uncertainty_ticks": late.uncertainty.tolist()}
+        print_json(facts | ticks)
         return
-    _tell(found, out)
+    tell_finding(found, {"kept in": out})
 
 
 def _swept(
@@ -123,16 +126,3 @@ def _known_ticks(out: str) -> float | None:
         return None
     late = open_calibration(out).quantities.get("light_late_ticks")
     return None if late is None else float(late.uncertainty.max())
-
-
-def _numbers(found: Finding) -> dict[str, object]:
-    late = found.quantities["light_late_ticks"]
-    return {"light_late_ticks": late.value.tolist(), "uncertainty_ticks": late.uncertainty.tolist()}
-
-
-def _tell(found: Finding, out: str) -> None:
-    from acquire.calibrate.words import found_facts
-
-    print_facts(found_facts(found) | {"kept in": out})
-    for text in found.warnings:
-        print_warning(text)

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from acquire.calibrate.guide import LINEARITY, MOST_LINES, RAMP_LINES
-from acquire.cli.calibrate_live import instrument, kept, record, wait_for_enter
+from acquire.cli.calibrate_live import instrument, kept, record, tell_finding, wait_for_enter
 from acquire.cli.control import SocketOption
-from acquire.cli.output import JsonFlag, note, print_facts, print_json, print_warning, say
+from acquire.cli.output import JsonFlag, note, print_json, say
 
 if TYPE_CHECKING:
     from acquire.calibrate.calibration import Finding
@@ -58,7 +58,8 @@ def linearity(
         print_json({"calibration": out, "steps": {each.step: _numbers(each) for each in found}})
         return
     for each in found:
-        _tell(each)
+        tell_finding(each)
+        say()
     say(f"kept in  {out}")
 
 
@@ -116,12 +117,3 @@ def _numbers(found: Finding) -> dict[str, object]:
         for name, each in found.quantities.items()
     }
     return {"facts": found.facts, "warnings": found.warnings, **values}
-
-
-def _tell(found: Finding) -> None:
-    from acquire.calibrate.words import found_facts
-
-    print_facts(found_facts(found))
-    for text in found.warnings:
-        print_warning(text)
-    say()

@@ -6,14 +6,14 @@ import os
 import sys
 import time
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from acquire.cli.output import note, print_warning
+from acquire.cli.output import note, print_facts, print_warning
 from acquire.daemon.who import LONGEST, WHO
 from acquire.errors import DataError, StateError, UsageError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
 
     from acquire.calibrate.calibration import Calibration, Finding
@@ -115,6 +115,15 @@ def kept(out: str, exposure: Exposure, look: Callable[[Calibration], Finding]) -
         raise UsageError(f"orientation: {found.warnings[0]}")
     save_calibration(out, known.with_step(found))
     return found
+
+
+def tell_finding(found: Finding, more: Mapping[str, Any] | None = None) -> None:
+    """Print what was found, ``more`` facts after it, and its warnings."""
+    from acquire.calibrate.words import found_facts
+
+    print_facts(found_facts(found) | dict(more or {}))
+    for text in found.warnings:
+        print_warning(text)
 
 
 def wait_for_enter() -> None:

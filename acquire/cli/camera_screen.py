@@ -48,7 +48,10 @@ class Screen:
     def __rich__(self) -> RenderableType:
         parts: list[RenderableType] = []
         for name, serial in self._names.items():
-            parts += [self._rows(name, serial), *self._said(name), Text("")]
+            parts.append(self._rows(name, serial))
+            if said := advice(self._readings.get(name)):
+                parts.append(Text(" " * (LABEL + 2) + said, style="yellow"))
+            parts.append(Text(""))
         return Group(*parts, Text(f"looking at {visible(self._where)}; Ctrl-C ends", style="dim"))
 
     def _rows(self, name: str, serial: str) -> Table:
@@ -71,10 +74,6 @@ class Screen:
         line = Text(running(list(self._focus[name])), "cyan")
         grid.add_row("focus", line, "–" if now is None else f"{now:.2%}", f"best {best:.2%}" if best else "")
         return grid
-
-    def _said(self, name: str) -> list[Text]:
-        said = advice(self._readings.get(name))
-        return [Text(" " * (LABEL + 2) + said, style="yellow")] if said else []
 
 
 def bar(part: float) -> str:

@@ -48,17 +48,15 @@ class Quick:
         """The value. typer.BadParameter where it is out of the option's range."""
         least, most = self._least, self._most
         if not (least is None or value >= least) or not (most is None or value <= most):  # nan is neither
-            possible = f"{least:g} to {most:g}" if None not in (least, most) else _limit(least, most)
+            possible = f"{most:g} or less" if least is None else f"{least:g} or more"
+            if least is not None and most is not None:
+                possible = f"{least:g} to {most:g}"
             raise OutOfRange(f"{value} is out of range: {possible}", ctx=ctx, param=param)
         return value
 
 
 class OutOfRange(typer.BadParameter):
     """A number that is one, and not in the range of its option."""
-
-
-def _limit(least: float | None, most: float | None) -> str:
-    return f"{least:g} or more" if least is not None else f"{most:g} or less"
 
 
 def ease(command: Any) -> None:

@@ -49,7 +49,7 @@ def completion(
 
 def words_so_far() -> list[str]:
     """The words before the one that is being typed, as the scripts hand them over."""
-    typed = os.environ.get("COMP_WORDS")
+    typed = os.environ.get("COMP_WORDS")  # bash; zsh and fish have typer's own variable
     if typed is not None:
         words = typed.split()
         return words[1 : int(os.environ.get("COMP_CWORD", len(words)))]

@@ -17,7 +17,6 @@ from acquire.text import did_you_mean, shown
 
 if TYPE_CHECKING:
     from acquire.client import Client
-    from acquire.daemon.messages import LastRecording
 
 SocketOption = Annotated[
     Path | None, typer.Option("--socket", envvar="ACQUIRE_SOCKET", help="Control socket of the daemon.")
@@ -136,8 +135,10 @@ def stop(socket: SocketOption = None, json: JsonFlag = False) -> None:
     with _daemon(socket) as daemon:
         status = daemon.stop()
     show(status, json)
-    if status.last is not None and status.last.condition in DAMAGED:
-        raise DataError(_damage(status.last), hint=f"acquire info {status.last.path}")
+    last = status.last
+    if last is not None and last.condition in DAMAGED:
+        became = f"{last.condition or 'not sealed'}: {last.end_reason or 'no end reason'}"
+        raise DataError(f"recording {last.path} is {became}", hint=f"acquire info {last.path}")
 
 
 def disarm(socket: SocketOption = None, json: JsonFlag = False) -> None:
@@ -233,7 +234,3 @@ def _daemon(socket: Path | None) -> Client:
     from acquire.client import Client
 
     return Client(socket, teller())
-
-
-def _damage(last: LastRecording) -> str:
-    return f"recording {last.path} is {last.condition or 'not sealed'}: {last.end_reason or 'no end reason'}"

@@ -111,12 +111,15 @@ def import_lines(
         first_line=first_line,
         start_ns=_utc_ns(start),
     )
-    layout = Layout(_dtype(dtype), pixels, skip_bytes, dataset)
+    if dtype is not None and dtype not in DTYPES:
+        raise UsageError(f"--dtype {dtype!r} is not known", possible=", ".join(DTYPES))
+    layout = Layout(None if dtype is None else DTYPES[dtype], pixels, skip_bytes, dataset)
     columns = {"a": _columns(columns_a), "b": _columns(columns_b)}
     with ExitStack() as held:
         arms = _arms(held, files, layout, columns, arm)
+        run_id = re.sub(r"[^A-Za-z0-9._-]", "_", PurePosixPath(out).stem) or "imported"
         with stage_progress(f"importing {PurePosixPath(out).name}") as advance:
-            done = import_lines(arms, instrument, out, _run_id(out), advance, most_lines=lines)
+            done = import_lines(arms, instrument, out, run_id, advance, most_lines=lines)
     if json:
         facts = {"path": str(done.path), "lines": done.lines, "arms": done.arms, "unknown": done.unknown}
         print_json(facts)
@@ -127,10 +130,6 @@ def import_lines(
     say(f"  acquire diagnose {done.path} holds the lines against the code")
 
 
-def _run_id(out: str) -> str:
-    return re.sub(r"[^A-Za-z0-9._-]", "_", PurePosixPath(out).stem) or "imported"
-
-
 def _utc_ns(text: str | None) -> int | None:
     if text is None:
         return None
@@ -138,12 +137,6 @@ def _utc_ns(text: str | None) -> int | None:
     if found is None:
         raise UsageError(f"--start {text!r} is no time", possible="UTC as 2026-01-31T12:00:00.25")
     return found
-
-
-def _dtype(text: str | None) -> str | None:
-    if text is not None and text not in DTYPES:
-        raise UsageError(f"--dtype {text!r} is not known", possible=", ".join(DTYPES))
-    return None if text is None else DTYPES[text]
 
 
 def _columns(text: str | None) -> tuple[int, int] | None:

@@ -6,7 +6,7 @@ import shlex
 import sys
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -63,7 +63,9 @@ def paper(
     if wrong := [name for name in chosen if name not in NAMES]:
         raise UsageError(f"figure {wrong[0]!r} is not known", possible=", ".join(NAMES))
     if recording is not None:
-        chosen = _one_of_a_recording(figures)
+        if figures not in (None, [], ["fig9"]):
+            raise UsageError(f"{', '.join(figures)} cannot be made from a recording", possible="fig9")
+        chosen = ["fig9"]
     from acquire.cores import idle_cores, limit_blas
     from acquire.evaluate.paper import Studio, make
     from acquire.evaluate.paper.page import draw, write_page
@@ -84,15 +86,11 @@ def paper(
         return
     for each in made:
         say(f"Fig. {each.facts['name'][3:]}  {each.facts['title']}")
-        print_table(
-            ("", "the paper", "here", "against it", "by"), [_cells(row) for row in each.facts["rows"]]
-        )
+        shown = ("what", "paper", "ours", "verdict", "by")
+        rows = [tuple(row[name] for name in shown) for row in each.facts["rows"]]
+        print_table(("", "the paper", "here", "against it", "by"), rows)
         say()
     say(f"page  {page}")
-
-
-def _cells(row: dict[str, Any]) -> tuple[str, ...]:
-    return row["what"], row["paper"], row["ours"], row["verdict"], row["by"]
 
 
 def _one_of_a_recording(figures: list[str] | None) -> list[str]:

@@ -189,14 +189,13 @@ def reconstruct(
         preview=preview,
         preset=preset,
         options=Options(
-            "balanced",
-            solver,
-            iterations,
-            budget,
-            None,
-            dtype,  # type: ignore[arg-type]  # checked there
-            device,
-            None if chosen is None else chosen.calibration,
+            preset="balanced",
+            solver=solver,
+            iterations=iterations,
+            budget_s=budget,
+            dtype=dtype,  # type: ignore[arg-type]  # checked there
+            device=device,
+            calibration=None if chosen is None else chosen.calibration,
             solver_options=solver_options,
             denoiser=denoiser,
             shared=_shared(search),

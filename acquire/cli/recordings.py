@@ -305,21 +305,20 @@ def _damage(recording: Outline) -> str | None:
 def _row(facts: dict[str, Any]) -> tuple[str, ...]:
     name = Path(facts["path"]).name
     if "error" in facts:
-        return (name, "-", "-", "-", _short(facts["error"].removeprefix(facts["path"]).lstrip(": ")), "-")
+        # One line of bounded length: an error may quote what lies on the disk.
+        why = " ".join(facts["error"].removeprefix(facts["path"]).lstrip(": ").split())
+        why = why if len(why) <= CELL_CHARACTERS else why[: CELL_CHARACTERS - 1] + "…"
+        return (name, "-", "-", "-", why, "-")
     state = (facts["run_condition"] or facts["state"]) + (", DAMAGED" if facts["damage"] else "")
     size = quantity(facts["bytes"], "B")
     return (name, str(facts["lines"]), f"{facts['duration_s']:.3f} s", size, state, _utc(facts["start_ns"]))
 
 
-def _short(text: str) -> str:
-    """One line of bounded length, for a cell of a table."""
-    line = " ".join(text.split())
-    return line if len(line) <= CELL_CHARACTERS else line[: CELL_CHARACTERS - 1] + "…"
-
-
 def _readable(facts: dict[str, Any]) -> dict[str, Any]:
     sizes = facts["geometry"]
     first, lines = facts["first_line"], facts["lines"]
+    doubt_ns = facts["clock"]["uncertainty_ns"]
+    utc = "UTC not known" if doubt_ns >= MOST_NS else f"UTC known to {doubt_ns} ns"
     return {
         "recording": facts["path"],
         "run": facts["run_id"],
@@ -336,7 +335,7 @@ def _readable(facts: dict[str, Any]) -> dict[str, Any]:
         "scene": _behind_fibre(sizes),
         "samples": facts["dtype"],
         "code": ", ".join(f"{key} {shortened(value, 60)}" for key, value in facts["code"].items()),
-        "clock": f"{facts['clock']['clock_hz']} Hz, {_known_to(facts['clock']['uncertainty_ns'])}",
+        "clock": f"{facts['clock']['clock_hz']} Hz, {utc}",
         "size": quantity(facts["bytes"], "B"),
         "damaged": facts["damage"],
         "disk": _disk(facts["disk"]),
@@ -348,10 +347,6 @@ def _readable(facts: dict[str, Any]) -> dict[str, Any]:
         "imported": _imported(facts["imported"]),
         "written by": f"acquire {facts['versions']['acquire']}",
     }
-
-
-def _known_to(uncertainty_ns: int) -> str:
-    return "UTC not known" if uncertainty_ns >= MOST_NS else f"UTC known to {uncertainty_ns} ns"
 
 
 def _imported(found: dict[str, Any] | None) -> str | None:

@@ -74,8 +74,13 @@ def replay(
             raise UsageError("--loop with --out would never end", possible="one of them")
         check_new_path(out)
     with _at_hand(recording) as stored:
-        if out is None:
-            _serve(stored, speed or 1.0, loop, socket)
+        if out is None:  # the daemon in this process, until it is told to end
+            from acquire.cli.replay_rig import replay_rig
+            from acquire.cli.serve import serve
+
+            with _private_directory() as directory:
+                table = replay_rig(stored, speed or 1.0, Path.cwd(), replay_loop=loop)
+                serve(str(_rig_file(directory, table)), socket, None)
             return
         used, differences = _until_nothing_is_lost(stored, out, speed or FASTEST)
         facts = {
@@ -173,6 +178,7 @@ def _record(stored: Recording, out: Path, speed: float) -> str | None:
         table = replay_rig(stored, speed, directory, replay_gate=str(gate))
         table["check"] = {"enable": False}  # flags are replayed, and when a verdict comes depends on the load
         table["recording"]["after"] = "idle"
+        # A process of its own: the daemon's signals and threads are not for this one.
         options = [f"--config={_rig_file(directory, table)}", f"--socket={socket}"]
         process = held.enter_context(daemon_process(options, log))
         client = held.enter_context(Client(socket))
@@ -180,7 +186,7 @@ def _record(stored: Recording, out: Path, speed: float) -> str | None:
         await_daemon(client, process, log)
         client.arm(force=True)  # the ring holds what the disk does not take in time
         client.start(out.absolute(), lines=stored.lines)
-        gate.touch()
+        gate.touch()  # no line comes before, so that none can come before the recording has begun
         status = follow(client, stored.lines, advance)
     if status.fault:
         return status.fault
@@ -216,13 +222,3 @@ def _rig_file(directory: Path, table: dict[str, Any]) -> Path:
     path = directory / "rig.toml"
     path.write_text("\n".join(dotted(table)) + "\n", encoding="utf-8")
     return path
-
-
-def _serve(stored: Recording, speed: float, loop: bool, socket: Path | None) -> None:
-    """The daemon in this process, until it is told to end."""
-    from acquire.cli.replay_rig import replay_rig
-    from acquire.cli.serve import serve
-
-    with _private_directory() as directory:
-        table = replay_rig(stored, speed, Path.cwd(), replay_loop=loop)
-        serve(str(_rig_file(directory, table)), socket, None)

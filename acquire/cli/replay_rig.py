@@ -45,6 +45,8 @@ def replay_rig(stored: Recording, speed: float, directory: Path, **simulation: A
     substeps = stored.substeps
     block = max(1, min(MOST_BLOCK_LINES, BLOCK_BYTES // line_bytes(stored)))
     slots = _slots(stored, block)
+    # As it was recorded, within what a rig may ask for.
+    chunk_lines = min(2**20, max(16, stored.camera("a").reader("lines").shape.chunk_rows))
     return {
         "name": "replay",
         "geometry": {"stages": geometry["stages"], "substeps": substeps},
@@ -58,7 +60,7 @@ def replay_rig(stored: Recording, speed: float, directory: Path, **simulation: A
         | ({} if fibre is None else {"layout": "fibre"}),
         "fibre": _table(fibre),
         "stream": {"block_lines": block, "ring_slots": slots, "reopen_s": PATIENCE_S},
-        "recording": {"directory": str(directory), "chunk_lines": _chunk_lines(stored), "reserve_gb": 0.0},
+        "recording": {"directory": str(directory), "chunk_lines": chunk_lines, "reserve_gb": 0.0},
         "simulation": {"speed": speed, "replay": str(stored.path.resolve()), **simulation},
     }
 
@@ -120,7 +122,3 @@ def _camera(stored: Recording, arm: str) -> dict[str, Any]:
         "black_level_dn": facts["black_level_dn"],
         "responsivity_dn": facts["responsivity_dn"],
     }
-
-
-def _chunk_lines(stored: Recording) -> int:
-    return min(2**20, max(16, stored.camera("a").reader("lines").shape.chunk_rows))

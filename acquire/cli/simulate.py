@@ -86,7 +86,15 @@ def simulate(
         print_json({**facts, "study": found and asdict(found)})
         return
     if facts:
-        print_facts(_readable(facts))
+        lost = {arm: count for arm, count in facts["lost_lines"].items() if any(facts["lost_lines"].values())}
+        print_facts(
+            {
+                "recording": facts["path"],
+                "lines": f"{facts['lines']} of both arms, {facts['simulated_s']:.4g} s",
+                "took": f"{facts['seconds']:.2f} s, {facts['speed']:.3g} x real time",
+                "dropped": ", ".join(f"{arm} {count}" for arm, count in lost.items()) or None,
+            }
+        )
     if found:
         _print_study(found, explain=explain)
 
@@ -99,16 +107,6 @@ def _line_count(rig: RigConfig, default: int, lines: int | None, duration: float
             raise UsageError(f"--duration {duration} is out of range", possible="more than 0")
         return max(1, round(duration * rig.line_rate_hz))
     return default if lines is None else lines
-
-
-def _readable(facts: dict[str, Any]) -> dict[str, Any]:
-    lost = facts["lost_lines"]
-    return {
-        "recording": facts["path"],
-        "lines": f"{facts['lines']} of both arms, {facts['simulated_s']:.4g} s",
-        "took": f"{facts['seconds']:.2f} s, {facts['speed']:.3g} x real time",
-        "dropped": ", ".join(f"{arm} {count}" for arm, count in lost.items()) if any(lost.values()) else None,
-    }
 
 
 def _print_study(found: Study, *, explain: bool) -> None:

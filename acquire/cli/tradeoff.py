@@ -195,19 +195,15 @@ def _cases(
         most = (first_line or FIRST_LINE) + lines + (repeats - 1) * APART
         recording, found = _opened(source, out, most)
         effects = effects or found
-        first = _first(recording, first_line, lines)
+        first = first_line
+        if first is None:  # not the very beginning, if there is room
+            first = recording.first_line + max(0, min(FIRST_LINE, recording.lines - lines))
         named = tile_of(recording, tile)
         seen = speaker(recording, () if named is None else (named,), (first, lines))
         # lines that are not there are refused before anything is measured
         recording.cut(first, lines, seen)
         cases.append(of_recording(Path(source).stem, recording, first, lines, APART, seen))
     return cases, effects
-
-
-def _first(recording: Recording, first_line: int | None, lines: int) -> int:
-    if first_line is not None:
-        return first_line
-    return recording.first_line + max(0, min(FIRST_LINE, recording.lines - lines))
 
 
 def _opened(source: str, out: Path, lines: int) -> tuple[Recording, Study | None]:

@@ -135,7 +135,8 @@ def _as_ours(error: Any) -> UsageError:
     command = context.command_path if context is not None else "acquire"
     said = (error.message if near else error.format_message()).partition(" Did you mean")[0].rstrip(".")
     where = f"{command.removeprefix('acquire').lstrip()}: ".removeprefix(": ")
-    meant = f"; did you mean {near[0]!r}?" if near else did_you_mean(_mistaken(said), _choices(context))
+    mistaken = said.partition("'")[2].partition("'")[0]  # the word that click quotes
+    meant = f"; did you mean {near[0]!r}?" if near else did_you_mean(mistaken, _choices(context))
     return UsageError(
         f"{where}{_sentence(said[:1].lower() + said[1:])}{meant}",
         possible=", ".join(sorted(near) if near else _choices(context)),
@@ -147,11 +148,6 @@ def _sentence(said: str) -> str:
     """With a verb where click has none."""
     said = re.sub(r"^no such (option|command):? ", r"there is no \1 ", said)
     return re.sub(r"^missing ((?:option|argument) .*)", r"the \1 is missing", said)
-
-
-def _mistaken(said: str) -> str:
-    """The word that an error quotes."""
-    return said.partition("'")[2].partition("'")[0]
 
 
 def _choices(context: Any) -> Iterator[str]:

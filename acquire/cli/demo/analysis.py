@@ -57,7 +57,10 @@ class Method:
 def analyse(plan: DemoPlan, captured: Captured, rig: RigConfig, journal: Journal) -> DemoResult:
     """Everything that the report shows; leaves truth and videos in ``plan.out``."""
     recording = open_recording(captured.path)
-    segment = _cut(recording, segment_row(rig), journal)
+    with journal.stage("Cut both arms") as note:
+        first = recording.first_line + segment_row(rig)
+        note["detail"] = f"lines {first} to {first + SEGMENT_LINES - 1}"
+        segment = recording.cut(first, SEGMENT_LINES)
     scene = _scene(recording, segment)
     with journal.stage("Save the truth at full resolution"):
         _save_truth(plan.out / "truth.zarr", scene, segment)
@@ -95,13 +98,6 @@ def analyse(plan: DemoPlan, captured: Captured, rig: RigConfig, journal: Journal
         stages=tuple(journal.stages),
         host=host.busyness(),
     )
-
-
-def _cut(recording: Recording, row: int, journal: Journal) -> Segment:
-    with journal.stage("Cut both arms") as note:
-        first = recording.first_line + row
-        note["detail"] = f"lines {first} to {first + SEGMENT_LINES - 1}"
-        return recording.cut(first, SEGMENT_LINES)
 
 
 def _solve(method: Method, segment: Segment, journal: Journal) -> Reconstruction:
