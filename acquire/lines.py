@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.alignment import Alignment
+    from acquire.blur import Blur
     from acquire.converter import ConverterCurve
     from acquire.noise import Noise
 
@@ -97,6 +98,7 @@ class Segment:
     curve : what makes the recorded DN those of a linear camera, of which black level, responsivity and noise
         are then told; None: they are
     alignment : where arm B's image lies beside arm A's; None: on it
+    blur : of either arm's optics; None: it is not known, or none
     noise : of the samples in DN; None: it is not known
     balanced : the arms' shares of the light are in ``responsivity_dn``, as far as anybody knows them
     first_column : of arms A and B, where on the sensor's columns these pixels begin; behind a fibre not at 0
@@ -113,6 +115,7 @@ class Segment:
     responsivity_dn: float | tuple[float, float] | NDArray[np.float64] = 1.0
     curve: ConverterCurve | None = None
     alignment: Alignment | None = None
+    blur: Blur | None = None
     noise: Noise | None = None
     balanced: bool = False
     first_column: tuple[int, int] = (0, 0)
@@ -181,7 +184,8 @@ class Segment:
         """With the arms in each other's places, and all that is known of either."""
         segment = self._of_arms(lambda values: values[::-1].copy(), per_arm=True)
         noise, curve = self.noise and self.noise.swapped(), self.curve and self.curve.swapped()
-        return replace(segment, noise=noise, curve=curve)
+        blur = self.blur and self.blur.swapped()
+        return replace(segment, noise=noise, curve=curve, blur=blur)
 
     def _of_arms(self, change: Callable[[NDArray[Any]], NDArray[Any]], *, per_arm: bool = False) -> Segment:
         """With all that there is of each arm and pixel changed alike; ``per_arm``: of each arm, too."""

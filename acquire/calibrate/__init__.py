@@ -2,11 +2,11 @@
 
 ::
 
-    recordings ──▶ exposure ──▶ dark, flat, transfer, orientation, align ──▶ Finding
-                                                                              │
-    recording's copy ◀── Calibration ◀── file (Zarr group) ◀── with_step ◀────┘
+    recordings ──▶ exposure ──▶ dark, flat, transfer, orientation, align, psf ──▶ Finding
+                                                                                   │
+    recording's copy ◀── Calibration ◀── file (Zarr group) ◀── with_step ◀─────────┘
                              │
-                             └──▶ apply: a segment's offsets, responsivities, mask, alignment
+                             └──▶ apply: a segment's offsets, responsivities, mask, alignment, blur
 
 A calibration holds what was measured and nothing else; what it does not hold is not corrected. Lines on disk
 are never altered.

@@ -1,4 +1,4 @@
-"""A calibration on lines: a segment's offsets, responsivities, mask and alignment. No line is altered."""
+"""A calibration on lines: a segment's offsets, responsivities, mask, alignment, blur. No line is altered."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from acquire.blur import Blur
 from acquire.calibrate.calibration import COLUMN, QUANTITIES, Calibration, Measured, differing
 from acquire.calibrate.curve import curve_of
 from acquire.calibrate.exposure import instrument_of
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 OLD_DAYS = 30
 WARMER_K = 5.0
 SLOWER = 0.01
+CLEAR_BLUR = 2.0
+"""Standard uncertainties above 0 from which on a width is part of the model."""
 
 
 def calibration_of(recording: Recording) -> Calibration | None:
@@ -64,27 +67,27 @@ def calibrated(segment: Segment, calibration: Calibration) -> Segment:
             possible="the same",
         )
     calibration = _of_columns(calibration, segment)
-    changes: dict[str, Any] = {}
-    black = black_level(segment, calibration)
-    if (curve := curve_of(calibration)) is not None:
-        changes["curve"] = curve
+    black, curve = black_level(segment, calibration), curve_of(calibration)
+    if curve is not None:
         black = curve.straight(_columns(segment.black_level_dn, segment) if black is None else black)
-    if black is not None:
-        changes["black_level_dn"] = black
-    if (responsivity := _responsivity(segment, calibration)) is not None:
-        changes["responsivity_dn"] = responsivity
+    known = {
+        "curve": curve,
+        "black_level_dn": black,
+        "responsivity_dn": _responsivity(segment, calibration),
+        "blur": blur_of(calibration),
+        "noise": _noise(calibration),
+    }
+    changes: dict[str, Any] = {name: value for name, value in known.items() if value is not None}
     if calibration.value("balance") is not None:
         changes["balanced"] = True
     if calibration.usable is not None and not calibration.usable.all():
         changes["mask"] = segment.mask & calibration.usable[:, None, :]
-    if (noise := _noise(calibration)) is not None:
-        changes["noise"] = noise
     corrected = replace(segment, **changes)
     if calibration.orientation is not None:
         corrected = oriented(corrected, view_named(calibration.orientation))
     if calibration.alignment is not None:
         corrected = replace(corrected, alignment=calibration.alignment.alignment)
-    return corrected
+    return _without_interpolation(corrected)
 
 
 def _of_columns(calibration: Calibration, segment: Segment) -> Calibration:
@@ -126,6 +129,28 @@ def black_level(segment: Segment, calibration: Calibration) -> NDArray[np.float6
         return None
     base = _columns(segment.black_level_dn, segment) if offset is None else offset
     return base if ambient is None else base + ambient
+
+
+def blur_of(calibration: Calibration) -> Blur | None:
+    """Of the optics, as far as it is clear that there is one; None where it is not, or was not measured."""
+    if "blur_px" not in calibration.quantities:
+        return None
+    found = calibration.quantities["blur_px"]
+    clear = np.where(found.value > CLEAR_BLUR * found.uncertainty, found.value, 0.0)
+    a, b = clear.tolist()
+    return Blur(tuple(a), tuple(b)) if clear.any() else None
+
+
+def _without_interpolation(segment: Segment) -> Segment:
+    """Arm B's blur less what laying it on arm A adds in the model: the width that was measured is of both."""
+    if segment.blur is None or segment.alignment is None:
+        return segment
+    from acquire.forward import interpolation_variance  # compiled loops, which a capture host is without
+
+    rows, columns = interpolation_variance(segment.alignment, segment.geometry.size)
+    along, across = segment.blur.b  # of arm B's charge, which moves along the scene's columns
+    left = (max(0.0, along**2 - columns) ** 0.5, max(0.0, across**2 - rows) ** 0.5)
+    return replace(segment, blur=Blur(segment.blur.a, left))
 
 
 def _noise(calibration: Calibration) -> Noise | None:

@@ -12,6 +12,7 @@
     full_well_e      (arm)           μ_e.sat of EMVA 1288
     light_late_ticks (arm)           by which light comes after the charge's moves, without lead and delays
     linearity_error  (arm)           LE of EMVA 1288
+    blur_px          (arm, axis)     standard deviation of the optics' blur, along the transfer and across it
     excess_dn        (arm, knot)     by which samples are too high that read so much, evenly from 0 to white
 
 and ``usable`` (arm, column), the orientation of arm B, and its alignment on arm A.
@@ -50,7 +51,7 @@ class Quantity:
     meaning: str
 
 
-ARM, COLUMN, CURVE = ("arm",), ("arm", "column"), ("arm", "knot")
+ARM, COLUMN, CURVE, WIDTHS = ("arm",), ("arm", "column"), ("arm", "knot"), ("arm", "axis")
 KNOTS = 65
 """Of a camera's curve: between them a bend of a percent is straight to a part in 10⁶."""
 QUANTITIES = {
@@ -67,6 +68,9 @@ QUANTITIES = {
         "1",
         "by which light comes after the charge's moves without lead and delays, in the trigger's ticks",
     ),
+    "blur_px": Quantity(
+        WIDTHS, "1", "standard deviation of the optics' blur along the transfer and across it, in fine pixels"
+    ),
     "linearity_error": Quantity(ARM, "1", "linearity error of EMVA 1288"),
     "excess_dn": Quantity(CURVE, "DN", "by which samples are too high that read 0 … white, evenly"),
 }
@@ -78,6 +82,7 @@ FOUND_BY = {
     "transfer": ("dn_per_electron", "read_noise_e", "full_well_e"),
     "linearity": ("linearity_error", "excess_dn"),
     "delay": ("light_late_ticks",),
+    "psf": ("blur_px",),
 }
 """Step → the quantities that it measures."""
 
@@ -189,7 +194,7 @@ class Calibration:
         )
 
     def __post_init__(self) -> None:
-        sizes = {"arm": len(ARMS), "column": self.instrument.columns, "knot": KNOTS}
+        sizes = {"arm": len(ARMS), "column": self.instrument.columns, "knot": KNOTS, "axis": 2}
         columns = tuple(sizes[dimension] for dimension in COLUMN)
         if self.usable is not None and self.usable.shape != columns:
             raise UsageError(

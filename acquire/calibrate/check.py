@@ -10,6 +10,7 @@ import numpy as np
 from acquire.calibrate.apply import check_fits
 from acquire.calibrate.columns import dark, flat
 from acquire.calibrate.field import mended
+from acquire.calibrate.psf import psf
 from acquire.calibrate.target import alignment, orientation
 from acquire.errors import UsageError
 
@@ -23,7 +24,14 @@ if TYPE_CHECKING:
 
 SURE = 5.0
 """Standard uncertainties of a difference from which on it is one."""
-MATTERS = {"offset_dn": 0.5, "gain": 0.003, "balance": 0.003, "pixels": 0.15, "turn_deg": 0.1}
+MATTERS = {
+    "offset_dn": 0.5,
+    "gain": 0.003,
+    "balance": 0.003,
+    "pixels": 0.15,
+    "turn_deg": 0.1,
+    "blur_px": 0.15,
+}
 """What a reconstruction notices: smaller changes leave a calibration true, however sure they are."""
 
 
@@ -81,13 +89,25 @@ def check(exposure: Exposure, known: Calibration, *, covered: bool = False) -> C
             f"{exposure.recording} shows a target behind a fibre, which is not compared tile by tile",
             possible="a dark or a flat; or `acquire calibrate align`, which tells where each tile lies now",
         )
+    focus, unfocused = _focus(exposure, known)
+    doubts += unfocused
     seen = orientation(exposure, known)
     believed = known.orientation or "turn 90"
     if seen.orientation is None or seen.orientation != believed:
         turned = "cannot be told" if seen.orientation is None else f"is {seen.orientation!r}"
         doubt = f"the orientation {turned}; {believed!r} was believed"
-        return Check((), (*doubts, doubt), same_view=seen.orientation is None)
-    return Check(tuple(_alignment(alignment(exposure, known), known)), doubts)
+        return Check(focus, (*doubts, doubt), same_view=seen.orientation is None)
+    return Check((*_alignment(alignment(exposure, known), known), *focus), doubts)
+
+
+def _focus(exposure: Exposure, known: Calibration) -> tuple[tuple[Compared, ...], tuple[str, ...]]:
+    """The optics' blur beside what is known of it, where a target has edges that tell; else why not."""
+    if "blur_px" not in known.quantities:
+        return (), ()
+    try:
+        return tuple(_blur(psf(exposure, known), known)), ()
+    except UsageError as error:
+        return (), (f"the optics' blur was not compared: {error.message}",)
 
 
 def _columns(found: Finding, known: Calibration, name: str, unit: str) -> Iterator[Compared]:
@@ -124,3 +144,13 @@ def _alignment(found: Finding, known: Calibration) -> Iterator[Compared]:
         sure = float(np.hypot(now.uncertainty[name], errors.get(name, 0.0))) * scale
         unit = "degrees" if kind == "turn_deg" else "fine pixels"
         yield Compared(name, unit, change, sure, MATTERS[kind])
+
+
+def _blur(found: Finding, known: Calibration) -> Iterator[Compared]:
+    before, now = known.quantities["blur_px"], found.quantities["blur_px"]
+    for arm, name in enumerate("ab"):
+        for axis, along in enumerate(("along", "across")):
+            change = float(now.value[arm, axis] - before.value[arm, axis])
+            sure = float(np.hypot(now.uncertainty[arm, axis], before.uncertainty[arm, axis]))
+            what = f"blur of arm {name} {along} the transfer"
+            yield Compared(what, "fine pixels", change, sure, MATTERS["blur_px"])

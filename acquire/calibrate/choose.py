@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from acquire.calibrate.apply import calibration_of, check_fits
+from acquire.calibrate.apply import blur_of, calibration_of, check_fits
 from acquire.calibrate.calibration import Calibration, Instrument, differing
 from acquire.calibrate.curve import curve_of
 from acquire.calibrate.file import open_calibration
@@ -64,6 +64,8 @@ def corrected(known: Calibration) -> list[str]:
         found.append(f"the orientation: {view.name}{seen}")
     if known.alignment is not None or known.tiles:
         found.append("arm B laid on arm A")
+    if blur_of(known) is not None:
+        found.append("the optics' blur")
     return found
 
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from acquire.calibrate.apply import CLEAR_BLUR
 from acquire.calibrate.calibration import Measured
 
 if TYPE_CHECKING:
@@ -35,6 +36,8 @@ def found_facts(found: Finding) -> dict[str, Any]:
     if found.step == "flat":
         facts["arm A's part of the light"] = f"{found.facts['part_a']:.2%}"
         facts["hidden by the optics"] = _columns(found.facts["optics_hide_columns"])
+    if found.step == "psf":
+        facts["edges"] = ", ".join(f"{arm} {found.facts[arm]['edges']}" for arm in "ab")
     if found.step == "linearity":
         facts |= _linearity(found)
     if found.step == "delay":
@@ -106,6 +109,8 @@ def _quantities(quantities: Any) -> dict[str, str]:
     for name, (label, unit) in PER_ARM.items():
         if name in quantities:
             facts[label] = _both(quantities[name], unit)
+    if "blur_px" in quantities:
+        facts["the optics' blur"] = _blur(quantities["blur_px"])
     if "linearity_error" in quantities:
         error = quantities["linearity_error"]
         facts["linearity error"] = _both(Measured(100 * error.value, 100 * error.uncertainty), " %")
@@ -136,6 +141,19 @@ def _curve(measured: Measured) -> str:
         f"{arm} {row[at]:+.1f} ± {error[at]:.2g} DN at {at / ends:.0%} of white"
         for arm, row, error, at in zip("ab", measured.value, measured.uncertainty, worst, strict=True)
     )
+
+
+def _blur(measured: Measured) -> str:
+    """Standard deviations, or that there is none that can be told."""
+    told = []
+    for arm, row, errors in zip("ab", measured.value, measured.uncertainty, strict=True):
+        for axis, value, error in zip(("along", "across"), row, errors, strict=True):
+            clear = value > CLEAR_BLUR * error
+            width = (
+                f"{value:.2f} ± {error:.2g}" if clear else f"not told from 0 (below {value + 2 * error:.2f})"
+            )
+            told.append(f"{arm} {axis} the transfer {width}")
+    return "; ".join(told) + " fine pixels (standard deviation)"
 
 
 def _range(measured: Measured, unit: str) -> str:

@@ -1,19 +1,24 @@
 """The forward model, Eq. (1)–(4): what the lines see of a scene, and the transpose of that."""
 
 from acquire.forward.arms import DualArm
+from acquire.forward.blurring import Blurring, blur_matrices, blurring
 from acquire.forward.gathered import GatheredArms
 from acquire.forward.merge import block_bounds, column_merging, hold_video, merge_video
-from acquire.forward.registration import Registration, registration
+from acquire.forward.registration import Registration, interpolation_variance, registration
 from acquire.forward.tdi import TdiArm
 
 __all__ = [
+    "Blurring",
     "DualArm",
     "GatheredArms",
     "Registration",
     "TdiArm",
     "block_bounds",
+    "blur_matrices",
+    "blurring",
     "column_merging",
     "hold_video",
+    "interpolation_variance",
     "merge_video",
     "registration",
 ]

@@ -12,6 +12,7 @@ import numpy as np
 
 from acquire.arrays import Arrays
 from acquire.errors import NumericsError, UsageError
+from acquire.forward.blurring import blurring
 from acquire.forward.kernels import add_transposed_frames, transpose_frames
 from acquire.forward.registration import registration
 from acquire.forward.tdi import TdiArm
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.alignment import Alignment
+    from acquire.blur import Blur
     from acquire.geometry import Geometry
 
 
@@ -33,6 +35,7 @@ class DualArm:
     spatial_merge, temporal_merge : N_m, T_m ≥ 1; a voxel's value is held over its block
     dtype : float32 or float64, of voxels and lines
     alignment : where arm B's image lies beside arm A's; absent: on it
+    blur : of either arm's optics; absent: none
     """
 
     def __init__(
@@ -43,6 +46,7 @@ class DualArm:
         temporal_merge: int = 1,
         dtype: type[np.floating[Any]] = np.float32,
         alignment: Alignment | None = None,
+        blur: Blur | None = None,
     ) -> None:
         if np.dtype(dtype) not in (np.dtype(np.float32), np.dtype(np.float64)):
             raise UsageError(f"an operator cannot have dtype {np.dtype(dtype)}", possible="float32, float64")
@@ -57,11 +61,14 @@ class DualArm:
         self._turned = np.empty(self.video_shape, dtype)
         arrays = Arrays(dtype="float32" if self.dtype == np.float32 else "float64")
         self._registration = registration(alignment, geometry, spatial_merge, arrays)
+        self._blurring = blurring(blur, geometry, spatial_merge, arrays)
 
     def forward(self, video: NDArray[Any]) -> NDArray[Any]:
         """Λ′·X′: (⌈T/T_m⌉, ⌈n/N_m⌉, ⌈n/N_m⌉) → (2, L_R, M)."""
         video = self._checked(video, self.video_shape, "video")
         seen = video if self._registration is None else self._registration.forward(video)
+        if self._blurring is not None:
+            video, seen = self._blurring.forward(0, video), self._blurring.forward(1, seen)
         transpose_frames(seen, self._turned)
         return np.stack([self._a.forward(video), self._b.forward(self._turned)])
 
@@ -70,11 +77,14 @@ class DualArm:
         lines = self._checked(lines, self.lines_shape, "lines")
         video = self._a.adjoint(lines[0])
         seen = self._b.adjoint(lines[1])
-        if self._registration is None:
+        if self._registration is None and self._blurring is None:
             add_transposed_frames(seen, video)
             return video
         transpose_frames(seen, self._turned)
-        video += self._registration.adjoint(self._turned)
+        back = self._turned
+        if self._blurring is not None:
+            video, back = self._blurring.adjoint(0, video), self._blurring.adjoint(1, back)
+        video += back if self._registration is None else self._registration.adjoint(back)
         return video
 
     def norm_bound(self, steps: int = 10) -> float:

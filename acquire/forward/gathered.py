@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from acquire.forward.blurring import blurring
 from acquire.forward.merge import block_bounds, column_merging
 from acquire.forward.registration import registration
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 
     from acquire.alignment import Alignment
     from acquire.arrays import Array, Arrays
+    from acquire.blur import Blur
     from acquire.geometry import Geometry
 
 
@@ -36,12 +38,14 @@ class GatheredArms:
         temporal_merge: int,
         arrays: Arrays,
         alignment: Alignment | None = None,
+        blur: Blur | None = None,
     ) -> None:
         starts, lengths = block_bounds(geometry.size, spatial_merge)
         flipped = geometry.size - starts - lengths
         frames = geometry.video_shape(spatial_merge, temporal_merge)[0]
         self._xp = arrays.xp
         self._registration = registration(alignment, geometry, spatial_merge, arrays)
+        self._blurring = blurring(blur, geometry, spatial_merge, arrays)
         self._merging = arrays.asarray(column_merging(geometry, spatial_merge))
         self._terms = [
             _Terms(*_crossings(geometry, code, order, lengths, temporal_merge), frames, arrays)
@@ -51,6 +55,8 @@ class GatheredArms:
     def forward(self, video: Array) -> Array:
         """Λ′·X′: (⌈T/T_m⌉, ⌈n/N_m⌉, ⌈n/N_m⌉) → (2, L_R, M)."""
         seen = video if self._registration is None else self._registration.forward(video)
+        if self._blurring is not None:
+            video, seen = self._blurring.forward(0, video), self._blurring.forward(1, seen)
         views = (video, self._xp.permute_dims(seen, (0, 2, 1)))
         arms = [terms.shear(view) for terms, view in zip(self._terms, views, strict=True)]
         return self._xp.stack(arms) @ self._merging
@@ -60,6 +66,8 @@ class GatheredArms:
         spread = lines @ self._merging.T
         a, b = (terms.unshear(spread[arm, ...]) for arm, terms in enumerate(self._terms))
         seen = self._xp.permute_dims(b, (0, 2, 1))
+        if self._blurring is not None:
+            a, seen = self._blurring.adjoint(0, a), self._blurring.adjoint(1, seen)
         return a + (seen if self._registration is None else self._registration.adjoint(seen))
 
 

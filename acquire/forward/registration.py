@@ -94,6 +94,14 @@ def sampling_matrix(alignment: Alignment, size: int, spatial_merge: int = 1) -> 
     return merged
 
 
+def interpolation_variance(alignment: Alignment, size: int) -> tuple[float, float]:
+    """By how much R itself blurs an image along rows and columns, in fine pixels²: f·(1 − f) of what lies at
+    the fraction f between two pixels, in the mean of the field."""
+    fractions = (each % 1 for each in alignment.sources(size))
+    rows, columns = (float((each * (1 - each)).mean()) for each in fractions)
+    return rows, columns
+
+
 class _Gather:
     """A sparse matrix along the pixels of frames."""
 

@@ -14,7 +14,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.arrays import host
-from acquire.forward import DualArm, GatheredArms, block_bounds, column_merging, registration
+from acquire.forward import (
+    DualArm,
+    GatheredArms,
+    block_bounds,
+    blur_matrices,
+    column_merging,
+    registration,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -23,6 +30,7 @@ if TYPE_CHECKING:
 
     from acquire.alignment import Alignment
     from acquire.arrays import Array
+    from acquire.blur import Blur
     from acquire.geometry import Geometry
     from acquire.recon.basis import Basis
 
@@ -37,13 +45,14 @@ def band_operator(
     spatial_merge: int = 1,
     temporal_merge: int = 1,
     alignment: Alignment | None = None,
+    blur: Blur | None = None,
 ) -> BandOperator | InBasis:
     """B = Λ′·Dᵀ, by the dense factors where these take at most 1 GiB, else by way of the video."""
     side = geometry.video_shape(spatial_merge, temporal_merge)[1]
     itemsize = np.dtype(basis.arrays.dtype).itemsize
     if 2 * geometry.lines * side * basis.count * itemsize <= LARGEST_FACTORS_BYTES:
-        return BandOperator(geometry, code, basis, spatial_merge, temporal_merge, alignment)
-    return InBasis(geometry, code, basis, spatial_merge, temporal_merge, alignment)
+        return BandOperator(geometry, code, basis, spatial_merge, temporal_merge, alignment, blur)
+    return InBasis(geometry, code, basis, spatial_merge, temporal_merge, alignment, blur)
 
 
 class BandOperator:
@@ -57,21 +66,30 @@ class BandOperator:
         spatial_merge: int = 1,
         temporal_merge: int = 1,
         alignment: Alignment | None = None,
+        blur: Blur | None = None,
     ) -> None:
         side = geometry.video_shape(spatial_merge, temporal_merge)[1]
         self.theta_shape = (basis.count, side, side)
         self.lines_shape = geometry.lines_shape
         self._xp, self._asarray = basis.arrays.xp, basis.arrays.asarray
         asarray = self._asarray
-        self._merging = asarray(column_merging(geometry, spatial_merge))
+        merging = column_merging(geometry, spatial_merge)
         self._registration = registration(alignment, geometry, spatial_merge, basis.arrays)
         starts, lengths = block_bounds(geometry.size, spatial_merge)
         lit = self._lit_cosines(code, basis, temporal_merge)
         flipped = geometry.size - starts - lengths
-        self._factors = [
-            asarray(_staircase(lit, order, lengths, geometry).reshape(geometry.lines, -1))
-            for order in (starts, flipped)
-        ]
+        factors = [_staircase(lit, order, lengths, geometry) for order in (starts, flipped)]
+        mergings: list[NDArray[Any]] = [merging, merging]
+        if blur is not None:
+            # along the transfer it is the factor's, across it that of the merging: frames cost nothing more
+            (along_a, across_a), (across_b, along_b) = blur_matrices(blur, geometry.size, spatial_merge)
+            factors = [
+                np.einsum("lqk,qp->lpk", factor, along.astype(factor.dtype), optimize=True)
+                for factor, along in zip(factors, (along_a, along_b), strict=True)
+            ]
+            mergings = [across.T @ merging for across in (across_a, across_b)]
+        self._mergings = [asarray(each) for each in mergings]
+        self._factors = [asarray(factor.reshape(geometry.lines, -1)) for factor in factors]
 
     def forward(self, theta: Array) -> Array:
         """B·θ."""
@@ -79,14 +97,16 @@ class BandOperator:
         views = (  # (block, K, across)
             self._xp.permute_dims(each, axes) for each, axes in ((theta, (1, 0, 2)), (seen, (2, 0, 1)))
         )
-        return self._xp.stack([self._arm(*pair) for pair in zip(self._factors, views, strict=True)])
+        return self._xp.stack(
+            [self._arm(*each) for each in zip(self._factors, self._mergings, views, strict=True)]
+        )
 
     def adjoint(self, lines: Array) -> Array:
         """Bᵀ·y."""
         K, side, _ = self.theta_shape
         rows, columns = (
-            self._xp.reshape(self._arm_adjoint(factor, lines[arm, ...]), (side, K, side))
-            for arm, factor in enumerate(self._factors)
+            self._xp.reshape(self._arm_adjoint(*pair, lines[arm, ...]), (side, K, side))
+            for arm, pair in enumerate(zip(self._factors, self._mergings, strict=True))
         )
         seen = self._xp.permute_dims(columns, (1, 2, 0))
         back = seen if self._registration is None else self._registration.adjoint(seen)
@@ -106,21 +126,19 @@ class BandOperator:
     @cached_property
     def _grams(self) -> list[NDArray[np.float64]]:
         """B·Bᵀ of either arm between the lines (L_R, L_R)."""
-        each = float(np.square(host(self._merging), dtype=np.float64).sum(axis=0).mean())
+        each = [np.square(host(m), dtype=np.float64).sum(axis=0).mean() for m in self._mergings]
         exact = [host(factor).astype(np.float64) for factor in self._factors]
-        return [each * (factor @ factor.T) for factor in exact]
+        return [float(size) * (factor @ factor.T) for size, factor in zip(each, exact, strict=True)]
 
-    def _arm(self, factor: Array, view: Array) -> Array:
+    def _arm(self, factor: Array, merging: Array, view: Array) -> Array:
         """Columns are merged into pixels on that side of the product where it is the smaller."""
-        side, pixels = self._merging.shape
+        side, pixels = merging.shape
         blocks = self._xp.reshape(view, (-1, side))
-        return factor @ (blocks @ self._merging) if side > pixels else (factor @ blocks) @ self._merging
+        return factor @ (blocks @ merging) if side > pixels else (factor @ blocks) @ merging
 
-    def _arm_adjoint(self, factor: Array, arm: Array) -> Array:
-        side, pixels = self._merging.shape
-        if side > pixels:
-            return (factor.T @ arm) @ self._merging.T
-        return factor.T @ (arm @ self._merging.T)
+    def _arm_adjoint(self, factor: Array, merging: Array, arm: Array) -> Array:
+        side, pixels = merging.shape
+        return (factor.T @ arm) @ merging.T if side > pixels else factor.T @ (arm @ merging.T)
 
     @staticmethod
     def _lit_cosines(code: NDArray[np.uint8], basis: Basis, temporal_merge: int) -> NDArray[Any]:
@@ -141,14 +159,15 @@ class InBasis:
         spatial_merge: int = 1,
         temporal_merge: int = 1,
         alignment: Alignment | None = None,
+        blur: Blur | None = None,
     ) -> None:
         self._basis, case = basis, (geometry, code, spatial_merge, temporal_merge)
         arrays = basis.arrays
         self._operator: DualArm | GatheredArms
         if arrays.compiled:
-            self._operator = DualArm(*case, np.dtype(arrays.dtype).type, alignment)
+            self._operator = DualArm(*case, np.dtype(arrays.dtype).type, alignment, blur)
         else:
-            self._operator = GatheredArms(*case, arrays, alignment)
+            self._operator = GatheredArms(*case, arrays, alignment, blur)
 
     def forward(self, theta: Array) -> Array:
         return self._operator.forward(self._basis.synthesize(theta))

@@ -75,7 +75,9 @@ def light_beyond(
     if frames // 2 <= count + WINDOW:
         return None
     basis = TemporalBasis(frames, frames // 2)
-    operator = band_operator(segment.geometry, segment.code, basis, merge, temporal_merge, segment.alignment)
+    operator = band_operator(
+        segment.geometry, segment.code, basis, merge, temporal_merge, segment.alignment, segment.blur
+    )
     left = np.where(problem.weight > 0, problem.samples - predicted, 0).astype(np.float32)
     energy = np.square(operator.adjoint(left), dtype=np.float64).sum((1, 2))
     floor = np.maximum(median_filter(energy, WINDOW, mode="nearest"), np.finfo(float).tiny)
@@ -93,7 +95,9 @@ def _tentative(
     basis = TemporalBasis(frames, count, arrays)
     problem = build_problem(segment, merge, temporal_merge, hold_out=0.0, arrays=arrays)
     operator = problem.masked(
-        band_operator(segment.geometry, segment.code, basis, merge, temporal_merge, segment.alignment)
+        band_operator(
+            segment.geometry, segment.code, basis, merge, temporal_merge, segment.alignment, segment.blur
+        )
     )
     parameters = AdmmParameters(grid_per_coefficient=1)
     solver = Admm(operator, problem.used_samples, (count, side, side), basis, parameters)

@@ -146,7 +146,7 @@ def _first_look(
     """
     N_m, T_m = options.spatial_merge, options.temporal_merge
     frames, side, _ = segment.geometry.video_shape(N_m, T_m)
-    operator = band_operator(segment.geometry, segment.code, basis, N_m, T_m, segment.alignment)
+    operator = band_operator(segment.geometry, segment.code, basis, N_m, T_m, segment.alignment, segment.blur)
 
     def begin(start: Array | None, *, explained: bool = False) -> InBand:
         parameters = _weighted(_defaults(frames, explained=explained), options.tv_weight)

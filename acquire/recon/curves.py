@@ -20,7 +20,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from acquire.arrays import dot, host
-from acquire.forward import column_merging, registration
+from acquire.forward import blurring, column_merging, registration
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -107,6 +107,9 @@ class CurveOperator:
         self._code = self._arrays.asarray(segment.code)
         aligned = registration(segment.alignment, segment.geometry, 1, self._arrays)
         seen = patterns if aligned is None else aligned.forward(patterns)
+        blurred = blurring(segment.blur, segment.geometry, 1, self._arrays)
+        if blurred is not None:
+            patterns, seen = blurred.forward(0, patterns), blurred.forward(1, seen)
         views = (patterns, self._xp.flip(self._xp.permute_dims(seen, (0, 2, 1)), axis=1))
         merging = self._arrays.asarray(column_merging(segment.geometry, 1))
         self._profiles = [_profiles(self._xp, view, merging, segment.geometry.substeps) for view in views]

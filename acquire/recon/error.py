@@ -205,7 +205,9 @@ def estimate_error(
 
 def white_error(segment: Segment, problem: Problem, prediction: float, merges: tuple[int, int]) -> float:
     """The RMS of independent errors of all voxels, in scene units, that lines miss by ``prediction``."""
-    operator = DualArm(segment.geometry, segment.code, *merges, alignment=segment.alignment)
+    operator = DualArm(
+        segment.geometry, segment.code, *merges, alignment=segment.alignment, blur=segment.blur
+    )
     signs = np.random.default_rng(0).integers(0, 2, operator.video_shape, np.int8).astype(np.float32)
     signs *= 2
     signs -= 1

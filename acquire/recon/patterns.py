@@ -176,7 +176,7 @@ class Refinement:
         basis = LearnedBasis(self._cosines, self.found.curves)
         geometry, code = self._segment.geometry, self._segment.code
         self._operator: Operator = band_operator(
-            geometry, code, basis, 1, self._temporal_merge, self._segment.alignment
+            geometry, code, basis, 1, self._temporal_merge, self._segment.alignment, self._segment.blur
         )
         return self._problem.masked(self._operator), basis
 

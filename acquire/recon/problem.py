@@ -197,7 +197,12 @@ def build_problem(
     if not usable.any():
         raise UsageError("no sample of the segment is usable", hint="another line range")
     operator = DualArm(
-        segment.geometry, segment.code, spatial_merge, temporal_merge, alignment=segment.alignment
+        segment.geometry,
+        segment.code,
+        spatial_merge,
+        temporal_merge,
+        alignment=segment.alignment,
+        blur=segment.blur,
     )
     norm = operator.norm_bound(steps=5)
     flat = operator.forward(np.ones(operator.video_shape, np.float32))

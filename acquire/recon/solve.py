@@ -63,7 +63,7 @@ def solve_twist(
     count = find_band(segment, problem, options, clock) if banded else shape[0]
     basis = TemporalBasis(shape[0], count, problem.arrays)
     make = band_operator if banded else InBasis
-    operator = make(segment.geometry, segment.code, basis, N_m, T_m, segment.alignment)
+    operator = make(segment.geometry, segment.code, basis, N_m, T_m, segment.alignment, segment.blur)
     parameters = TwistParameters()
     if options.tv_weight is not None:
         parameters = replace(parameters, tv_weight=options.tv_weight)

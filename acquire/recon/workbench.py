@@ -336,7 +336,7 @@ class Workbench:
             if brightness is not None:
                 code = code * np.repeat(brightness, self._merges[1])[: len(code)]
             self._operators[key] = band_operator(
-                segment.geometry, code, basis, *self._merges, segment.alignment
+                segment.geometry, code, basis, *self._merges, segment.alignment, segment.blur
             )
         return self._operators[key]
 

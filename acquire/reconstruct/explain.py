@@ -12,8 +12,10 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from acquire.calibrate import calibrated
+from acquire.calibrate.apply import blur_of
 from acquire.calibrate.curve import curve_of
 from acquire.calibrate.orientation import MODEL, view_named
+from acquire.calibrate.psf import without_blur
 from acquire.recon import reconstruct
 
 if TYPE_CHECKING:
@@ -106,3 +108,5 @@ def _without(known: Calibration) -> Iterator[tuple[str, Calibration]]:
         yield "the orientation", replace(known, orientation=None)
     if known.alignment is not None or known.tiles:
         yield "arm B laid on arm A", replace(known, alignment=None, tiles=())
+    if blur_of(known) is not None:
+        yield "the optics' blur", without_blur(known)

@@ -9,6 +9,7 @@ from recon_cases import cases
 
 from acquire.alignment import Alignment
 from acquire.arrays import open_arrays
+from acquire.blur import Blur
 from acquire.errors import UsageError
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
@@ -63,7 +64,9 @@ def test_band_operator_is_the_sensing_matrix_in_the_basis(case: tuple[Geometry, 
     whole = DualArm(g, code, N_m, T_m, np.float64)
     basis = TemporalBasis(whole.video_shape[0], K, DOUBLE)
     off = Alignment(*rng.uniform(-2, 2, 2), *rng.uniform(-9, 9, 1)) if seed % 2 else None
-    band, composed = BandOperator(g, code, basis, N_m, T_m, off), InBasis(g, code, basis, N_m, T_m, off)
+    a, b = rng.uniform(0, 2, (2, 2)).tolist()
+    blur = Blur(tuple(a), tuple(b)) if seed % 4 > 1 else None
+    band, composed = (each(g, code, basis, N_m, T_m, off, blur) for each in (BandOperator, InBasis))
     theta = rng.standard_normal(band.theta_shape)
     lines = rng.standard_normal(g.lines_shape)
     np.testing.assert_allclose(band.forward(theta), composed.forward(theta), atol=1e-11)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from acquire.alignment import Alignment
+from acquire.blur import Blur
 from acquire.codes import mix_seed, prbs
 from acquire.errors import UsageError
 from acquire.forward import DualArm
@@ -41,17 +42,23 @@ def segment(video: np.ndarray = TRUTH) -> Segment:
     )
 
 
+OFF, BLUR = Alignment(1.5, -0.7, 3.0, 1.02), Blur((0.8, 0.3), (1.4, 0.0))
+
+
 @pytest.mark.parametrize(
-    ("merge", "off"), [(1, None), (4, None), (7, None), (4, Alignment(1.5, -0.7, 3.0, 1.02))]
+    ("merge", "off", "blur"),
+    [(1, None, None), (4, None, None), (7, None, None), (4, OFF, None), (1, None, BLUR), (4, OFF, BLUR)],
 )
-def test_curve_operator_is_the_sensing_matrix_of_the_patterns(merge: int, off: Alignment | None) -> None:
+def test_curve_operator_is_the_sensing_matrix_of_the_patterns(
+    merge: int, off: Alignment | None, blur: Blur | None
+) -> None:
     frames = GEOMETRY.video_shape(1, merge)[0]
     cosines = TemporalBasis(frames, min(9, frames))
-    operator = CurveOperator(replace(segment(), alignment=off), IMAGES, cosines, merge)
+    operator = CurveOperator(replace(segment(), alignment=off, blur=blur), IMAGES, cosines, merge)
     rng = np.random.default_rng(0)
     curves = rng.standard_normal((cosines.count, 2)).astype(np.float32)
     video = np.tensordot(cosines.synthesize(curves), IMAGES, 1).astype(np.float32)
-    expected = DualArm(GEOMETRY, CODE, 1, merge, alignment=off).forward(video)
+    expected = DualArm(GEOMETRY, CODE, 1, merge, alignment=off, blur=blur).forward(video)
     np.testing.assert_allclose(operator.forward(curves), expected, rtol=1e-4, atol=1e-3)
     lines = rng.standard_normal(GEOMETRY.lines_shape).astype(np.float32)
     left, right = np.vdot(operator.forward(curves), lines), np.vdot(curves, operator.adjoint(lines))

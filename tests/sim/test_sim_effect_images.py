@@ -135,3 +135,14 @@ def test_images_of_masks_and_of_frames_agree():
     framed = LedSceneConfig.model_validate(scene.model_dump() | {"shutters": [window]})
     masks, frames = (read(config, 80, CODE).pixels.astype(int) for config in (scene, framed))
     assert np.abs(masks - frames).max() <= 1
+
+
+def test_the_point_spread_of_arm_b_may_be_another():
+    listed = effects("psf", sigma_b_pixels=2.0)
+    a, b = (bench(flat(listed=listed)).camera(arm, LIT).stages[0] for arm in ("a", "b"))
+    point = np.zeros((1, N, N), np.float32)
+    point[0, N // 2, N // 2] = 1
+    _, of_a = moments(a.run(point)[0])
+    _, of_b = moments(b.run(point)[0])
+    np.testing.assert_allclose(of_a, 1.2**2, rtol=0.02)
+    np.testing.assert_allclose(of_b, 2.0**2, rtol=0.02)

@@ -58,18 +58,20 @@ class Misregistration(Effect):
 
 
 class PointSpread(Effect):
-    """A Gaussian point spread function."""
+    """A Gaussian point spread function, of both arms or each its own."""
 
     kind: Literal["psf"]
     place: ClassVar[Place] = "image"
     rank: ClassVar[float] = 40
     sigma_pixels: Positive = Field(description="standard deviation in fine pixels")
+    sigma_b_pixels: Positive | None = Field(default=None, description="that of arm B; absent: the same")
 
-    def stages(self, setting: Setting) -> list[Stage]:  # noqa: ARG002
+    def stages(self, setting: Setting) -> list[Stage]:
         """Convolution with a normalised Gaussian of σ fine pixels, cut off at 4σ; light may leave."""
         from scipy.ndimage import gaussian_filter1d
 
-        sigma = self.sigma_pixels
+        of_b = self.sigma_b_pixels if setting.arm == "b" else None
+        sigma = self.sigma_pixels if of_b is None else of_b
 
         def run(frames: NDArray[np.float32]) -> NDArray[np.float32]:
             along = gaussian_filter1d(frames, sigma, axis=1, mode="constant")

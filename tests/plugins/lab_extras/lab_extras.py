@@ -147,7 +147,8 @@ class LeastSquares(Solver):
     def solve(self, segment, problem, request, clock):
         problem = problem.on_host()
         merges = request.spatial_merge, request.temporal_merge
-        model = DualArm(segment.geometry, segment.code, *merges, alignment=segment.alignment)
+        known = {"alignment": segment.alignment, "blur": segment.blur}
+        model = DualArm(segment.geometry, segment.code, *merges, **known)
         operator, samples = problem.masked(model), problem.used_samples  # of norm at most 1
         answer = Answer(model, problem.norm, np.zeros(model.video_shape, np.float32))
         ahead, momentum = answer.x, 1.0

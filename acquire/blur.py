@@ -1,0 +1,33 @@
+"""How wide the optics blur either arm's image: a Gaussian, along the charge's transfer and across it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from acquire.errors import UsageError
+
+LARGEST_SIGMA_PIXELS = 16.0
+
+
+@dataclass(frozen=True, slots=True)
+class Blur:
+    """Standard deviations (along, across) of the blur of arms A and B, in fine pixels.
+
+    Along and across the transfer of the arm's own charge. 0: that axis is not blurred.
+    Raises UsageError for what is no width.
+    """
+
+    a: tuple[float, float]
+    b: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        if not all(math.isfinite(each) and 0 <= each <= LARGEST_SIGMA_PIXELS for each in (*self.a, *self.b)):
+            raise UsageError(
+                f"the blur is impossible: {self}",
+                possible=f"standard deviations from 0 to {LARGEST_SIGMA_PIXELS:g} fine pixels",
+            )
+
+    def swapped(self) -> Blur:
+        """With the arms in each other's places."""
+        return Blur(self.b, self.a)

@@ -1,0 +1,110 @@
+"""The optics' blur in the model: what either arm's sensor gets of a frame, as matrices and their transposes.
+
+The kernel of an axis is that of the effect ``psf``, a Gaussian at whole fine pixels, normalised and cut off
+at 4σ, and as wide as was measured: narrow ones have less variance than the σ that they are made of. Beyond
+the edge the scene is what it is at the edge. So elements are not negative and rows sum to 1, a uniform scene
+stays what it is, and the bound of ‖Λ′‖ holds. For voxels of N_m > 1 it is the kernel between holding a voxel
+over its block and taking the mean of one: as the Gaussian, one matrix for rows and one for columns.
+
+Where Λ′ is a product of dense factors (`acquire.recon.band`), these take the matrices up once and nothing is
+done per frame; elsewhere frames are multiplied by them. Without a blur there is nothing.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.optimize import brentq
+
+from acquire.arrays import HOST
+from acquire.forward.merge import block_bounds
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.arrays import Array, Arrays
+    from acquire.blur import Blur
+    from acquire.geometry import Geometry
+
+CUT_AT = 4.0
+"""σ, as `scipy.ndimage.gaussian_filter1d` does it by itself."""
+NARROWEST = 0.2
+"""σ of a kernel whose neighbours get 4·10⁻⁶: nothing narrower is told from a point."""
+
+
+def blurring(
+    blur: Blur | None, geometry: Geometry, spatial_merge: int = 1, arrays: Arrays = HOST
+) -> Blurring | None:
+    """What a blur does to frames; None where there is none, and nothing is done."""
+    return None if blur is None else Blurring(blur, geometry.size, spatial_merge, arrays)
+
+
+class Blurring:
+    """The blur of either arm on frames (k, n′, n′) in the scene's rows and columns, in any ``arrays``."""
+
+    def __init__(self, blur: Blur, size: int, spatial_merge: int, arrays: Arrays = HOST) -> None:
+        self._pairs = [
+            tuple(arrays.asarray(each) for each in pair) for pair in blur_matrices(blur, size, spatial_merge)
+        ]
+
+    def forward(self, arm: int, frames: Array) -> Array:
+        """What arm 0 or 1 gets of frames."""
+        rows, columns = self._pairs[arm]
+        return rows @ frames @ columns.T
+
+    def adjoint(self, arm: int, frames: Array) -> Array:
+        """The transpose."""
+        rows, columns = self._pairs[arm]
+        return rows.T @ frames @ columns
+
+
+def blur_matrices(
+    blur: Blur, size: int, spatial_merge: int = 1
+) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Of arms A and B: what acts on the scene's rows and on its columns, each (n′, n′).
+
+    Arm A's charge moves along the scene's rows, arm B's along its columns.
+    """
+    along_a, across_a, along_b, across_b = (
+        blur_matrix(sigma, size, spatial_merge) for sigma in (*blur.a, *blur.b)
+    )
+    return [(along_a, across_a), (across_b, along_b)]
+
+
+@lru_cache(maxsize=32)
+def blur_matrix(sigma: float, size: int, spatial_merge: int = 1) -> NDArray[np.float64]:
+    """The blur of one axis (n′, n′) by a kernel whose standard deviation is ``sigma`` fine pixels."""
+    weights = kernel(sigma)
+    reach = len(weights) // 2
+    at = np.arange(size)[:, None]
+    fine = np.zeros((size, size))
+    for distance, weight in zip(range(-reach, reach + 1), weights, strict=True):
+        np.add.at(fine, (at, np.clip(at + distance, 0, size - 1)), weight)
+    if spatial_merge > 1:
+        starts, lengths = block_bounds(size, spatial_merge)
+        sums = np.add.reduceat(np.add.reduceat(fine, starts, axis=0), starts, axis=1)
+        fine = sums / lengths[:, None]
+    fine.setflags(write=False)
+    return fine
+
+
+def kernel(sigma: float) -> NDArray[np.float64]:
+    """A Gaussian at whole pixels of which the standard deviation is ``sigma``, of odd length."""
+    if sigma**2 <= _variance(_gaussian(NARROWEST)):
+        return np.ones(1)
+    made_of = brentq(lambda each: _variance(_gaussian(each)) - sigma**2, NARROWEST, sigma + 1, xtol=1e-9)
+    return _gaussian(float(made_of))
+
+
+def _gaussian(sigma: float) -> NDArray[np.float64]:
+    reach = max(1, int(CUT_AT * sigma + 0.5))
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    normalised: NDArray[np.float64] = weights / weights.sum()
+    return normalised
+
+
+def _variance(weights: NDArray[np.float64]) -> float:
+    at = np.arange(len(weights)) - len(weights) // 2
+    return float((weights * at**2).sum())

@@ -1,0 +1,139 @@
+"""The optics' blur of either arm in Λ′: its kernel, its transpose, and the effect ``psf``."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.ndimage import gaussian_filter1d
+
+from acquire.alignment import Alignment
+from acquire.arrays import Arrays
+from acquire.blur import Blur
+from acquire.errors import UsageError
+from acquire.forward import (
+    DualArm,
+    GatheredArms,
+    blur_matrices,
+    hold_video,
+    interpolation_variance,
+    merge_video,
+)
+from acquire.forward.blurring import blur_matrix, kernel
+from acquire.forward.registration import sampling_matrix
+from acquire.geometry import Geometry
+
+BLUR = Blur((0.7, 0.4), (1.3, 0.9))
+
+
+@pytest.mark.parametrize("sigma", [0.15, 0.3, 0.6, 1.0, 3.0])
+def test_a_kernel_is_as_wide_as_was_measured(sigma: float) -> None:
+    weights = kernel(sigma)
+    at = np.arange(len(weights)) - len(weights) // 2
+    assert weights.sum() == pytest.approx(1)
+    assert (weights * at**2).sum() == pytest.approx(sigma**2, rel=1e-6)
+    np.testing.assert_array_equal(weights, weights[::-1])
+
+
+def test_what_is_not_blurred_stays_what_it_is() -> None:
+    np.testing.assert_array_equal(blur_matrix(0.0, 12), np.eye(12))
+    np.testing.assert_array_equal(blur_matrix(0.0, 12, 3), np.eye(4))
+
+
+def test_it_is_the_simulators_gaussian_inside_the_field() -> None:
+    frame = np.random.default_rng(0).random((40, 40))
+    at = np.arange(-6, 7)
+    weights = np.exp(-0.5 * (at / 1.4) ** 2)
+    sigma = float(np.sqrt((weights * at**2).sum() / weights.sum()))
+    expected = gaussian_filter1d(frame, 1.4, axis=0, mode="nearest")
+    np.testing.assert_allclose(blur_matrix(sigma, 40) @ frame, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("merge", [1, 2, 3, 5])
+def test_rows_sum_to_one_and_nothing_is_negative(merge: int) -> None:
+    for pair in blur_matrices(BLUR, 12, merge):
+        for matrix in pair:
+            np.testing.assert_allclose(matrix.sum(axis=1), 1, atol=1e-12)
+            assert matrix.min() >= 0
+
+
+@pytest.mark.parametrize("merge", [2, 3, 5])
+def test_voxels_are_held_blurred_and_averaged(merge: int) -> None:
+    geometry = Geometry(4, 3, 1)
+    voxels = np.random.default_rng(3).random(geometry.video_shape(merge, geometry.span))
+    fine = hold_video(voxels, geometry, merge, geometry.span)[:1]
+    for (rows, columns), (by_row, by_column) in zip(
+        blur_matrices(BLUR, 12), blur_matrices(BLUR, 12, merge), strict=True
+    ):
+        expected = merge_video(rows @ fine @ columns.T, merge, 1)
+        np.testing.assert_allclose(by_row @ voxels @ by_column.T, expected, rtol=1e-6)
+
+
+def test_each_arm_is_blurred_along_and_across_its_own_transfer() -> None:
+    """A point before arm A spreads down by its width along, before arm B to the side."""
+    g = Geometry(8, 3, 40)
+    code = np.random.default_rng(0).integers(0, 2, g.span).astype(np.uint8)
+    video = np.zeros((1, 24, 24))
+    video[0, 11, 13] = 1
+    tall, wide = np.zeros_like(video), np.zeros_like(video)
+    tall[0, :, 13] = wide[0, 11, :] = 1
+    tall[0] *= blur_matrix(1.2, 24)[11][:, None]
+    wide[0] *= blur_matrix(0.8, 24)[13]
+    sharp = DualArm(g, code, 1, g.span, np.float64)
+    blurred = DualArm(g, code, 1, g.span, np.float64, blur=Blur((1.2, 0), (0.8, 0)))
+    seen = blurred.forward(video)
+    np.testing.assert_allclose(seen[0], sharp.forward(tall)[0], atol=1e-12)
+    np.testing.assert_allclose(seen[1], sharp.forward(wide)[1], atol=1e-12)
+
+
+@st.composite
+def cases(draw: st.DrawFn) -> tuple[Geometry, int, int, Blur, Alignment | None, int]:
+    g = Geometry(draw(st.integers(1, 4)), draw(st.integers(1, 3)), draw(st.integers(1, 5)))
+    sigma = st.floats(0, 3)
+    blur = Blur((draw(sigma), draw(sigma)), (draw(sigma), draw(sigma)))
+    off = Alignment(draw(st.floats(-3, 3)), 0.4, draw(st.floats(-20, 20))) if draw(st.booleans()) else None
+    merges = draw(st.integers(1, g.size)), draw(st.integers(1, g.span + 2))
+    return g, *merges, blur, off, draw(st.integers(0, 2**32 - 1))
+
+
+@settings(max_examples=60, deadline=None)
+@given(cases())
+def test_the_transpose_is_exact_and_the_bound_holds(
+    case: tuple[Geometry, int, int, Blur, Alignment | None, int],
+) -> None:
+    g, N_m, T_m, blur, off, seed = case
+    rng = np.random.default_rng(seed)
+    code = rng.integers(0, 2, g.span).astype(np.uint8)
+    code[0] = 1
+    sharp, model = (DualArm(g, code, N_m, T_m, np.float64, off, each) for each in (None, blur))
+    video, lines = rng.standard_normal(model.video_shape), rng.standard_normal(g.lines_shape)
+    forward = model.forward(video)
+    assert np.vdot(forward, lines) == pytest.approx(np.vdot(video, model.adjoint(lines)), abs=1e-9)
+    (rows, columns), (rows_b, columns_b) = blur_matrices(blur, g.size, N_m)
+    np.testing.assert_allclose(forward[0], sharp.forward(rows @ video @ columns.T)[0], atol=1e-10)
+    seen = video
+    if off is not None:
+        moved = sampling_matrix(off, g.size, N_m) @ video.reshape(len(video), -1).T
+        seen = moved.T.reshape(video.shape)
+    plain = DualArm(g, code, N_m, T_m, np.float64)
+    np.testing.assert_allclose(forward[1], plain.forward(rows_b @ seen @ columns_b.T)[1], atol=1e-10)
+    bound = model.norm_bound(5)
+    some = [rng.standard_normal(video.shape) for _ in range(3)]
+    assert all(np.linalg.norm(model.forward(x)) <= bound * np.linalg.norm(x) for x in some)
+    gathered = GatheredArms(g, code, N_m, T_m, Arrays(dtype="float64"), off, blur)
+    np.testing.assert_allclose(gathered.forward(video), forward, atol=1e-10)
+    np.testing.assert_allclose(gathered.adjoint(lines), model.adjoint(lines), atol=1e-10)
+
+
+def test_laying_arm_b_on_arm_a_blurs_by_what_it_says() -> None:
+    """A point's image, a third and a half of a pixel off, has the variance f·(1 − f)."""
+    rows, columns = interpolation_variance(Alignment(1 / 3, 0.5), 30)
+    assert (rows, columns) == pytest.approx((2 / 9, 1 / 4))
+    assert interpolation_variance(Alignment(2, -1), 30) == pytest.approx((0, 0))
+
+
+@pytest.mark.parametrize("values", [(-0.1, 0), (np.nan, 0), (0, 17)])
+def test_what_is_no_width_is_refused(values: tuple[float, float]) -> None:
+    with pytest.raises(UsageError, match="blur is impossible"):
+        Blur((0, 0), values)

@@ -1,0 +1,151 @@
+"""How wide the optics blur: instruments drawn at random, what slanted edges tell of them, and what it gives.
+
+Usage: OMP_NUM_THREADS=1 python -m tools.bench_psf [--instruments 4] [--seed 1] [--no-video]
+
+Instruments are those of `bench_calibrate`, with a blur of either arm drawn from 0 to 1.5 fine pixels. Dark,
+flat, target and a checkerboard that is turned by 3 to 20 degrees are recorded with 1024 lines each, and
+calibrated as `acquire calibrate` does. Then lamps that were drawn as well are reconstructed from 263 lines
+(voxels 3 x 1): calibrated without the blur, with it, and from lines that had nothing but the same noise.
+Columns: widths found less those that are (fine pixels, along and across of arms A and B; arm B's is that of
+the blur and of the simulator's bilinear image together), their standard uncertainty, PSNR in dB, seconds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from acquire.alignment import Alignment
+from acquire.calibrate import calibrated
+from acquire.calibrate.exposure import open_exposure
+from acquire.calibrate.psf import psf, without_blur
+from acquire.forward import interpolation_variance, merge_video
+from acquire.recon import reconstruct
+from acquire.sim.media import VideoSceneConfig
+from acquire.sim.scenes import build_scene
+from acquire.store import open_recording
+from tools.bench_calibrate import NOISE, SEGMENT, Drawn, calibrate
+from tools.results import Run, add_option, recorded
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.config.scene import SceneConfig
+    from acquire.lines import Segment
+
+SIZE, FINER = 192, 8
+
+
+class Blurred(Drawn):
+    """An instrument whose arms are blurred each in its own way."""
+
+    @property
+    def widths(self) -> tuple[float, float]:
+        """σ of arms A and B."""
+        a, b = np.random.default_rng(self.seed + 3000).uniform(0, 1.5, 2).tolist()
+        return a, b
+
+    @property
+    def effects(self) -> list[dict[str, Any]]:
+        sharp = [each for each in super().effects if each["kind"] != "psf"]
+        a, b = self.widths
+        return [*sharp, {"kind": "psf", "sigma_pixels": a, "sigma_b_pixels": b}]
+
+    def scene(self, kind: str, effects: list[dict[str, Any]], directory: Path) -> SceneConfig:
+        if kind != "edges":
+            return super().scene(kind, effects, directory)
+        np.save(directory / "edges.npy", checkerboard(self.seed))
+        common = {"seed": self.seed, "system_gain_dn_per_e": 0.1, "effects": effects}
+        return VideoSceneConfig.model_validate({"kind": "video", "path": directory / "edges.npy", **common})
+
+    def rig(self, kind: str) -> Any:
+        return super().rig("target" if kind == "edges" else kind)
+
+
+def checkerboard(seed: int) -> NDArray[np.float32]:
+    """Squares of about 58 fine pixels, turned; pixels hold the mean of what covers them."""
+    angle = np.deg2rad(np.random.default_rng(seed + 4000).uniform(3, 20))
+    at = (np.arange(SIZE * FINER) + 0.5) / FINER - SIZE / 2
+    y, x = np.meshgrid(at, at, indexing="ij")
+    u, v = y * np.cos(angle) + x * np.sin(angle), x * np.cos(angle) - y * np.sin(angle)
+    squares = (np.floor(3.3 * u / SIZE) + np.floor(3.3 * v / SIZE)) % 2
+    means = squares.reshape(SIZE, FINER, SIZE, FINER).mean(axis=(1, 3))
+    return np.asarray(means, np.float32)[None]
+
+
+def true_widths(drawn: Blurred) -> NDArray[np.float64]:
+    """(arm, axis) of what the simulator does: kernels at whole pixels, and between them arm B's image."""
+    variances = []
+    for sigma in drawn.widths:
+        at = np.arange(-int(4 * sigma + 0.5), int(4 * sigma + 0.5) + 1)
+        weights = np.exp(-0.5 * (at / sigma) ** 2)
+        variances.append(float((weights * at**2).sum() / weights.sum()))
+    off = Alignment(drawn.rows, drawn.columns, drawn.turn_deg, drawn.magnification)
+    rows, columns = interpolation_variance(off, SIZE)
+    a, b = variances
+    return np.sqrt([[a, a], [b + columns, b + rows]])
+
+
+def pictures(drawn: Blurred, known: Any, directory: Path) -> dict[str, float]:
+    noise = [effect for effect in drawn.effects if effect["kind"] in NOISE]
+    raw = open_recording(drawn.record("scene", directory, 400)).cut(70, SEGMENT)
+    plain = open_recording(drawn.record("scene", directory, 400, noise)).cut(70, SEGMENT)
+    scene = build_scene(drawn.scene("scene", [], directory), SIZE, 1e-5)
+    truth = merge_video(scene.frames(3 * 70, raw.geometry.span), 3, 1)
+    cases = {"without": calibrated(raw, without_blur(known)), "with": calibrated(raw, known), "noise": plain}
+    found = {}
+    for name, segment in cases.items():
+        began = time.process_time()
+        found[f"{name}_db"] = psnr(segment, truth)
+        found[f"{name}_cpu_s"] = time.process_time() - began
+    return found
+
+
+def psnr(segment: Segment, truth: NDArray[np.float32]) -> float:
+    result = reconstruct(segment, 3, 1)
+    at = result.trusted
+    return float(10 * np.log10(truth[at].max() ** 2 / np.mean((result.video[at] - truth[at]) ** 2)))
+
+
+def instrument(seed: int, *, video: bool, run: Run) -> None:
+    drawn = Blurred.at_random(seed)
+    assert isinstance(drawn, Blurred)
+    with tempfile.TemporaryDirectory() as name:
+        directory = Path(name)
+        known = calibrate(drawn, directory, 1024)
+        found = psf(open_exposure(drawn.record("edges", directory, 1024)), known)
+        measured, truth = found.quantities["blur_px"], true_widths(drawn)
+        row = {
+            "edges_a": found.facts["a"]["edges"],
+            "edges_b": found.facts["b"]["edges"],
+            "largest_error_px": float(np.abs(measured.value - truth).max()),
+            "errors_in_sigma": float((np.abs(measured.value - truth) / measured.uncertainty).max()),
+        }
+        if video:
+            row |= pictures(drawn, known.with_step(found), directory)
+    facts = "  ".join(f"{key} {value:.3g}" for key, value in row.items())
+    print(f"{seed:4} is {np.round(truth.ravel(), 3)} found {np.round(measured.value.ravel(), 3)}  {facts}")
+    run.add(f"seed {seed}", **row)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--instruments", type=int, default=4)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--no-video", action="store_true")
+    add_option(parser)
+    asked = parser.parse_args()
+    with recorded("bench_psf", keep=asked.record) as run:
+        for number in range(asked.instruments):
+            instrument(asked.seed + number, video=not asked.no_video, run=run)
+
+
+if __name__ == "__main__":
+    main()
