@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class Rig:
-    """The devices of one instrument; a context manager that lets go of them.
+    """The devices of one instrument; a context manager that closes them.
 
     Building one touches no device; it reads the scene where cameras see one. Raises ConfigError for files and
     values, UsageError for a scene that cannot be shown to these cameras.

@@ -94,7 +94,7 @@ class Camera(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of the device. Idempotent."""
+        """Close the device. Idempotent."""
         ...
 
 

@@ -65,7 +65,7 @@ class LiveCamera:
         return {}
 
     def close(self) -> None:
-        """Let go of the camera. Idempotent."""
+        """Close the camera. Idempotent."""
         self._worker.end(time.monotonic() + _END_S)
 
 

@@ -41,7 +41,7 @@ class Latencies:
         return found | {"max": self._words[self.BINS] / 1e6}
 
     def close(self) -> None:
-        """Let go of the memory. Idempotent."""
+        """Release the memory. Idempotent."""
         self._words.release()
         self._memory.close()
 

@@ -55,7 +55,7 @@ def live(
     """Show level, saturation and focus of the cameras, five times a second, until Ctrl-C.
 
     Of a daemon that is armed or records it shows the lines that pass, and takes none away. With --config it
-    opens the rig's cameras itself, lets the trigger run, and lets go of both at the end. The focus number is
+    opens the rig's cameras itself, lets the trigger run, and closes both at the end. The focus number is
     the difference between neighbouring pixels beside the mean: turn the lens to where it is largest, at
     steady light and with a target that has detail. With --json, one object per line.
 
@@ -69,7 +69,7 @@ def live(
     if code is not None and code not in get_args(LightCode):
         raise UsageError(f"the light cannot follow --code {code!r}", possible=", ".join(get_args(LightCode)))
     with (
-        first_interrupt_asks("letting go of the cameras") as asked,
+        first_interrupt_asks("closing the cameras") as asked,
         eyes_of(config, serial, code, Client(socket)) as eyes,  # type: ignore[arg-type]  # checked above
     ):
         if sys.stdout.isatty() and not json:

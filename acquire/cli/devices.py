@@ -40,7 +40,7 @@ def devices(
 ) -> None:
     """List triggers and cameras with their serial numbers, and say what each lacks.
 
-    With a rig file its devices are opened and set, one after the other, and let go of again. Without one
+    With a rig file its devices are opened and set, one after the other, and closed again. Without one
     the host's serial ports, triggers on USB and cameras are listed; nothing is opened, nothing is sent.
 
     Example: [bold]acquire devices --config rig-demo[/]

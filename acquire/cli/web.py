@@ -52,8 +52,8 @@ def web(
 ) -> None:
     """Serve the operator's page for the daemon of this host, until SIGTERM or Ctrl-C.
 
-    `acquire serve` does so by itself where the rig has [web]. Nobody waits for the page: the capture goes on
-    whatever becomes of it. Who opens it needs a token, which --link prints; other hosts reach it by
+    `acquire serve` does so automatically where the rig has [web]. Nobody waits for the page: the capture
+    goes on whatever becomes of it. Who opens it needs a token, which --link prints; other hosts reach it by
     `ssh -L 8300:127.0.0.1:8300 HOST`, or with a certificate (web.host, web.certificate, web.key).
 
     Example: [bold]acquire web --link[/]

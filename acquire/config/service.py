@@ -1,4 +1,4 @@
-"""Models of a rig's ``[service]`` and ``[hooks]``: what the daemon does by itself, and whom it tells."""
+"""Models of a rig's ``[service]`` and ``[hooks]``: what the daemon does on its own, and whom it notifies."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from acquire.config.base import FrozenModel
 
 
 class ServiceConfig(FrozenModel):
-    """What the daemon does by itself once it has started, as after a crash or a power failure."""
+    """What the daemon does on its own once it has started, as after a crash or a power failure."""
 
     begin: Literal["idle", "armed", "recording"] = Field(
         default="idle",

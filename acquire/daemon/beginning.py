@@ -1,4 +1,4 @@
-"""What the daemon does by itself once it has started: `[service] begin`.
+"""What the daemon does on its own once it has started: `[service] begin`.
 
 A daemon that came back after a crash arms, or records, as the rig says. What refuses is told and tried again;
 whoever gives a command of their own takes over, and nothing is tried any more.

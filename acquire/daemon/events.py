@@ -1,4 +1,4 @@
-"""Recordings that start by themselves: what the rig's ``[events]`` ask for, in lines."""
+"""Recordings that start automatically: what the rig's ``[events]`` ask for, in lines."""
 
 from __future__ import annotations
 

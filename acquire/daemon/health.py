@@ -60,7 +60,7 @@ def _of_arms(status: Status, line_rate_hz: float, age_s: float) -> list[HealthCh
 
 
 def _ring(name: str, arm: ArmStatus, state: State) -> HealthCheck:
-    """While nothing is recorded, blocks are let go at once."""
+    """While nothing is recorded, blocks are released at once."""
     fill = arm.ring.fill / arm.ring.slots
     busy = state in (State.RECORDING, State.DRAINING)
     level: CheckLevel = "bad" if fill > RING_BAD else "warning" if fill >= RING_GOOD and busy else "good"

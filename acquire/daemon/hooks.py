@@ -1,4 +1,4 @@
-"""Whom the daemon tells by itself: a command or a webhook, at a fault, lost lines, a disk that fills.
+"""Whom the daemon notifies on its own: a command or a webhook, at a fault, lost lines, a disk that fills.
 
 A thread of its own tells one after the other. It listens to the news as anybody does: what is slow or hangs
 is given up after its time, and what happened meanwhile is told afterwards, as far as the log still has it.

@@ -1,6 +1,6 @@
 """The operator's page, started where the rig has ``[web]``: a process of its own that nobody waits for.
 
-It ends when its standard input does, which the daemon holds, however that ends. One that ends by itself is
+It ends when its standard input does, which the daemon holds, however that ends. One that ends on its own is
 started anew, after growing waits.
 """
 

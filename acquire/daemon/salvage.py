@@ -1,4 +1,4 @@
-"""Recordings that nobody sealed: the daemon recovers them by itself, in a process that stands back.
+"""Recordings that nobody sealed: the daemon recovers them automatically, in a process of low priority.
 
 ::
 

@@ -92,7 +92,7 @@ def serve(config: RigConfig, origin: str = "", reread: Callable[[], RigConfig] |
         with contextlib.closing(page), contextlib.closing(hooks):
             code = asyncio.run(Daemon(service, endpoint, page, reloading).run())
         last_resort = LastResort(endpoint.remove)
-        last_resort.within(END_S)  # for devices that do not let go
+        last_resort.within(END_S)  # for devices that do not close
     last_resort.cancel()
     return leave(code)
 

@@ -1,4 +1,4 @@
-"""Recordings go to a remote store by themselves, while they grow: `recording.upload_to`.
+"""Recordings are copied to a remote store automatically, while they grow: `recording.upload_to`.
 
 ::
 

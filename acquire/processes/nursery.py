@@ -343,7 +343,7 @@ def _keep(channel: socket.socket) -> int | None:
 
 
 def _begin(channel: socket.socket, children: dict[int, tuple[int, socket.socket]], fds: list[int]) -> int:
-    """First steps of a worker: let go of all that is the nursery's."""
+    """First steps of a worker: close all that is the nursery's."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     channel.close()
     # Of other workers: the owner takes the end of such a socket for the nursery's, which a copy would hide.

@@ -69,7 +69,7 @@ class Counters:
         self._words[self._position[name]] += value
 
     def close(self) -> None:
-        """Let go of the memory. Idempotent."""
+        """Release the memory. Idempotent."""
         self._words.release()
         self._memory.close()
 

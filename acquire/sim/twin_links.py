@@ -53,7 +53,7 @@ class TwinTransport:
         self._fed.set()
 
     def close(self) -> None:
-        """Nothing to let go of."""
+        """Nothing to release."""
 
     def unplug(self) -> None:
         self._unplugged = True

@@ -148,7 +148,7 @@ class ArrayWriter:
             self._unsynced = False
 
     def close(self) -> None:
-        """Let go of the file; rows that wait are dropped. Idempotent; no piece is on its way any more."""
+        """Close the file; rows that wait are dropped. Idempotent; no piece is on its way any more."""
         if self._shard is not None:
             self._shard.close()
 

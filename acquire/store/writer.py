@@ -61,7 +61,7 @@ class RecordingWriter:
     are held in memory and become readable at `seal` only: ``kill -9`` can lose them, but nothing that
     `committed_lines` has acknowledged. (With ``fsync="seal"`` a power failure can; with ``"commit"`` it
     cannot, for a reader that starts at the root.) What can be lost is bounded, see `spec.Durability`: the
-    writer commits by itself when as many lines wait for it as the specification allows.
+    writer commits on its own when as many lines wait for it as the specification allows.
 
     A row is committed when both arms have it. An arm that runs ahead is written but not visible; how far
     it may run is the caller's to bound.
@@ -323,7 +323,7 @@ class RecordingWriter:
             return self._rescue()
 
     def close(self) -> None:
-        """Let go of all files; what was not committed is dropped. Idempotent."""
+        """Close all files; what was not committed is dropped. Idempotent."""
         self._closed = True
         for threads in (self._pool, self._behind):
             if threads is not None:
@@ -378,7 +378,7 @@ class RecordingWriter:
             return {}
 
     def _publish_kept(self, rows: int, nodes: dict[str, layout.Document], room: Room) -> None:
-        """The commit, without the lines that retention lets go; their files are deleted once it is told."""
+        """The commit, without the lines that retention drops; their files are deleted once it is told."""
         looked, self._looked = self._looked is not room, room
         going = self._keeper.choose(rows, -room.free_bytes if looked else 0) if self._keeper else []
         if looked:

@@ -71,7 +71,7 @@ class Observer:
         return ObserverStatistics(min(self._ring.head - cursor, self._ring.shape.slots), peak, lost)
 
     def close(self) -> None:
-        """Let go of the ring's memory, before the ring does. Idempotent."""
+        """Release the ring's memory, before the ring does. Idempotent."""
         self._words.release()
 
     def _lose(self, blocks: int) -> None:

@@ -114,7 +114,7 @@ class Peek:
         return None
 
     def close(self) -> None:
-        """Let go of the memory; views of blocks must be gone. Idempotent."""
+        """Release the memory; views of blocks must be gone. Idempotent."""
         self._ring.close()
 
     def _skip(self, blocks: int) -> None:

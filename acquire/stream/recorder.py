@@ -377,7 +377,7 @@ class Recorder:
         return True
 
     def _move(self, name: str, arm: Arm) -> bool:
-        """Let go of the arm's last block and take the next, if there is one that may go."""
+        """Release the arm's last block and take the next, if there is one that may go."""
         self._release(name, arm)
         arm.watch(time.monotonic(), self._counters[f"awaited_{name}"])
         self._hold_ups.update()

@@ -374,7 +374,7 @@ class Ring:
         self._memory.map.madvise(mmap.MADV_REMOVE)
 
     def close(self) -> None:
-        """Let go of the memory; the other processes keep theirs. Idempotent."""
+        """Release the memory; the other processes keep theirs. Idempotent."""
         if self._bell < 0:
             return
         self._slots.clear()

@@ -119,7 +119,7 @@ class Watcher:
             self._next_s = now_s
 
     def close(self) -> None:
-        """Let go of the rings' memory, before they do."""
+        """Release the rings' memory, before they do."""
         for observer in self._observers.values():
             observer.close()
 

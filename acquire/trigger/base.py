@@ -122,5 +122,5 @@ class Trigger(Protocol):
         ...
 
     def close(self) -> None:
-        """Stop and let go of the device. Idempotent."""
+        """Stop and close the device. Idempotent."""
         ...

@@ -7,7 +7,7 @@
     stop      STOP → the last line ends → lines counted
 
 Nothing is opened before it is needed. A link that dies raises TriggerError at once in whoever waits, and in
-every later call but three: `prepare` and `stop` connect again by themselves, since the light may still
+every later call but three: `prepare` and `stop` reconnect on their own, since the light may still
 flash out there; `reopen` does so and says what became of the run.
 
 The device's watchdog (``trigger.watchdog_s``) watches every run from its first clock. Requests keep it quiet:
@@ -205,7 +205,7 @@ class TriggerDriver:
         return {"pulses": device.read(r.LINES), **known, **device.counters(), **link}
 
     def close(self) -> None:
-        """Stop, as far as the device can still be reached, and let go of it. Idempotent."""
+        """Stop, as far as the device can still be reached, and close it. Idempotent."""
         with self._lock:
             device = self._device
             try:
@@ -243,7 +243,7 @@ class TriggerDriver:
             return Reunion(run.run_id, False, None, status)
 
     def release(self) -> None:
-        """Let go of the device and leave it as it is. Idempotent."""
+        """Close the device and leave it as it is. Idempotent."""
         with self._lock:
             device, self._device = self._device, None
             if device is not None:

@@ -54,7 +54,7 @@ class Live:
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread and let go of the rings."""
+        """End the thread and release the rings."""
         self._ended = True
         self._changed.set()
         self._thread.join(10.0)

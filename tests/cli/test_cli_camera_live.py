@@ -54,7 +54,7 @@ def test_one_camera_until_ctrl_c() -> None:
         children = psutil.Process(looking.pid).children(recursive=True)
         looking.send_signal(signal.SIGINT)
         _, said = looking.communicate(timeout=300)
-    assert (looking.returncode, "letting go" in said) == (0, True)
+    assert (looking.returncode, "closing the cameras" in said) == (0, True)
     assert children
     assert not psutil.wait_procs(children, timeout=60)[1]
 

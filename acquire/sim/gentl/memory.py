@@ -165,7 +165,7 @@ class CameraMemory:
         return room
 
     def close(self) -> None:
-        """Let go of the memory; other holders keep theirs. Idempotent."""
+        """Release the memory; other holders keep theirs. Idempotent."""
         self._words.release()
         self.lines = self.headers = np.empty((0, 0), np.uint8)
         self._memory.close()

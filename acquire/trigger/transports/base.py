@@ -26,5 +26,5 @@ class Transport(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go. Idempotent."""
+        """Close the connection. Idempotent."""
         ...

@@ -26,7 +26,7 @@ class PortLock:
             self._descriptor = _open_for_all(path)
         except OSError as error:
             raise TriggerError(f"{port} cannot be locked: {path}: {error.strerror}") from error
-        # flock, not a file with a number in it: the kernel lets go of it with the process, however that ends.
+        # flock, not a file with a number in it: the kernel releases it with the process, however that ends.
         try:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
