@@ -310,3 +310,55 @@ def test_the_built_setup_through_gige_vision(tmp_path: Path) -> None:
     recording, status = record(config, tmp_path / "r.zarr", 3000)
     assert status.condition is RunCondition.GOOD
     built_matches(config, recording)
+
+
+FIBRE: dict[str, Any] = {
+    "geometry.stages": 16,
+    "geometry.substeps": 1,
+    "cameras.layout": "fibre",
+    "fibre.rows": 32,
+    "fibre.columns": 48,
+    "fibre.sensor_pixels": 104,
+    "simulation.speed": 0.08,
+    "trigger.tag_every_lines": 32,  # lines are confirmed by the tag behind them, which the end waits for
+}
+"""2 x 3 tiles of 16 pixels, side by side on two sensors that are wider than they have stages."""
+
+
+def fibre_matches(config: RigConfig, recording: Recording) -> None:
+    """Whole lines are, bit for bit, what the simulator gives; and tiles are cut from them."""
+    assert recording.fibre is not None
+    bench = bench_of(config, load_scene("scene-leds"))
+    lines, usable = recording.whole_lines(recording.first_line, recording.lines)
+    for number, arm in enumerate("ab"):
+        camera = bench.camera(arm, config.code.build())
+        expected = camera.read(recording.first_line, recording.lines).pixels
+        assert expected.shape[1] == 104
+        np.testing.assert_array_equal(lines[number], expected)
+    assert usable.all()
+    assert len(recording.fibre.tiles) == 6
+    for tile in recording.fibre.tiles:
+        assert recording.cut(recording.first_line, 100, tile).geometry == Geometry(16, 1, 100)
+
+
+@needs_compiler
+def test_a_fibre_through_the_producer(tmp_path: Path) -> None:
+    settings = [
+        ["remote", "Width", 104],
+        ["remote", "PixelFormat", "Mono12Packed"],
+        ["stream", "BufferHeight", 100],
+    ]
+    config = load_rig("rig-demo-gentl", SMALL | FIBRE | {f"cameras.{arm}.settings": settings for arm in "ab"})
+    recording, status = record(config, tmp_path / "r.zarr", 3000)
+    assert status.condition is RunCondition.GOOD, status.lines
+    fibre_matches(config, recording)
+    assert verify(tmp_path / "r.zarr").intact
+
+
+@pytest.mark.needs_aravis
+def test_a_fibre_through_gige_vision(tmp_path: Path) -> None:
+    settings = [["remote", "Width", 104], ["remote", "PixelFormat", "Mono12"], ["remote", "Height", 100]]
+    config = gige_config(**FIBRE | {f"cameras.{arm}.settings": settings for arm in "ab"})
+    recording, status = record(config, tmp_path / "r.zarr", 3000)
+    assert status.condition is RunCondition.GOOD, status.lines
+    fibre_matches(config, recording)
