@@ -82,7 +82,7 @@ def export(
 
     Of a video the trusted frames alone are written, unless you ask for all of them. The file says where it
     comes from; .npy holds the numbers alone. The error that a video tells of its regions is taken along but
-    for .npy and .mp4, which have no place for it.
+    for .tif, .npy and .mp4, which have no place for it.
 
     Example: [bold]acquire export video.zarr video.tif --from 2ms --to 5ms[/]
     """
@@ -114,7 +114,9 @@ def export(
         shape = " × ".join(map(str, content.image.shape))
         say(f"{out}: {shape} ({', '.join(content.image.dims)}), {quantity(size, 'B')}")
     if missing:
-        print_warning(f"{out.name} has no place for the estimated error of regions: .tif, .h5 and .npz have")
+        print_warning(
+            f"{out.name} has no place for the estimated error of regions: .ome.tif, .h5 and .npz have"
+        )
     if content.untrusted:
         print_warning(
             f"{content.untrusted} of {content.image.shape[0]} frames are not trusted: sampled in part"

@@ -61,7 +61,9 @@ def check_export(content: Content, path: Path) -> None:
 
 def left_out(content: Content, path: Path) -> tuple[str, ...]:
     """Names of what lies beside the image that such a file does not hold."""
-    return tuple(each.name for each in content.beside) if format_for(path) in {"npy", "movie"} else ()
+    return (
+        tuple(each.name for each in content.beside) if format_for(path) in {"imagej", "npy", "movie"} else ()
+    )
 
 
 def export(

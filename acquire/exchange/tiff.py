@@ -1,8 +1,8 @@
 """TIFF: an ImageJ hyperstack, or, as ``.ome.tif``, an OME-TIFF of any size.
 
 The image lies in one piece behind the header, so that it is written as it is read, block by block. What lies
-beside it is a second image of an OME-TIFF. A hyperstack can have none: it is one more page behind those that
-ImageJ looks at, frames below one another.
+beside it is a second image of an OME-TIFF. A hyperstack has none: a page behind its frames is one more frame
+to Bio-Formats and to others.
 """
 
 from __future__ import annotations
@@ -31,10 +31,9 @@ AXES = {"video": "TYX", "lines": "CYX"}
 def check_tiff(content: Content, *, ome: bool) -> None:
     """UsageError for an image that no such file can hold."""
     library("tifffile", "export", "a TIFF file")
-    needed = sum(array.bytes for array in (content.image, *content.beside))
-    if not ome and needed > MOST_BYTES:
+    if not ome and content.image.bytes > MOST_BYTES:
         raise UsageError(
-            f"a TIFF file for ImageJ cannot hold {needed} bytes of pixels",
+            f"a TIFF file for ImageJ cannot hold {content.image.bytes} bytes of pixels",
             possible=f"up to {MOST_BYTES}",
             hint="NAME.ome.tif, which can, or NAME.h5; or a part: --from and --to",
         )
@@ -44,6 +43,7 @@ def write_tiff(path: Path, content: Content, advance: Callable[[int], object], *
     """Raises OSError as the disk gives it."""
     tifffile = library("tifffile", "export", "a TIFF file")
     kind: dict[str, Any] = {"ome": True, "bigtiff": True} if ome else {"imagej": True}
+    beside = content.beside if ome else ()
     with tifffile.TiffWriter(path, byteorder="<", **kind) as writer:
         writer.write(
             None,
@@ -54,22 +54,14 @@ def write_tiff(path: Path, content: Content, advance: Callable[[int], object], *
             resolution=_resolution(content),
             resolutionunit="NONE",
         )
-        for array in content.beside if ome else ():
+        for array in beside:
             about = {"axes": "TYX", "Name": array.name, "Description": json.dumps(array.attributes)}
             empty = {"shape": array.shape, "dtype": array.dtype, "photometric": "minisblack"}
             writer.write(None, **empty, metadata=about)
-    for array in () if ome else content.beside:
-        with tifffile.TiffWriter(path, byteorder="<", append="force") as writer:  # it has an image already
-            shape = (array.shape[0] * array.shape[1], array.shape[2])
-            described = json.dumps({"name": array.name, "shape": array.shape} | array.attributes)
-            empty = {"shape": shape, "dtype": array.dtype, "photometric": "minisblack"}
-            writer.write(None, **empty, metadata=None, description=described)
     with tifffile.TiffFile(path) as reader:
         places = [each.dataoffset for each in reader.series]
-        if not ome:
-            places[1:] = [page.dataoffsets[0] for page in reader.pages[content.image.shape[0] :]]
     with path.open("r+b") as file:
-        for place, array in zip(places, (content.image, *content.beside), strict=True):
+        for place, array in zip(places, (content.image, *beside), strict=True):
             file.seek(place)
             for _, block in array.blocks():
                 file.write(np.ascontiguousarray(block).data)
