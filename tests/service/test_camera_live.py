@@ -32,7 +32,9 @@ def test_an_observer_of_the_daemon_s_rings(tmp_path: Path) -> None:
         assert sum(turn["b"]["lines"] for turn in turns) > 1000
         assert "a" not in only_b
         lines = open_recording(tmp_path / "run.zarr").camera("a").lines[:]
-        assert turns[-1]["a"]["level"] == pytest.approx(lines.mean() / 4095, rel=0.1)
-        assert turns[-1]["a"]["saturated"] == pytest.approx((lines == 4095).mean(), abs=0.01)
+        # on a busy host no line may come within a turn
+        *_, told = [turn["a"] for turn in turns if turn["a"]["level"] is not None]
+        assert told["level"] == pytest.approx(lines.mean() / 4095, rel=0.1)
+        assert told["saturated"] == pytest.approx((lines == 4095).mean(), abs=0.01)
     finally:
         daemon.close()

@@ -254,7 +254,9 @@ def test_a_watcher_that_dies_or_stops_costs_no_line(tmp_path: Path, number: sign
         status = sealed(capture)
         if number is signal.SIGSTOP:
             os.kill(watcher, signal.SIGCONT)
-    assert (status.condition, status.fault, status.recorded_lines) == (RunCondition.GOOD, None, 20_000)
+    # tainted: on a busy host lines may come before a tag has confirmed them
+    assert status.condition in (RunCondition.GOOD, RunCondition.TAINTED)
+    assert (status.fault, status.recorded_lines) == (None, 20_000)
     recording, _ = check_rows(tmp_path / "r.zarr")
     kinds = {event.kind for event in recording.events}
     assert ("fault" in kinds) == (number is signal.SIGKILL)  # another took its place
