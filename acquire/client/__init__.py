@@ -9,7 +9,7 @@
         client.start("run.zarr", pre_s=0.2, post_s=1.0)
         client.mark("the valve opens")
         client.wait(SEALED, timeout_s=60)
-        for news in client.events(history=True, timeout_s=0.1):
+        for news in client.events(history=True, timeout_s=0):
             print(news.time, news.text)
         segment = client.open("run.zarr").cut(first_line, lines=263)
 

@@ -140,8 +140,8 @@ class AsyncClient:
 
     async def follow(
         self, reader: EventReader, *, history: bool = False, status_s: float | None = None
-    ) -> AsyncIterator[News | Status]:
-        """News, and statuses where ``status_s`` asks for them, of one connection.
+    ) -> AsyncIterator[News | Status | None]:
+        """News, and statuses where ``status_s`` asks for them, of one connection; None: no more for now.
 
         Raises NoDaemonError when it breaks, or gives no sign of life for `core.SILENT_S`.
         """

@@ -205,28 +205,33 @@ class Client:
     def events(
         self, last_id: str | None = None, *, history: bool = False, timeout_s: float | None = None
     ) -> Iterator[News]:
-        """What happens, as it happens; ends after ``timeout_s`` in all, or never.
+        """What happens, as it happens; ends ``timeout_s`` after the daemon has told what it knows, or never.
 
-        Begins after the news ``last_id``, with all that is known (``history``), or with what comes. A
+        Begins after the news ``last_id``, with all that is known (``history``), or with what comes; however
+        slow the host, that is told whole. It ends with the next sign of life, which comes each second. A
         connection that breaks is made again, and what happened meanwhile comes first. Raises NoDaemonError
         where the daemon is gone for longer than `PATIENCE_S`.
         """
         reader = EventReader(last_id)
-        end_s = None if timeout_s is None else time.monotonic() + timeout_s
+        end_s: float | None = None
         lost_s: float | None = None
         while end_s is None or time.monotonic() < end_s:
             try:
-                for one in self._follow(reader, history=history, end_s=end_s):
+                for one in self._follow(reader, history=history):
                     lost_s = None
                     if isinstance(one, News):
                         yield one
+                    elif end_s is None and timeout_s is not None:
+                        end_s = time.monotonic() + timeout_s
+                    if end_s is not None and time.monotonic() >= end_s:
+                        return
             except NoDaemonError:
                 lost_s = lost_s or time.monotonic()
                 if time.monotonic() - lost_s > PATIENCE_S:
                     raise
                 time.sleep(POLL_S)
 
-    def _follow(self, reader: EventReader, *, history: bool, end_s: float | None) -> Iterator[News | Status]:
+    def _follow(self, reader: EventReader, *, history: bool) -> Iterator[News | Status | None]:
         """One connection's worth of news. Raises NoDaemonError when it breaks."""
         reader.begin()
         with self._connection(core.SILENT_S) as connection:
@@ -240,8 +245,6 @@ class Client:
                     core.fact("events", Status).read(response.status, content, self._target)
                 while line := response.readline(core.MOST_LINE_BYTES):
                     yield from reader.take(line.decode().rstrip("\r\n"))
-                    if end_s is not None and time.monotonic() >= end_s:
-                        return
             except (OSError, http.client.HTTPException) as error:
                 raise NoDaemonError(f"the daemon on {self._target} went away while it told news") from error
         raise NoDaemonError(f"the daemon on {self._target} has ended")

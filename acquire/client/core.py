@@ -199,11 +199,13 @@ class EventReader:
         """A connection begins: half an event that an earlier one ended with is told again, whole."""
         self._event = self._data = ""
 
-    def take(self, line: str) -> Iterator[News | Status]:
-        """The next line, without its end; what is complete with it."""
+    def take(self, line: str) -> Iterator[News | Status | None]:
+        """The next line, without its end; what is complete with it. None: nothing more to tell for now."""
         name, _, value = line.partition(":")
         value = value.removeprefix(" ")
-        if name == "event":
+        if line.startswith(":"):
+            yield None
+        elif name == "event":
             self._event = value
         elif name == "data":
             self._data += value

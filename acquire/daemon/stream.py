@@ -5,7 +5,7 @@
     id: 5f3a9c01-17                       id: of the news; given back as Last-Event-ID after a reconnection
     event: news | status
     data: {…}                             `News` | `Status`
-    : alive                               nothing to tell
+    : alive                               nothing more to tell for now
 
 A stream reads on from its place in the log when it is woken. It waits in its socket for a slow reader, and
 the connection is ended where one does not read at all (`connections.SEND_S`).
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from acquire.daemon.news import NewsLog
 
 ALIVE_S = 1.0
+ALIVE = ": alive\n\n"
+"""Also after the news with which a stream begins: whoever listens knows then that this was all."""
 MOST_STREAMS = 16
 """Each holds a connection (`connections.MOST_CONNECTIONS`)."""
 LEAST_STATUS_S, MOST_STATUS_S = 0.05, 60.0
@@ -64,7 +66,7 @@ class Streams:
 
         self._open += 1
         self._log.listen(wake)
-        due_s = time.monotonic()
+        due_s, begins = time.monotonic(), True
         try:
             while not self._log.closed:
                 told = woken.is_set()
@@ -77,8 +79,9 @@ class Streams:
                 if status_s is not None and (told or now_s >= due_s):
                     due_s = now_s + status_s
                     yield status_text(self._status())
-                elif not news:
-                    yield ": alive\n\n"
+                elif begins or not news:
+                    yield ALIVE
+                begins = False
                 await wait(woken, ALIVE_S if status_s is None else min(ALIVE_S, max(0.0, due_s - now_s)))
         finally:
             self._open -= 1

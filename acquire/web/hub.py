@@ -116,7 +116,7 @@ class Hub:
             if isinstance(one, News):
                 self._news.append((self._count, json_message("news", one.model_dump_json())))
                 self._count += 1
-            else:
+            elif one is not None:
                 await self._take(one)
             self._wake()
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from acquire.client import core
 from acquire.daemon.messages import Status
-from acquire.daemon.stream import news_text, status_text
+from acquire.daemon.stream import ALIVE, news_text, status_text
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -64,4 +64,7 @@ class Passing:
     ) -> AsyncIterator[str]:
         reader = core.EventReader(last_id)
         async for one in self._client.follow(reader, history=history, status_s=status_s):
-            yield status_text(one) if isinstance(one, Status) else news_text(one)
+            if one is None:
+                yield ALIVE
+            else:
+                yield status_text(one) if isinstance(one, Status) else news_text(one)

@@ -124,7 +124,7 @@ def test_both_clients_hear_the_same(path: Path, daemon: Client, run: FakeRun) ->
                     return found
         return found
 
-    assert asyncio.run(listen()) == [one.text for one in daemon.events(history=True, timeout_s=0.5)]
+    assert asyncio.run(listen()) == [one.text for one in daemon.events(history=True, timeout_s=0)]
 
 
 def test_the_async_client_commands_and_is_refused_as_the_other(path: Path, daemon: Client) -> None:
@@ -165,7 +165,7 @@ def test_a_status_comes_with_the_news_and_by_itself(path: Path, daemon: Client) 
     assert kinds[:3] == ["Status"] * 3
 
 
-def _breaking_off(path: Path, ends: list[bytes]) -> threading.Thread:
+def _breaking_off(path: Path, ends: list[bytes], late_s: float = 0.0) -> threading.Thread:
     """A daemon that answers each connection with one of ``ends`` of a stream of events, and hangs up."""
     listener = socket.socket(socket.AF_UNIX)
     listener.bind(str(path))
@@ -178,7 +178,9 @@ def _breaking_off(path: Path, ends: list[bytes]) -> threading.Thread:
                 with listener.accept()[0] as connection:
                     connection.recv(1 << 16)
                     head = b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\nConnection: close\r\n\r\n"
-                    connection.sendall(head + end)
+                    connection.sendall(head)
+                    time.sleep(late_s)
+                    connection.sendall(end)
 
     server = threading.Thread(target=serve)
     server.start()
@@ -199,6 +201,14 @@ def test_half_an_event_is_forgotten_with_its_connection(tmp_path: Path, kind: st
             return await anext(aiter(client.events()))
 
     assert (asyncio.run(first()) if kind == "asynchronous" else next(Client(path).events())) == news
+    server.join(60)
+
+
+def test_what_is_known_is_told_whole_however_late_the_daemon_is(tmp_path: Path) -> None:
+    news = News(id="a-1", time=datetime.now(UTC), kind="mark", text="drop", state=State.ARMED)
+    whole = f"id: a-1\nevent: news\ndata: {news.model_dump_json()}\n\n: alive\n\n".encode()
+    server = _breaking_off(tmp_path / "sock", [whole], late_s=0.5)
+    assert list(Client(tmp_path / "sock").events(history=True, timeout_s=0)) == [news]
     server.join(60)
 
 

@@ -43,7 +43,7 @@ def rewrite(daemon: Daemon, **replaced: str) -> None:
 
 def told(client: Client) -> str:
     """The latest news of a reload."""
-    return [one.text for one in client.events(history=True, timeout_s=0.3) if one.kind == "reload"][-1]
+    return [one.text for one in client.events(history=True, timeout_s=0) if one.kind == "reload"][-1]
 
 
 def sentence(answer: Answer) -> str:

@@ -71,7 +71,7 @@ def test_scripts_steer_from_elsewhere_as_from_here(
     assert client.arm(request_id="one").state is State.ARMED
     assert client.arm(request_id="one").state is State.ARMED  # carried out once, through the page as well
     client.mark("from elsewhere")
-    assert "from elsewhere" in [news.text for news in client.events(history=True, timeout_s=0.5)]
+    assert "from elsewhere" in [news.text for news in client.events(history=True, timeout_s=0)]
     with pytest.raises(StateError, match="cannot stop while armed"):
         client.stop()
     with pytest.raises(UsageError, match="for looking only"):
