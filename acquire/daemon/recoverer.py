@@ -37,7 +37,7 @@ _ELSEWHERE = "open, and not written on this machine, where it could be seen whet
 @dataclass(frozen=True, slots=True)
 class Task:
     """One recording to be recovered. ``ours``: this daemon's run has left it, ``why``, after its recorder
-    had acknowledged ``committed_lines``.
+    had acknowledged ``committed_lines`` and heard what was ``told``: line, kind and text.
     """
 
     path: Path
@@ -46,6 +46,7 @@ class Task:
     committed_lines: int = 0
     tries: int = 0
     not_before_s: float = 0.0
+    told: tuple[tuple[int, str, str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +104,7 @@ def _salvage(mailbox: Mailbox, task: Task) -> RecoveryStatus:
         if not task.ours and not is_here(attributes or {}):
             return RecoveryStatus(path=path, state="left", text=_ELSEWHERE)
         reason = f"{RECOVERED}{task.why}" if task.why else Circumstances().reason
-        known = Circumstances(reason, committed_intact=has_run_on(attributes or {}), alone=False)
+        known = Circumstances(reason, has_run_on(attributes or {}), alone=False, told=task.told)
         done = recover(path, progress=lambda *_: _ask(mailbox), known=known)
     except StateError as error:
         return RecoveryStatus(path=path, state="waiting", text=error.message)

@@ -26,6 +26,7 @@ from acquire.errors import AcquireError, StateError
 from acquire.lines import ARMS, LineFlag
 from acquire.store import layout
 from acquire.store.array_files import COLUMNS
+from acquire.store.chunks import AbsentChunkError, DamagedChunkError
 from acquire.store.files import DISK, SCRATCH, Publisher, locked
 from acquire.store.links import refuse_links
 from acquire.store.mend import mend_index, rewrite_chunk
@@ -70,11 +71,13 @@ class Circumstances:
     reason : of the recording's end
     committed_intact : the machine has run on since, and nothing else is to be feared for what was committed
     alone : nobody else can be writing it, also where the file system has no locks that would tell
+    told : line, kind and text of events that the writer was told of and may not have listed
     """
 
     reason: str = REASON
     committed_intact: bool = False
     alone: bool = True
+    told: tuple[tuple[int, str, str], ...] = ()
 
 
 UNKNOWN = Circumstances()
@@ -145,6 +148,7 @@ class _Recoverer:
         self.path = path
         self.disk = disk
         self.reason = known.reason
+        self.told = known.told
         self.sealed = recording.state == "sealed"
         self.rows = recording.lines
         self.flags_changed = 0
@@ -268,11 +272,25 @@ class _Recoverer:
         gaps.not_listed += recording.gaps_not_listed
         for event in recording.events:
             events.add({"tick": event.tick, "line": event.line, "kind": event.kind, "text": event.text})
+        # A writer that dies between a line's commit and that of its event leaves a line without its mark.
+        listed = {(event.line, event.kind, event.text) for event in recording.events}
+        for line, kind, said in self.told:
+            if recording.first_line <= line < end and (line, kind, said) not in listed:
+                events.add({"tick": self._tick(line), "line": line, "kind": kind, "text": said})
+                listed.add((line, kind, said))
         text = f"{self.rows} lines, {recording.lines} of them were committed"
         events.add({"tick": 0, "line": end, "kind": "recovered", "text": text})
         for table in (gaps, events):
             table.publish(publisher, durable=True)
         return gaps.nodes() | events.nodes()
+
+    def _tick(self, line: int) -> int:
+        """Of the trigger, at a line; 0 where that is damaged."""
+        chunk, row = divmod(line - self.recording.first_line, self.tag_rows)
+        for arm in ARMS:
+            with contextlib.suppress(AbsentChunkError, DamagedChunkError, OSError):
+                return int(self.recording.arms[arm].reader("tick").chunk(chunk)[row])
+        return 0
 
     def _resize(self, publisher: Publisher, nodes: dict[str, layout.Document]) -> None:
         """Make the rows visible to readers that begin below the root."""

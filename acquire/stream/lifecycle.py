@@ -29,8 +29,9 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
     from pathlib import Path
 
-    from acquire.stream.messages import Began, Begin, Sealed
+    from acquire.stream.messages import Began, Begin, Note, Sealed
 
+_MOST_TOLD = 1024
 _MOST_KEPT = 256
 """Recordings whose lines are remembered; those that a ring still holds lines of are fewer."""
 
@@ -157,6 +158,7 @@ class Lifecycle:
     refused : why it was not begun
     path : where ``began`` is: not where it was first begun, if it goes on in another segment
     resumption : when a recording that the disk has ended goes on, and why it has not yet
+    told : what the recorder was told of lately: it may die before that is written
     """
 
     def __init__(self, *, goes_on: bool) -> None:
@@ -166,6 +168,7 @@ class Lifecycle:
         self.refused: Refused | None = None
         self.path: Path | None = None
         self.resumption = Resumption()
+        self.told: deque[Note] = deque(maxlen=_MOST_TOLD)
         self._goes_on = goes_on
         self._begin: Begin | None = None
         self._end_reason: str | None = None
@@ -243,7 +246,7 @@ class Lifecycle:
         for arm, ranges in self._kept.items():
             ranges.append((began.first_line, began.first_line + rows[arm]))
         if not sealed.on_disk:
-            self._orphans.append(Orphan(path, sealed.end_reason, committed_lines))
+            self._leave(Orphan(path, sealed.end_reason, committed_lines))
         if following is None:
             self.sealed = sealed
         else:
@@ -263,7 +266,7 @@ class Lifecycle:
         if begin is None or was in (Stage.NONE, Stage.SEALED, Stage.LOST):
             return None
         if was in (Stage.ASKED, Stage.CANCELLED):
-            self._orphans.append(Orphan(begin.path, f"its recorder was {death}"))
+            self._leave(Orphan(begin.path, f"its recorder was {death}"))
             if was is Stage.ASKED:
                 self.refused = Refused(DeviceError(f"start: the recorder was {death}", hint="start again"))
             return None
@@ -273,7 +276,7 @@ class Lifecycle:
             self._begin, committed_lines = once_more(begin), 0  # the counters may be neither's
         if self._begin.path != begin.path:  # else it was killed before it had made anything
             why = f"its recorder was {death}; it goes on in {self._begin.path.name}"
-            self._orphans.append(Orphan(begin.path, why, committed_lines))
+            self._leave(Orphan(begin.path, why, committed_lines))
         if was is Stage.PAUSED:
             self.resumption.ended(now_s, f"its recorder was {death}")
             return None
@@ -302,12 +305,15 @@ class Lifecycle:
         known = {orphan.path for orphan in self._orphans}
         if self.stage is Stage.LOST and self._begin is not None and self._begin.path not in known:
             lines = committed_lines if self._begin.path == self.path else 0  # else those of the one before
-            self._orphans.append(Orphan(self._begin.path, why, lines))
+            self._leave(Orphan(self._begin.path, why, lines))
 
     def _go(self, event: Event) -> Stage:
         """Gives the stage before."""
         before, self.stage = self.stage, after(self.stage, event)
         return before
+
+    def _leave(self, orphan: Orphan) -> None:
+        self._orphans.append(replace(orphan, told=tuple(self.told)))
 
     def _close_pause(self, was: Stage) -> bool:
         """Nobody wants the further segment any more that has not begun yet; says whether there was one."""

@@ -45,11 +45,15 @@ READY_S = 120.0
 
 @dataclass(frozen=True, slots=True)
 class Orphan:
-    """A recording whose recorder did not live to seal it, and why; lines of it were acknowledged."""
+    """A recording whose recorder did not live to seal it, and why; lines of it were acknowledged.
+
+    ``told``: what its recorder was told of, which it may not have written; lines of other recordings, too.
+    """
 
     path: Path
     why: str
     committed_lines: int = 0
+    told: tuple[Note, ...] = ()
 
 
 class Resumption:

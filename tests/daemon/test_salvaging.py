@@ -21,7 +21,7 @@ from acquire.daemon.salvage import MOST_ODD, Salvage
 from acquire.lines import ARMS, LineBlock
 from acquire.store import RecordingWriter, open_recording
 from acquire.store.files import locked
-from acquire.stream import Orphan
+from acquire.stream import Note, Orphan
 from acquire.stream.tagger import Tagger
 
 CLOCK = ClockFit(90_000_000, 0, 0)
@@ -108,6 +108,21 @@ def test_acknowledged_lines_without_a_root_are_recovered(salvage: Salvage, tmp_p
     (ended,) = salvage.wait(WAIT_S)
     assert (ended.state, ended.lines, ended.text) == ("recovered", LINES, "recovered: killed")
     assert open_recording(path).lines == LINES
+
+
+def test_what_the_recorder_was_told_of_its_lines_and_did_not_write_is_listed(
+    salvage: Salvage, tmp_path: Path
+) -> None:
+    """A mark whose line was committed, and which was not, belongs to this recording and to no successor's."""
+    path = leave_open(tmp_path / "x.zarr", LINES)
+    first = open_recording(path).first_line
+    told = [Note(first + 17, "mark", "the valve opens"), Note(first + LINES, "mark", "the successor's")]
+    salvage.add([Orphan(path, "killed", LINES, (told[0], told[0], told[1]))])
+    salvage.wait(WAIT_S)
+    recording = open_recording(path)
+    marks = [event for event in recording.events if event.kind == "mark"]
+    assert [(mark.line, mark.text) for mark in marks] == [(first + 17, "the valve opens")]
+    assert marks[0].tick == recording.arms["a"].read("tick", 17, 18)[0]
 
 
 def test_a_directory_that_is_gone_is_not_called_recovered(salvage: Salvage, tmp_path: Path) -> None:
