@@ -190,7 +190,9 @@ class RigConfig(FrozenModel):
 
     @model_validator(mode="after")
     def _ring_fits(self) -> RigConfig:
-        """Lines wait for their tag in the ring, of which half must stay free for the cameras."""
+        """Lines wait for their tag in the ring, and no longer once half of it is full: a sixth is for a tag
+        that comes late on a busy host.
+        """
         lines = self.ring_slots * self.stream.block_lines
         pixel_bytes = 1 if self.cameras.a.dtype == "uint8" else 2
         if (size := lines * self.pixels * pixel_bytes) > MAX_RING_BYTES:
@@ -198,10 +200,10 @@ class RigConfig(FrozenModel):
                 f"stream.{self._ring_keys} = {lines} lines of {self.pixels} pixels "
                 f"are {size} bytes of memory per arm; possible: up to {MAX_RING_BYTES}"
             )
-        if self.trigger.tag_every_lines > lines // 2:
+        if self.trigger.tag_every_lines > lines // 3:
             raise ValueError(
                 f"trigger.tag_every_lines cannot be {self.trigger.tag_every_lines}; possible: 1 to "
-                f"{lines // 2}, half of what a ring holds (stream.{self._ring_keys})"
+                f"{lines // 3}, a third of what a ring holds (stream.{self._ring_keys})"
             )
         return self
 

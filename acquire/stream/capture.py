@@ -223,7 +223,7 @@ class Capture:
             run=plan.run,
             stages=plan.stages,
             stall_timeout_s=plan.stall_timeout_s,
-            tag_wait_s=plan.tag_wait_s,
+            tag_wait_s=plan.tag_wait_s + plan.run.tag_every_lines * plan.line_period_ns / 1e9,
             max_skew_lines=plan.max_skew_lines,
             realtime=plan.realtime,
             disk=plan.disk,

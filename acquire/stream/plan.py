@@ -57,7 +57,7 @@ class CapturePlan:
     goes_on : a recording that ended since the disk was too slow goes on in a further segment
     seal_timeout_s : at the capture's end, a recording of which nothing more reaches the disk for so long is
         given up: it is left to be recovered
-    tag_wait_s : how long lines wait for the tag that confirms them before they are flagged
+    tag_wait_s : how long lines wait for the tag that confirms them, once it is due, before they are flagged
     reopen_timeout_s : how long a camera that is gone is waited for; less than ``stall_timeout_s``, or the
         arm counts as stalled first
     line_period_ns : by the trigger's clock; 0: not told
@@ -101,12 +101,13 @@ class CapturePlan:
             )
         if self.dtype not in ("uint8", "uint16"):
             raise UsageError(f"a capture cannot have {self.dtype!r} samples", possible="uint8, uint16")
-        # Lines wait for their tag in the ring, of which half must stay free for the cameras.
-        most = self.ring_shape.slots * self.block_lines // 2
+        # Lines wait for their tag in the ring, and no longer once half of it is full: a sixth is for a tag
+        # that comes late on a busy host.
+        most = self.ring_shape.slots * self.block_lines // 3
         if not 1 <= self.run.tag_every_lines <= most:
             raise UsageError(
                 f"a capture cannot have a tag every {self.run.tag_every_lines} lines",
-                possible=f"1 to {most}, half of what a ring holds",
+                possible=f"1 to {most}, a third of what a ring holds",
                 hint="more tags, or more ring slots",
             )
 

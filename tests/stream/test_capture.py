@@ -385,6 +385,16 @@ def test_lines_without_tags_are_flagged_not_lost(tmp_path: Path) -> None:
     assert ((flags & UNCONFIRMED) == UNCONFIRMED).all()
 
 
+def test_lines_wait_for_a_tag_that_is_not_due_yet(tmp_path: Path) -> None:
+    """A tag each second, which a patience of less than that would not have waited for."""
+    bench = make_bench(tag_wait_s=0.9, line_period_ns=50_000.0)
+    bench = replace(bench, plan=replace(bench.plan, run=replace(bench.plan.run, tag_every_lines=20_000)))
+    with armed(bench) as capture:
+        capture.start(Begin(tmp_path / "r.zarr", make_spec(), 50_000))
+        status = sealed(capture)
+    assert (status.condition, status.ledger["tainted_by"]) == (RunCondition.GOOD, {})
+
+
 def test_tags_that_contradict_the_lines_taint_the_recording(tmp_path: Path) -> None:
     bench = make_bench(tag_wait_s=0.05)
     with armed(bench) as capture:
