@@ -1,7 +1,8 @@
 """The daemon's status without the models that check it: for a command that is typed again and again.
 
-The models take longer to import than the daemon takes to answer. What is not as expected is left to
-`acquire.client.Client`, which has patience with a daemon that is starting and words for one that refuses.
+The models take longer to import than the daemon takes to answer. That nobody listens is said as quickly;
+what else is not as expected is left to `acquire.client.Client`, which has patience with a daemon that is
+starting and words for one that refuses.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import json
 from typing import TYPE_CHECKING, Any
 
 from acquire.daemon.peer import connect
+from acquire.daemon.starting import is_one_starting
 from acquire.errors import NoDaemonError
 from acquire.place import default_socket
 
@@ -19,14 +21,17 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 CONNECT_TIMEOUT_S = 5.0
-NO_ANSWER = (NoDaemonError, OSError, http.client.HTTPException, LookupError, TypeError, ValueError)
+NO_ANSWER = (OSError, http.client.HTTPException, LookupError, TypeError, ValueError)
 """What `status_document`, and showing a document of another version, raise."""
 
 
 def status_document(place: Path | None) -> dict[str, Any]:
-    """The status of the daemon on a Unix socket, the default one for None, as JSON. Raises `NO_ANSWER`."""
+    """The status of the daemon on a Unix socket, the default one for None, as JSON.
+
+    Raises NoDaemonError where none listens and none is starting, else one of `NO_ANSWER`.
+    """
     connection = _Connection("acquire", timeout=CONNECT_TIMEOUT_S)
-    connection.sock = connect(place or default_socket(), CONNECT_TIMEOUT_S)
+    connection.sock = _connected(place or default_socket())
     try:
         connection.request("GET", "/status", headers={"Connection": "close"})
         answer = connection.getresponse()
@@ -38,6 +43,15 @@ def status_document(place: Path | None) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise TypeError("the status is no object")
     return document
+
+
+def _connected(place: Path) -> socket.socket:
+    try:
+        return connect(place, CONNECT_TIMEOUT_S)
+    except NoDaemonError:
+        if is_one_starting(place):
+            raise ConnectionRefusedError("a daemon is starting") from None
+        return connect(place, CONNECT_TIMEOUT_S)  # one that has just begun to listen does not start any more
 
 
 class _Connection(http.client.HTTPConnection):

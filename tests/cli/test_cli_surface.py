@@ -165,11 +165,11 @@ def test_help_loads_nothing_heavy(words: list[str]) -> None:
     assert ended.stdout.splitlines()[-1] == "loaded: []"
 
 
-def test_status_loads_no_recording_or_mathematics(tmp_path: Path) -> None:
+def test_status_loads_no_models_or_mathematics(tmp_path: Path) -> None:
     code = (
         "import sys\nfrom acquire.cli import main\n"
         "assert main() == 3\n"
-        f"print(sorted({(HEAVY - {'numpy', 'httpx'})!r} & set(sys.modules)))"
+        f"print(sorted({HEAVY | {'pydantic'}!r} & set(sys.modules)))"
     )
     ended = subprocess.run(
         [sys.executable, "-c", code, "status", "--socket", str(tmp_path / "no.sock")],
