@@ -9,7 +9,8 @@ point spread. Dark, flat and target are recorded with ``--lines`` lines each, th
 every second instrument. Then a scene of three lamps, whose shapes, places and frequencies are drawn as well,
 is reconstructed from 263 lines (voxels 3 x 1): as recorded, calibrated, and from lines that had nothing but
 the same noise. Columns: errors of shift (fine pixels), turn (degrees), DN per electron (%), gains and offsets
-in the worst column that the optics do not hide (%, DN), the splitter (%), PSNR in dB, seconds.
+in the worst column that the optics do not hide (%, DN; gain_inner: without the outermost columns, where light
+that the field's edge takes passes for gain), the splitter (%), PSNR in dB, seconds.
 
 --orientations draws 24 instruments instead (eight views of arm B, three targets each) and counts answers.
 """
@@ -202,6 +203,7 @@ def compared(drawn: Drawn, known: Calibration, directory: Path) -> dict[str, flo
     errors = np.where(hidden, 0.0, gains - own / np.array(level)[:, None])
     errors -= np.array([row[~out].mean() for row, out in zip(errors, hidden, strict=True)])[:, None]
     errors[hidden] = 0
+    inner = errors[:, 1:-1][~hidden[:, 1:-1]]
     balance = known.quantities["balance"].value
     truth = np.array([drawn.part_a, 1 - drawn.part_a]) * np.array(level)
     dark_truth = fixed(drawn, "dark", DARK, directory)
@@ -211,6 +213,7 @@ def compared(drawn: Drawn, known: Calibration, directory: Path) -> dict[str, flo
         "magnification": abs(at.magnification - drawn.magnification),
         "dn_per_e_percent": 100 * float(np.abs(K_found / K - 1).max()),
         "gain_percent": 100 * float(np.abs(errors).max()),
+        "gain_inner_percent": 100 * float(np.abs(inner - inner.mean()).max()),
         "offset_dn": float(np.abs(offset - dark_truth).max()),
         "splitter_percent": 100 * abs(float(balance[0] / balance.sum() / (truth[0] / truth.sum()) - 1)),
     }

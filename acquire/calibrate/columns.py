@@ -100,8 +100,9 @@ def flat(
     """Gain per column and the arms' balance, from a uniform scene under steady light.
 
     ``smooth``: the scene is not quite uniform, and a smooth profile (polynomial of degree 4) is its own, not
-    the columns'. Columns at the edge that the optics leave dark get the gain 1. Raises UsageError for lines
-    that are too dark or saturated, a code that is not steady, and without a dark.
+    the columns'. Columns at the edge that the optics leave dark get the gain 1; the gain of the others at the
+    edge may hold some of the field's, and their uncertainty says how much. Raises UsageError for lines that
+    are too dark or saturated, a code that is not steady, and without a dark.
     """
     refuse_coded(exposure, "flat")
     offset = offset_of(known, "flat")
@@ -124,6 +125,8 @@ def flat(
     own_error = np.sqrt(np.maximum(found.own_variance, QUANTISATION) / found.lines[:, None])
     relative = np.hypot(own_error, known.quantities["offset_dn"].uncertainty)
     relative = relative / np.where(alive, light, np.inf)  # a column that sees nothing has no gain
+    # what the field's edge takes from the outermost is not seen below the spread of the columns' own gains
+    relative[:, [0, -1]] = np.hypot(relative[:, [0, -1]], _spread(shape, trusted) / np.sqrt(2))
     gain = np.where(trusted, shape / level, 1.0)
     arm_error = np.sqrt((error**2).sum(axis=1)) / light.sum(axis=1)
     balance = arms / arms.mean()
@@ -159,22 +162,31 @@ def _dark_edges(shape: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArra
 def _blurred(
     shape: NDArray[np.float64], usable: NDArray[np.bool_], dark: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """The outermost columns, where all of them together lack light: a lens blurs the field's edge.
+    """The outermost columns, where together they lack light: a lens blurs the field's edge.
 
-    Each alone lacks no more than columns differ; the four of both arms do not do so by chance.
+    Each alone lacks no more than columns differ; the four of both arms do not do so by chance. Of an arm, a
+    dark one is evidence against the other, which its own gain may make as bright as the rest.
     """
     outermost = np.zeros_like(usable)
     outermost[:, [0, -1]] = True
-    witnesses = outermost & usable & ~dark
-    inner = [row[good] for row, good in zip(shape, usable & ~outermost, strict=True)]
-    middle = np.array([np.median(row) for row in inner])[:, None]
-    spread = np.mean([1.4826 * np.median(np.abs(row / np.median(row) - 1)) for row in inner])
-    count = witnesses.sum()
-    if not count:
-        return witnesses
-    lack = 1 - float((shape / middle)[witnesses].mean())
-    blurred = lack > max(TOGETHER * spread / np.sqrt(count), LEAST_LACK)
-    return witnesses if blurred else np.zeros_like(witnesses)
+    witnesses = outermost & usable
+    middle = np.array([np.median(row[good]) for row, good in zip(shape, usable & ~outermost, strict=True)])[
+        :, None
+    ]
+    lack, spread = 1 - shape / middle, _spread(shape, usable & ~outermost)
+    hidden = np.zeros_like(usable)
+    for told in (witnesses & ~dark, *(witnesses & row for row in np.eye(len(shape), dtype=bool)[..., None])):
+        if (count := told.sum()) and float(lack[told].mean()) > max(
+            TOGETHER * spread / np.sqrt(count), LEAST_LACK
+        ):
+            hidden |= told
+    return hidden
+
+
+def _spread(shape: NDArray[np.float64], usable: NDArray[np.bool_]) -> float:
+    """Standard deviation of the columns' own response, of both arms."""
+    inner = [row[good] for row, good in zip(shape, usable, strict=True)]
+    return float(np.mean([1.4826 * np.median(np.abs(row / np.median(row) - 1)) for row in inner]))
 
 
 def _responses(shape: NDArray[np.float64], edges: NDArray[np.bool_]) -> dict[str, dict[str, float]]:

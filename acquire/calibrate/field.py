@@ -31,11 +31,13 @@ BALANCE_ERROR = 5e-4
 
 
 def profile(alignment: Alignment, stages: int, substeps: int) -> NDArray[np.float64]:
-    """Part of the light that each pixel of arm B gets where nothing is lit beyond arm A's field: (M,)."""
+    """Part of the light that each pixel of arm B gets where nothing is lit beyond arm A's field: (M,).
+
+    Of a fine pixel that reaches over the field's edge, the part within it.
+    """
     size = stages * substeps
-    rows, columns = alignment.sources(size)
-    inside = (rows >= 0) & (rows <= size - 1) & (columns >= 0) & (columns <= size - 1)
-    lit: NDArray[np.float64] = inside.mean(axis=1).reshape(stages, substeps).mean(axis=1)
+    down, right = (np.clip(np.minimum(each + 1, size - each), 0, 1) for each in alignment.sources(size))
+    lit: NDArray[np.float64] = (down * right).mean(axis=1).reshape(stages, substeps).mean(axis=1)
     return lit
 
 

@@ -9,7 +9,7 @@ import pytest
 from instruments import ALL, COLUMNS, NOISE, columns_truth, record, white
 
 from acquire.calibrate import Calibration
-from acquire.calibrate.columns import ambient, dark, flat
+from acquire.calibrate.columns import _dark_edges, ambient, dark, flat
 from acquire.calibrate.exposure import Exposure, open_exposure
 from acquire.calibrate.transfer import transfer
 from acquire.errors import UsageError
@@ -69,6 +69,20 @@ def test_a_blurred_edge_of_the_field_is_no_gain(tmp_path: Path, sigma: float | N
     step = measured(*map(open_exposure, paths)).steps["flat"]
     edge = {0, 23}
     assert all(edge.issubset(step["optics_hide_columns"][arm]) is hidden for arm in ARMS)
+
+
+def test_a_bright_column_does_not_hide_the_edge_of_its_arm() -> None:
+    """The column at the other end is dark: that both are is what the optics do."""
+    own = 1 + 0.018 * np.random.default_rng(3).standard_normal((2, 64))
+    own[:, [0, -1]] = [[1.055, 0.966], [1.0, 1.0]]
+    seen = own.copy()
+    seen[0, [0, -1]] *= 0.93
+    usable = np.ones(seen.shape, bool)
+    found, without = (_dark_edges(each, usable) for each in (seen, own))
+    assert found[0, [0, -1]].all()
+    assert not without[:, 1:-1].any()
+    assert not without[0, 0]
+    assert not found[1].any()
 
 
 @pytest.mark.parametrize("part_a", [0.46, 0.5, 0.57])

@@ -44,7 +44,8 @@ class Misregistration(Effect):
 
         alignment = Alignment(self.rows, self.columns, self.turn_deg, self.magnification)
         back = np.linalg.inv(alignment.matrix)
-        mode: Literal["nearest", "constant"] = "nearest" if self.beyond == "edge" else "constant"
+        # not "constant", which makes a pixel that reaches over the edge by a hundredth wholly dark
+        mode: Literal["nearest", "grid-constant"] = "nearest" if self.beyond == "edge" else "grid-constant"
         middle = np.full(2, (setting.scene.size - 1) / 2)
         offset = middle - back @ (middle + np.array([self.rows, self.columns]))
 

@@ -41,7 +41,10 @@ class LensDistortion(Effect):
         source = seen * (1 - self.part * (seen**2).sum(axis=0) / half**2) + middle
 
         def run(frames: NDArray[np.float32]) -> NDArray[np.float32]:
-            return np.stack([map_coordinates(frame, source, order=1, mode="constant") for frame in frames])
+            # not "constant", which makes a pixel that reaches over the edge by a hundredth wholly dark
+            return np.stack(
+                [map_coordinates(frame, source, order=1, mode="grid-constant") for frame in frames]
+            )
 
         return [Stage("lens_distortion", "image", run)]
 
