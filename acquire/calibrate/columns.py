@@ -112,7 +112,7 @@ def flat(
     response = light / exposure.camera("responsivity_dn")[:, None]
     alive, middle = response > 0, np.median(response, axis=1, keepdims=True)
     shape = response / _profile(response, alive) if smooth else response
-    edges = _dark_edges(shape, alive)
+    edges = dark_edges(shape, alive)
     usable = response > np.where(edges, DARK, DEAD) * middle
     trusted = usable & ~edges
     if known.usable is not None:
@@ -146,7 +146,7 @@ def flat(
     return Finding("flat", exposure.instrument, quantities, usable, facts=facts, warnings=warnings)
 
 
-def _dark_edges(shape: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def dark_edges(shape: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Columns from either edge inwards that are below all others: what lies beyond the field is dark."""
     dark = np.zeros_like(usable)
     most = max(1, round(EDGE_SHARE * shape.shape[1]))
@@ -170,16 +170,15 @@ def _blurred(
     outermost = np.zeros_like(usable)
     outermost[:, [0, -1]] = True
     witnesses = outermost & usable
-    middle = np.array([np.median(row[good]) for row, good in zip(shape, usable & ~outermost, strict=True)])[
-        :, None
-    ]
-    lack, spread = 1 - shape / middle, _spread(shape, usable & ~outermost)
+    inner = usable & ~outermost
+    middle = np.array([[np.median(row[good])] for row, good in zip(shape, inner, strict=True)])
+    lack, spread = 1 - shape / middle, _spread(shape, inner)
+    of_one_arm = [witnesses & arm[:, None] for arm in np.eye(len(shape), dtype=bool)]
     hidden = np.zeros_like(usable)
-    for told in (witnesses & ~dark, *(witnesses & row for row in np.eye(len(shape), dtype=bool)[..., None])):
-        if (count := told.sum()) and float(lack[told].mean()) > max(
-            TOGETHER * spread / np.sqrt(count), LEAST_LACK
-        ):
-            hidden |= told
+    for group in (witnesses & ~dark, *of_one_arm):
+        count = group.sum()
+        if count and float(lack[group].mean()) > max(TOGETHER * spread / np.sqrt(count), LEAST_LACK):
+            hidden |= group
     return hidden
 
 
@@ -200,7 +199,7 @@ def _responses(shape: NDArray[np.float64], edges: NDArray[np.bool_]) -> dict[str
 def _profile(response: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.float64]:
     """The smooth part of each arm's response: a polynomial of the columns."""
     x = np.linspace(-1, 1, response.shape[1])
-    inner = usable & ~_dark_edges(response, usable)
+    inner = usable & ~dark_edges(response, usable)
     fits = [
         np.polynomial.chebyshev.Chebyshev.fit(x[good], row[good], min(SMOOTH_DEGREE, good.sum() - 1), [-1, 1])
         for row, good in zip(response, inner, strict=True)

@@ -9,7 +9,7 @@ import pytest
 from instruments import ALL, COLUMNS, NOISE, columns_truth, record, white
 
 from acquire.calibrate import Calibration
-from acquire.calibrate.columns import _dark_edges, ambient, dark, flat
+from acquire.calibrate.columns import ambient, dark, dark_edges, flat
 from acquire.calibrate.exposure import Exposure, open_exposure
 from acquire.calibrate.transfer import transfer
 from acquire.errors import UsageError
@@ -78,7 +78,7 @@ def test_a_bright_column_does_not_hide_the_edge_of_its_arm() -> None:
     seen = own.copy()
     seen[0, [0, -1]] *= 0.93
     usable = np.ones(seen.shape, bool)
-    found, without = (_dark_edges(each, usable) for each in (seen, own))
+    found, without = (dark_edges(each, usable) for each in (seen, own))
     assert found[0, [0, -1]].all()
     assert not without[:, 1:-1].any()
     assert not without[0, 0]
