@@ -109,6 +109,7 @@ def main() -> None:
     parser.add_argument("--case", help="only those whose name has this", default="")
     add_option(parser)
     options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
     with recorded("bench_capture", keep=options.record) as run:
         for name in (name for name in LOADS if options.case in name):
             mb_s, cpu = bare_write(options.out)

@@ -17,14 +17,15 @@ import json
 import os
 import re
 import select
+import signal
 import socket
 import statistics
 import subprocess
 import sys
 import tempfile
-import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 from shutil import rmtree, which
@@ -90,20 +91,23 @@ def rig_of(directory: Path, *, small: bool) -> RigConfig:
     )
 
 
-@contextlib.contextmanager
-def daemon(config: RigConfig, socket_path: Path) -> Iterator[TimedRig]:
-    """A daemon in a thread of this process; its workers are processes as ever."""
+def beside_a_daemon(config: RigConfig, socket_path: Path, measure: Callable[[TimedRig], None]) -> None:
+    """Run ``measure`` in a thread; the daemon has the main one, which gets its signals, and ends with it."""
     with contextlib.closing(Endpoint(socket_path)) as endpoint, Rig(config) as plain:
         rig = TimedRig(plain)
         warm_up(*worker_modules(plain), "acquire.capacity.latency")
         service = Service(config, lambda _="rig": Run(config, rig))  # type: ignore[arg-type,misc]
-        served = Daemon(service, endpoint)
-        served._take_signals = lambda: None  # type: ignore[method-assign]
-        thread = threading.Thread(target=asyncio.run, args=(served.run(),))
-        thread.start()
-        yield rig
-        served._ending.set()
-        thread.join()
+
+        def measured() -> None:
+            try:
+                measure(rig)
+            finally:
+                os.kill(os.getpid(), signal.SIGTERM)
+
+        with ThreadPoolExecutor(1) as threads:
+            measuring = threads.submit(measured)
+            asyncio.run(Daemon(service, endpoint).run())
+            measuring.result()
 
 
 @contextlib.contextmanager
@@ -268,29 +272,30 @@ def main() -> None:
     parser.add_argument("--small", action="store_true")
     add_option(parser)
     options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
     with (
         recorded("bench_page", keep=options.record) as run,
         tempfile.TemporaryDirectory(dir=options.out) as place,
     ):
         directory = Path(place)
-        config = rig_of(directory, small=options.small)
-        with (
-            daemon(config, directory / "c.sock") as rig,
-            page(directory / "c.sock", directory) as (process, address),
-        ):
-            client = Client(directory / "c.sock")
-            client.arm(force=True)
-            time.sleep(2)
-            taken = rounds(client, rig, directory, address, process, options, run)
-            print(compared(*taken))
-            used = cores(process, 5.0)
-            print(f"without clients: {used:.3f} cores of the page's process")
-            run.add("page's process, no client", cores=used, pictures_to_each_mb_s=None)
-            if which("chromium"):
-                found = browse(address, client)
-                print("browser:", found)
-                run.add("browser", **found)
-            client.disarm()
+
+        def measure(rig: TimedRig) -> None:
+            with page(directory / "c.sock", directory) as (process, address):
+                client = Client(directory / "c.sock")
+                client.arm(force=True)
+                time.sleep(2)
+                taken = rounds(client, rig, directory, address, process, options, run)
+                print(compared(*taken))
+                used = cores(process, 5.0)
+                print(f"without clients: {used:.3f} cores of the page's process")
+                run.add("page's process, no client", cores=used, pictures_to_each_mb_s=None)
+                if which("chromium"):
+                    found = browse(address, client)
+                    print("browser:", found)
+                    run.add("browser", **found)
+                client.disarm()
+
+        beside_a_daemon(rig_of(directory, small=options.small), directory / "c.sock", measure)
 
 
 if __name__ == "__main__":

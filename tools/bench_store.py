@@ -322,6 +322,7 @@ def main() -> None:
     parser.add_argument("--cut", nargs=2, metavar=("RECORDING", "LINE"), help=argparse.SUPPRESS)
     add_option(parser)
     options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
     if options.cut:
         cut_here(Path(options.cut[0]), int(options.cut[1]))
         return

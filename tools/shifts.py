@@ -390,6 +390,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, default=Path(tempfile.gettempdir()))
     parser.add_argument("--no-browser", action="store_true")
     options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
     home = Path(tempfile.mkdtemp(prefix="acquire-night-", dir=options.out))
     begun_s = time.monotonic()
     browser = which("chromium") is not None and not options.no_browser
