@@ -109,9 +109,12 @@ def main() -> None:
     parser.add_argument("--case", help="only those whose name has this", default="")
     add_option(parser)
     options = parser.parse_args()
+    cases = [name for name in LOADS if options.case in name]
+    if not cases:
+        parser.error(f"no case has {options.case!r} in its name; there are: {'; '.join(LOADS)}")
     options.out.mkdir(parents=True, exist_ok=True)
     with recorded("bench_capture", keep=options.record) as run:
-        for name in (name for name in LOADS if options.case in name):
+        for name in cases:
             mb_s, cpu = bare_write(options.out)
             copy_gb_s = bare_copy()
             print(f"bare O_DIRECT write {mb_s:.0f} MB/s, {cpu:.3f} s per GB; memcpy {copy_gb_s:.1f} GB/s")

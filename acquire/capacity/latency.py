@@ -32,13 +32,15 @@ class Latencies:
         self._words[:] = memoryview(bytes((self.BINS + 1) * WORD_BYTES)).cast("q")
 
     def percentiles_ms(self) -> dict[str, float]:
-        """Upper ends of the steps; 0 where nothing was added."""
+        """Upper ends of the steps, at most the latest of all; 0 where nothing was added."""
         reached = np.cumsum(np.array(self._words[: self.BINS]))
-        found = {
-            name: float(np.searchsorted(reached, part * reached[-1]) + 1) * self.STEP_NS / 1e6
-            for name, part in (("p50", 0.5), ("p99", 0.99), ("p99.9", 0.999))
-        }
-        return found | {"max": self._words[self.BINS] / 1e6}
+        latest_ns = int(self._words[self.BINS])
+        found = {"max": latest_ns / 1e6}
+        for name, part in (("p50", 0.5), ("p99", 0.99), ("p99.9", 0.999)):
+            step = int(np.searchsorted(reached, part * reached[-1]))
+            is_last = step >= self.BINS - 1  # it holds whatever was later, too
+            found[name] = (latest_ns if is_last else min((step + 1) * self.STEP_NS, latest_ns)) / 1e6
+        return found
 
     def close(self) -> None:
         """Release the memory. Idempotent."""
