@@ -1,4 +1,4 @@
-"""Codes as a user says them: a register and its state, bits in a file or in hexadecimal, or a constant."""
+"""Codes as a user writes them: a register and its state, bits in a file or in hexadecimal, or a constant."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from acquire.codes import MOST_LISTED_BITS, ConstantCode, ListedCode, PrbsCode
 from acquire.errors import UsageError
-from acquire.exchange.foreign import check_file
+from acquire.exchange.foreign import check_file, mapped
 from acquire.reading import read_regular
 from acquire.store.refusals import refused
 from acquire.text import shortened
@@ -68,12 +68,12 @@ def _from_array(path: Path) -> NDArray[np.uint8]:
     check_file(path)
     with refused(path, "read"):
         try:
-            found = np.load(path, mmap_mode="r", allow_pickle=False)
+            found = mapped(path)
         except ValueError as error:
-            raise UsageError(f"{path} is no array of NumPy's: {error}") from error
-    if not isinstance(found, np.ndarray):
-        raise UsageError(f"{path} is an archive of several arrays", possible="one array in a .npy file")
-    if found.ndim != 1 or not 0 < len(found) <= MOST_LISTED_BITS or not np.isin(found, (0, 1)).all():
+            raise UsageError(f"{path} cannot be read as NumPy: {error}") from error
+    # Records cannot be compared with numbers, and of complex numbers the half would be dropped.
+    is_real = found.dtype.kind in "biuf" and found.ndim == 1
+    if not (is_real and 0 < len(found) <= MOST_LISTED_BITS and np.isin(found, (0, 1)).all()):
         raise UsageError(
             f"{path} holds no bits: {found.dtype} {found.shape}",
             possible=f"one axis of up to {MOST_LISTED_BITS} values, 0 or 1",

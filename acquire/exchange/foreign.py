@@ -9,13 +9,16 @@ Everything that can be wrong with a file's shape or type is found when it is ope
 
 from __future__ import annotations
 
+import lzma
 import math
+import zlib
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.lib import format as npy
 
 from acquire.errors import DataError, PlaceError, UsageError
 from acquire.exchange.libraries import library
@@ -42,7 +45,11 @@ KINDS = {
 """What a file's name ends with → what it is."""
 TYPES = ("uint8", "uint16")
 MOST_PAGE_BYTES = 2**28
-"""Of one page of a TIFF file that is not in one piece: it is unpacked whole."""
+"""Of one page of a TIFF file that is not in one piece: it is unpacked whole, one of each arm at a time."""
+MALFORMED = (*DAMAGE, zlib.error, lzma.LZMAError)
+"""What libraries raise for damaged files: tifffile passes on the errors of its decompressors."""
+ARCHIVE = b"PK\x03\x04"
+"""What an ``.npz`` file begins with."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +99,7 @@ class LineFile:
         """Lines ``start`` to ``stop - 1`` (line, pixel), in the machine's byte order. Raises DataError."""
         try:
             found = np.asarray(self.read(arm, start, stop))
-        except DAMAGE as error:
+        except MALFORMED as error:
             raise DataError(f"{self.path}: lines {start} to {stop - 1} cannot be read: {error}") from error
         if found.shape != (stop - start, self.pixels):
             raise DataError(f"{self.path} ends before line {stop}: it was cut short")
@@ -108,7 +115,7 @@ def open_lines(path: Path, layout: Layout) -> Iterator[LineFile]:
         check_file(path)
         try:
             file = openers[kind](path, layout, held)
-        except DAMAGE as error:
+        except MALFORMED as error:
             raise UsageError(f"{path} cannot be read as {kind}: {error}") from error
         shape = " x ".join(map(str, file.shape))
         if len(file.shape) not in {2, 3} or 0 in file.shape or file.arms not in {1, 2}:
@@ -130,6 +137,15 @@ def check_file(path: Path) -> None:
     with refused(path, "read"):
         if (kind := kind_of(path.stat().st_mode)) is not None:
             raise PlaceError(f"{path} cannot be read: it is {kind}", possible="a file")
+
+
+def mapped(path: Path) -> np.memmap[Any, np.dtype[Any]]:
+    """The array of a ``.npy`` file, read when sliced. UsageError for an archive, ValueError for junk."""
+    # np.load would open the archive, and leave the file open where that fails: one that was cut short.
+    with path.open("rb") as file:
+        if file.read(len(ARCHIVE)) == ARCHIVE:
+            raise UsageError(f"{path} is an archive of several arrays", possible="one array in a .npy file")
+    return npy.open_memmap(path, mode="r")
 
 
 def _kind(path: Path, layout: Layout) -> str:
@@ -193,9 +209,7 @@ def _plain(
 
 
 def _numpy(path: Path, _: Layout, __: ExitStack) -> LineFile:
-    array = np.load(path, mmap_mode="r", allow_pickle=False)
-    if not isinstance(array, np.memmap):
-        raise UsageError(f"{path} is an archive of several arrays", possible="one array in a .npy file")
+    array = mapped(path)
     in_order = array.flags.c_contiguous
     read = _plain(path, array.dtype, array.shape, array.offset) if in_order else _sliced(array)
     return LineFile(path, "NumPy", array.shape, array.dtype, read)
@@ -204,10 +218,20 @@ def _numpy(path: Path, _: Layout, __: ExitStack) -> LineFile:
 def _hdf5(path: Path, layout: Layout, held: ExitStack) -> LineFile:
     h5py = library("h5py", "export", "an HDF5 file")
     file = held.enter_context(h5py.File(path, "r"))
-    name = layout.dataset or _only_dataset(path, file, h5py)
+    there = _datasets(file, h5py)
+    if layout.dataset is None:
+        # An export of ours has its flags beside the lines, and they are uint16 of two axes, too.
+        found = [name for name in there if not name.endswith("/flags")]
+        if len(found) != 1:
+            raise UsageError(
+                f"{path} has {len(found)} arrays that could be lines",
+                possible=", ".join(found) or "arrays of uint8 or uint16, (line, pixel) or (arm, line, pixel)",
+                hint="--dataset PATH" if found else "",
+            )
+    name = found[0] if layout.dataset is None else layout.dataset
     dataset = file.get(name)
     if not isinstance(dataset, h5py.Dataset):
-        raise UsageError(f"{path} has no dataset {name!r}", possible=", ".join(_datasets(file, h5py)))
+        raise UsageError(f"{path} has no dataset {name!r}", possible=", ".join(there))
     return LineFile(
         path=path,
         kind="HDF5",
@@ -228,17 +252,6 @@ def _datasets(file: Any, h5py: Any) -> list[str]:
 
     file.visititems(visit)
     return found
-
-
-def _only_dataset(path: Path, file: Any, h5py: Any) -> str:
-    found = [name for name in _datasets(file, h5py) if not name.endswith("/flags")]
-    if len(found) != 1:
-        raise UsageError(
-            f"{path} has {len(found)} arrays that could be lines",
-            possible=", ".join(found) or "arrays of uint8 or uint16, (line, pixel) or (arm, line, pixel)",
-            hint="--dataset PATH" if found else "",
-        )
-    return found[0]
 
 
 def _raw(path: Path, layout: Layout, _: ExitStack) -> LineFile:
@@ -290,19 +303,20 @@ def _pages(path: Path, series: Any, lines: tuple[int, ...]) -> Callable[[int | N
             possible=f"up to {MOST_PAGE_BYTES} bytes in a page",
             hint="the file without compression",
         )
-    last: dict[int, NDArray[Any]] = {}
+    # An import reads blocks of the arms in turn: with one page for both, each block would unpack one anew.
+    last: dict[int, tuple[int, NDArray[Any]]] = {}
 
-    def page(number: int) -> NDArray[Any]:
-        if number not in last:
-            last.clear()
-            last[number] = series.pages[number].asarray().reshape(rows, pixels)
-        return last[number]
+    def page(arm: int, number: int) -> NDArray[Any]:
+        if arm not in last or last[arm][0] != number:
+            last.pop(arm, None)  # before the next is unpacked: never two of one arm in memory
+            last[arm] = number, series.pages[number].asarray().reshape(rows, pixels)
+        return last[arm][1]
 
     def read(arm: int | None, start: int, stop: int) -> NDArray[Any]:
         offset = (arm or 0) * lines[-2]
         first, end = start + offset, stop + offset
         parts = [
-            page(number)[max(0, first - number * rows) : end - number * rows]
+            page(arm or 0, number)[max(0, first - number * rows) : end - number * rows]
             for number in range(first // rows, -(-end // rows))
         ]
         return np.concatenate(parts)

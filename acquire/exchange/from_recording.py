@@ -131,17 +131,10 @@ def _of_arms(recording: Recording, rows: range, name: str) -> Iterator[Block]:
 def _of_either(recording: Recording, rows: range, name: str) -> Iterator[Block]:
     """Tags of arm a; where its line is missing, those of arm b."""
     for start, stop in _steps(recording, rows):
-        (missing, values), (_, others) = (_tags(recording, arm, name, start, stop) for arm in ARMS)
-        both = np.where(missing, others, values)
+        flags = {arm: flags_of(recording, arm, start, stop) for arm in ARMS}
+        first, other = (present_values(recording, arm, name, start, flags[arm]) for arm in ARMS)
+        both = np.where((flags[ARMS[0]] & MISSING) != 0, other, first)
         yield block((_place(rows, start, stop),), both[:: rows.step])
-
-
-def _tags(
-    recording: Recording, arm: str, name: str, start: int, stop: int
-) -> tuple[NDArray[np.bool_], NDArray[Any]]:
-    """Which rows are missing, and the tags of the others."""
-    flags = flags_of(recording, arm, start, stop)
-    return (flags & MISSING) != 0, present_values(recording, arm, name, start, flags)
 
 
 def _place(rows: range, start: int, stop: int) -> slice:
@@ -159,6 +152,6 @@ def _all_flags(flags: NDArray[np.uint16], count: int) -> NDArray[np.uint16]:
 def _means(lines: NDArray[Any], flags: NDArray[np.uint16], count: int) -> NDArray[np.float32]:
     """Of ``count`` lines each, without those that are missing, which are 0."""
     edges = np.arange(0, len(lines), count)
-    total = np.add.reduceat(lines, edges, axis=0, dtype=np.float64)
+    total = np.add.reduceat(lines, edges, axis=0, dtype=np.float64)  # a sum of uint16 would overflow
     there = np.add.reduceat((flags & MISSING) == 0, edges, dtype=np.int64)
     return (total / np.maximum(there, 1)[:, None]).astype(np.float32)

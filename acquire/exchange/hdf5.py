@@ -76,16 +76,13 @@ def _write_axis(data: Any, axis: Axis, count: int) -> None:
 
 
 def _write(data: Any, array: Array, advance: Callable[[int], object]) -> None:
-    dataset = data.create_dataset(array.name, array.shape, array.dtype, chunks=_chunks(array))
+    """In chunks of about `CHUNK_BYTES`: frames, or lines of one arm, since no block has lines of both."""
+    ahead = 1 if array.dims[0] == "arm" else 0
+    row_bytes = array.dtype.itemsize * int(np.prod(array.shape[ahead + 1 :]))
+    rows = min(array.shape[ahead], max(1, CHUNK_BYTES // row_bytes))
+    chunks = (*(1,) * ahead, rows, *array.shape[ahead + 1 :])
+    dataset = data.create_dataset(array.name, array.shape, array.dtype, chunks=chunks)
     dataset.attrs.update(array.attributes)
     for index, block in array.blocks():
         dataset[index] = block
         advance(block.nbytes)
-
-
-def _chunks(array: Array) -> tuple[int, ...]:
-    """Frames, or lines of one arm, of about `CHUNK_BYTES`."""
-    ahead = 1 if array.dims[0] == "arm" else 0
-    row_bytes = array.dtype.itemsize * int(np.prod(array.shape[ahead + 1 :]))
-    rows = min(array.shape[ahead], max(1, CHUNK_BYTES // row_bytes))
-    return (*(1,) * ahead, rows, *array.shape[ahead + 1 :])

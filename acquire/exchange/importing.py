@@ -244,6 +244,7 @@ def _spec(
 ) -> RecordingSpec:
     file = next(iter(arms.values())).file
     dtype = file.dtype.newbyteorder("=")
+    # Of a short import no chunk is much longer than the lines there are: the rest would be filler.
     chunk_lines = min(
         usual_chunk_lines(file.pixels * dtype.itemsize, instrument.line_rate_hz),
         1 << max(4, lines.bit_length()),

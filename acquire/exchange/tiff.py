@@ -43,7 +43,7 @@ def write_tiff(path: Path, content: Content, advance: Callable[[int], object], *
     """Raises OSError as the disk gives it."""
     tifffile = library("tifffile", "export", "a TIFF file")
     kind: dict[str, Any] = {"ome": True, "bigtiff": True} if ome else {"imagej": True}
-    beside = content.beside if ome else ()
+    beside, (*_, y, x) = content.beside if ome else (), content.axes
     with tifffile.TiffWriter(path, byteorder="<", **kind) as writer:
         writer.write(
             None,
@@ -51,13 +51,14 @@ def write_tiff(path: Path, content: Content, advance: Callable[[int], object], *
             dtype=content.image.dtype,
             photometric="minisblack",
             metadata=_ome(content) if ome else _imagej(content),
-            resolution=_resolution(content),
+            resolution=(1 / (x.step or 1.0), 1 / (y.step or 1.0)),  # pixels per unit
             resolutionunit="NONE",
         )
         for array in beside:
             about = {"axes": "TYX", "Name": array.name, "Description": json.dumps(array.attributes)}
             empty = {"shape": array.shape, "dtype": array.dtype, "photometric": "minisblack"}
             writer.write(None, **empty, metadata=about)
+    # The writer has left room for the pixels; only a reader of the finished headers knows where.
     with tifffile.TiffFile(path) as reader:
         places = [each.dataoffset for each in reader.series]
     with path.open("r+b") as file:
@@ -66,12 +67,6 @@ def write_tiff(path: Path, content: Content, advance: Callable[[int], object], *
             for _, block in array.blocks():
                 file.write(np.ascontiguousarray(block).data)
                 advance(block.nbytes)
-
-
-def _resolution(content: Content) -> tuple[float, float]:
-    """Pixels per unit, along x and y."""
-    *_, y, x = content.axes
-    return 1 / (x.step or 1.0), 1 / (y.step or 1.0)
 
 
 def _imagej(content: Content) -> dict[str, Any]:

@@ -60,6 +60,7 @@ def _video(place: str, group: str | None) -> xarray.Dataset:
     levels = open_video(place).attrs["ome"]["multiscales"][0]["datasets"]
     smaller = [str(level["path"]) for level in levels[1:]]
     store = source_of(place).zarr_store()
+    # With chunks=None xarray reads lazily without dask, which may not be installed.
     dataset: xarray.Dataset = xarray.open_zarr(store, consolidated=False, chunks=None, drop_variables=smaller)
     return dataset.rename({"0": IMAGE})
 

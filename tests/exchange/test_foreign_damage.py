@@ -1,0 +1,75 @@
+"""Files of other programs that are cut short, damaged or packed: refused by name, and unpacked once."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+import tifffile
+
+from acquire.errors import DataError, UsageError
+from acquire.exchange import Layout, open_lines, parse_code
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+@pytest.mark.parametrize(
+    ("raw", "words"),
+    [(b"", "cannot be read as NumPy"), (b"PK\x03\x04 cut short", "is an archive of several arrays")],
+)
+def test_a_cut_numpy_file_is_refused_as_lines_and_as_code(tmp_path: Path, raw: bytes, words: str) -> None:
+    path = tmp_path / "cut.npy"
+    path.write_bytes(raw)
+    with pytest.raises(UsageError, match=words), open_lines(path, Layout()):
+        pass
+    with pytest.raises(UsageError, match=words):
+        parse_code(f"bits:{path}")
+
+
+@pytest.mark.parametrize(
+    "values", [np.zeros(3, [("bit", "u1")]), np.ones(3, np.complex64), np.ones((2, 3)), np.uint8(1)]
+)
+def test_what_is_no_row_of_real_numbers_holds_no_bits(tmp_path: Path, values: np.ndarray) -> None:
+    path = tmp_path / "code.npy"
+    np.save(path, values)
+    with pytest.raises(UsageError, match="holds no bits"):
+        parse_code(f"bits:{path}")
+
+
+@pytest.mark.parametrize("compression", ["zlib", "lzma"])
+def test_a_damaged_page_is_an_error_of_the_lines_in_it(tmp_path: Path, compression: str) -> None:
+    path = tmp_path / "damaged.tif"
+    lines = np.random.default_rng(3).integers(0, 200, (4, 64, 32), np.uint8)
+    tifffile.imwrite(path, lines, compression=compression, photometric="minisblack")
+    with tifffile.TiffFile(path) as file:
+        place = file.pages[1].dataoffsets[0]
+    with path.open("r+b") as raw:
+        raw.seek(place)
+        raw.write(b"\xff" * 40)
+    with open_lines(path, Layout()) as found:
+        np.testing.assert_array_equal(found.rows(None, 0, 64), lines[0])
+        with pytest.raises(DataError, match="lines 60 to 69 cannot be read"):
+            found.rows(None, 60, 70)
+
+
+def test_arms_read_in_turn_unpack_each_page_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "arms.tif"
+    lines = np.random.default_rng(4).integers(0, 200, (2, 64, 32), np.uint8)
+    tifffile.imwrite(path, lines, compression="zlib", photometric="minisblack", metadata={"axes": "CYX"})
+    unpacked = []
+    whole = tifffile.TiffPage.asarray
+
+    def counted(page: tifffile.TiffPage) -> np.ndarray:
+        unpacked.append(page.index)
+        return whole(page)
+
+    monkeypatch.setattr(tifffile.TiffPage, "asarray", counted)
+    with open_lines(path, Layout()) as found:
+        assert found.arms == 2
+        for start in range(0, 64, 16):
+            for arm in (0, 1):
+                part = found.rows(arm, start, start + 16)
+                np.testing.assert_array_equal(part, lines[arm, start : start + 16])
+    assert unpacked == [0, 1]
