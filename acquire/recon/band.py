@@ -76,9 +76,9 @@ class BandOperator:
         merging = column_merging(geometry, spatial_merge)
         self._registration = registration(alignment, geometry, spatial_merge, basis.arrays)
         starts, lengths = block_bounds(geometry.size, spatial_merge)
-        lit = self._lit_cosines(code, basis, temporal_merge)
+        lit = lit_cosines(code, basis, temporal_merge)
         flipped = geometry.size - starts - lengths
-        factors = [_staircase(lit, order, lengths, geometry) for order in (starts, flipped)]
+        factors = [staircase(lit, order, lengths, geometry) for order in (starts, flipped)]
         mergings: list[NDArray[Any]] = [merging, merging]
         if blur is not None:
             # along the transfer it is the factor's, across it that of the merging: frames cost nothing more
@@ -140,13 +140,6 @@ class BandOperator:
         side, pixels = merging.shape
         return (factor.T @ arm) @ merging.T if side > pixels else factor.T @ (arm @ merging.T)
 
-    @staticmethod
-    def _lit_cosines(code: NDArray[np.uint8], basis: Basis, temporal_merge: int) -> NDArray[Any]:
-        """E(t)·D_k(t // T_m): (T, K)."""
-        frame = np.arange(len(code)) // temporal_merge
-        lit: NDArray[Any] = basis.matrix().T[frame] * code[:, None].astype(basis.arrays.dtype)
-        return lit
-
 
 class InBasis:
     """Λ′·Dᵀ by synthesising the video and shearing it: for a full basis, K = T."""
@@ -176,7 +169,14 @@ class InBasis:
         return self._basis.analyze(self._operator.adjoint(lines))
 
 
-def _staircase(
+def lit_cosines(code: NDArray[np.uint8], basis: Basis, temporal_merge: int) -> NDArray[Any]:
+    """E(t)·D_k(t // T_m): (T, K)."""
+    frame = np.arange(len(code)) // temporal_merge
+    lit: NDArray[Any] = basis.matrix().T[frame] * code[:, None].astype(basis.arrays.dtype)
+    return lit
+
+
+def staircase(
     lit: NDArray[Any], starts: NDArray[np.int64], lengths: NDArray[np.int64], geometry: Geometry
 ) -> NDArray[Any]:
     """Σ_d m(d)·lit[i·S + start_q + d] for every line i and row block q: (L_R, n′, K)."""

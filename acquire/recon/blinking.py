@@ -40,6 +40,8 @@ WIDER_SHARE = 0.5
 """Of a budget, after which nothing is made again in a wider band."""
 TENTATIVE_SHARE = 0.15
 """Of a budget, after which the search for the bandwidth hurries."""
+LAMPS_SHARE = 0.3
+"""Of a budget: where the fastest lamp would not be found before, it is not looked for."""
 UNSEARCHED_SHARE = 0.4
 """Of a budget: where posing the problem alone took more, the bandwidth is not looked for."""
 PLAIN_ITERATIONS = 90
@@ -224,7 +226,13 @@ def find_band(segment: Segment, problem: Problem, options: SolveOptions, clock: 
         )
         return few
     if options.bandwidth is None:
-        return estimate_coefficients(segment, N_m, T_m, lambda: clock.spent(TENTATIVE_SHARE), problem.arrays)
+        return estimate_coefficients(
+            segment,
+            problem,
+            (N_m, T_m),
+            hurry=lambda: clock.spent(TENTATIVE_SHARE),
+            affords=lambda seconds: clock.affords(seconds, LAMPS_SHARE),
+        )
     frames = segment.geometry.video_shape(N_m, T_m)[0]
     return min(frames, max(1, round(options.bandwidth * frames)))
 

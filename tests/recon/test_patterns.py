@@ -16,9 +16,10 @@ from acquire.forward import DualArm
 from acquire.geometry import Geometry
 from acquire.lines import Segment
 from acquire.recon import HaarShrink, Progress, reconstruct
-from acquire.recon.bandwidth import estimate_coefficients
+from acquire.recon.bandwidth import FEWEST_COEFFICIENTS, estimate_coefficients
 from acquire.recon.basis import TemporalBasis
 from acquire.recon.curves import CurveFit, CurveOperator
+from acquire.recon.lamps import _whitened, last_lamp
 from acquire.recon.patterns import find_patterns
 from acquire.recon.problem import build_problem
 
@@ -134,11 +135,69 @@ def test_more_iterations_do_not_spoil_the_picture() -> None:
 
 
 def test_the_bandwidth_is_found_from_the_lines() -> None:
-    slow = estimate_coefficients(segment(), 3, 1)
+    def found(recorded: Segment, temporal_merge: int = 1) -> int:
+        problem = build_problem(recorded, 3, temporal_merge, hold_out=0.0)
+        return estimate_coefficients(recorded, problem, (3, temporal_merge))
+
+    slow = found(segment())
     assert 32 <= slow <= 40
     fast = TRUTH * (0.5 + 0.5 * np.sin(2 * np.pi * INSTANTS / 9))[:, None, None]
-    assert estimate_coefficients(segment(fast), 3, 1) > slow
-    assert estimate_coefficients(segment(), 3, 50) == GEOMETRY.video_shape(3, 50)[0]
+    assert found(segment(fast)) > slow
+    assert found(segment(), 50) == GEOMETRY.video_shape(3, 50)[0]
+
+
+@pytest.mark.parametrize("coarse", [3, 36])
+def test_lamps_are_looked_for_where_coarse_voxels_are_larger_than_the_videos(
+    monkeypatch: pytest.MonkeyPatch, coarse: int
+) -> None:
+    fast = segment(TRUTH * (0.5 + 0.5 * np.sin(2 * np.pi * INSTANTS / 9))[:, None, None])
+    problem, needed = build_problem(fast, 3, 1, hold_out=0.0), 2 * GEOMETRY.span / 9
+    asked: list[float] = []
+    monkeypatch.setattr("acquire.recon.bandwidth.COARSE_SIDE", coarse)
+    found = estimate_coefficients(fast, problem, (3, 1), affords=lambda s: not asked.append(s))
+    assert (found > needed, bool(asked)) == (True, coarse == 3)
+    asked.clear()
+    estimate_coefficients(fast, problem, (3, 1), affords=lambda s: bool(asked.append(s)))
+
+
+def lamp(recorded: Segment) -> int:
+    return last_lamp(recorded, build_problem(recorded, 3, 1, hold_out=0.08), 1, 0.25)
+
+
+def test_the_fastest_lamp_stands_out_of_the_lines_covariance() -> None:
+    fast = TRUTH * (0.5 + 0.5 * np.sin(2 * np.pi * INSTANTS / 9))[:, None, None]
+    assert lamp(segment(fast)) == pytest.approx(2 * GEOMETRY.span / 9, rel=0.15)
+
+
+@pytest.mark.parametrize("density", [0.01, 0.99, 1.0])
+def test_under_a_code_that_hardly_changes_no_fast_lamp_stands_out(density: float) -> None:
+    code = (np.random.default_rng(0).random(GEOMETRY.span) < density).astype(np.uint8)
+    code[100] = 1
+    lines = DualArm(GEOMETRY, code).forward(TRUTH).astype(np.float32)
+    assert lamp(replace(segment(), code=code, lines=lines)) < FEWEST_COEFFICIENTS
+
+
+def test_what_rests_has_no_lamp_and_lost_lines_make_none() -> None:
+    still = segment(np.broadcast_to(IMAGES.sum(0), TRUTH.shape))
+    noise = np.random.default_rng(7).normal(0, 0.02 * still.lines.mean(), GEOMETRY.lines_shape)
+    holed = replace(still, lines=still.lines + noise)
+    holed.mask[0, 20:24] = False
+    holed.mask[1, 40:50, 3] = False
+    assert lamp(holed) == 0
+
+
+def test_samples_that_are_lost_weigh_nothing_where_lines_are_whitened() -> None:
+    rng = np.random.default_rng(0)
+    half = rng.standard_normal((9, 14))
+    covariance = half @ half.T
+    pixels = rng.standard_normal((9, 5)).astype(np.float32)
+    seen = np.ones(pixels.shape, bool)
+    seen[2:4, :2] = seen[7, 3] = False
+    found = _whitened(np.linalg.inv(covariance).astype(np.float32), pixels, seen)
+    for kept, pixel, white in zip(seen.T, pixels.T, found.T, strict=True):
+        wanted = np.linalg.solve(covariance[np.ix_(kept, kept)], pixel[kept])
+        np.testing.assert_allclose(white[kept], wanted, rtol=1e-3, atol=1e-3)
+        assert not white[~kept].any()
 
 
 def test_a_warm_start_begins_where_the_last_ended() -> None:
