@@ -69,6 +69,17 @@ TARGET = Step(
     "rig",
     ("orientation", "align"),
 )
+PSF = Step(
+    "psf",
+    "Put a square or a checkerboard in, at rest and in focus, turned by 3 to 20 degrees, its edges 30 fine "
+    "pixels or more from one another.",
+    LINES,
+    "rig",
+    ("psf",),
+)
+"""Not after dark or flat: it asks how wide edges are, which columns that differ by 3 % leave as it is."""
 STEPS = (DELAY, DARK, LINEARITY, FLAT, TARGET)
 AT_ONCE = (DARK, FLAT, TARGET)
 """Those of `acquire calibrate all`, of one recording each."""
+WHERE_WANTED = (PSF,)
+"""Of one recording each, too, after those, and only where somebody asks for them."""

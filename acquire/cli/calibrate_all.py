@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from acquire.calibrate.guide import AT_ONCE, LINES, MOST_LINES, Step
+from acquire.calibrate.guide import AT_ONCE, LINES, MOST_LINES, PSF, WHERE_WANTED, Step
 from acquire.cli.calibrate_live import instrument, kept, record, tell_finding, wait_for_enter
 from acquire.cli.control import SocketOption
 from acquire.cli.output import JsonFlag, note, print_json, print_warning, say
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from acquire.calibrate.calibration import Calibration, Finding
     from acquire.calibrate.exposure import Exposure
-    from acquire.client import Client
+    from acquire.client import Client, Setup
 
 TRIES = 3
 """Of a step, where somebody can mend what was wrong."""
@@ -36,33 +36,58 @@ def calibrate_all(
     ] = LINES,
     only: Annotated[
         list[str] | None,
-        typer.Option(metavar="STEP", help="Only this step, dark, flat or target; repeatable; absent: all."),
+        typer.Option(
+            metavar="STEP", help="Only this step: dark, flat, target or psf; repeatable; absent: all but psf."
+        ),
     ] = None,
+    psf: Annotated[
+        bool, typer.Option("--psf", help="In the end the optics' blur, too, from edges that are put in.")
+    ] = False,
     yes: Annotated[
         bool, typer.Option("--yes", help="Ask nothing: everything is in place already, or moves by itself.")
     ] = False,
     socket: SocketOption = None,
     json: JsonFlag = False,
 ) -> None:
-    """Calibrate the instrument that the daemon runs: dark, flat, target, one after the other.
+    """Calibrate the instrument that the daemon runs: dark, flat, target in turn, psf where wanted.
 
     Says before each recording what to do, and waits for Enter. What was found is kept step by step; begun
     again with --only, it goes on where it ended. The instrument is left as it was: armed or not.
 
     Example: [bold]acquire calibrate all --out cal.zarr[/]
     """
-    names = [step.name for step in AT_ONCE]
+    names = [step.name for step in (*AT_ONCE, *WHERE_WANTED)]
     if wrong := [each for each in only or () if each not in names]:
         raise UsageError(f"step {wrong[0]!r} is not known", possible=", ".join(names))
     steps = [step for step in AT_ONCE if not only or step.name in only]
+    if psf or PSF.name in (only or ()):
+        steps.append(PSF)
     found: list[Finding] = []
     with instrument(socket, directory) as daemon:
+        if PSF in steps:
+            _refuse_edges_unseen(daemon.setup())
         for step in steps:
             found += _step(daemon, step, out, directory, lines, ask=not yes, quiet=json)
     if json:
         print_json({"calibration": out, "steps": {each.step: each.facts for each in found}})
     else:
         say(f"kept in  {out}; acquire calibrate show {out} --out DIR draws it")
+
+
+def _refuse_edges_unseen(setup: Setup) -> None:
+    """UsageError, before the first recording, on a rig whose lines cannot tell how wide the optics blur."""
+    if setup.config["cameras"]["layout"] == "fibre":
+        raise UsageError(
+            "psf: the rig has a fibre, and edges are not followed from band to band",
+            possible="a rig without a fibre",
+            hint="leave psf out",
+        )
+    if setup.config["code"]["kind"] == "constant":
+        raise UsageError(
+            "psf: the rig's code is constant, which does not tell the rows of a scene apart",
+            possible="a pseudo-random code: code.kind = 'prbs'",
+            hint="leave psf out, or give the rig such a code",
+        )
 
 
 def _step(
@@ -93,7 +118,7 @@ def _step(
 
 def _looks(step: Step, exposure: Exposure, out: str) -> Iterator[Callable[[Calibration], Finding]]:
     """What is to be found in a step's recording, given what is known; a ramp told more than a flat does."""
-    from acquire.calibrate import columns, open_calibration, target
+    from acquire.calibrate import columns, open_calibration, psf, target
     from acquire.calibrate.transfer import transfer
 
     looks: dict[str, Callable[[Calibration], Finding]] = {
@@ -102,6 +127,7 @@ def _looks(step: Step, exposure: Exposure, out: str) -> Iterator[Callable[[Calib
         "transfer": lambda known: transfer([exposure], known),
         "orientation": lambda known: target.orientation(exposure, known),
         "align": lambda known: target.alignment(exposure, known),
+        "psf": lambda known: psf.psf(exposure, known),
     }
     for name in step.finds:
         if name != "transfer" or "linearity" not in open_calibration(out).steps:

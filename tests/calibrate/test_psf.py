@@ -77,6 +77,14 @@ def test_the_width_of_either_arm_is_found(known: Calibration) -> None:
     assert corrected(known) == ["the optics' blur"]
 
 
+def test_columns_that_differ_leave_the_widths_as_they_are(tmp_path: Path) -> None:
+    """Without a dark and a flat: why the guided step asks for neither."""
+    uneven = ({"kind": "prnu", "prnu": 0.03}, {"kind": "column_offsets", "sigma_dn": 5.0})
+    exposure = open_exposure(taken(tmp_path / "edges.zarr", 8.0, blurred(0.7, 1.4), *uneven))
+    found = psf(exposure, Calibration(exposure.instrument)).quantities["blur_px"]
+    np.testing.assert_allclose(found.value, [[0.7, 0.7], [1.4, 1.4]], atol=0.12)
+
+
 def still(turn_deg: float) -> Still:
     """Of a checkerboard before optics that do not blur."""
     fine = board(turn_deg)

@@ -1,0 +1,100 @@
+"""The optics' blur in the guided calibration: where wanted, and refused where it cannot be told."""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from live_daemon import Daemon
+
+from acquire.calibrate import open_calibration
+
+M, S, FINER = 64, 3, 8
+N = M * S
+SETTINGS = (
+    f"geometry.stages={M}",
+    f"geometry.substeps={S}",
+    "trigger.substep_ticks=9000",
+    *(f"cameras.{arm}.black_level_dn=20.0" for arm in "ab"),
+    *(f"cameras.{arm}.responsivity_dn=3.0" for arm in "ab"),
+)
+EFFECTS = """
+[[effects]]
+kind = "psf"
+sigma_pixels = 0.7
+sigma_b_pixels = 1.3
+[[effects]]
+kind = "prnu"
+prnu = 0.01
+[[effects]]
+kind = "shot_noise"
+[[effects]]
+kind = "read_noise"
+sigma_e = 20.0
+"""
+
+
+def checkerboard(turn_deg: float) -> np.ndarray:
+    """Squares of 58 fine pixels; a pixel holds the mean of what covers it."""
+    angle = np.deg2rad(turn_deg)
+    at = (np.arange(N * FINER) + 0.5) / FINER - N / 2
+    y, x = np.meshgrid(at, at, indexing="ij")
+    u, v = y * np.cos(angle) + x * np.sin(angle), x * np.cos(angle) - y * np.sin(angle)
+    squares = (np.floor(u / 58 + 0.5) + np.floor(v / 58 + 0.5)) % 2
+    return squares.reshape(N, FINER, N, FINER).mean(axis=(1, 3)).astype(np.float32)
+
+
+def put(home: Path, picture: np.ndarray) -> str:
+    """Before the cameras; the setting that names it."""
+    np.save(home / "fresh.npy", picture[None])
+    (home / "fresh.npy").replace(home / "scene.npy")
+    (home / "scene.toml").write_text(f"kind = 'video'\npath = '{home}/scene.npy'\n{EFFECTS}")
+    return f"simulation.scene='{home}/scene.toml'"
+
+
+def test_the_blur_is_found_after_the_others_and_what_they_found_is_kept(tmp_path: Path) -> None:
+    scene = put(tmp_path, np.full((N, N), 0.6, np.float32))
+    cal = tmp_path / "cal.zarr"
+    with contextlib.closing(Daemon(tmp_path, *SETTINGS, scene)) as daemon:
+        words = ("calibrate", "all", "--yes", "--lines", 1024, "--out", cal)
+        nothing_there = daemon(*words, "--only", "dark", "--psf")
+        assert nothing_there.code == 2
+        assert "cannot tell how wide the optics of arm a blur" in nothing_there.err
+        assert "a square or a checkerboard, turned a little" in nothing_there.err
+        assert list(open_calibration(cal).steps) == ["dark"]
+
+        put(tmp_path, checkerboard(8.0))
+        found = daemon(*words, "--only", "psf", "--json")
+        assert found.code == 0, found.err
+        assert "psf: Put a square or a checkerboard in" in found.err
+        assert list(found.json["steps"]) == ["psf"]
+        known = open_calibration(cal)
+        assert list(known.steps) == ["dark", "psf"]
+        blur = known.quantities["blur_px"].value
+        np.testing.assert_allclose(blur, [[0.7, 0.7], [1.3, 1.3]], atol=0.12)
+        with daemon.client() as client:
+            assert client.status().state == "idle"
+
+
+@pytest.mark.parametrize(
+    ("settings", "asked", "why"),
+    [
+        (("code={kind='constant'}",), ("--psf",), "psf: the rig's code is constant"),
+        (
+            ("cameras.layout='fibre'", "fibre={rows=32,columns=48,sensor_pixels=100}"),
+            ("--only", "psf"),
+            "psf: the rig has a fibre",
+        ),
+    ],
+)
+def test_a_rig_that_cannot_tell_is_refused_before_anything_is_recorded(
+    tmp_path: Path, settings: tuple[str, ...], asked: tuple[str, ...], why: str
+) -> None:
+    with contextlib.closing(Daemon(tmp_path, *settings)) as daemon:
+        refused = daemon("calibrate", "all", *asked, "--yes", "--out", tmp_path / "cal.zarr")
+        assert refused.code == 2
+        assert why in refused.err
+        assert "leave psf out" in refused.err
+        assert not list((tmp_path / "calibration-recordings").iterdir())
