@@ -1,4 +1,4 @@
-"""The instrument as a device of bluesky: recorded by a plan, told of in documents.
+"""The instrument as a bluesky device: a plan records with it, and documents say where the lines are.
 
 ::
 
@@ -24,6 +24,6 @@ from acquire.exchange.libraries import library
 for _module in ("bluesky.protocols", "event_model", "ophyd_async.core"):
     library(_module, "bluesky", "acquire.bluesky")
 
-from acquire.bluesky.recorder import Recorder  # noqa: E402 - what is missing is told before
+from acquire.bluesky.recorder import Recorder  # noqa: E402 - a missing package is named first
 
 __all__ = ["Recorder", "StartRequest"]

@@ -1,7 +1,7 @@
-"""What a plan's documents say of a recording: where its lines lie, and which of them can be read by now.
+"""What a plan's documents say of a recording: where its lines are, and which of them can be read by now.
 
-Index i of a StreamResource is row i of its arrays. A recording that goes on in a further segment is a further
-StreamResource for each arm, whose indices begin at 0 again.
+Index i of a StreamResource is row i of its arrays. A recording that continues in a further segment is a
+further StreamResource for each arm, whose indices begin at 0 again.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def key_of(name: str, arm: str) -> str:
 
 
 def data_keys(name: str, rig: RigConfig) -> dict[str, DataKey]:
-    """An event is a line of either arm."""
+    """One key per arm; an event is one line."""
     return {
         key_of(name, arm): {
             "source": f"acquire://{quote(rig.name)}/{arm}/lines",
@@ -49,7 +49,7 @@ def data_keys(name: str, rig: RigConfig) -> dict[str, DataKey]:
 
 @dataclass(slots=True)
 class Segment:
-    """One recording on disk: rows that a reader can see in both arms, and those that documents tell of."""
+    """One recording on disk: how many rows a reader can see in both arms, and how many documents cover."""
 
     path: Path
     first_line: int | None = None
@@ -72,7 +72,7 @@ class Account:
 
     @property
     def reach(self) -> int:
-        """Lines from the first to the last, those included that are between two segments."""
+        """Lines from the first to the last, including those between two segments that neither has."""
         first, last = self.segments[0].first_line, self.now.first_line
         return self.now.lines + (0 if first is None or last is None else last - first)
 
@@ -87,9 +87,9 @@ class Account:
         return told + sum(segment.lines - segment.told for segment in self.untold[:1])
 
     def tell(self, index: int) -> Iterator[StreamAsset]:
-        """Of the lines up to ``index``, those not told yet.
+        """Documents for the lines up to ``index`` that none covers yet.
 
-        The RunEngine takes one range at a time, so that it is those of the first segment that has any.
+        They are of one segment, the first that has such lines: the RunEngine takes one range at a time.
         """
         for segment in self.untold[:1]:
             told = sum(one.told for one in self.segments)

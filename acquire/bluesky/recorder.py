@@ -36,14 +36,15 @@ if TYPE_CHECKING:
     from ophyd_async.core import DeviceMock
 
 PATIENCE_S = 30.0
-"""For a daemon that does not answer: a supervisor may restart it, and the new one says what it found."""
+"""How long `complete` waits for a daemon that does not answer: a supervisor may restart it, and the new one
+says what it found."""
 POLL_S = 0.1
 
 log = logging.getLogger("acquire.bluesky")
 
 
 class Marker(Device, Movable[str]):
-    """Set to a text, it marks the newest line with it."""
+    """Setting it to a text marks the newest line with that text."""
 
     def __init__(self, client: AsyncClient) -> None:
         self._client = client
@@ -55,17 +56,21 @@ class Marker(Device, Movable[str]):
 
 
 class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStreamAssets):
-    """One instrument. Its recordings must lie where they can be read from this host, too.
+    """One instrument, whose recordings must be readable from this host, too.
 
     A recording that faults, that somebody else ends before its budget, or whose daemon dies fails the status
     of `complete`, with what happened in words; what was committed can be collected all the same.
     """
 
     def __init__(self, place: Path | str | None = None, *, token: str | None = None, name: str = "") -> None:
-        """As `acquire.client.Client`'s."""
+        """``place`` and ``token`` as for `acquire.client.Client`."""
         self._client = AsyncClient(place, token=token)
+        # A plan that fails unstages while a kickoff may be waiting for the daemon's answer: the recording
+        # which that starts must be known before it can be stopped.
         self._commands = asyncio.Lock()
-        self._heeding = asyncio.Lock()
+        # `complete` and `get_index` update the account at once, and each waits for files in between: both
+        # would append the same further segment.
+        self._updating = asyncio.Lock()
         self._staged = self._armed = False
         self._request = StartRequest()
         self._account: Account | None = None
@@ -145,12 +150,12 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
     async def complete(self) -> AsyncIterator[WatcherUpdate[int]]:
         """Ends once the recording is sealed; raises DeviceError unless it became what was asked for."""
         account, request = self._under_way(), self._request
-        is_open = request.lines is request.duration_s is request.post_s is None
+        is_open = all(limit is None for limit in (request.lines, request.duration_s, request.post_s))
         while True:
-            status = await self._patiently()
+            status = await self._status_patiently()
             if status.fault is not None and self._staged:
                 raise fault_error(status.fault)
-            if not await self._heed(account, status):
+            if not await self._update_account(account, status):
                 break
             yield WatcherUpdate(
                 account.reach, 0, account.budget or account.reach, name=self.name, unit="lines"
@@ -158,25 +163,30 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
             if is_open and status.state is State.RECORDING:
                 await self._client.stop()
             await asyncio.sleep(POLL_S)
-        if self._staged:  # else it was this device that stopped it
-            self._judge(account, status)
+        if self._staged:  # otherwise `unstage` stopped it, and the plan knows
+            self._check_outcome(account, status)
 
     @AsyncStatus.wrap
     async def unstage(self) -> None:
-        """Whatever became of the plan: no recording of its own goes on, and what it armed is idle."""
+        """However the plan ended: stop the recording that it started, and disarm what it armed."""
         async with self._commands:
             if not self._staged:
                 return
+            # First of all: `complete`, which may still be waiting, must not take our stop for a stranger's.
             self._staged, armed, self._armed = False, self._armed, False
             try:
-                await self._leave(disarm=armed)
+                await self._stop_recording(disarm=armed)
             except NoDaemonError as error:
-                log.warning("%s: nothing is left to be stopped: %s", self.name, error)
+                log.warning("%s: there is nothing left to stop: %s", self.name, error)
 
-    async def _leave(self, *, disarm: bool) -> None:
+    async def _stop_recording(self, *, disarm: bool) -> None:
         while True:
             status, account = await self._client.status(), self._account
-            ours = account is not None and status.recording is not None and await self._heed(account, status)
+            ours = (
+                account is not None
+                and status.recording is not None
+                and await self._update_account(account, status)
+            )
             if not ours and status.state is not State.DRAINING:
                 break
             if status.state is State.RECORDING:
@@ -191,13 +201,13 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
         return data_keys(self.name, await self._rig())
 
     async def get_index(self) -> int:
-        """Lines that `collect` can tell of: those that a reader can see."""
+        """Lines that `collect` can cover: those that a reader can see."""
         account = self._under_way()
         try:
             status = await self._client.status()
         except NoDaemonError:  # `complete` fails with it; what was committed stays
             status = None
-        await self._heed(account, status)
+        await self._update_account(account, status)
         return account.index
 
     async def collect_asset_docs(self, index: int | None = None) -> AsyncIterator[StreamAsset]:
@@ -223,7 +233,7 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
         }
 
     async def _facts(self) -> dict[str, str | float]:
-        """Everything else is in the recording's own attributes."""
+        """The configuration in short; everything else is in the recording's own attributes."""
         setup = await self._client.setup()
         facts = {
             "rig": setup.name,
@@ -244,28 +254,30 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
             raise StateError(f"{self.name} records nothing", possible="bps.kickoff(recorder, wait=True)")
         return self._account
 
-    async def _heed(self, account: Account, status: Status | None) -> bool:
-        """Write down how far the recording is, as the daemon says, or its files once it is over.
+    async def _update_account(self, account: Account, status: Status | None) -> bool:
+        """Update ``account`` from what the daemon says, or from the files once the recording is over.
 
-        Whether it is still under way.
+        Returns whether it is still under way.
         """
-        async with self._heeding:
+        async with self._updating:
             now = None if status is None else status.recording
             if now is not None and now.path != account.now.path:
                 try:
-                    await asyncio.to_thread(_go_on, account, now.path)
+                    await asyncio.to_thread(_add_segment, account, now.path)
                 except (PlaceError, DataError):
                     return True  # what has only just begun cannot be read yet
             if now is not None and now.path == account.now.path:
                 first_line = account.now.first_line
-                if first_line in (None, now.first_line):  # else the numbers are of the segment before yet
+                # The daemon may name a new segment while its numbers are still those of the one before: they
+                # count once their first line is the segment's own.
+                if first_line in (None, now.first_line):
                     account.now.first_line = now.first_line
                     account.now.lines = max(account.now.lines, now.committed_lines)
                 return True
             account.now.lines = (await asyncio.to_thread(open_recording, account.now.path)).lines
             return now is None and status is not None and status.state is State.DRAINING
 
-    async def _patiently(self) -> Status:
+    async def _status_patiently(self) -> Status:
         end_s = time.monotonic() + PATIENCE_S
         while True:
             try:
@@ -275,7 +287,7 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
                     raise
             await asyncio.sleep(POLL_S)
 
-    def _judge(self, account: Account, status: Status) -> None:
+    def _check_outcome(self, account: Account, status: Status) -> None:
         path = account.now.path
         attrs = open_recording(path).attrs
         if attrs["state"] != "sealed":
@@ -292,15 +304,15 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
         if len(account.untold) > 1:
             paths = ", ".join(str(segment.path) for segment in account.untold)
             raise DeviceError(
-                f"{self.name}: one collect cannot tell of all segments of the recording: {paths}",
-                hint="bps.collect_while_completing(..., flush_period=1.0) tells of one after the other",
+                f"{self.name}: one collect cannot cover all segments of the recording: {paths}",
+                hint="bps.collect_while_completing(..., flush_period=1.0) covers one after the other",
             )
         if condition != RunCondition.GOOD:
             log.warning("%s: %s is %s: %s", self.name, path, condition, reason)
 
 
-def _go_on(account: Account, path: Path) -> None:
-    """Where the recording at ``path`` is a further segment of the one under way, and not somebody's next."""
+def _add_segment(account: Account, path: Path) -> None:
+    """Add the recording at ``path``, if it continues the one under way and is not somebody's next."""
     following, until_now = open_recording(path), open_recording(account.now.path)
     known, found = segment_of(until_now.attrs), segment_of(following.attrs)
     if found is None or found[0] != (known[0] if known is not None else account.now.path.name):
