@@ -24,8 +24,12 @@ OUTPUT = Console()
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m firmware.formal", description="Prove the gateware.")
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"of {', '.join(PROOFS)}; all")
-    parser.add_argument("--mutants", action="store_true", help="break the gateware and see it noticed")
+    parser.add_argument(
+        "names", nargs="*", metavar="NAME", help=f"a proof to carry out, by default all: {', '.join(PROOFS)}"
+    )
+    parser.add_argument(
+        "--mutants", action="store_true", help="also break the gateware, and expect each change to be noticed"
+    )
     parser.add_argument("--first", action="store_true", help="stop a proof at the first property broken")
     parser.add_argument("--json", action="store_true", help="verdicts as JSON")
     chosen = parser.parse_args()
@@ -62,16 +66,15 @@ def _as_table(names: list[str], first: bool) -> bool:
 
 
 def _mutants(names: list[str]) -> bool:
-    table = Table("mutant", "file", "in place of", "stands", "breaks", "s", title="mutants")
+    table = Table("mutant", "file", "in place of", "is", "breaks", "s", title="mutants")
     caught = True
     for mutant in (mutant for mutant in MUTANTS if mutant.proof in names):
         began = time.monotonic()
         LOG.info("mutant %r", mutant.name)
         broken = broken_by(mutant)
         caught &= bool(broken)
-        told = ", ".join(broken) or "NOTHING"
-        row = (mutant.name, mutant.file, mutant.old, mutant.new, told, f"{time.monotonic() - began:.1f}")
-        table.add_row(*row)
+        change = (mutant.name, mutant.file, mutant.old, mutant.new)
+        table.add_row(*change, ", ".join(broken) or "NOTHING", f"{time.monotonic() - began:.1f}")
     OUTPUT.print(table)
     return caught
 

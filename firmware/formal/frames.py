@@ -1,4 +1,4 @@
-r"""Nothing is believed of the link but whole frames: the deframer, whatever bytes come, at any pace.
+r"""Of what comes over the link only whole frames are believed: the deframer, whatever bytes, at any pace.
 
 ::
 
@@ -26,7 +26,7 @@ def frames_proof() -> Proof:
     harness, deframer = Harness(), Deframer(MAX_PAYLOAD)
     m, claim, lemma = harness.m, harness.claim, harness.lemma
     m.submodules.deframer, inside = opened(deframer)
-    # What somebody finds who undoes COBS on his own: bytes of the frame, what is left of its block.
+    # An independent decoder of COBS, to compare with: the frame's bytes, and what is left of its block.
     m.submodules.crc = crc = Crc32()
     taken, byte = deframer.bytes.valid & deframer.bytes.ready, deframer.bytes.payload
     size, block, begun, zero_due, too_long = Signal(9), Signal(8), Signal(), Signal(), Signal()

@@ -7,7 +7,7 @@ r"""Every request is answered by exactly one camera pulse, at the distance from 
              |<-delay+2->|<-width>|
 
 Pulses are therefore exactly as far apart as the requests: no jitter comes in here, and with `settings`'
-claim that the distance is at least CAMERA_MIN_PERIOD no two are closer than the camera stands.
+claim that the distance is at least CAMERA_MIN_PERIOD no two are closer than the camera can take.
 """
 
 from __future__ import annotations

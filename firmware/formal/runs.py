@@ -1,4 +1,4 @@
-r"""Runs begin when they shall, end when they must, and the state that the host reads is the truth.
+r"""Runs begin when they should, end when they must, and the state that the host reads is true.
 
 `Commands`, `Timing`, `Watchdog` and `Light` as they are joined in `firmware.top`; commands, edges, signs of
 life of the host and the loss of the clock come at any time, all at once if they like::

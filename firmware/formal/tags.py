@@ -36,7 +36,7 @@ class Ledger:
         self.owed, self.patience = Signal(16), Signal(range(SOON + 2))
         flags = tagger.entry[FLAGS]
         self.told = Mux(tagger.put & ~flags[0], flags, 0)
-        self.just_come = just_come = Signal(16)  # while a tag was being made: not in it
+        self.just_come = just_come = Signal(16)  # while a tag was being made, hence in the next one
         m.d.sync += just_come.eq(tagger.events)
         m.d.sync += self.owed.eq((self.owed & ~self.told) | just_come | tagger.events)
         m.d.sync += self.delivered.eq(self.delivered + (queue.output.valid & queue.output.ready))

@@ -1,4 +1,4 @@
-r"""What the inputs tell is told exactly: strobes against pulses, and the instant of a second.
+r"""What the inputs show is reported exactly: strobes against pulses, and the instant of a second.
 
 ::
 
