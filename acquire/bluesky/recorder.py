@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import logging
 import time
 from typing import TYPE_CHECKING, Any
@@ -140,7 +141,7 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
             budget = status.recording.budget_lines if status.recording else self._request.lines
             self._account = Account(self.name, rig, made.path, budget)
             if not await asyncio.to_thread(made.path.exists):
-                await self._client.stop()
+                await self._stop()
                 raise UsageError(
                     f"{self.name}: the daemon records to {made.path}, which this host does not see",
                     hint="run the plan on the daemon's host, or mount its recordings at the same path",
@@ -161,7 +162,7 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
                 account.reach, 0, account.budget or account.reach, name=self.name, unit="lines"
             )
             if is_open and status.state is State.RECORDING:
-                await self._client.stop()
+                await self._stop()
             await asyncio.sleep(POLL_S)
         if self._staged:  # otherwise `unstage` stopped it, and the plan knows
             self._check_outcome(account, status)
@@ -190,10 +191,15 @@ class Recorder(Device, Stageable, Preparable, Flyable, Collectable, WritesStream
             if not ours and status.state is not State.DRAINING:
                 break
             if status.state is State.RECORDING:
-                await self._client.stop()
+                await self._stop()
             await asyncio.sleep(POLL_S)
         if disarm and status.state is State.ARMED:
             await self._client.disarm()
+
+    async def _stop(self) -> None:
+        """Stop what is recorded, unless it has ended since the daemon was asked."""
+        with contextlib.suppress(StateError):
+            await self._client.stop()
 
     # ---- documents
 

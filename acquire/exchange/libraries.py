@@ -14,6 +14,6 @@ def library(module: str, extra: str, what: str) -> Any:
         return import_module(module)
     except ModuleNotFoundError as error:
         raise UsageError(
-            f"{what} needs the Python package {module!r}, which is not installed",
+            f"{what} needs the Python package {error.name or module!r}, which is not installed",
             hint=f"pip install 'tdi-acquire[{extra}]'",
         ) from error

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import re
 import signal
@@ -120,6 +121,24 @@ def in_words(engine: RunEngine, plan: Any) -> str:
     with pytest.raises(FailedStatus) as failed:
         engine(plan)
     return str(failed.value.__cause__ or failed.value.args[0].exception())
+
+
+def test_a_recording_that_somebody_else_stops_first_is_completed(
+    daemon: Daemon, engine: RunEngine, told: Told, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with init_devices(), daemon.client() as other:
+        recorder = Recorder(daemon.socket, name="recorder")
+        stop, asked = recorder._client.stop, []
+
+        async def too_late() -> Any:
+            asked.append(await asyncio.to_thread(other.stop))
+            return await stop()
+
+        monkeypatch.setattr(recorder._client, "stop", too_late)
+    engine(fly(recorder, None))
+    assert asked
+    (end,) = told.all("stop")
+    assert end["exit_status"] == "success"
 
 
 def test_the_example_s_documents_cover_exactly_the_recorded_lines(
@@ -306,6 +325,6 @@ except UsageError as error:
 """
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout == (
-        "acquire.bluesky needs the Python package 'ophyd_async.core', which is not installed; "
+        "acquire.bluesky needs the Python package 'ophyd_async', which is not installed; "
         "try: pip install 'tdi-acquire[bluesky]'\n"
     )
