@@ -78,7 +78,7 @@ PSF = Step(
     ("psf",),
 )
 """Not after dark or flat: it asks how wide edges are, which columns that differ by 3 % leave as it is."""
-STEPS = (DELAY, DARK, LINEARITY, FLAT, TARGET)
+STEPS = (DELAY, DARK, LINEARITY, FLAT, TARGET, PSF)
 AT_ONCE = (DARK, FLAT, TARGET)
 """Those of `acquire calibrate all`, of one recording each."""
 WHERE_WANTED = (PSF,)

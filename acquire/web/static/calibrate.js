@@ -4,7 +4,7 @@ import { ask } from "./link.js";
 import { $, count, day, fill, make } from "./words.js";
 
 const REFRESH_MS = 1000;
-const TITLES = { delay: "Delay", dark: "Dark", linearity: "Linearity", flat: "Flat", target: "Target" };
+const TITLES = { delay: "Delay", dark: "Dark", linearity: "Linearity", flat: "Flat", target: "Target", psf: "Blur" };
 /** In these states of the daemon a step can have the instrument. */
 const FREE = ["idle", "armed"];
 
