@@ -50,7 +50,10 @@ class ExternalCounts:
         }
 
     def cameras(self) -> dict[str, dict[str, int]]:
-        """Arm → what its camera gave and lost since it was armed."""
+        """Arm → what its camera gave and lost since it was armed.
+
+        A block that is being taken just now is ``delivered`` already, and ``next_line`` is still its first.
+        """
         return {
             arm: {str(name): counted[name] for name in CAMERA_COUNTS if counted[name]}
             for arm, counted in self._cameras.items()
