@@ -82,8 +82,13 @@ def record(
         missing = max(0, lines - made.lines) + sum(gap.count for gap in made.gaps)
         if missing <= MOST_LOST * lines:
             return open_exposure(path)
-        print_warning(f"{path} lacks {missing} of {lines} lines: once more")
-    raise DataError(f"{TRIES} recordings lacked lines", hint="acquire status, acquire bench")
+        ended = f"{made.attrs['run_condition']}: {made.attrs['end_reason']}"
+        print_warning(f"{path} lacks {missing} lines of {lines} per arm ({ended})")
+    raise DataError(
+        f"{TRIES} recordings lacked lines, the last one {missing} of {lines} per arm ({ended})",
+        possible=f"up to {int(MOST_LOST * lines)}, of both arms together",
+        hint="acquire bench, whether this host keeps up; stream.stall_s, where it only begins late",
+    )
 
 
 def _recorded(daemon: Client, path: Path, lines: int) -> Path:

@@ -14,6 +14,7 @@ from acquire.calibrate import open_calibration
 M, S, FINER = 64, 3, 8
 N = M * S
 SETTINGS = (
+    "stream.stall_s=60",  # a host busy with other tests may take seconds for the first simulated block
     f"geometry.stages={M}",
     f"geometry.substeps={S}",
     "trigger.substep_ticks=36000",  # every sub-step is blurred: what a busy host simulates in time
@@ -76,6 +77,19 @@ def test_the_blur_is_found_after_the_others_and_what_they_found_is_kept(tmp_path
         np.testing.assert_allclose(blur, [[0.7, 0.7], [1.3, 1.3]], atol=0.12)
         with daemon.client() as client:
             assert client.status().state == "idle"
+
+
+def test_lines_that_are_missing_each_time_are_told_with_how_the_recordings_ended(tmp_path: Path) -> None:
+    scene = "kind = 'usaf'\n[[effects]]\nkind = 'dropped_lines'\nrate = 0.3\n"
+    (tmp_path / "scene.toml").write_text(scene)
+    with contextlib.closing(Daemon(tmp_path, f"simulation.scene='{tmp_path}/scene.toml'")) as daemon:
+        words = ("calibrate", "all", "--yes", "--lines", 1024, "--only", "dark")
+        refused = daemon(*words, "--out", tmp_path / "cal.zarr")
+        with daemon.client() as client:
+            assert client.status().state == "idle"
+    assert refused.code == 6
+    assert "3 recordings lacked lines" in refused.err
+    assert refused.err.count("of 1024 per arm (INCOMPLETE: line budget reached)") == 4
 
 
 @pytest.mark.parametrize(
