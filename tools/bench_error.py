@@ -9,10 +9,11 @@ Scenes of `tools.error_scenes` that were kept from the fit, with an ordinary cam
 claimed interval holds it, the rank correlation of estimated and true error over 8 × 8 regions and over
 frames, and what the estimate took of the processor time. At the end, how often nine of ten was nine of ten.
 
---fit calibrates: on the scenes of `acquire.sim.procedural` and the others of `tools.error_scenes`, prints
-the powers for `acquire/recon/error.py` and, each scene estimated by powers fitted to the others, how far
-estimates were off. All scenes count alike, however many of their cases are estimated; where light beyond the
-band was found, none is.
+--fit calibrates: on the scenes of `acquire.sim.procedural` and the others of `tools.error_scenes`, some of
+them also cut after a few iterations, prints the powers for `acquire/recon/error.py`, of what is judged by
+lines and by its prior, and, each scene estimated by powers fitted to the others, how far estimates were off.
+All scenes count alike, however many of their cases are estimated; where light beyond the band was found, none
+is.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from scipy.stats import spearmanr
@@ -43,6 +44,9 @@ RIDGE = 0.02
 FAR, ROUNDS = 0.3, 30
 """Of a logarithm, beyond which a case counts for less (Huber), and fits until that has settled: clean stills
 are off by ten times, and would bend all others."""
+CUT = ("leds", "leds_dot", "digits", "flicker")
+CUT_CAMERAS, CUTS = ("1e4", "clean"), (60, 140, 300)
+"""What the fit has cut, too, in 3 × 1 voxels: scenes that go on longest, after so many iterations."""
 BEYOND_THE_BAND = "fastled"
 """Light that no video of the fit can hold, which is not to be estimated where it is not found."""
 NINE_OF_TEN = (0.05, 0.95)
@@ -72,12 +76,17 @@ class Case:
         return np.asarray(np.sqrt(np.square(self.true).mean((1, 2))))
 
 
-def measure(scene: str, seed: int, camera: str, voxels: tuple[int, int], make: Make) -> Case:
+def measure(
+    scene: str, seed: int, camera: str, voxels: tuple[int, int], make: Make, iterations: int | None = None
+) -> Case:
+    """With preset fast, or cut after so many iterations of preset best."""
     made = make(scene, seed, stages=STAGES, substeps=SUBSTEPS, lines=LINES, camera=CAMERAS[camera])
-    result = reconstruct(made.segment, *voxels, "fast")
+    result = reconstruct(
+        made.segment, *voxels, "fast" if iterations is None else "best", iterations=iterations
+    )
     off = result.video[result.trusted] - made.truth(*voxels)
     took = 0.0 if isinstance(result.error, str) else result.error.processor_s / result.processor_s
-    name = f"{scene}, {camera}, {voxels[0]} × {voxels[1]}"
+    name = f"{scene}, {camera}, {voxels[0]} × {voxels[1]}" + (f", {iterations}" if iterations else "")
     return Case(
         name=name,
         scene=scene,
@@ -152,9 +161,8 @@ def judge(cases: Iterable[Case], run: Run) -> None:
 
 
 def signs(clues: Clues, shown: slice) -> np.ndarray:
-    """Of the whole: logarithms beside what blocks say, whose powers are constant and moved."""
-    moved = np.sqrt(np.square(clues.moved[shown]).mean())
-    return np.array([1.0, np.log(moved / clues.blocks)])
+    """Of the whole: logarithms, whose powers are `Powers.whole`."""
+    return estimation.signs(float(np.sqrt(np.square(clues.moved[shown]).mean())), clues)
 
 
 def signs_here(clues: Clues, shown: slice) -> np.ndarray:
@@ -186,15 +194,18 @@ def _shares(scenes: list[str]) -> np.ndarray:
 
 
 def fit(cases: list[Case]) -> Powers:
-    """Without factors: those are what it misses by on scenes that it was not fitted to."""
+    """Those that there are, but factors: these are what it misses by on scenes that it was not fitted to."""
     told = [(case, case.error.clues) for case in cases if isinstance(case.error, VideoError)]
     scenes = [case.scene for case, _ in told]
-    whole = robust(
-        [signs(clues, case.shown)[None] for case, clues in told],
-        [np.log([case.rms / clues.blocks]) for case, clues in told],
+    known = told[0][1].powers
+    there = known.whole != 0
+    whole = np.zeros(len(there))
+    whole[there] = robust(
+        [signs(clues, case.shown)[None, there] for case, clues in told],
+        [np.log([case.rms / clues.missed]) for case, clues in told],
         scenes,
     )
-    true = [np.maximum(case.regions, estimation.FAINT * clues.scale) for case, clues in told]
+    true = [np.maximum(case.regions, clues.powers.faint * clues.scale) for case, clues in told]
     here = robust(
         [signs_here(clues, case.shown) for case, clues in told],
         [np.log(each / np.sqrt(np.square(each).mean())) for each in true],
@@ -206,11 +217,9 @@ def fit(cases: list[Case]) -> Powers:
         [np.log(case.frames / case.rms) for case, _ in told],
         scenes,
     )
-    (constant, of_moved), (moved_here, change_here, edge_here), (moved_now,) = (
-        each.tolist() for each in (whole, here, now)
-    )
-    powers = (constant, of_moved, moved_here, change_here, edge_here, moved_now)
-    return Powers(*powers, factors=(1, 1), region_factors=(1, 1), frame_factors=(1, 1))
+    names = [each.name for each in fields(Powers) if each.type == "float" and each.name != "faint"]
+    powers = dict(zip(names, np.concatenate([whole, here, now]).tolist(), strict=True))
+    return replace(known, **powers)
 
 
 def nine_of_ten(off: list[np.ndarray], scenes: list[str]) -> tuple[float, float]:
@@ -223,9 +232,16 @@ def nine_of_ten(off: list[np.ndarray], scenes: list[str]) -> tuple[float, float]
     return float(low), float(high)
 
 
-def calibrate(cases: list[Case]) -> None:
+def calibrate(cases: list[Case], name: str, known: Powers) -> None:
     """Print the powers, and by which factors estimates are off on scenes that these were not fitted to."""
-    told = [case for case in cases if isinstance(case.error, VideoError) and case.scene != BEYOND_THE_BAND]
+    told = [
+        case
+        for case in cases
+        if isinstance(case.error, VideoError)
+        and case.error.clues.powers is known
+        and case.scene != BEYOND_THE_BAND
+    ]
+    print(f"{name}: {len(told)} cases")
     scenes = [case.scene for case in told]
     others = {scene: fit([case for case in told if case.scene != scene]) for scene in sorted(set(scenes))}
     wholes, here, now, alike = [], [], [], []
@@ -234,7 +250,7 @@ def calibrate(cases: list[Case]) -> None:
         found = from_clues(case.error.clues, case.shown, others[case.scene])
         regions = np.sqrt(np.square(found.regions[case.shown]).mean(0)).ravel()
         wholes.append(np.array([case.rms / found.rms]))
-        here.append(np.maximum(case.regions, estimation.FAINT * case.error.full_scale) / regions)
+        here.append(np.maximum(case.regions, known.faint * case.error.full_scale) / regions)
         now.append(case.frames / found.frames[case.shown])
         alike.append(correlation(regions, case.regions))
     for scene in others:
@@ -247,8 +263,16 @@ def calibrate(cases: list[Case]) -> None:
     factors = [nine_of_ten(off, scenes) for off in (wholes, here, now)]
     powers = fit(told)
     print(
-        "POWERS =", replace(powers, factors=factors[0], region_factors=factors[1], frame_factors=factors[2])
+        f"{name} =", replace(powers, factors=factors[0], region_factors=factors[1], frame_factors=factors[2])
     )
+
+
+def ways(scene: str, camera: str, *, cut: bool) -> list[tuple[tuple[int, int], int | None]]:
+    """Voxels and the number of iterations of a scene's cases; None for the preset's."""
+    found: list[tuple[tuple[int, int], int | None]] = [(voxels, None) for voxels in VOXELS]
+    if cut and scene in CUT and camera in CUT_CAMERAS:
+        found += [(VOXELS[0], iterations) for iterations in CUTS]
+    return found
 
 
 def main() -> None:
@@ -270,14 +294,16 @@ def main() -> None:
         drawn = [(name, error_scenes.record, asked.seeds or (901,)) for name in names]
     with limit_threads(1), recorded("bench_error", keep=asked.record and not asked.fit) as run:
         cases = (
-            measure(name, seed, camera, voxels, make)
+            measure(name, seed, camera, voxels, make, iterations)
             for name, make, seeds in drawn
             for seed in seeds
             for camera in asked.cameras
-            for voxels in VOXELS
+            for voxels, iterations in ways(name, camera, cut=asked.fit)
         )
         if asked.fit:
-            calibrate(list(cases))
+            measured = list(cases)
+            for name in ("BY_LINES", "BY_PRIOR"):
+                calibrate(measured, name, getattr(estimation, name))
         else:
             judge(cases, run)
 

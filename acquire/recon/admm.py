@@ -18,7 +18,7 @@ Over-relaxed by 1.7 (Eckstein and Bertsekas, Math. Program. 55, 293 (1992)).
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from acquire.arrays import dot, namespace
@@ -119,10 +119,12 @@ class Admm:
         self._sign = self._xp.asarray(other._sign, copy=True)
         self._sign_multiplier = other._sign_multiplier * (old.sign_penalty / new.sign_penalty)
 
-    def on(self, operator: MaskedOperator, samples: Array) -> Admm:
-        """A solver that goes on from here with other samples, or others of them masked; this one stays as it
-        is, but for the dual field of the denoiser, which they share."""
+    def on(self, operator: MaskedOperator, samples: Array, heavier: float = 1.0) -> Admm:
+        """A solver that goes on from here with other samples, or others of them masked, and a ``heavier``
+        prior; this one stays as it is, but for the dual field of the denoiser, which they share."""
         other = copy(self)
+        other._parameters = replace(self._parameters, tv_weight=heavier * self._parameters.tv_weight)
+        other._strength = self._strength * heavier
         other._samples, other._operator = samples, operator
         other._tv_multiplier = self._xp.asarray(self._tv_multiplier, copy=True)
         other._w = self._xp.asarray(self._w, copy=True)

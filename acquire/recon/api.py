@@ -13,8 +13,8 @@ from acquire.arrays import Dtype, open_arrays
 from acquire.cores import idle_cores, limit_threads
 from acquire.recon.balance import balance_of, divided
 from acquire.recon.clock import IterationClock
+from acquire.recon.clues import AS_LONG_AS, estimate_error
 from acquire.recon.denoisers import open_denoiser
-from acquire.recon.error import AS_LONG_AS, estimate_error
 from acquire.recon.faster import tell_faster_light
 from acquire.recon.judge import frame_error, judge
 from acquire.recon.least import check_budget, least_seconds
@@ -137,7 +137,12 @@ def reconstruct(
         if look is not None:
             clock.looks = _looking(look, problem, chosen)
         estimate = _solve(segment, problem, options, chosen, clock)
-        result = _finish(segment, problem, options, chosen, estimate, clock, check=check, error=error)
+        # A number of iterations that was asked for cuts as a budget does; with a preset's, solvers are about
+        # where they would end.
+        cut = clock.ended == "budget" or (clock.ended == "done" and iterations is not None)
+        result = _finish(
+            segment, problem, options, chosen, estimate, clock, check=check, error=error, cut=cut
+        )
     return replace(
         result,
         warnings=(*warnings, *result.warnings),
@@ -180,10 +185,12 @@ def _error(
     options: SolveOptions,
     estimate: Estimate,
     video: NDArray[Any],
-    prediction: float,
+    quality: Quality,
     clock: IterationClock,
     told: Told,
     faster: tuple[str, ...],
+    *,
+    cut: bool,
 ) -> VideoError | str:
     """Not of what the lines contradict: what it is estimated from shows nothing of either."""
     if not told.believed:
@@ -193,7 +200,7 @@ def _error(
     if clock.ended == "stopped":
         return "the reconstruction was stopped"
     merges = (options.spatial_merge, options.temporal_merge)
-    return estimate_error(segment, problem, estimate, video, prediction, merges, clock)
+    return estimate_error(segment, problem, estimate, video, quality, merges, clock, cut=cut)
 
 
 def _finish(
@@ -206,6 +213,7 @@ def _finish(
     *,
     check: bool,
     error: bool,
+    cut: bool,
 ) -> Reconstruction:
     T_m = options.temporal_merge
     predicted = estimate.predict()
@@ -225,7 +233,7 @@ def _finish(
         faster = tell_faster_light(segment, problem, predicted, video, resolved_hz, clock)
     off: VideoError | str = "it was not asked for"
     if error:
-        off = _error(segment, problem, options, estimate, video, prediction, clock, told, faster)
+        off = _error(segment, problem, options, estimate, video, quality, clock, told, faster, cut=cut)
     return Reconstruction(
         video=video,
         time_ns=segment.frame_time_ns(T_m),

@@ -99,16 +99,30 @@ class IterationClock:
         """Keep time for so many after the last of the solver's (`afterwards`), as long as those of late."""
         self._reserved = iterations
 
-    def afterwards(self, most: int) -> Iterator[int]:
-        """Yields before each iteration that time was kept for: nothing is kept from now on."""
+    def afterwards(self, most: int, least: int = 0, twice: int = 0) -> Iterator[int]:
+        """Yields before each iteration that time was kept for: nothing is kept from now on.
+
+        What comes after the last of these is told by their mean: only some of them, as a refinement's every
+        fifth, are much longer. The first ``least`` are made where they fit themselves. With ``twice``, as
+        many again are to follow: none is made where not that many fit twice.
+        """
         self._reserved = 0.0
-        lately = self._lately_s = deque(maxlen=REMEMBERED)
+        before, lately = self._lately_s, deque[float](maxlen=REMEMBERED)
+        expected_s, self._lately_s = self.mean_s, lately
         for made in range(most):
-            if self.asked or not self.affords(SLOWER * self.longest_s):
-                return
+            needed_s, after_s = SLOWER * self.longest_s, self.mean_s if made >= least else 0.0
+            if twice:
+                one_s = self.mean_s or expected_s
+                needed_s = max(needed_s, one_s) + one_s * (max(twice, made + 1) + max(twice - made - 1, 0))
+            if self.asked or not self._fits(needed_s, after_s):
+                break
             begun = self.seconds
             yield made
+            if made == 1:
+                lately.clear()  # the first prepares what the others have
             lately.append(self.seconds - begun)
+        if not lately:
+            self._lately_s = before
 
     def run(
         self, most: int, stage: str, share: float = 1.0, video: Callable[[], NDArray[Any]] | None = None
@@ -166,9 +180,13 @@ class IterationClock:
 
     def affords(self, seconds: float, share: float = 1.0) -> bool:
         """Whether work of so long fits before the end, or into that share of the budget."""
+        return self._fits(seconds, self.longest_s, share)
+
+    def _fits(self, seconds: float, iteration_s: float, share: float = 1.0) -> bool:
+        """As `affords`, where what comes after the last iteration is told by one of so long."""
         if self._budget_s is None:
             return True
-        finish_s = FINISH_SHARE * self._budget_s + FINISH_ITERATIONS * self.longest_s
+        finish_s = FINISH_SHARE * self._budget_s + FINISH_ITERATIONS * iteration_s
         finish_s += min(self._reserved * self.mean_s, RESERVED_SHARE * self._budget_s)
         return self.seconds + seconds <= min(share * self._budget_s, self._budget_s - finish_s)
 

@@ -9,8 +9,6 @@ from acquire.arrays import host
 from acquire.recon.admm import Admm
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from numpy.typing import NDArray
 
     from acquire.recon.admm import AdmmParameters
@@ -33,13 +31,21 @@ class Estimate(Protocol):
     def facts(self) -> dict[str, Any]: ...
 
 
+class Onward(Protocol):
+    """A solver that goes on from an estimate: an iteration, and the dimensionless video as it is now."""
+
+    def step(self) -> None: ...
+
+    def video(self) -> NDArray[Any]: ...
+
+
 @runtime_checkable
 class GoesOn(Protocol):
     """An estimate that can be gone on with, which is how the error of a video is estimated (`error`)."""
 
-    def gone_on(self, problem: Problem, steps: Iterable[object]) -> NDArray[Any] | None:
-        """The dimensionless video after an iteration for each of ``steps`` on another problem's samples; None
-        where this one cannot. The estimate stays as it is."""
+    def onward(self, problem: Problem, heavier: float = 1.0, *, still: bool = False) -> Onward | None:
+        """On a problem's samples, with a prior that is so many times ``heavier``; with ``still``, that which
+        a change is beside, too. None where this one cannot. The estimate stays as it is."""
         ...
 
 
@@ -68,13 +74,20 @@ class InBand:
     def facts(self) -> dict[str, Any]:
         return {"temporal_coefficients": self.basis.count} | asdict(self._parameters)
 
-    def gone_on(self, problem: Problem, steps: Iterable[object]) -> NDArray[Any] | None:
+    def step(self) -> None:
+        self.solver.step()
+
+    def onward(
+        self,
+        problem: Problem,
+        heavier: float = 1.0,
+        *,
+        still: bool = False,  # noqa: ARG002
+    ) -> InBand | None:
         if not isinstance(self.solver, Admm):
             return None
-        solver = self.solver.on(problem.masked(self._operator), problem.used_samples)
-        for _ in steps:
-            solver.step()
-        return host(self.basis.synthesize(solver.theta))
+        solver = self.solver.on(problem.masked(self._operator), problem.used_samples, heavier)
+        return InBand(solver, self._operator, self.basis, problem, self._parameters)
 
 
 class Refined:
@@ -95,11 +108,14 @@ class Refined:
         found = {"temporal_coefficients": self._coefficients, "patterns": self._refinement.rank}
         return found | asdict(self._refinement.parameters)
 
-    def gone_on(self, problem: Problem, steps: Iterable[object]) -> NDArray[Any]:
-        refinement = self._refinement.on(problem)
-        for _ in steps:
-            refinement.step()
-        return refinement.video()
+    def onward(
+        self,
+        problem: Problem,
+        heavier: float = 1.0,
+        *,
+        still: bool = False,  # noqa: ARG002
+    ) -> Refinement:
+        return self._refinement.on(problem, heavier)
 
 
 class Preferred:
@@ -112,6 +128,6 @@ class Preferred:
     def facts(self) -> dict[str, Any]:
         return self._estimate.facts() | {"prior": "cosines", "candidates": self._record}
 
-    def gone_on(self, problem: Problem, steps: Iterable[object]) -> NDArray[Any] | None:
+    def onward(self, problem: Problem, heavier: float = 1.0, *, still: bool = False) -> Onward | None:
         estimate = self._estimate
-        return estimate.gone_on(problem, steps) if isinstance(estimate, GoesOn) else None
+        return estimate.onward(problem, heavier, still=still) if isinstance(estimate, GoesOn) else None

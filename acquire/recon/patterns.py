@@ -151,13 +151,16 @@ class Refinement:
         self.found = found
         self._operators()
 
-    def on(self, problem: Problem) -> Refinement:
-        """A refinement that goes on from here with another problem's samples; this one stays as it is."""
+    def on(self, problem: Problem, heavier: float = 1.0) -> Refinement:
+        """A refinement that goes on from here with another problem's samples and a ``heavier`` prior; this
+        one stays as it is."""
         other = copy(self)
+        other.parameters = replace(self.parameters, tv_weight=heavier * self.parameters.tv_weight)
+        other._first = replace(self._first, tv_weight=heavier * self._first.tv_weight)
         other._problem, other._steps = problem, 0
         other._fit = CurveFit(self._segment, problem, self._cosines, self._temporal_merge, RIDGE)
         operator, basis = other._operators()
-        other._admm = self._admm.on(operator, problem.used_samples)
+        other._admm = self._admm.on(operator, problem.used_samples, heavier)
         other._admm.rebase(operator, basis, self.found.patterns)
         return other
 

@@ -46,7 +46,7 @@ def changing(bench: Workbench, still: Trial) -> Workbench:
     Priors cost nothing where nothing changes, however fine the still, and the lines are free of its detail.
     """
     known = still.bench.predict(still).astype(bench.problem.samples.dtype)
-    return bench.on(replace(bench.problem, known=known), beside=still.coefficients)
+    return bench.on(replace(bench.problem, known=known), still=still)
 
 
 def told_by(still: Trial, candidate: Candidate) -> Candidate:

@@ -22,7 +22,7 @@ from acquire.recon.tv import FrameTv
 from acquire.recon.volume import Smooth, VolumeTv
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -125,11 +125,12 @@ class Workbench:
         notes: Notes | None = None,
         *,
         fine: bool = False,
-        beside: Array | None = None,
+        still: Trial | None = None,
     ) -> None:
         self._segment, self.problem, self.clock, self.held_out = segment, problem, clock, held_out
         self._options, self._notes = options, notes or Notes()
-        self.fine, self.beside = fine, beside
+        self.fine, self.still = fine, still
+        self.beside = None if still is None else still.coefficients
         self._merges = (1 if fine else options.spatial_merge, options.temporal_merge)
         self.merge = options.spatial_merge if fine else 1
         self.frames, self._side, _ = segment.geometry.video_shape(*self._merges)
@@ -141,10 +142,10 @@ class Workbench:
     def record(self) -> list[dict[str, Any]]:
         return self._notes.record
 
-    def on(self, problem: Problem, *, fine: bool | None = None, beside: Array | None = None) -> Workbench:
-        """Another for the same lines: with other weights, ``fine``, or for what changes ``beside`` light."""
+    def on(self, problem: Problem, *, fine: bool | None = None, still: Trial | None = None) -> Workbench:
+        """Another for the same lines: with other weights, ``fine``, or of what changes beside a ``still``."""
         kept = self._segment, problem, self._options, self.clock, self.held_out, self._notes
-        return Workbench(*kept, fine=self.fine if fine is None else fine, beside=beside)
+        return Workbench(*kept, fine=self.fine if fine is None else fine, still=still)
 
     def merged(self, theta: Array) -> Array:
         """Coefficients of the voxels that were asked for."""
@@ -359,13 +360,38 @@ class Chosen:
         chosen["temporal_coefficients"] = chosen.pop("coefficients")
         return chosen | {"candidates": self._bench.record}
 
-    def gone_on(self, problem: Problem, steps: Iterable[object]) -> NDArray[Any]:
-        own = self._bench.problem
-        problem = replace(problem, known=own.known, doubt=own.doubt)
-        solver = self._trial.admm.on(problem.masked(self._trial.operator), problem.used_samples)
-        for _ in steps:
-            solver.step()
-        return self._bench.video(replace(self._trial, admm=solver))
+    def onward(self, problem: Problem, heavier: float = 1.0, *, still: bool = False) -> Onwards:
+        beside = self._bench.still if still else None
+        return Onwards(
+            self._bench,
+            _on(self._trial, problem, heavier),
+            None if beside is None else _on(beside, problem, heavier),
+        )
+
+
+class Onwards:
+    """A trial that goes on, and the still that it changes beside, if that does: most of the picture is it."""
+
+    def __init__(self, bench: Workbench, trial: Trial, still: Trial | None) -> None:
+        self._bench, self._trial, self._still = bench, trial, still
+
+    def step(self) -> None:
+        self._trial.admm.step()
+        if self._still is not None:
+            self._still.admm.step()
+
+    def video(self) -> NDArray[Any]:
+        if self._still is None:
+            return self._bench.video(self._trial)
+        bench = self._bench.on(self._bench.problem, still=self._still)
+        return bench.video(replace(self._trial, bench=bench))
+
+
+def _on(trial: Trial, problem: Problem, heavier: float) -> Trial:
+    own = trial.bench.problem
+    problem = replace(problem, known=own.known, doubt=own.doubt)
+    operator = problem.masked(trial.operator)
+    return replace(trial, admm=trial.admm.on(operator, problem.used_samples, heavier))
 
 
 def _denoiser(candidate: Candidate) -> Denoiser:

@@ -100,6 +100,41 @@ def test_time_is_kept_for_what_goes_on_after_the_last_iteration(wall: Wall) -> N
     assert clock.seconds == pytest.approx(8.3, abs=0.1)  # no more than 15 % are kept
 
 
+def test_one_long_iteration_in_five_does_not_end_what_goes_on_after_the_last(wall: Wall) -> None:
+    clock = IterationClock(1000, 10.0)
+    wall.now += 8.0
+    made = 0
+    for made in clock.afterwards(1000):
+        wall.now += 0.5 if made % 5 == 4 else 0.02
+    assert made > 8
+    assert clock.seconds <= 10.0
+
+
+def test_the_fewest_after_the_last_are_made_where_they_fit(wall: Wall) -> None:
+    for least, expected in ((0, 1), (2, 2)):
+        clock = IterationClock(1000, 10.0)
+        wall.now += 8.5
+        for _ in clock.afterwards(1000, least):
+            wall.now += 0.6
+        assert clock.seconds == pytest.approx(8.5 + 0.6 * expected)
+
+
+@pytest.mark.parametrize(("left_s", "first"), [(6.0, 15), (2.0, 8), (0.9, 0)])
+def test_what_is_to_be_made_twice_leaves_time_for_the_second(wall: Wall, left_s: float, first: int) -> None:
+    clock = IterationClock(1000, 10.0)
+    for _ in clock.run(1, "solve"):
+        wall.now += 0.1
+    wall.now += 9.9 - left_s
+    made = again = 0
+    for made, _ in enumerate(clock.afterwards(15, twice=4), 1):  # noqa: B007
+        wall.now += 0.1
+    for again, _ in enumerate(clock.afterwards(max(made, 4), 2), 1):  # noqa: B007
+        wall.now += 0.1
+    assert made == first
+    assert again == max(made, 4)
+    assert clock.seconds <= 10.0
+
+
 def test_compiling_is_no_part_of_the_time() -> None:
     began = time.monotonic()
     clock = IterationClock(10, 1.0)

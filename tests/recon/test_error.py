@@ -15,6 +15,8 @@ from scipy.stats import spearmanr
 from acquire.recon import Reconstruction, api, reconstruct
 from acquire.recon import clock as clocks
 from acquire.recon.error import (
+    BY_LINES,
+    BY_PRIOR,
     REGIONS,
     Clues,
     VideoError,
@@ -24,7 +26,7 @@ from acquire.recon.error import (
     together,
 )
 from acquire.showing import error_in_words
-from acquire.sim.procedural import Recorded, record
+from acquire.sim.procedural import CLEAN, Camera, Recorded, record
 
 EVERY = slice(None)
 
@@ -112,12 +114,15 @@ def test_regions_hold_all_voxels_alike(side: int) -> None:
 def test_an_error_has_degree_one_in_its_clues() -> None:
     rng = np.random.default_rng(3)
     moved, change, edge = rng.uniform(0.1, 1, (20, 8, 8)), rng.uniform(0.1, 1, (8, 8)), rng.random((8, 8))
-    once = from_clues(Clues(0.1, 2.0, moved, change, edge), EVERY)
-    twice = from_clues(Clues(0.2, 4.0, 2 * moved, 2 * change, 2 * edge), EVERY)
+    once = from_clues(Clues(BY_LINES, 0.1, 2.0, moved, change, edge), EVERY)
+    twice = from_clues(Clues(BY_LINES, 0.2, 4.0, 2 * moved, 2 * change, 2 * edge), EVERY)
     assert twice.rms == pytest.approx(2 * once.rms)
     assert np.allclose(twice.regions, 2 * once.regions)
-    unsure = from_clues(Clues(0.2, 2.0, 2 * moved, change, edge), EVERY)
+    unsure = from_clues(Clues(BY_LINES, 0.2, 2.0, 2 * moved, change, edge), EVERY)
     assert unsure.rms > once.rms
+    cut = Clues(BY_PRIOR, 0.1, 2.0, moved, change, edge, drifts=0.3)
+    assert from_clues(replace(cut, fine=True), EVERY).rms > from_clues(cut, EVERY).rms
+    assert from_clues(replace(cut, drifts=0.9), EVERY).rms > from_clues(cut, EVERY).rms
     assert np.sqrt(np.square(once.frames).mean()) == pytest.approx(once.rms)
 
 
@@ -131,3 +136,31 @@ def test_sub_segments_are_told_together() -> None:
     assert error_in_words(whole) == "about 1.8 % of full scale (1.3 to 3.3 % in nine of ten)"
     unknown = together([*parts, {"unknown": "the video is dark"}], [1, 1, 1])
     assert error_in_words(unknown) == "cannot be told: the video is dark"
+
+
+@pytest.mark.parametrize("camera", [CLEAN, Camera()], ids=["clean", "1e4"])
+def test_a_still_finer_than_pixels_is_judged_by_its_prior(camera: Camera) -> None:
+    """Its lines are explained to a part in a thousand where the picture is some percent off."""
+    made = record("still", 72, stages=24, lines=120, camera=camera)
+    result = reconstruct(made.segment, 2, 8, "fast")
+    assert isinstance(result.error, VideoError)
+    assert result.error.clues.fine
+    off = np.sqrt(np.square(result.video[result.trusted] - made.truth(2, 8)).mean())
+    assert result.error.low < off < 1.5 * result.error.high
+
+
+@pytest.mark.parametrize("scene", ["leds", "leds_dot"])
+def test_what_is_cut_drifts_and_is_not_told_to_be_near(scene: str) -> None:
+    """Its lines are explained long before the picture is right: they say less of it than of others."""
+    made = record(scene, 73, stages=24, lines=120, camera=CLEAN)
+    cut = reconstruct(made.segment, 3, 1, "best", iterations=40)
+    assert cut.ended == "done"
+    assert isinstance(cut.error, VideoError)
+    assert cut.error.clues.powers is BY_PRIOR
+    assert cut.error.clues.drifts > 0.1
+    off = np.sqrt(np.square(cut.video[cut.trusted] - made.truth(3, 1)).mean())
+    assert cut.error.low < off < cut.error.high
+    settled = solved("splash")
+    assert settled.ended == "converged"
+    assert isinstance(settled.error, VideoError)
+    assert settled.error.clues.powers is BY_LINES
