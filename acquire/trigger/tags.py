@@ -35,8 +35,8 @@ class TagReader:
     """Reads the tags of ``run``, which the device knows by ``number`` and began at ``start_tick``.
 
     What it counts: ``tags`` received, those of events included; ``tags_missing``, made by the device but
-    not received; ``tags_repeated``, older than the ones before; ``tags_wrong``, whose code index does not
-    belong to their line. The latter two are dropped.
+    not received, without whole turns of 65536 at once; ``tags_repeated``, older than the ones before;
+    ``tags_wrong``, whose code index does not belong to their line. The latter two are dropped.
     """
 
     NOTHING: ClassVar[Mapping[str, int]] = {
@@ -50,7 +50,7 @@ class TagReader:
         self.lines_known = 0
         """Lines that have begun for certain."""
         self._run, self._number, self._start_tick = run, number % (1 << _RUN_BITS), start_tick
-        self._next = 0
+        self._next, self._newest_line = 0, -1
         self._counts = dict(self.NOTHING)
         self._events: deque[TagEvent] = deque(maxlen=_MOST_EVENTS)
 
@@ -74,9 +74,10 @@ class TagReader:
         number, tag = arrival
         if tag.run != self._number:  # of the run before: it was still under way in link or queue
             return None
-        # Numbers of 16 bits come round: what seems more than half a turn ahead is behind.
+        # Numbers of 16 bits come round: what seems more than half a turn ahead is behind, unless its line
+        # says that so many were lost.
         ahead = (number - self._next) % _NUMBERS
-        if ahead >= _NUMBERS // 2:
+        if ahead >= _NUMBERS // 2 and tag.line <= self._newest_line:
             self._counts["tags_repeated"] += 1
             return None
         self._next = (number + 1) % _NUMBERS
@@ -86,6 +87,7 @@ class TagReader:
             self._counts["tags_wrong"] += 1
             return None
         self._counts["tags"] += 1
+        self._newest_line = max(self._newest_line, tag.line)
         if not tag.flags & TagFlag.NO_LINES:
             self.lines_known = max(self.lines_known, tag.line + 1)
         for flag, kind in EVENTS.items():
