@@ -42,8 +42,8 @@ Make = Callable[..., Recorded]
 RIDGE = 0.02
 """Of the number of cases, which holds powers towards 0 that hardly matter."""
 FAR, ROUNDS = 0.3, 30
-"""Of a logarithm, beyond which a case counts for less (Huber), and fits until that has settled: clean stills
-are off by ten times, and would bend all others."""
+"""Of a logarithm, beyond which a case counts for less (Huber), and fits until that has settled: a flash
+before a clean still is off by five times, and would bend all others."""
 CUT = ("leds", "leds_dot", "digits", "flicker")
 CUT_CAMERAS, CUTS = ("1e4", "clean"), (60, 140, 300)
 """What the fit has cut, too, in 3 × 1 voxels: scenes that go on longest, after so many iterations."""

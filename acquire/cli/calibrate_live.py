@@ -87,7 +87,7 @@ def record(
     raise DataError(
         f"{TRIES} recordings lacked lines, the last one {missing} of {lines} per arm ({ended})",
         possible=f"up to {int(MOST_LOST * lines)}, of both arms together",
-        hint="acquire bench, whether this host keeps up; stream.stall_s, where it only begins late",
+        hint="acquire bench (does this host keep up?); a longer stream.stall_s, where it only begins late",
     )
 
 

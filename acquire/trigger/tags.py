@@ -74,16 +74,17 @@ class TagReader:
         number, tag = arrival
         if tag.run != self._number:  # of the run before: it was still under way in link or queue
             return None
+        # Two counters of the device that must agree: a check of the gateware, beside the frame's CRC.
+        wrong = tag.code_index != tag.line * self._run.substeps
         # Numbers of 16 bits come round: what seems more than half a turn ahead is behind, unless its line
         # says that so many were lost.
         ahead = (number - self._next) % _NUMBERS
-        if ahead >= _NUMBERS // 2 and tag.line <= self._newest_line:
+        if ahead >= _NUMBERS // 2 and (wrong or tag.line <= self._newest_line):
             self._counts["tags_repeated"] += 1
             return None
         self._next = (number + 1) % _NUMBERS
         self._counts["tags_missing"] += ahead
-        # Two counters of the device that must agree: a check of the gateware, beside the frame's CRC.
-        if tag.code_index != tag.line * self._run.substeps:
+        if wrong:
             self._counts["tags_wrong"] += 1
             return None
         self._counts["tags"] += 1

@@ -91,14 +91,16 @@ def test_nothing_is_claimed_where_nothing_can_be_known() -> None:
 
 @pytest.mark.parametrize("scene", ["splash", "leds", "still"])
 def test_a_budget_leaves_time_to_tell_it(scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By processor time, since a busy machine leaves a wall clock's budget with one iteration."""
+    """By the processor time of one thread: a busy machine leaves a budget of wall time with one iteration."""
     own = SimpleNamespace(monotonic=time.process_time, process_time=time.process_time)
     monkeypatch.setattr(clocks, "time", own)
     monkeypatch.setattr(api, "time", own)
+    monkeypatch.setattr(api, "idle_cores", lambda: 1)  # threads of BLAS that wait take processor time, too
+    segment = recorded(scene).segment
     whole_s = solved(scene).processor_s
     for share in (0.4, 0.7):
         began_s = time.process_time()
-        result = reconstruct(recorded(scene).segment, 3, 1, budget_s=share * whole_s, refuse=False)
+        result = reconstruct(segment, 3, 1, budget_s=share * whole_s, refuse=False)
         assert isinstance(result.error, VideoError), result.error
         assert time.process_time() - began_s < 1.1 * share * whole_s + 0.3
 
@@ -146,7 +148,7 @@ def test_a_still_finer_than_pixels_is_judged_by_its_prior(camera: Camera) -> Non
     assert isinstance(result.error, VideoError)
     assert result.error.clues.fine
     off = np.sqrt(np.square(result.video[result.trusted] - made.truth(2, 8)).mean())
-    assert result.error.low < off < 1.5 * result.error.high
+    assert result.error.low < off < result.error.high
 
 
 @pytest.mark.parametrize("scene", ["leds", "leds_dot"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 from pathlib import Path
 
 import numpy as np
@@ -89,7 +90,10 @@ def test_lines_that_are_missing_each_time_are_told_with_how_the_recordings_ended
             assert client.status().state == "idle"
     assert refused.code == 6
     assert "3 recordings lacked lines" in refused.err
-    assert refused.err.count("of 1024 per arm (INCOMPLETE: line budget reached)") == 4
+    # A slow host may end one by a stall instead: what is promised is that each says how.
+    told = re.findall(r"of 1024 per arm \(INCOMPLETE: ([^)]+)\)", refused.err)
+    assert len(told) == 4
+    assert "line budget reached" in told
 
 
 @pytest.mark.parametrize(

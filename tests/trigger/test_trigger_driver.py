@@ -244,8 +244,9 @@ def test_tags_that_are_missing_repeated_or_wrong_are_counted_and_only_good_ones_
 def test_after_more_missing_tags_than_half_a_turn_of_their_numbers_the_next_are_no_repetitions() -> None:
     tags = TagReader(run(), 5, 0)
     sent = [TagArrival(line % 2**16, tag_of(line)) for line in (0, 50_000, 50_001, 50_000)]
+    sent.append(TagArrival(50_000, tag_of(60_000, code_index=1)))  # an old number, and a line that is wrong
     assert [tag.line for tag in tags.take(sent)] == [0, 50_000, 50_001]
-    assert tags.statistics() == {"tags": 3, "tags_missing": 49_999, "tags_repeated": 1, "tags_wrong": 0}
+    assert tags.statistics() == {"tags": 3, "tags_missing": 49_999, "tags_repeated": 2, "tags_wrong": 0}
 
 
 @given(st.lists(st.booleans(), max_size=300), st.integers(0, 2**17))
