@@ -33,7 +33,9 @@ from acquire.cores import usable_cores
 
 ROOT = Path(__file__).parents[1]
 FILE = ROOT / "tools/results.jsonl"
-DOCUMENTS = (ROOT / "README.md", ROOT / "tools/MEASURED.md")
+DOCUMENTS = tuple(
+    ROOT / name for name in ("README.md", "tools/MEASURED.md", "tools/MEASURED_RECONSTRUCTION.md")
+)
 _PLACE = re.compile(r"(<!-- results of (.+?) -->\n).*?(<!-- end of results -->)", re.DOTALL)
 Figure = float | int | str | None
 
