@@ -1,6 +1,6 @@
 """Instrument software for TDI-based compressed video.
 
-The way of the data is one direction::
+Data flows in one direction::
 
     scene -> forward -> simulated devices -+
     trigger (FPGA) -> tags ----------------+-> ring -> tagger -> writer -> Zarr -> cut -> reconstruct -> video
@@ -27,7 +27,8 @@ The layers, top to bottom; imports point downwards only (checked by the tests)::
     logs  reading  showing           one line per entry · files that anybody may have put there · reprs
     errors  text                     failures that a user can meet, with exit codes · foreign text
 
-Why things are so, and what else was considered, is in `DECISIONS.md` beside this file.
+`GLOSSARY.md`, next to this file, defines the terms; `DECISIONS.md` gives the reasons for the design and the
+alternatives that were considered.
 
 Equation numbers in docstrings refer to Li, Wang and Liu, "TDI-based continuous window compressed
 spatio-temporal imaging capable of flexible voxels post-interpretation".
