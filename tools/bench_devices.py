@@ -1,10 +1,10 @@
-"""What a solver's iterations cost by device, dtype and threads of BLAS: Fig. 9, the same code everywhere.
+"""Cost of a solver's iterations by device, dtype and BLAS threads: Fig. 9, the same code everywhere.
 
 Usage: python -m tools.bench_devices [--devices cpu gpu] [--dtypes float32 float64] [--threads 1 2]
 
-Every case in turn, three times over, the best of each: wall-clock and processor time, and how often the time
-of the first case. PSNR is of that many iterations, which are few: it shows what the dtype does to the video,
-not what the solver reaches. Only the iterations differ between devices; lines are made on the host.
+All cases run in turn, three times, and the best of each counts: wall-clock and processor time, also as a
+multiple of the first case. PSNR is that after these few iterations: it shows the effect of the dtype on the
+video, not the final quality. Only the iterations differ between devices; lines are made on the host.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def main() -> None:
 
 
 def table(asked: argparse.Namespace, run: Run) -> None:
-    """A line per solver, device, dtype and number of threads."""
+    """Print a line per solver, device, dtype and number of threads."""
     case = CASES["fig9"]
     scene, segment = record(case, 1)
     true = truth(scene, case.geometry.substeps * case.first_line, case.geometry.span, *case.merges)

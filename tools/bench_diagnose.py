@@ -1,12 +1,12 @@
-"""Are wrong descriptions named, and right ones left alone? Procedural scenes with an ordinary camera's noise.
+"""Are wrong descriptions named, and right ones accepted? Procedural scenes with an ordinary camera's noise.
 
 Usage: python tools/bench_diagnose.py [--seeds 11 12] [--scenes bullet …] [--full-well 10000]
 
-Every scene is recorded once per seed (scene, code and noise are of it), described rightly and wrongly, and
-diagnosed. `acquire.recon.search` was written looking at seeds 1 to 5: figures of these and of others are to
-be told apart. Prints what was said of each: ✓ named as it is, ? cannot tell, · nothing, u the code does not
-explain the lines, 2 one of two, ✗ another fault; ! a level besides. Where all is right, any fault named is
-a false alarm.
+Every scene is recorded once per seed (of scene, code and noise), described correctly and incorrectly, and
+diagnosed. `acquire.recon.search` was developed on seeds 1 to 5, so figures of other seeds count separately.
+Prints the answer for each: ✓ named correctly, ? undecided, · nothing, u the code does not explain the lines,
+2 one of two, ✗ another fault; ! a level in addition. For a right description any fault named is a false
+alarm.
 
     seed      the code of another seed         swapped   arm A is called B
     inverted  every bit                        mirrored  arm B's pixels in the other order
@@ -34,11 +34,11 @@ from acquire.sim.procedural import SCENES, Camera, record
 from tools.results import Run, add_option, recorded
 
 DEGREE, AHEAD = 31, 64
-"""Recordings begin some bits into their code, so that it can be early as well as late."""
+"""Recordings begin a few bits into their code, so that the code can be early as well as late."""
 
 
 def shifted(segment: Segment, bits: np.ndarray, late: int) -> Segment:
-    """Described with a code against which its lines are so many sub-steps late."""
+    """Describe the segment with a code against which its lines are ``late`` sub-steps late."""
     return replace(segment, code=bits[AHEAD + late : AHEAD + late + segment.geometry.span])
 
 
@@ -48,7 +48,7 @@ def described_as(segment: Segment, bits: np.ndarray, substeps: int) -> Segment:
 
 
 def faults(segment: Segment, bits: np.ndarray, seed: int) -> dict[str, tuple[Segment, Hypothesis | None]]:
-    """Wrong descriptions, each with the hypothesis that puts it right; None: no hypothesis does."""
+    """Wrong descriptions, each with the hypothesis that corrects it; None: no hypothesis does."""
     sign, S = 1 - 2 * (seed % 2), segment.geometry.substeps
     a, b = segment.lines
     other = prbs(DEGREE, mix_seed(seed + 4711, DEGREE), 0, segment.geometry.span)

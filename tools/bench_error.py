@@ -1,19 +1,19 @@
-"""Is the estimated error of a video the error? Against the truth, on scenes it was not calibrated on.
+"""Compare the estimated error of a video with the true error, on scenes to which the estimate was not fitted.
 
     OMP_NUM_THREADS=1 python tools/bench_error.py [--scenes swing pan …] [--seeds 901] [--record]
     OMP_NUM_THREADS=1 python tools/bench_error.py --fit
 
-Scenes of `tools.error_scenes` that were kept from the fit, with an ordinary camera's noise
+It uses the scenes of `tools.error_scenes` that were excluded from the fit, with an ordinary camera's noise
 (full well 10⁴ e, 10 e read), with less light (10³ e) and clean, in voxels of 3 × 1 and 2 × 8, preset fast,
 32 stages, 160 lines. Per scene: the true RMS error and its estimate in percent of full scale, whether the
-claimed interval holds it, the rank correlation of estimated and true error over 8 × 8 regions and over
-frames, and what the estimate took of the processor time. At the end, how often nine of ten was nine of ten.
+stated interval holds the true error, the rank correlation of estimated and true error over 8 × 8 regions and
+over frames, and the estimate's share of the processor time. At the end: the share of intervals that held.
 
 --fit calibrates: on the scenes of `acquire.sim.procedural` and the others of `tools.error_scenes`, some of
-them also cut after a few iterations, prints the powers for `acquire/recon/error.py`, of what is judged by
-lines and by its prior, and, each scene estimated by powers fitted to the others, how far estimates were off.
-All scenes count alike, however many of their cases are estimated; where light beyond the band was found, none
-is.
+them also interrupted after a few iterations, it prints the exponents for `acquire/recon/error.py`, for videos
+that are judged by their lines and by their prior, and the errors of the estimates when each scene is
+predicted from the others. All scenes have equal weight, whatever their number of cases; cases with light
+beyond the band are left out.
 """
 
 from __future__ import annotations
@@ -40,15 +40,15 @@ CAMERAS = {"1e4": Camera(), "1e3": Camera(1e3), "clean": procedural.CLEAN}
 VOXELS = ((3, 1), (2, 8))
 Make = Callable[..., Recorded]
 RIDGE = 0.02
-"""Of the number of cases, which holds powers towards 0 that hardly matter."""
+"""Share of the number of cases: the penalty that pulls unimportant exponents towards 0."""
 FAR, ROUNDS = 0.3, 30
 """Of a logarithm, beyond which a case counts for less (Huber), and fits until that has settled: a flash
 before a clean still is off by five times, and would bend all others."""
 CUT = ("leds", "leds_dot", "digits", "flicker")
 CUT_CAMERAS, CUTS = ("1e4", "clean"), (60, 140, 300)
-"""What the fit has cut, too, in 3 × 1 voxels: scenes that go on longest, after so many iterations."""
+"""Scenes, the slowest to converge, that the fit also interrupts after these iterations, in 3 × 1 voxels."""
 BEYOND_THE_BAND = "fastled"
-"""Light that no video of the fit can hold, which is not to be estimated where it is not found."""
+"""Light that no video of the fit resolves: no estimate is fitted to it, even if that light is not found."""
 NINE_OF_TEN = (0.05, 0.95)
 
 
@@ -79,7 +79,7 @@ class Case:
 def measure(
     scene: str, seed: int, camera: str, voxels: tuple[int, int], make: Make, iterations: int | None = None
 ) -> Case:
-    """With preset fast, or cut after so many iterations of preset best."""
+    """Reconstruct with preset fast, or interrupt preset best after ``iterations``."""
     made = make(scene, seed, stages=STAGES, substeps=SUBSTEPS, lines=LINES, camera=CAMERAS[camera])
     result = reconstruct(
         made.segment, *voxels, "fast" if iterations is None else "best", iterations=iterations
@@ -98,7 +98,7 @@ def measure(
 
 
 def show(case: Case, run: Run) -> tuple[bool, np.ndarray, np.ndarray] | None:
-    """Print a row; whether the whole is held, and which regions and frames are."""
+    """Print a row; return whether the interval of the whole held, and of which regions and frames."""
     error = case.error
     if isinstance(error, str):
         print(f"{case.name:30} cannot be told: {error}", flush=True)
@@ -137,7 +137,7 @@ def show(case: Case, run: Run) -> tuple[bool, np.ndarray, np.ndarray] | None:
 
 
 def correlation(estimated: np.ndarray, true: np.ndarray) -> float:
-    """Of ranks; NaN where all are alike, as frames of a still are."""
+    """Rank correlation; NaN if all values are equal, as for the frames of a still."""
     if np.ptp(estimated) == 0 or np.ptp(true) == 0:
         return math.nan
     return float(spearmanr(estimated, true)[0])
@@ -161,18 +161,18 @@ def judge(cases: Iterable[Case], run: Run) -> None:
 
 
 def signs(clues: Clues, shown: slice) -> np.ndarray:
-    """Of the whole: logarithms, whose powers are `Powers.whole`."""
+    """Logarithms of the whole video's predictors, whose exponents are `Powers.whole`."""
     return estimation.signs(float(np.sqrt(np.square(clues.moved[shown]).mean())), clues)
 
 
 def signs_here(clues: Clues, shown: slice) -> np.ndarray:
-    """Of regions beside the whole: logarithms (64, 3)."""
+    """Logarithms of the regions' predictors relative to the whole (64, 3)."""
     maps = (np.sqrt(np.square(clues.moved[shown]).mean(0)), clues.change, clues.edge)
     return np.stack([np.log(each / np.sqrt(np.square(each).mean())).ravel() for each in maps], 1)
 
 
 def robust(rows: list[np.ndarray], wanted: list[np.ndarray], scenes: list[str]) -> np.ndarray:
-    """Powers, held towards 0, but for a constant; of the cases (each a list's item) of equal scenes."""
+    """Fit exponents, penalised towards 0 except the constant; one item per case, equal weight per scene."""
     share = np.repeat(_shares(scenes), [len(each) for each in wanted]) / np.repeat(
         [len(each) for each in wanted], [len(each) for each in wanted]
     )
@@ -188,13 +188,13 @@ def robust(rows: list[np.ndarray], wanted: list[np.ndarray], scenes: list[str]) 
 
 
 def _shares(scenes: list[str]) -> np.ndarray:
-    """Of each case, so that all scenes count alike."""
+    """Weight of each case, such that all scenes count equally."""
     _, place, count = np.unique(scenes, return_inverse=True, return_counts=True)
     return np.asarray(1 / count[place])
 
 
 def fit(cases: list[Case]) -> Powers:
-    """Those that there are, but factors: these are what it misses by on scenes that it was not fitted to."""
+    """Fit the exponents in use; keep the factors, which come from scenes left out of the fit."""
     told = [(case, case.error.clues) for case in cases if isinstance(case.error, VideoError)]
     scenes = [case.scene for case, _ in told]
     known = told[0][1].powers
@@ -223,7 +223,7 @@ def fit(cases: list[Case]) -> Powers:
 
 
 def nine_of_ten(off: list[np.ndarray], scenes: list[str]) -> tuple[float, float]:
-    """Between which nine of ten lie, of scenes that count alike."""
+    """Limits between which nine of ten values lie, with equal weight for each scene."""
     share = np.repeat(_shares(scenes) / [len(each) for each in off], [len(each) for each in off])
     values = np.concatenate(off)
     order = np.argsort(values)
@@ -233,7 +233,7 @@ def nine_of_ten(off: list[np.ndarray], scenes: list[str]) -> tuple[float, float]
 
 
 def calibrate(cases: list[Case], name: str, known: Powers) -> None:
-    """Print the powers, and by which factors estimates are off on scenes that these were not fitted to."""
+    """Print the exponents, and the factors between true error and estimate on scenes left out of the fit."""
     told = [
         case
         for case in cases
@@ -268,7 +268,7 @@ def calibrate(cases: list[Case], name: str, known: Powers) -> None:
 
 
 def ways(scene: str, camera: str, *, cut: bool) -> list[tuple[tuple[int, int], int | None]]:
-    """Voxels and the number of iterations of a scene's cases; None for the preset's."""
+    """Voxels and number of iterations of a scene's cases; None: the preset's."""
     found: list[tuple[tuple[int, int], int | None]] = [(voxels, None) for voxels in VOXELS]
     if cut and scene in CUT and camera in CUT_CAMERAS:
         found += [(VOXELS[0], iterations) for iterations in CUTS]

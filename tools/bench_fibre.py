@@ -3,11 +3,11 @@
     python tools/bench_fibre.py still                          # N_m = 1, a minute of a core for a tile
     python tools/bench_fibre.py video --tiles 1,3 --nm 8       # T_m = 16, 64 frames and more
 
-Stills are binary textures at two scales, in tiles of their own: features in proportion to the whole scene on
-the left, as fine as those of a scene of one tile on the right, which is unfavourable. Videos are of
-`scene-fibre`, of which some tiles hold little but darkness: those are easy, and told apart by their contrast.
-The brightest sample has 10 000 electrons, and 10 are read noise. PSNR has a peak of 1, full light. The line
-of JSON that is printed has dB and contrast (standard deviation of the truth) of each tile.
+Stills are binary textures at two scales: on the left, features in proportion to the whole scene; on the
+right, features as fine as those of a scene of one tile, which is unfavourable. Videos show `scene-fibre`,
+in which some tiles hold little but darkness; these are easy and can be recognised by their low contrast.
+The brightest sample has 10 000 electrons, and the read noise is 10. PSNR has a peak of 1, full light. The
+printed line of JSON has dB and contrast (standard deviation of the truth) of each tile.
 """
 
 from __future__ import annotations
@@ -58,17 +58,17 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("what", choices=("still", "video"))
-    parser.add_argument("--seed", type=int, default=1, help="of texture, code and noise")
-    parser.add_argument("--lines", type=int, help="absent: 600 of a still, 1344 of a video")
-    parser.add_argument("--tiles", help="as acquire reconstruct takes them; absent: all")
-    parser.add_argument("--nm", type=int, help="absent: 1 of a still, 4 of a video")
-    parser.add_argument("--tm", type=int, help="absent: all sub-steps, or 16")
+    parser.add_argument("--seed", type=int, default=1, help="seed of texture, code and noise")
+    parser.add_argument("--lines", type=int, help="lines; absent: 600 for a still, 1344 for a video")
+    parser.add_argument("--tiles", help="tiles, as for acquire reconstruct; absent: all")
+    parser.add_argument("--nm", type=int, help="N_m; absent: 1 for a still, 4 for a video")
+    parser.add_argument("--tm", type=int, help="T_m; absent: all sub-steps for a still, 16 for a video")
     parser.add_argument("--preset", default="fast")
     parser.add_argument(
-        "--search", choices=("shared", "each"), default="shared", help="as acquire reconstruct"
+        "--search", choices=("shared", "each"), default="shared", help="search, as for acquire reconstruct"
     )
     parser.add_argument("--workers", type=int)
-    parser.add_argument("--keep", type=Path, help="directory for the recording and the video; absent: none")
+    parser.add_argument("--keep", type=Path, help="directory in which recording and video are kept")
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         home = asked.keep or Path(scratch)
@@ -77,7 +77,7 @@ def main() -> None:
 
 
 def measure(asked: argparse.Namespace, home: Path) -> None:
-    """Simulate, reconstruct, compare; prints a line of JSON."""
+    """Simulate, reconstruct, compare; print a line of JSON."""
     resting = asked.what == "still"
     table = still_scene(home, asked.seed) if resting else load_scene("scene-fibre").model_dump(mode="json")
     scene = SceneFile.model_validate({**table, **EFFECTS, "seed": asked.seed}).root
@@ -146,7 +146,7 @@ def measure(asked: argparse.Namespace, home: Path) -> None:
 
 
 def truth_of(rig, scene, request, kept: range) -> np.ndarray:  # type: ignore[no-untyped-def]
-    """The voxels of the whole scene in the frames that are kept."""
+    """True voxels of the whole scene in the compared frames."""
     fibre, grid = rig.laid_out, request.grid
     rows, columns = fibre.field()
     shown = build_scene(scene, fibre.side, rig.trigger.substep_ticks / rig.trigger.clock_hz)

@@ -1,13 +1,13 @@
-"""What bands of a fibre that lie beside their places cost, and what aligning each tile gives back.
+"""Cost of fibre bands beside their nominal positions, and the gain from aligning each tile.
 
     python tools/bench_fibre_bands.py
 
 A binary texture of 128 x 192 behind a fibre on sensors of 64 stages, S = 1; full well 10 000 electrons, 10 of
-read noise; bands shifted by normal deviates along either axis. 1024 lines of the scene itself, at rest, are
-the target (`acquire.calibrate.target.tile_alignments`), and 300 of them make a still of each tile. A tile is
-compared with the truth where arm A sees it: its own shift, which nothing but the truth tells, is sought by
-least squares, and so is that of a tile without shifts. Prints PSNR in the mean of six tiles, with a peak of
-full light.
+read noise; bands shifted by normally distributed deviations along both axes. 1024 lines of the scene itself,
+at rest, are the target (`acquire.calibrate.target.tile_alignments`), and 300 of them make a still of each
+tile. A tile is compared with the truth at the position where arm A sees it: that shift, which only the truth
+reveals, is found by least squares, also for tiles without shifts. Prints the mean PSNR of six tiles, with a
+peak of full light.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--seed", type=int, default=1, help="of texture, code, noise and shifts")
+    parser.add_argument("--seed", type=int, default=1, help="seed of texture, code, noise and shifts")
     parser.add_argument("--shifts", type=float, nargs="*", default=[0.0, 0.5, 1.0, 2.0], metavar="PIXELS")
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as home:
@@ -48,10 +48,10 @@ def main() -> None:
 
 
 def measured(home: Path, seed: int, pixels: float) -> dict[str, object]:
-    """With bands beside their places by so much, as they are and aligned."""
+    """Measure with this deviation of the bands: uncorrected and aligned."""
     picture = np.clip(still(Stage(COLUMNS, 2, seed))(0, 0.0)[:ROWS], 0, 1)
     Image.fromarray(np.rint(255 * picture).astype(np.uint8)).save(home / "still.png")
-    light = STAGES * 0.5 * 0.6  # of a texture that is white for the greater part, half of the time lit
+    light = STAGES * 0.5 * 0.6  # for a mostly white texture that is lit half of the time
     camera = {"responsivity_dn": TOP_DN / light / 1.6, "dn_per_electron": K, "read_noise_e": 10.0}
     camera |= {"black_level_dn": 100.0, "pixel_format": "Mono12"}
     changes = {f"cameras.{arm}.{key}": value for arm in "ab" for key, value in camera.items()}

@@ -1,10 +1,10 @@
-"""Live video: how many glimpses a second, how old they are, what they cost, and what the recording loses.
+"""Live video: pictures per second, their age and cost, and lines lost by the recording.
 
     python tools/bench_glimpse.py [--seconds 20] [--busy 2]
 
-A daemon with cameras of stored lines records 100 000 sub-steps per second; one process makes glimpses of what
-has just passed, as it does for the page. Each row is one size of sensor; ``--busy`` keeps so many other
-processes computing meanwhile, before which the glimpses stand back.
+A daemon with cameras of stored lines records 100 000 sub-steps per second; one process makes pictures of the
+latest lines, as it does for the page. Each row is one size of sensor. ``--busy`` runs that many other
+processes at the same time, to which the pictures give way.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ WAIT_S = 60.0
 
 @contextlib.contextmanager
 def armed(directory: Path, stages: int, substeps: int) -> Iterator[Client]:
-    """A daemon with such a sensor, whose cameras cost next to nothing."""
+    """Run a daemon with such a sensor, whose cameras take hardly any processor time."""
     socket = directory / "c.sock"
     settings = {
         "geometry.stages": stages,
@@ -90,7 +90,7 @@ class Viewer:
         return found
 
     def _read(self) -> None:
-        with contextlib.suppress(Exception):  # the process has ended, in the midst of a message
+        with contextlib.suppress(Exception):  # the process ended in the middle of a message
             while True:
                 self.seen.append(self._next())
 
@@ -151,7 +151,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--seconds", type=float, default=20.0)
-    parser.add_argument("--busy", type=int, default=0, help="processes that compute beside it")
+    parser.add_argument("--busy", type=int, default=0, help="number of other busy processes")
     add_option(parser)
     options = parser.parse_args()
     with recorded("bench_glimpse", keep=options.record) as run:

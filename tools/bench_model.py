@@ -1,11 +1,11 @@
-"""What a calibration in the model costs: reconstructions with nothing, with each part alone, and with all.
+"""Cost of a calibration in the model: reconstructions without it, with each part alone, and with all parts.
 
 Usage: OMP_NUM_THREADS=1 python -m tools.bench_model [--iterations 80]
 
-263 lines of the practice instrument before its lamps (voxels 3 x 1, 64 x 64 x 598), with a calibration that
-holds offsets, gains, balance, a column that is left out, the cameras' curves and an alignment. All trials
-have the same bandwidth and as many iterations. Columns: processor seconds, which neighbours hardly change,
-and the same beside a reconstruction with nothing; the least of two.
+It uses 263 lines of the practice instrument in front of its lamps (voxels 3 x 1, 64 x 64 x 598), with a
+calibration of offsets, gains, balance, an excluded column, the cameras' curves and an alignment. All trials
+have the same bandwidth and number of iterations. Columns: processor seconds, which depend little on other
+load, and their ratio to a reconstruction without a calibration; the smaller of two runs.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def main() -> None:
 
 
 def measure(iterations: int, run: Run) -> None:
-    """Every case at one bandwidth and with as many iterations."""
+    """Run every case with the same bandwidth and number of iterations."""
     with tempfile.TemporaryDirectory() as directory:
         segments = cases(Path(directory))
     frames = segments["nothing"].geometry.video_shape(3, 1)[0]

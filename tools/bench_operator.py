@@ -1,9 +1,9 @@
-"""What the sensing matrix costs: matrix-free, as scipy.sparse, and beside a bare pass over the voxels.
+"""Cost of the sensing matrix: matrix-free, with scipy.sparse, and compared with a copy of the voxels.
 
 Usage: python tools/bench_operator.py [--record]
 
 For the sizes of the paper's figures: one forward and one adjoint of both arms, the same with an explicit
-sparse matrix, and a copy of the voxels, the least that touching them all can cost. Best of five each.
+sparse matrix, and a copy of the voxels, the lower limit for any operation on all of them. Best of five each.
 """
 
 from __future__ import annotations

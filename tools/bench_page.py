@@ -1,11 +1,12 @@
-"""What the operator's page costs the capture, and how quick it is: with clients and without, in one run.
+"""Cost of the operator's page for the capture, and its speed: with and without clients, in one run.
 
 ``python tools/bench_page.py --out DIR`` runs a daemon with cameras of stored lines and the page's process. It
-records without any client, then with five that follow the live picture, of which one never reads, in turn,
-``--rounds`` times; says what was lost, how late the grabbers' blocks were, and what the page's process
-took; then it opens the page in Debian's chromium, where that and playwright are installed: the first picture,
-and how late the state is told. The clients are a process of the lowest priority: theirs are other computers.
-``--small`` is 2 x 512 px x 33 klines/s, whose pictures are 2 x 1 MB/s; else it is 928 MB/s in all.
+records without clients and then with five that follow the live picture, one of which never reads, alternating
+``--rounds`` times. It prints the lost lines, the latency of the grabbers' blocks and the page's processor
+time. Then it opens the page in Debian's chromium, if that and playwright are installed, and measures the time
+to the first picture and the delay of the state. The clients run in a process of the lowest priority, since
+real ones run on other computers. ``--small`` is 2 x 512 px x 33 klines/s, with pictures of 2 x 1 MB/s; the
+default is 928 MB/s in total.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ from acquire.web.tokens import load_tokens
 from tools.results import add_option, recorded
 
 CLIENTS = 4
-"""That read; one more does not."""
+"""Clients that read; one more does not."""
 COMMON: dict[str, Any] = {
     "cameras.a.driver": "pattern",
     "cameras.b.driver": "pattern",
@@ -65,7 +66,7 @@ SMALL = {"geometry.stages": 512}
 
 
 class TimedRig:
-    """A rig whose cameras note how late their blocks are."""
+    """A rig whose cameras record the latency of their blocks."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
@@ -92,7 +93,7 @@ def rig_of(directory: Path, *, small: bool) -> RigConfig:
 
 
 def beside_a_daemon(config: RigConfig, socket_path: Path, measure: Callable[[TimedRig], None]) -> None:
-    """Run ``measure`` in a thread; the daemon has the main one, which gets its signals, and ends with it."""
+    """Run ``measure`` in a thread; the daemon has the main thread, for its signals, and ends with it."""
     with contextlib.closing(Endpoint(socket_path)) as endpoint, Rig(config) as plain:
         rig = TimedRig(plain)
         warm_up(*worker_modules(plain), "acquire.capacity.latency")
@@ -125,7 +126,7 @@ def page(socket_path: Path, directory: Path) -> Iterator[tuple[psutil.Process, s
 
 
 def follow(address: str, bytes_read: Any, ending: Any) -> None:
-    """Clients of the live picture until the end; the last one stands still from the first byte on."""
+    """Follow the live picture with all clients until the end; the last one never reads."""
     os.nice(19)
     port, token = re.findall(r":(\d+)/#token=(\S+)", address)[0]
     head = f"GET /api/live HTTP/1.1\r\nHost: 127.0.0.1:{port}\r\nAuthorization: Bearer {token}\r\n\r\n"
@@ -141,7 +142,7 @@ def follow(address: str, bytes_read: Any, ending: Any) -> None:
 
 @contextlib.contextmanager
 def followers(address: str) -> Iterator[Any]:
-    """The bytes that they have read so far, together."""
+    """Total number of bytes that they have read so far."""
     spawn = get_context("spawn")
     bytes_read, ending = spawn.Value("q", 0), spawn.Event()
     process = spawn.Process(target=follow, args=(address, bytes_read, ending))
@@ -154,7 +155,7 @@ def followers(address: str) -> Iterator[Any]:
 
 
 def take(client: Client, rig: TimedRig, directory: Path, name: str, seconds: float) -> dict[str, Any]:
-    """One recording: what was lost, and the latencies of its blocks."""
+    """Make one recording; return its lost lines and the latencies of its blocks."""
     for latencies in rig.latencies.values():
         latencies.clear()
     path = directory / f"{name}.zarr"
@@ -185,7 +186,7 @@ def cores(process: psutil.Process, seconds: float) -> float:
 
 
 def browse(address: str, client: Client) -> dict[str, float]:
-    """Seconds to the first picture, and from a mark to its place on the page."""
+    """Seconds to the first picture, and from a mark to its appearance on the page."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as playwright:
@@ -226,7 +227,7 @@ def rounds(
     options: Any,
     run: Any,
 ) -> tuple[list[float], list[float]]:
-    """The p99.9 of the grabbers' blocks in ms without clients, and with them, in turn."""
+    """p99.9 latency of the grabbers' blocks in ms without and with clients, alternating."""
     alone, followed = [], []
     for number in range(options.rounds):
         found = take(client, rig, directory, f"alone-{number}", options.seconds)
@@ -255,7 +256,7 @@ def rounds(
 
 
 def compared(alone: list[float], followed: list[float]) -> str:
-    """Medians, and how far apart rounds of one kind are, without which the difference says nothing."""
+    """Medians, and the spread of the rounds of each kind, without which a difference means nothing."""
     without, beside = statistics.median(alone), statistics.median(followed)
     spread = (max(alone) - min(alone)) / without
     return (

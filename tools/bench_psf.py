@@ -1,13 +1,13 @@
-"""How wide the optics blur: instruments drawn at random, what slanted edges tell of them, and what it gives.
+"""The optics' blur: measured from slanted edges on random instruments, and its value for a reconstruction.
 
 Usage: OMP_NUM_THREADS=1 python -m tools.bench_psf [--instruments 4] [--seed 1] [--no-video]
 
-Instruments are those of `bench_calibrate`, with a blur of either arm drawn from 0 to 1.5 fine pixels. Dark,
-flat, target and a checkerboard that is turned by 3 to 20 degrees are recorded with 1024 lines each, and
-calibrated as `acquire calibrate` does. Then lamps that were drawn as well are reconstructed from 263 lines
-(voxels 3 x 1): calibrated without the blur, with it, and from lines that had nothing but the same noise.
-Columns: widths found less those that are (fine pixels, along and across of arms A and B; arm B's is that of
-the blur and of the simulator's bilinear image together), their standard uncertainty, PSNR in dB, seconds.
+The instruments are those of `bench_calibrate`, with a random blur of 0 to 1.5 fine pixels for each arm. Dark,
+flat, target and a checkerboard turned by 3 to 20 degrees are recorded with 1024 lines each and calibrated as
+`acquire calibrate` does. Then random lamps are reconstructed from 263 lines (voxels 3 x 1): calibrated
+without the blur, with it, and from lines with only the same noise. Columns: measured minus true widths (fine
+pixels, along and across the transfer, arms A and B; arm B's includes the simulator's bilinear interpolation),
+their standard uncertainty, PSNR in dB, seconds.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ SIZE, FINER = 192, 8
 
 
 class Blurred(Drawn):
-    """An instrument whose arms are blurred each in its own way."""
+    """An instrument whose arms have different blurs."""
 
     @property
     def widths(self) -> tuple[float, float]:
@@ -68,7 +68,7 @@ class Blurred(Drawn):
 
 
 def checkerboard(seed: int) -> NDArray[np.float32]:
-    """Squares of about 58 fine pixels, turned; pixels hold the mean of what covers them."""
+    """A turned checkerboard with squares of about 58 fine pixels; pixels hold the mean over their area."""
     angle = np.deg2rad(np.random.default_rng(seed + 4000).uniform(3, 20))
     at = (np.arange(SIZE * FINER) + 0.5) / FINER - SIZE / 2
     y, x = np.meshgrid(at, at, indexing="ij")
@@ -79,7 +79,7 @@ def checkerboard(seed: int) -> NDArray[np.float32]:
 
 
 def true_widths(drawn: Blurred) -> NDArray[np.float64]:
-    """(arm, axis) of what the simulator does: kernels at whole pixels, and between them arm B's image."""
+    """Blur (arm, axis) of the simulator: kernels at whole pixels, and arm B's interpolation between them."""
     variances = []
     for sigma in drawn.widths:
         at = np.arange(-int(4 * sigma + 0.5), int(4 * sigma + 0.5) + 1)

@@ -1,17 +1,17 @@
-"""What accuracy costs in time: the figures' scenes against the truth, on exposure codes not tuned on.
+"""Cost of accuracy in time: the figures' scenes and the truth, on codes on which nothing was tuned.
 
 Usage: python tools/bench_reconstruct.py [fig9 motion detail static pulses chopper digits] [--seeds 1 2]
 
 For every case and code: PSNR over the trusted interval after each budget of time, for the default solver and
-the paper's TwIST, and beside them TwIST with the default's band and sign (what the prior gains without the
-algorithm). Nothing is told to the solvers but the lines; --budgets in seconds, of wall-clock time. Lines come
-from the streaming simulator, rounded to 12 bits. Fig. 9 also has the largest error of the three fitted
-frequencies and the ratio of fitted to true amplitude at 5 kHz; pulses the correlation of the light with the
-truth over lit sub-steps, the still image known, 1 % noise.
+the paper's TwIST, and TwIST with the default's band and sign (the gain of the prior without the algorithm).
+The solvers get nothing but the lines; budgets are seconds of wall-clock time. Lines come from the streaming
+simulator, rounded to 12 bits. Fig. 9 also has the largest error of the three fitted frequencies and the ratio
+of fitted to true amplitude at 5 kHz; pulses have the correlation of the light with the truth over lit
+sub-steps, with a known still image and 1 % noise.
 
---against-twist instead says, one line per case and code, how good the paper's solver gets within 400
-iterations (the paper makes at most 200), how much sooner the default is as good, in wall-clock and in
-processor time, and how good the default is in the time of TwIST's best.
+--against-twist prints one line per case and code instead: the best PSNR of the paper's solver within 400
+iterations (the paper makes at most 200), how much sooner the default reaches it, in wall-clock and in
+processor time, and the default's PSNR in the time of TwIST's best.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ GAIN_DN = 6.0
 
 @dataclass(frozen=True)
 class Case:
-    """A scene, its geometry and voxels, and the budgets of the goals (dB there)."""
+    """A scene, its geometry and voxels, and the goals: (budget in s, dB)."""
 
     scene: str
     geometry: Geometry
@@ -66,7 +66,7 @@ PULSES = ("scene-pulses-300khz", "scene-pulses-900khz")
 
 
 def record(case: Case, seed: int) -> tuple[Scene, Segment]:
-    """The lines as a 12-bit camera would have recorded them."""
+    """Lines as a 12-bit camera would have recorded them."""
     g = case.geometry
     scene, code = (
         build_scene(load_scene(case.scene), g.size, case.substep_s),
@@ -88,7 +88,7 @@ def record(case: Case, seed: int) -> tuple[Scene, Segment]:
 
 
 def judged(result: Reconstruction) -> slice:
-    """The trusted frames; all of them where a frame is longer than the trusted interval."""
+    """The trusted frames; all frames if a frame is longer than the trusted interval."""
     return result.trusted if result.trusted.stop > result.trusted.start else slice(None)
 
 
@@ -134,7 +134,7 @@ def compare(name: str, case: Case, seed: int, solvers: list[str], run: Run) -> N
 
 @dataclass(frozen=True)
 class Trial:
-    """A reconstruction against the truth, with what it took."""
+    """PSNR of a reconstruction, with its time."""
 
     db: float
     seconds: float

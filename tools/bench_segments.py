@@ -1,4 +1,4 @@
-"""What a long stretch takes: seconds and the largest memory of any process, by the length of the stream.
+"""Cost of a long range: seconds and the largest memory of any process, by the length of the stream.
 
 Usage: python tools/bench_segments.py [--lines 1000 4000] [--iterations 10]
 
@@ -24,7 +24,7 @@ from tools.results import add_option, recorded
 
 
 def measure(path: Path, lines: int, iterations: int, answer: multiprocessing.queues.Queue) -> None:
-    """Reconstruct the first lines; seconds, sub-segments, peak of this process and of its workers in MB."""
+    """Reconstruct the first lines; seconds, sub-segments, and peak MB of this process and of its workers."""
     recording = open_recording(path)
     request = in_voxels(by_lines(recording, 0, lines), Voxels(3, 1))
     tasks = len(request.stretches)

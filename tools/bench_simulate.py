@@ -1,12 +1,12 @@
-"""How fast the streaming simulation gives lines: against real time, bare operators, memory and scipy.
+"""Rate of the streaming simulation, compared with real time, bare operators, memory and scipy.
 
     python tools/bench_simulate.py [--stages 64] [--substeps 3] [--seconds 2] [--record]
 
-1. LEDs (separable), one thread: what a scene without effects costs beside the bare operator it consists of
-   (the two in turns), and that beside the matrix product inside, on the same windows and weights.
-2. Any scene, frame by frame, a thread per arm: frames stand ready in memory, more of them than fit into
-   caches; beside the time to read as many bytes, and the same sums as scipy.sparse products (one thread).
-3. What single effects add to 1.
+1. LEDs (separable), one thread: a scene without effects compared with its bare operator (alternating), and
+   the operator with its matrix product, on the same windows and weights.
+2. Any scene, frame by frame, a thread per arm: frames are ready in memory, more than fit into the caches;
+   compared with the time to read as many bytes, and with the same sums as scipy.sparse products (one thread).
+3. The additional cost of single effects in case 1.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ CODE = PrbsCode.from_seed(64, 1)
 
 
 def best_s(seconds: float, *works: Callable[[], object]) -> list[float]:
-    """Best times of works done in turns for so long: the machine's other work only ever slows one down."""
+    """Best times of tasks that alternate for ``seconds``: other load can only slow them down."""
     best, end = [float("inf")] * len(works), time.perf_counter() + seconds * len(works)
     while time.perf_counter() < end:
         for k, work in enumerate(works):
@@ -56,7 +56,7 @@ def best_s(seconds: float, *works: Callable[[], object]) -> list[float]:
 
 
 class Ready:
-    """A scene whose frames stand in memory, in the order in which lit sub-steps ask for them."""
+    """A scene whose frames are in memory, in the order in which lit sub-steps need them."""
 
     def __init__(self, frames: NDArray[np.float32]) -> None:
         self._frames, self._next = frames, 0

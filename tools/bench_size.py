@@ -1,11 +1,11 @@
-"""Larger sensors: Fig. 9's lamps on M pixels, in a limit of processor time and memory.
+"""Larger sensors: Fig. 9's lamps on M pixels, within a limit of processor time and memory.
 
     OMP_NUM_THREADS=1 python tools/bench_size.py [64 96 128 256] [--seeds 201 202] [--full-well 1e4]
 
 One row per size and code: PSNR over the trusted frames in voxels of 3 × 1, the largest error of the three
-frequencies, the band that was resolved, processor seconds of one thread and the largest memory. Each runs in
-a process of its own, so that its memory is its own. No budget is given, since that is wall time, which others
-shorten: what is solved is told to stop at the size's processor seconds, and gives the best so far.
+frequencies, the resolved band, processor seconds of one thread and the largest memory. Each case runs in its
+own process, so that its memory can be measured. Budgets are not used, since they are wall time, which
+depends on other load: the solver is stopped at the size's processor seconds and returns the best so far.
 
     M = 64, 263 lines     64 × 64 × 980       40 s, 40 dB (clean)
     M = 96, 392 lines     96 × 96 × 1463      90 s, 42 dB (clean)
@@ -42,7 +42,7 @@ READ_NOISE_E = 10.0
 
 @dataclass(frozen=True)
 class Size:
-    """A sensor, and what is asked of it."""
+    """A sensor, and its goals."""
 
     lines: int
     limit_s: float
@@ -54,7 +54,7 @@ SIZES = {64: Size(263, 40, 40), 96: Size(392, 90, 42), 128: Size(520, 180, 40), 
 
 @dataclass(frozen=True)
 class Row:
-    """What came of one."""
+    """Result of one case."""
 
     psnr_db: float
     curves: str
@@ -106,7 +106,7 @@ def measure(stages: int, seed: int, full_well_e: float, limit_s: float) -> Row:
 
 
 def _watch(enough: threading.Event, until: float) -> None:
-    """Set ``enough`` when this process has used its processor time."""
+    """Set ``enough`` once this process has used its processor time."""
     while not enough.wait(0.2):
         if time.process_time() >= until:
             enough.set()
@@ -119,7 +119,7 @@ def main() -> None:
     parser.add_argument("stages", nargs="*", type=int, default=[96, 128], choices=list(SIZES), metavar="M")
     parser.add_argument("--seeds", type=int, nargs="+", default=[201, 202])
     parser.add_argument("--full-well", type=float, default=math.inf)
-    parser.add_argument("--seconds", type=float, help="of processor time, in place of the sizes' own")
+    parser.add_argument("--seconds", type=float, help="processor seconds, instead of those of each size")
     add_option(parser)
     asked = parser.parse_args()
     fresh = multiprocessing.get_context("spawn")

@@ -1,16 +1,15 @@
-"""The default beside the best plain still: one frame, repeated, which is what it must never be worse than.
+"""Compare the default with the best plain still: one frame, repeated. The default must never be worse.
 
     python tools/bench_still.py [--scenes spark flicker …] [--seeds 901 902 903] [--full-well 1e4 clean]
                                 [--voxels 2x8 3x1] [--stages 32] [--lines 160] [--preset fast]
 
-One row per scene, seed (of code, scene and noise), camera and voxels: how far the trusted frames are from the
-truth, in dB, for
+One row per scene, seed (of code, scene and noise), camera and voxels: PSNR of the trusted frames in dB, for
 
-    mean      the truth's own mean over time, repeated: the best of all stills, which no lines give
+    mean      the truth's own mean over time, repeated: the best possible still, not computable from lines
     still     one frame, reconstructed from the same lines with the same preset, and repeated
-    default   what `reconstruct` gives; with its prior, held-out error, processor seconds of one thread
+    default   the result of `reconstruct`, with its prior, held-out error and processor seconds of one thread
 
-Then, of every scene, the worst and the mean of "default minus still". The truth is seen here only.
+Then, for every scene, the worst and the mean of "default minus still". Only this comparison uses the truth.
 """
 
 from __future__ import annotations
@@ -31,12 +30,12 @@ from acquire.sim.procedural import CLEAN, SCENES, Camera, record
 from tools.results import add_option, recorded
 
 NOT_WORSE_DB = -0.1
-"""A still that the default has chosen is solved once more, and ends as much off."""
+"""Tolerance: a still that the default has chosen is solved again and may differ by this much."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """PSNR in dB of each way, and how the default came about."""
+    """PSNR in dB of each method, and details of the default."""
 
     mean_db: float
     still_db: float

@@ -1,8 +1,8 @@
-"""What the store costs beside the bare disk: writing, packing, and cutting a segment out of an hour.
+"""Cost of the store compared with the bare disk: writing, packing, and cutting a segment from an hour.
 
 ``python tools/bench_store.py --out DIR`` alternates a bare O_DIRECT write of the same bytes with every case,
-so that each ratio is within one run. Lines are 4640 pixels of 8 bit, both arms, with the noise of photons of
-a sensor whose white is 20 000 electrons; blocks like those of a ring, in page-aligned memory.
+so that each ratio is within one run. Lines are 4640 pixels of 8 bit, both arms, with the photon noise of a
+sensor whose white is 20 000 electrons; blocks like those of a ring, in page-aligned memory.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ SHARD_LINES = CHUNK_LINES * SHARD_CHUNKS
 MIDDLE = HOUR_LINES // 2 // SHARD_LINES * SHARD_LINES
 CUT_LINES = 263
 MEMORY_BYTES = 2**30
-"""Of lines whose packing is measured: the largest cache that a processor's cores share is smaller."""
+"""Bytes of lines whose packing is measured: more than the largest shared cache of a processor."""
 WHITE_ELECTRONS = 20_000
 CAMERA = {"white_dn": 255, "black_level_dn": 0.0, "responsivity_dn": 1.0}
 
@@ -80,7 +80,7 @@ def spec(codec: str = "none", fsync: str = "seal") -> RecordingSpec:
 
 
 def block_memory(count: int = 8) -> list[np.ndarray]:
-    """Blocks of lines like those of a camera, on pages."""
+    """Page-aligned blocks of lines like those of a camera."""
     generator = np.random.default_rng(0)
     blocks = []
     for _ in range(count):
@@ -116,7 +116,7 @@ def paced(work: Callable[[], None], size: int) -> Pace:
 
 
 def bare(directory: Path, memory: list[np.ndarray], count: int) -> Pace:
-    """One file, direct I/O, the same memory, pieces of the same size."""
+    """Write one file with direct I/O from the same memory, in pieces of the same size."""
     path = directory / ".bare"
     path.touch()
     fd, size = open_direct(path), memory[0].nbytes // PAGE * PAGE
@@ -133,7 +133,7 @@ def bare(directory: Path, memory: list[np.ndarray], count: int) -> Pace:
 
 
 def written(directory: Path, memory: list[np.ndarray], count: int, codec: str, fsync: str) -> Pace:
-    """A recording of both arms, ``count`` blocks in all, until its last line is committed."""
+    """Write a recording of both arms, ``count`` blocks in total, until its last line is committed."""
     path = directory / ".bench-store.zarr"
     blocks = [
         [block(arm, number, memory[number % len(memory)]) for arm in ARMS]
@@ -143,7 +143,7 @@ def written(directory: Path, memory: list[np.ndarray], count: int, codec: str, f
 
         def work() -> None:
             for pair in blocks:
-                for one in pair:  # as the recorder does: while one arm's lines are written, the other's turn
+                for one in pair:  # as the recorder does: the arms alternate between preparing and writing
                     writer.give_back(one.arm)
                     writer.lend(one)
             writer.commit()
@@ -177,11 +177,10 @@ def write_cases(directory: Path, gigabytes: float, run: Run) -> None:
 
 
 def codec_cases(run: Run) -> None:
-    """From memory, as a recording's lines are: chunks that no cache holds all of, each packed once a pass.
+    """Pack chunks from memory, as in a recording: more than any cache holds, each packed once per pass.
 
-    By processor time, which a busy machine changes less. ``cached_mb_s`` is of one chunk again and again, out
-    of the cache, as `measure_codec` looks at it: a checksum is many times as fast there, which no recording
-    ever sees.
+    Processor time is used, which depends less on other load. ``cached_mb_s`` is for one chunk again and again
+    from the cache, as in `measure_codec`: a checksum is many times faster there, but never in a recording.
     """
     lines = np.resize(np.concatenate(block_memory()), (MEMORY_BYTES // PIXELS, PIXELS))
     chunks = lines[: len(lines) // CHUNK_LINES * CHUNK_LINES].reshape(-1, CHUNK_LINES, PIXELS)
@@ -204,7 +203,7 @@ def codec_cases(run: Run) -> None:
 
 
 def _pace_mb_s(chunks: Sequence[np.ndarray] | np.ndarray, work: Callable[[np.ndarray], object]) -> float:
-    """MB per second of the thread's processor time: the best of three passes."""
+    """MB per second of the thread's processor time; the best of three passes."""
     seconds = []
     for _ in range(3):
         begun = time.thread_time()
@@ -215,7 +214,7 @@ def _pace_mb_s(chunks: Sequence[np.ndarray] | np.ndarray, work: Callable[[np.nda
 
 
 def hour(directory: Path) -> Path:
-    """A recording of an hour: one shard in its middle has lines, the others are names of files."""
+    """Make a recording of an hour: one shard in its middle has lines, the others are only names of files."""
     path = directory / ".bench-hour.zarr"
     lines = block_memory(1)[0]
     small = replace(spec(), first_line=MIDDLE)
@@ -229,7 +228,7 @@ def hour(directory: Path) -> Path:
 
 
 def _stretch(path: Path, first_line: int) -> None:
-    """Give the recording an hour of rows, of which the shard that it has is in the middle."""
+    """Extend the recording to an hour of rows, with its only shard in the middle."""
     shard, shards = first_line // SHARD_LINES, HOUR_LINES // SHARD_LINES
     root = path / "zarr.json"
     document = json.loads(root.read_bytes())
@@ -263,8 +262,8 @@ def cut_case(directory: Path, run: Run) -> None:
 
 
 def _cut_cold(path: Path, line: int) -> list[float]:
-    """In a process of its own, its files out of the page cache: ms to open and cut, to cut, to cut the same
-    again, to cut others once the files are out of the cache again, and to read their chunks barely.
+    """Measure in a separate process, with the files out of the page cache: ms to open and cut, to cut, to cut
+    the same lines again, to cut others after evicting the files again, and to read only their chunks.
     """
     _chill(path)
     command = [sys.executable, __file__, "--cut", str(path), str(line)]
@@ -274,7 +273,7 @@ def _cut_cold(path: Path, line: int) -> list[float]:
 
 
 def _chill(path: Path) -> None:
-    """Have the files of the lines out of the page cache."""
+    """Evict the files of the lines from the page cache."""
     for file in shard_files(path, MIDDLE // SHARD_LINES):
         fd = os.open(file, os.O_RDONLY)
         os.fsync(fd)
@@ -301,7 +300,7 @@ def cut_here(path: Path, line: int) -> None:
 
 
 def _bare_read(path: Path, line: int) -> float:
-    """The chunks of lines that the cut needs, of both arms, one after the other, past the page cache."""
+    """Read the chunks that the cut needs, of both arms, one after the other, past the page cache."""
     row = line - MIDDLE
     chunks = range(row // CHUNK_LINES, -(-(row + CUT_LINES) // CHUNK_LINES))
     memory = aligned_bytes(CHUNK_LINES * PIXELS)

@@ -1,16 +1,16 @@
-"""What lines tell of the instrument without a calibration: the arms' balance, and light beyond the band.
+"""What lines reveal of the instrument without a calibration: the arms' balance, light beyond the band.
 
     python tools/bench_told.py balance [--scenes still splash …] [--seeds 70 71]
     python tools/bench_told.py field
     python tools/bench_told.py fast
 
-balance   dB of a reconstruction (32 stages, voxels 2 × 8) where arm B gets so many times the light of arm A,
-          with the lines' own balance and without
-field     arms that get the same light and do not see the same field: how far off the balance is, and how
-          often it is corrected all the same
-fast      a lamp of 20 kHz, and scenes without one: how often light beyond the band is told
+balance   dB of a reconstruction (32 stages, voxels 2 × 8) where arm B gets a multiple of the light of arm A,
+          without and with the blind balance
+field     arms that get the same light but do not see the same field: the error of the balance, and how often
+          it is corrected wrongly
+fast      a lamp of 20 kHz, and scenes without one: how often light beyond the band is reported
 
-All with the noise of a full well of 10⁴ e, of seeds of scene, code and noise that nothing was tuned on.
+All have the noise of a full well of 10⁴ e, and seeds of scene, code and noise on which nothing was tuned.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ from tools.results import Run, add_option, recorded
 RATIOS = (1.0, 1.02, 1.05, 1.1, 1.2)
 STAGES, LINES = 32, 160
 SHIFTS = ((1, -1), (3, -2), (6, -4), (12, -8))
-"""Rows and columns of 96 fine pixels by which arm B looks elsewhere."""
+"""Rows and columns, of 96 fine pixels, by which arm B's field is displaced."""
 MARGIN = 12
 FAST = "fastled"
 
 
 def split(segment: Segment, ratio: float) -> Segment:
-    """As recorded behind a splitter that gives arm B so many times the light of arm A."""
+    """The segment as recorded behind a splitter that gives arm B ``ratio`` times the light of arm A."""
     shares = np.array([2 / (1 + ratio), 2 * ratio / (1 + ratio)])[:, None, None]
     pixels = np.clip((segment.lines - BLACK_DN) * shares + BLACK_DN, 0, 4095)
     return replace(segment, lines=np.rint(pixels).astype(np.uint16), mask=pixels < 4095)
@@ -66,7 +66,7 @@ def balance(run: Run, scenes: list[str], seeds: list[int]) -> None:
 
 
 def shifted(scene: str, seed: int, rows: int, columns: int) -> Segment:
-    """Lines of arms that look at the same light, arm B so many fine pixels beside arm A."""
+    """Lines of arms that see the same light, with arm B's field displaced by some fine pixels."""
     geometry = Geometry(STAGES, 3, LINES)
     size, code = geometry.size, prbs(31, mix_seed(seed, 31), 0, geometry.span)
     wide = light(scene, seed, size + MARGIN, geometry.span)
@@ -108,9 +108,9 @@ def fast(run: Run, scenes: list[str], seeds: list[int]) -> None:
                 counts[scene == FAST][0] += bool(told)
                 counts[scene == FAST][1] += 1
                 if told or scene == FAST:
-                    print(f"{scene:9} {seed} {stages} stages: {told or 'nothing is told'}", flush=True)
+                    print(f"{scene:9} {seed} {stages} stages: {told or 'nothing is reported'}", flush=True)
     for has_lamp, (told_of, cases) in counts.items():
-        print(f"{'with' if has_lamp else 'without'} the lamp: told in {told_of} of {cases}")
+        print(f"{'with' if has_lamp else 'without'} the lamp: reported in {told_of} of {cases}")
 
 
 WAYS = {"balance": balance, "field": field, "fast": fast}
@@ -123,7 +123,7 @@ def main() -> None:
     )
     parser.add_argument("what", choices=list(WAYS))
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES), metavar="SCENE")
-    parser.add_argument("--seeds", nargs="+", type=int, help="absent: those of the tables that are published")
+    parser.add_argument("--seeds", nargs="+", type=int, help="absent: those of the published tables")
     add_option(parser)
     options = parser.parse_args()
     with limit_threads(1), recorded("bench_told", keep=options.record) as run:

@@ -1,17 +1,18 @@
-"""Scenes that nothing was tuned on, with an ordinary camera's noise: the default beside honest yardsticks.
+"""Compare the default with simple references, on scenes on which nothing was tuned, with a camera's noise.
 
     python tools/bench_trust.py [--scenes bullet splash …] [--seeds 21 22] [--full-well 1e4] [--twist]
 
-One row per scene and seed (of code, scene and noise): how far the trusted frames in voxels of 3 × 3 are from
-the truth, in dB, for
+One row per scene and seed (of code, scene and noise): PSNR of the trusted frames in voxels of 3 × 3, in dB,
+for
 
-    mean      the truth's own mean over time, repeated: an oracle that knows nothing of time
+    mean      the truth's own mean over time, repeated: an oracle without resolution in time
     still     one frame, reconstructed from the same lines and repeated
-    cosines   32 cosines with total variation, and nothing chosen
+    cosines   32 cosines with total variation, without any choice
     TwIST     the paper's solver, 200 iterations (--twist)
-    default   what `reconstruct` gives; with its prior, held-out error, processor seconds of one thread
+    default   the result of `reconstruct`, with its prior, held-out error and processor seconds of one thread
 
-The truth is seen here only. "worse" counts rows in which the default is more than 0.3 dB below the still.
+Only this comparison uses the truth. "worse" counts rows in which the default is more than 0.3 dB below the
+still.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ SLACK_DB = 0.3
 
 @dataclass(frozen=True)
 class Row:
-    """PSNR in dB of each way, and how the default came about."""
+    """PSNR in dB of each method, and details of the default."""
 
     scene: str
     mean: float
@@ -73,7 +74,7 @@ def measure(scene: str, seed: int, camera: Camera, *, twist: bool) -> Row:
 
 
 def figures(row: Row) -> dict[str, float | str]:
-    """To be kept."""
+    """Figures to keep."""
     ways = {f"{name}_db": getattr(row, name) for name in ("mean", "still", "cosines", "twist", "default")}
     error = {"ssim": row.ssim, "held_out_error_percent": 100 * row.error}
     return ways | error | {"processor_s": row.processor_s, "prior": row.prior}
@@ -86,7 +87,7 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=list(SCENES), choices=list(SCENES), metavar="SCENE")
     parser.add_argument("--seeds", nargs="+", type=int, default=[21])
     parser.add_argument("--full-well", type=float, default=1e4, help="electrons at the brightest; inf: clean")
-    parser.add_argument("--twist", action="store_true", help="the paper's solver, too (minutes)")
+    parser.add_argument("--twist", action="store_true", help="also run the paper's solver (minutes)")
     add_option(parser)
     options = parser.parse_args()
     camera = Camera(options.full_well) if np.isfinite(options.full_well) else CLEAN

@@ -1,4 +1,4 @@
-"""How fast is our TV prox beside a library's, on the coefficient frames of the demo?
+"""Speed of our TV proximal step compared with a library's, on the coefficient frames of the demo.
 
 Usage: python tools/bench_tv.py [--frames 128] [--side 64] [--iterations 10] [--record]
 
@@ -44,7 +44,7 @@ def measure(run: Run, asked: argparse.Namespace) -> None:
     shape = (asked.frames, asked.side, asked.side)
     frames = np.random.default_rng(0).random(shape, np.float32)
     tv = FrameTv(asked.iterations)
-    tv.prox(frames, 0.1)  # compiled now
+    tv.prox(frames, 0.1)  # compiles
     ours = best_ms(lambda: tv.prox(frames, 0.1))
 
     def library() -> None:

@@ -1,9 +1,9 @@
-"""What the check of the light's code costs, and how soon it notices: ``python tools/bench_watcher.py``.
+"""Cost and delay of the check of the exposure code: ``python tools/bench_watcher.py``.
 
-Lines of a simulated scene go through real rings at the camera's rate, from one process; the watcher looks at
-them in another. Half-way, arm b slips by one line. Printed: cores of the watcher, beside those of the process
-that copies the lines into the rings (one bare copy of every line, and its pace) in the same run; verdicts;
-the time from the slip to the verdict; ring slots that the watcher lost.
+One process puts lines of a simulated scene through real rings at the camera's rate; the watcher checks them
+in another. Half-way, arm b slips by one line. Prints the cores used by the watcher, and by the process that
+copies the lines into the rings (one bare copy of every line, paced) in the same run; the verdicts; the time
+from the slip to the verdict; and the ring slots that the watcher lost.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ CASES = (
 
 def main() -> None:
     words = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    words.add_argument("--seconds", type=float, default=4.0, help="of lines, per case")
+    words.add_argument("--seconds", type=float, default=4.0, help="seconds of lines per case")
     add_option(words)
     asked = words.parse_args()
     with recorded("bench_watcher", keep=asked.record) as run:
@@ -68,7 +68,7 @@ def main() -> None:
 
 
 def measure(case: Case, seconds: float) -> dict[str, Figure]:
-    """Figures by name; ``noticed_after_s`` is None where the slip was not noticed."""
+    """Figures by name; ``noticed_after_s`` is None if the slip was not noticed."""
     rig = load_rig("rig-demo", {"geometry.stages": case.stages, "code.degree": CODE_DEGREE})
     lines = simulated(rig, int(seconds * case.line_rate_hz) // BLOCK_LINES * BLOCK_LINES)
     shape = RingShape(SLOTS, BLOCK_LINES, case.stages, "uint16", observers=2)
@@ -110,7 +110,7 @@ def measure(case: Case, seconds: float) -> dict[str, Figure]:
 
 
 def simulated(rig: RigConfig, count: int) -> dict[str, np.ndarray]:
-    """Lines of both arms, of a still scene under a code that repeats; b's a line late from the middle on."""
+    """Lines of both arms of a still under a repeating code; arm b is one line late from the middle on."""
     cameras = {arm: rig.cameras.arm(arm) for arm in ARMS}
     bench, code = Bench(load_scene("scene-usaf"), rig.geometry, cameras, 1e-5), rig.code.build()
     lines = {}
@@ -122,7 +122,7 @@ def simulated(rig: RigConfig, count: int) -> dict[str, np.ndarray]:
 
 
 def produce(rings: dict[str, Ring], lines: dict[str, np.ndarray], line_rate_hz: float, cores: Any) -> None:
-    """Put the lines into the rings at their rate; ``cores`` (a shared double) is what that took."""
+    """Put the lines into the rings at their rate; store the cores used in ``cores`` (a shared double)."""
     begun_s, used_s = time.monotonic(), time.process_time()
     for at in range(0, len(lines["a"]), BLOCK_LINES):
         while time.monotonic() < begun_s + (at + BLOCK_LINES) / line_rate_hz:

@@ -1,5 +1,5 @@
-"""Scenes for the estimate of a video's error (`tools/bench_error.py`): it is fitted to those of `SCENES`, and
-judged by those that were kept (`KEPT`), which nothing was fitted to or chosen by.
+"""Scenes for the estimate of a video's error (`tools/bench_error.py`): it is fitted to those of `SCENES` and
+tested on those in `KEPT`, to which nothing was fitted and by which nothing was chosen.
 
     leds goldfish digits usaf   the paper's, from configs/
     pan zoom turn               a photograph that moves, grows, turns
@@ -7,12 +7,12 @@ judged by those that were kept (`KEPT`), which nothing was fitted to or chosen b
     lamps                       two photographs that blink at 0.8 and 3.1 kHz, side by side
     rain bubbles                streaks that fall fast, discs that rise on a slope of light
 
-    swing fan shadow pulse      kept: a rod that swings, blades that turn, a soft shadow that passes, a spot
-                                whose brightness beats, before a photograph
-    ripples smoke               kept: waves of two sources; what drifts before a photograph, half transparent
-    typing flashes              kept: squares that appear one by one, and lights that flare and fade
+    swing fan shadow pulse      tested: a rod that swings, blades that turn, a soft shadow that passes, a spot
+                                of pulsing brightness, in front of a photograph
+    ripples smoke               tested: waves of two sources; half transparent clouds in front of a photograph
+    typing flashes              tested: squares that appear one by one, and lights that flare and fade
 
-The photographs are scikit-image's. Sizes are shares of the picture and times shares of the span.
+The photographs are those of scikit-image. Sizes are fractions of the picture, times fractions of the span.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ FIRST_SUBSTEP = 600
 
 
 def _photograph(s: Stage, share: float = 1.0) -> NDArray[np.float32]:
-    """A grey crop of one of them, drawn anew at each call, whose side is so many pictures."""
+    """A random grey crop of one of them, new at each call; its side in units of the picture's."""
     whole = getattr(data, str(s.rng.choice(PHOTOGRAPHS)))().astype(np.float64)
     grey = whole.mean(2) if whole.ndim == 3 else whole
     side = min(grey.shape)
@@ -58,7 +58,7 @@ def _photograph(s: Stage, share: float = 1.0) -> NDArray[np.float32]:
 def _seen(
     photo: NDArray[np.float32], n: int, matrix: NDArray[np.float64], shift: NDArray[np.float64]
 ) -> NDArray[np.float32]:
-    """n × n pixels of a photograph about its middle, through a matrix, beside it by a shift in pixels."""
+    """n × n pixels about the middle of a photograph, transformed by a matrix and shifted by some pixels."""
     middle = (np.array(photo.shape) - 1) / 2 + shift
     offset = middle - matrix @ (np.full(2, n - 1) / 2)
     found = affine_transform(photo, matrix, offset, (n, n), order=1, mode="mirror")
@@ -244,7 +244,7 @@ def record(name: str, seed: int, *, stages: int, substeps: int, lines: int, came
         scene = build_scene(load_scene(OF_THE_PAPER[name]), geometry.size, 1 / SUBSTEP_HZ)
         light = truth(scene, FIRST_SUBSTEP * seed, geometry.span, 1, 1)
     else:
-        drawn = 1000 * seed + [*SCENES, *KEPT].index(name)  # or all would show the same photograph
+        drawn = 1000 * seed + [*SCENES, *KEPT].index(name)  # otherwise all would show the same photograph
         frame = (OF_OUR_OWN | KEPT)[name](Stage(geometry.size, geometry.span, drawn))
         light = np.stack([frame(t, t / (geometry.span - 1)) for t in range(geometry.span)])
     light = np.asarray(light, np.float32)

@@ -1,9 +1,9 @@
-"""How full the ULX3S's ECP5-25F is and how fast the trigger may run there, over placements of three seeds.
+"""Utilisation of the ULX3S's ECP5-25F, and the trigger's maximum clock there, for placements of three seeds.
 
-    python tools/fpga_report.py             some five minutes, the paper's XC4VSX55 included (area only)
+    python tools/fpga_report.py             about five minutes, including the paper's XC4VSX55 (area only)
     python tools/fpga_report.py --usb       the board with USB in place of the UART
 
-Ends with 1 if a goal is missed: 95 MHz with every seed, a quarter of the logic. They are the UART board's.
+Ends with 1 if a goal is missed: 95 MHz with every seed, a quarter of the logic. The goals are for the UART.
 """
 
 from __future__ import annotations

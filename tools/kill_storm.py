@@ -1,14 +1,14 @@
-"""kill -9 of any process of a daemon that records, again and again; then: is every acknowledged line there?
+"""Kill processes of a recording daemon at random (kill -9), and check that no acknowledged line is lost.
 
 ::
 
-    arm, start ─▶ stop the recorder for a while, as a disk does, and let it go on or kill it
+    arm, start ─▶ stop the recorder for a while, as a disk does, and let it continue or kill it
                ─▶ kill a process at random ─▶ another takes its place ─▶ … ─▶ stop, or kill the daemon
-               ─▶ the daemon, or the next one, seals what is left ─▶ every row is its line, or flagged and
+               ─▶ the daemon, or the next one, seals the rest ─▶ every row holds its line, or is flagged and
                   listed; nothing acknowledged is missing
 
 ``python tools/kill_storm.py --kills 200`` prints what was killed and what was found. The cameras show a
-pattern without a zero in it, so that a row that was never written shows.
+pattern without zeros, so that a row that was never written is noticed.
 """
 
 from __future__ import annotations
@@ -69,20 +69,20 @@ scene = "{scene}"
 """
 VICTIMS = ("recorder", "a", "b")
 STOPS = 0.3
-"""So often the recorder is stopped before something is killed."""
+"""Probability that the recorder is stopped before something is killed."""
 KILLS_PER_RUN = 4
-"""Fewer than the successors that one process can have."""
+"""Fewer than the successors that one process may have."""
 WAIT_S = 90.0
 LONGEST_PAUSE_S = 0.5
 ROOT_LOST = 0.5
-"""Of the recorders that are killed, so many lose the root of their recording as well."""
+"""Share of the killed recorders that lose the root of their recording as well."""
 LONGEST_STOP_S = 3.0
-"""Of a recorder: less than what the rings hold."""
+"""Pause of a recorder: shorter than what the rings hold."""
 
 
 @dataclass
 class Outcome:
-    """What was killed, and what was wrong with the recordings afterwards: nothing, one hopes."""
+    """What was killed, and what was wrong with the recordings afterwards (nothing, if all is well)."""
 
     killed: Counter[str] = field(default_factory=Counter)
     roots: int = 0
@@ -105,7 +105,7 @@ class Outcome:
 
 
 class Storm:
-    """Runs and kills, seeded; everything below ``home``."""
+    """Seeded runs and kills; all files are below ``home``."""
 
     def __init__(self, home: Path, seed: int) -> None:
         self._home = home
@@ -118,7 +118,7 @@ class Storm:
         self.outcome = Outcome()
 
     def run(self, kills: int) -> Outcome:
-        """Kill so many processes."""
+        """Kill this many processes."""
         try:
             while (left := kills - self.outcome.killed.total()) > 0:
                 self._one_run(min(left, KILLS_PER_RUN))
@@ -136,7 +136,7 @@ class Storm:
         daemon = self._serve()
         path = self._home / f"r{self.outcome.recordings}.zarr"
         with Client(self._socket) as client:
-            client.arm(force=True)  # what a busy host sustains is not the question
+            client.arm(force=True)  # the rate that a busy host sustains does not matter here
             client.start(path)
             _until(lambda: _committed(client.status()) > 0)
             for _ in range(kills - 1):
@@ -147,12 +147,12 @@ class Storm:
                 self._end_daemon(daemon, acknowledged)
             else:
                 self._end_run(client, last)
-        self._serve()  # a daemon that was killed has left the last recovery to the next
+        self._serve()  # a killed daemon has left the last recovery to the next one
         _until(lambda: not _open_parts(path))
         self._examine(path, acknowledged)
 
     def _end_run(self, client: Client, last: str) -> None:
-        """Stop, with a process killed just before or not."""
+        """Stop, in some cases just after a process was killed."""
         if last in VICTIMS:
             self._kill_one(client)
         status = client.status()
@@ -170,7 +170,7 @@ class Storm:
         _until(lambda: not any(Path("/proc", str(pid)).exists() for pid in status.processes.values()))
 
     def _kill_one(self, client: Client) -> None:
-        """A process at a random moment; then wait until another has taken its place."""
+        """Kill a process at a random moment, and wait until another has taken its place."""
         time.sleep(self._chance.uniform(0, LONGEST_PAUSE_S))
         name, before = self._chance.choice(VICTIMS), client.status()
         recorder = before.processes["recorder"]
@@ -181,7 +181,7 @@ class Storm:
             if name != "recorder":  # else it is killed as it is
                 os.kill(recorder, signal.SIGCONT)
         if name == "recorder" and before.recording is not None and self._chance.random() < ROOT_LOST:
-            os.kill(before.processes[name], signal.SIGSTOP)  # or its next commit would write another
+            os.kill(before.processes[name], signal.SIGSTOP)  # otherwise its next commit would write a new one
             (before.recording.path / "zarr.json").unlink(missing_ok=True)
             self.outcome.roots += 1
         os.kill(before.processes[name], signal.SIGKILL)
@@ -218,7 +218,7 @@ class Storm:
             return False
 
     def _examine(self, path: Path, acknowledged: Status) -> None:
-        """The recording and those beside it that went on from it."""
+        """The recording and the segments that continue it."""
         end = None
         for part in (path, *(segment.path for segment in open_recording(path).segments)):
             self.outcome.faults += [f"{part.name}: {fault}" for fault in check_recording(part)]
@@ -237,7 +237,7 @@ class Storm:
 
 
 def _open_parts(path: Path) -> list[str]:
-    """Of a recording and its segments, those that are not sealed, or not listed in the first."""
+    """Segments of a recording that are not sealed, or not listed in the first."""
     if not (path / "zarr.json").exists():
         return [path.name]
     listed = [path.name, *open_recording(path).attrs.get("segments", [])]
@@ -249,7 +249,7 @@ def _open_parts(path: Path) -> list[str]:
 
 
 def check_recording(path: Path) -> list[str]:
-    """What is wrong with a recording of patterns."""
+    """Defects of a recording of patterns."""
     recording = open_recording(path)
     found = []
     for arm in ARMS:
@@ -278,7 +278,7 @@ def check_recording(path: Path) -> list[str]:
 
 
 def _check_ledger(book: dict[str, object] | None, lines: int, missing: np.ndarray, arm: str) -> list[str]:
-    """Where the recorder wrote one, it must agree with the rows."""
+    """The ledger, if the recorder wrote one, must agree with the rows."""
     if book is None or "stored" not in book:
         return []
     stored, lost = int(str(book["stored"])), sum(dict(book["missing"]).values())  # type: ignore[call-overload]
@@ -294,7 +294,7 @@ def _committed(status: Status) -> int:
 
 
 def _place(status: Status) -> tuple[Path, int | None] | None:
-    """A recorder that was killed before it had made anything leaves its name to the next."""
+    """Path and first line; a recorder killed before it created anything leaves its name to the next one."""
     return None if status.recording is None else (status.recording.path, status.recording.first_line)
 
 

@@ -1,9 +1,9 @@
-"""The moving picture of README.md: what two cameras record, and two videos of it, chosen afterwards.
+"""Make the README's moving picture: the lines of two cameras, and two videos reconstructed from them.
 
     python tools/moving_picture.py [OUT.webp]
 
 The two goldfish of the paper's Fig. 7, with an ordinary camera's noise (full well 10 000 e, read noise 10 e,
-12 bits): 2.28 ms, 1313 lines of 54 pixels from either camera. The same lines are reconstructed once for
+12 bits): 2.28 ms, 1313 lines of 54 pixels from each camera. The same lines are reconstructed once for
 detail (162 × 162 pixels, five frames) and once for motion (54 × 54, 1025 frames).
 """
 
@@ -43,7 +43,7 @@ OUT = Path(__file__).parent / "pictures" / "goldfish.webp"
 
 
 def noisy_scene() -> SceneConfig:
-    """The scene, seen by a camera whose brightest sample is `FULL_WELL_E` electrons."""
+    """The scene, recorded by a camera whose brightest sample has `FULL_WELL_E` electrons."""
     effects = [{"kind": "shot_noise"}, {"kind": "read_noise", "sigma_e": READ_NOISE_E}]
     scene = load_scene(SCENE)
     noise = {"effects": effects, "system_gain_dn_per_e": TOP_DN / FULL_WELL_E}
@@ -51,7 +51,7 @@ def noisy_scene() -> SceneConfig:
 
 
 def recorded(lines: int, directory: Path) -> Segment:
-    """The lines as they are recorded and cut."""
+    """Lines as recorded and cut."""
     rig = load_rig(RIG)
     simulate(rig, noisy_scene(), directory / "goldfish.zarr", lines)
     return open_recording(directory / "goldfish.zarr").cut(0, lines)
@@ -60,7 +60,7 @@ def recorded(lines: int, directory: Path) -> Segment:
 def draw(
     segment: Segment, detail: Reconstruction, motion: Reconstruction, frames: int = FRAMES
 ) -> list[Image.Image]:
-    """The pictures of the loop, one per instant."""
+    """Pictures of the loop, one per instant."""
     span_ns = detail.time_ns[0], motion.time_ns[motion.trusted][-1]
     strips = [_grey(segment.lines[arm], STRIP_PX, 1.0) for arm in range(len(ARMS))]
     still = [_grey(frame, PANEL_PX, 0.995) for frame in _shown(detail)]

@@ -1,8 +1,8 @@
-"""Wheel and source distribution, made and looked at: what is in them that should not be, and what is missing.
+"""Make wheel and source distribution, and report files that are missing or should not be in them.
 
-``python tools/packages.py --out dist`` makes them from a checkout: of all that git does not ignore, committed
-or not. The wheel is made from the source distribution, as pip makes it for whoever has only that; one that is
-made from the checkout must hold the same files. All are packed with the hatchling that is installed here.
+``python tools/packages.py --out dist`` makes them from a checkout: from all files that git does not ignore,
+committed or not. The wheel is made from the source distribution, as pip does; a wheel made from the checkout
+must hold the same files. All are packed with the hatchling that is installed here.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 ADDED = {"PKG-INFO"}
-"""To the source distribution, by its maker."""
+"""Files that the build backend adds to the source distribution."""
 LONGEST_S = 600
 
 
 @dataclass(frozen=True)
 class Packages:
-    """What was made."""
+    """The packages that were made."""
 
     sdist: Path
     wheel: Path
@@ -33,7 +33,7 @@ class Packages:
 
 
 def make(out: Path, root: Path = ROOT) -> Packages:
-    """Source distribution, and wheels from it and from the checkout. Raises CalledProcessError."""
+    """Make the source distribution, and wheels from it and from the checkout. Raises CalledProcessError."""
     aside = out / "of-checkout"
     _build(root, out)
     _build(root, aside, "--wheel")
@@ -58,20 +58,20 @@ def files_of_wheel(path: Path) -> set[str]:
 
 
 def files_of_sdist(path: Path) -> set[str]:
-    """Below the one folder that it unpacks to."""
+    """Files below the one folder to which it unpacks."""
     with tarfile.open(path) as file:
         return {entry.name.partition("/")[2] for entry in file if not entry.isdir()}
 
 
 def files_of_git(root: Path = ROOT) -> set[str]:
-    """That it keeps, or would if it was told to."""
+    """Files that git tracks, or would track if they were added."""
     words = ("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard")
     listed = subprocess.run(words, cwd=root, check=True, capture_output=True, text=True, timeout=LONGEST_S)
     return {name for name in listed.stdout.split("\0") if name and (root / name).exists()}
 
 
 def faults(made: Packages, root: Path = ROOT) -> list[str]:
-    """What is wrong with the packages, in words; the checkout is one of git's."""
+    """Describe the defects of the packages; the checkout must be a git checkout."""
     packed, known = files_of_sdist(made.sdist) - ADDED, files_of_git(root)
     wheel, other = files_of_wheel(made.wheel), files_of_wheel(made.wheel_of_checkout)
     program = {name for name in known if name.startswith("acquire/")}
@@ -97,7 +97,7 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument(
-        "--out", type=Path, default=ROOT / "dist", help="where the packages go (default: dist)"
+        "--out", type=Path, default=ROOT / "dist", help="directory for the packages (default: dist)"
     )
     out = parser.parse_args().out
     with tempfile.TemporaryDirectory() as home:

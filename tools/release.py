@@ -1,9 +1,9 @@
-"""What must be so before a release, looked at one by one; what is not so, and what to do about it.
+"""Check the conditions of a release one by one, and list what is left to do.
 
-``python tools/release.py --check`` looks at the tree, the version, the changelog, the documents, the rules of
-the code, the versions of the libraries, and the packages, which it makes, installs afresh and tries.
-``--tests`` runs the whole suite as well, ``--all-pythons`` tries every Python that is promised.
-Nothing is tagged and nothing leaves this machine. Ends with 1 where something is left to do.
+``python tools/release.py --check`` checks the tree, the version, the changelog, the documents, the rules of
+the code, the versions of the libraries, and the packages, which it makes, installs in a fresh environment and
+tries. ``--tests`` also runs the whole suite, and ``--all-pythons`` tries every supported Python. Nothing is
+tagged and nothing leaves this machine. Ends with 1 if something is left to do.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ LIMIT_S = 3600
 
 
 class Undone(Exception):  # noqa: N818 - a thing to do, told like a result
-    """What is not so, in words, and ``todo`` about it."""
+    """An unmet condition, in words, and what ``todo`` about it."""
 
     def __init__(self, what: str, todo: str) -> None:
         super().__init__(what)
@@ -68,7 +68,7 @@ def version_is_new(root: Path) -> str:
 
 
 def changelog_tells_it(root: Path) -> str:
-    """The newest section is this version's, has entries, and a date that has come, or says unreleased."""
+    """The newest section is that of this version, has entries, and a date in the past or (unreleased)."""
     text, version = (root / "CHANGELOG.md").read_text(encoding="utf-8"), version_of(root)
     headings = list(HEADING.finditer(text))
     if text.count("\n## ") != len(headings) or not headings:
@@ -88,7 +88,7 @@ def changelog_tells_it(root: Path) -> str:
 
 
 def documents_hold(root: Path) -> str:
-    """Links, paths and commands exist; every fault names its test; the citation is of this version."""
+    """Links, paths and commands exist; every fault names its test; the citation names this version."""
     return _pytest(root, *DOCUMENTS)
 
 
@@ -98,7 +98,7 @@ def rules_hold(root: Path) -> str:
 
 
 def constraints_suit(root: Path) -> str:
-    """Everything that is asked for has a version there, which is allowed, and is what is installed here."""
+    """Every requirement has an allowed version in the constraints, which is the one installed here."""
     pins = read_pins(root / CONSTRAINTS.relative_to(ROOT))
     wrong, count = [], 0
     for wanted in requirements(root):
@@ -149,7 +149,7 @@ def tests_pass(root: Path) -> str:
 
 
 def version_of(root: Path) -> str:
-    """As it is written, whatever is imported."""
+    """Version as written in the file, whatever is imported."""
     found = re.search(
         r'^__version__ = "(.+)"$', (root / "acquire/__init__.py").read_text("utf-8"), re.MULTILINE
     )
@@ -165,7 +165,7 @@ def read_pins(path: Path) -> dict[str, str]:
 
 
 def requirements(root: Path) -> Iterator[Requirement]:
-    """Of the core and the extra `dev`, with the extras that it names, as far as this machine needs them."""
+    """Requirements of the core and of the extra `dev`, with the extras that it names, for this machine."""
     project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     waiting, seen = [*project["dependencies"], *project["optional-dependencies"]["dev"]], set[str]()
     while waiting:
@@ -230,7 +230,7 @@ Item = Callable[[Path], str]
 
 
 def check(items: Mapping[str, Item], root: Path) -> int:
-    """Print what is so and what is not; how many are not."""
+    """Print which conditions are met; return the number that are not."""
     undone = 0
     for name, item in items.items():
         try:
@@ -243,9 +243,9 @@ def check(items: Mapping[str, Item], root: Path) -> int:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--check", action="store_true", required=True, help="look, and change nothing")
-    parser.add_argument("--tests", action="store_true", help="run the whole suite")
-    parser.add_argument("--all-pythons", action="store_true", help="not this one only")
+    parser.add_argument("--check", action="store_true", required=True, help="check, and change nothing")
+    parser.add_argument("--tests", action="store_true", help="also run the whole suite")
+    parser.add_argument("--all-pythons", action="store_true", help="try every supported Python")
     asked = parser.parse_args()
     programs = claimed() if asked.all_pythons else [sys.executable]
     items: dict[str, Item] = {

@@ -1,11 +1,11 @@
-"""What benchmarks measured: one line of JSON per run, in a file that is kept, and tables made from it.
+"""Kept results of benchmarks: one line of JSON per run, and tables made from them.
 
-``--record`` of a benchmark appends its run to tools/results.jsonl: the command, when, at which commit, on
-which machine and how busy that was before, and a row of figures per case. ``python tools/results.py`` lists
-the runs, ``--table NAME`` prints the newest whole one of a benchmark as Markdown, ``--run NUMBER`` another.
+``--record`` of a benchmark appends its run to tools/results.jsonl: the command, date, commit, machine and its
+load before the run, and a row of figures per case. ``python tools/results.py`` lists the runs, ``--table
+NAME`` prints the newest complete run of a benchmark as Markdown, ``--run NUMBER`` any other.
 
-Between ``<!-- results of COMMAND -->`` and ``<!-- end of results -->`` in a document, ``--write`` puts the
-newest whole run of that command, given without its ``--record``. A test tells where a document differs.
+Between ``<!-- results of COMMAND -->`` and ``<!-- end of results -->`` in a document, ``--write`` inserts the
+newest complete run of that command, which is given without ``--record``. A test notices outdated tables.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ Figure = float | int | str | None
 
 @dataclass(frozen=True)
 class Machine:
-    """What figures depend on; no name of it."""
+    """Properties of the machine on which figures depend, without its name."""
 
     cpu: str
     cores: int
@@ -54,7 +54,7 @@ class Machine:
 
     @classmethod
     def here(cls) -> Machine:
-        """With the load of the last minute, before the benchmark adds its own."""
+        """This machine, with the load of the last minute before the benchmark adds its own."""
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
         return cls(
             cpu=cpu_model(),
@@ -71,7 +71,7 @@ class Machine:
 class Run:
     """One run of a benchmark: a row per case, named figures with their units in the names.
 
-    ``commit`` ends with + where the tree differed from it. ``whole``: it came to its end.
+    ``commit`` ends with + if the tree differed from it. ``whole``: the run was completed.
     """
 
     benchmark: str
@@ -84,17 +84,17 @@ class Run:
     whole: bool = False
 
     def add(self, case: str, **figures: Any) -> None:
-        """A case; what is not finite is noted as absent."""
+        """Add a case; figures that are not finite are recorded as absent."""
         self.rows.append({"case": case, **{name: _plain(value) for name, value in figures.items()}})
 
 
 def add_option(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--record", action="store_true", help=f"append what is measured to tools/{FILE.name}")
+    parser.add_argument("--record", action="store_true", help=f"append the results to tools/{FILE.name}")
 
 
 @contextmanager
 def recorded(benchmark: str, *, keep: bool, file: Path = FILE) -> Iterator[Run]:
-    """A run to add figures to, appended to the file when it ends; if that is early, as far as it came."""
+    """A run to add figures to. It is appended to the file when it ends, also if it ends early."""
     run = Run(
         benchmark=benchmark,
         command=_command(sys.argv),
@@ -113,7 +113,7 @@ def recorded(benchmark: str, *, keep: bool, file: Path = FILE) -> Iterator[Run]:
 
 
 def cpu_model(path: Path = Path("/proc/cpuinfo")) -> str:
-    """As the kernel names it; the architecture where it does not."""
+    """CPU model as reported by the kernel, or the architecture."""
     lines = (line.partition(":") for line in path.read_text(encoding="utf-8").splitlines())
     return next(
         (value.strip() for name, _, value in lines if name.strip() == "model name"), platform.machine()
@@ -121,7 +121,7 @@ def cpu_model(path: Path = Path("/proc/cpuinfo")) -> str:
 
 
 def commit(root: Path = ROOT) -> str:
-    """Of the tree that is measured; the results themselves do not change it. "unknown" outside a checkout."""
+    """Commit of the measured tree, ignoring changes of the results; "unknown" outside a checkout."""
 
     def git(*words: str) -> str:
         return subprocess.run(
@@ -136,14 +136,14 @@ def commit(root: Path = ROOT) -> str:
 
 
 def _command(words: list[str]) -> str:
-    """As it was given, but for places on this machine."""
+    """The command as given, without paths on this machine."""
     program = Path(words[0]).absolute()
     name = program.relative_to(ROOT) if program.is_relative_to(ROOT) else Path(program.name)
     return shlex.join(["python", str(name), *("DIR" if word.startswith("/") else word for word in words[1:])])
 
 
 def _plain(value: Any) -> Figure:
-    """Numbers of any library, as JSON has them."""
+    """Convert numbers of any library to those of JSON."""
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, float):
@@ -153,11 +153,11 @@ def _plain(value: Any) -> Figure:
     raise TypeError(f"{value!r} is no figure; possible: a number, a text, None")
 
 
-# ---- what is there
+# ---- reading runs and making tables
 
 
 def read(file: Path = FILE) -> list[Run]:
-    """All runs, the oldest first. Raises ValueError for a line that is none."""
+    """All runs, the oldest first. Raises ValueError for a line that is not a run."""
     runs = []
     for number, line in enumerate(file.read_text(encoding="utf-8").splitlines() if file.exists() else (), 1):
         try:
@@ -169,13 +169,13 @@ def read(file: Path = FILE) -> list[Run]:
 
 
 def table(run: Run) -> str:
-    """In Markdown: where the figures come from, then a table of each group of cases with the same figures."""
+    """Markdown: the origin of the figures, then a table for each group of cases with the same figures."""
     parts = [list(rows) for _, rows in groupby(run.rows, key=tuple)]
     return "\n\n".join([_origin(run), *map(_part, parts)])
 
 
 def _part(rows: list[dict[str, Figure]]) -> str:
-    """A row per case, and a column per figure that one of them has."""
+    """Table with a row per case, and a column per figure that any of them has."""
     columns = [name for name in rows[0] if any(row[name] is not None for row in rows)]
     shown = [[_shown(row[name]) for name in columns] for row in rows]
     lines = [[_heading(name) for name in columns], ["---"] * len(columns), *shown]
@@ -203,11 +203,11 @@ UNITS = {
     "hz": "Hz",
     "percent": "%",
 }
-"""Ending of a figure's name → its unit. Longer endings first: gb_s is none of seconds."""
+"""Ending of a figure's name → its unit. Longer endings come first: gb_s is not in seconds."""
 
 
 def _heading(name: str) -> str:
-    """The name's words, and its unit in brackets: write_mb_s → write (MB/s)."""
+    """Heading of a figure: its words, and the unit in brackets: write_mb_s → write (MB/s)."""
     for ending, unit in UNITS.items():
         if name == ending:
             return unit
@@ -217,7 +217,7 @@ def _heading(name: str) -> str:
 
 
 def _shown(value: Figure) -> str:
-    """Three digits, without exponents as long as that can be read."""
+    """Format with three digits, without an exponent if readable."""
     if value is None:
         return ""
     if not isinstance(value, float):
@@ -229,7 +229,7 @@ def _shown(value: Figure) -> str:
 
 
 def choose(runs: list[Run], benchmark: str | None, number: int | None) -> Run:
-    """The run of a number, or the newest whole one of a benchmark. Raises ValueError, with what there is."""
+    """The run with a number, or a benchmark's newest complete run. Raises ValueError listing all."""
     if number is not None:
         if not 1 <= number <= len(runs):
             raise ValueError(f"run {number}: there are {len(runs)}")
@@ -244,7 +244,7 @@ def choose(runs: list[Run], benchmark: str | None, number: int | None) -> Run:
 
 
 def with_tables(text: str, runs: list[Run]) -> str:
-    """A document with its tables made anew. Raises ValueError for a command that has no whole run."""
+    """The document with its tables updated. Raises ValueError for a command without a complete run."""
 
     def filled(place: re.Match[str]) -> str:
         before, command, after = place.groups()
@@ -260,10 +260,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--table", metavar="NAME", help="of a benchmark: bench_store, …")
-    parser.add_argument("--run", type=int, metavar="NUMBER", help="of the list, instead of the newest")
-    parser.add_argument("--write", action="store_true", help="make the tables of the documents anew")
-    parser.add_argument("--file", type=Path, default=FILE, help=f"instead of tools/{FILE.name}")
+    parser.add_argument("--table", metavar="NAME", help="print this benchmark's newest run: bench_store, …")
+    parser.add_argument("--run", type=int, metavar="NUMBER", help="print this run of the list instead")
+    parser.add_argument("--write", action="store_true", help="update the tables of the documents")
+    parser.add_argument("--file", type=Path, default=FILE, help=f"file of runs, instead of tools/{FILE.name}")
     asked = parser.parse_args()
     try:
         runs = read(asked.file)

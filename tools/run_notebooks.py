@@ -1,7 +1,7 @@
-"""Runs the notebooks and keeps their outputs: ``python tools/run_notebooks.py [NAME.ipynb ...]``.
+"""Run the notebooks and keep their outputs: ``python tools/run_notebooks.py [NAME.ipynb ...]``.
 
-Needs ``pip install nbclient ipykernel`` beside the package with ``[report]``; the tests need neither, they
-run the cells by themselves. What a notebook writes stays in a temporary directory.
+Needs ``pip install nbclient ipykernel`` in addition to the package with ``[report]``. The tests need neither,
+since they run the cells themselves. Files written by a notebook stay in a temporary directory.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 
 HERE = Path(__file__).parent / "notebooks"
 MOST_BYTES = 200_000
-"""Of a notebook with its outputs."""
+"""Largest size of a notebook with its outputs."""
 KEPT = ("image/png", "text/html", "text/plain")
 
 
@@ -30,7 +30,7 @@ def main(names: list[str]) -> int:
 
 
 def run(path: Path) -> dict[str, Any]:
-    """The notebook with the outputs of all its cells. Raises what a cell raises."""
+    """Return the notebook with the outputs of all its cells. Raises what a cell raises."""
     import nbclient
     import nbformat
 
@@ -51,12 +51,12 @@ def run(path: Path) -> dict[str, Any]:
 
 
 def _is_shown(output: dict[str, Any]) -> bool:
-    """Not what a program says on stderr meanwhile."""
+    """Whether to keep an output: not what a program writes to stderr."""
     return output["output_type"] != "stream" or output["name"] == "stdout"
 
 
 def tidied(output: dict[str, Any]) -> dict[str, Any]:
-    """An output with what a reader of the notebook sees, and no more."""
+    """Reduce an output to what a reader of the notebook sees."""
     if "data" in output:
         output["data"] = {kind: output["data"][kind] for kind in KEPT if kind in output["data"]}
         if "image/png" in output["data"]:

@@ -1,8 +1,8 @@
-"""Pictures of every scene: what it shows (truth), its light over time, and the lines of both arms.
+"""Draw every scene: its truth, its light over time, and the lines of both arms.
 
     python tools/scene_pictures.py OUT_DIRECTORY [SCENE …]
 
-One PNG per scene. Scenes that last are shown where the paper cuts them, 263 lines from 52 ms on.
+One PNG per scene. Scenes without an end are shown where the paper cuts them, 263 lines from 52 ms on.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ if TYPE_CHECKING:
 
 FRAMES = 6
 LONG = SceneBase().lines
-"""A scene of so many lines has no end of its own."""
+"""A scene of this many lines has no end of its own."""
 
 
 def picture(name: str) -> Figure:
-    """Truth, light and lines of one scene."""
+    """Draw truth, light and lines of one scene."""
     scene = load_scene(name)
     rig = load_rig(scene.rig)
     bench, code = bench_of(rig, scene), rig.code.build()
@@ -75,7 +75,7 @@ def new_figure(title: str) -> Figure:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("out", type=Path)
-    parser.add_argument("scenes", nargs="*", help="names or files; else all that come with the program")
+    parser.add_argument("scenes", nargs="*", help="names or files; absent: all scenes of the program")
     options = parser.parse_args()
     mpl.use("Agg")
     options.out.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""The instrument of `tools/shifts.py`: a daemon and its page, brought back when they die; what they hold."""
+"""The instrument of `tools/shifts.py`: a daemon and its page, restarted when they die."""
 
 from __future__ import annotations
 
@@ -53,14 +53,14 @@ scene = "{scene}"
 """
 SAMPLE_S = 2.0
 BACK_S = 120.0
-"""systemd would wait longer than this for nobody."""
+"""systemd would not wait longer for any process."""
 END_S = 60.0
 LONG_S = 480.0
-"""A shorter life may still be loading modules and filling bounded caches: its growth is told, not judged."""
+"""A shorter life may still load modules and fill bounded caches: its growth is reported but not judged."""
 CALM_S = 20.0
-"""After the last stranger has gone: connections that nobody closed have had their time."""
+"""Wait after the last stranger has gone, so that unclosed connections time out."""
 MOST_MORE = (4, 10)
-"""Descriptors and threads beyond those of a process that is new; pools of threads fill once."""
+"""Allowed descriptors and threads beyond those of a new process; thread pools fill once."""
 _SHARED = re.compile(r"/dev/shm/(\S+)")
 PART = re.compile(r"-\d+$")
 
@@ -108,7 +108,7 @@ class Host:
             return None
 
     def keep(self, ending: threading.Event) -> None:
-        """Bring the daemon back as a supervisor does, and note what is used, until the end."""
+        """Restart the daemon as a supervisor does, and record the resources used, until the end."""
         while not ending.wait(SAMPLE_S):
             if self._daemon.poll() is not None:
                 begun_s = time.monotonic()
@@ -136,7 +136,7 @@ class Host:
             return False
 
     def _until_answers(self) -> None:
-        """Or is dead once more, which `keep` sees."""
+        """Wait until it listens, or is dead again, which `keep` notices."""
         deadline = time.monotonic() + BACK_S
         while self._daemon.poll() is None and not self.answers():
             if time.monotonic() > deadline:
@@ -146,7 +146,7 @@ class Host:
     # ---- recordings
 
     def first_part(self, path: Path) -> Path:
-        """Of a recording that went on in segments: take-3-2.zarr is of take-3.zarr."""
+        """First recording of a segment: take-3-2.zarr belongs to take-3.zarr."""
         stem = path.stem
         return path if stem.count("-") < 2 else path.with_name(PART.sub("", stem) + ".zarr")
 
@@ -163,14 +163,14 @@ class Host:
     # ---- the end
 
     def told_by_log(self) -> list[str]:
-        """Failures that nobody foresaw."""
+        """Unforeseen failures."""
         text = self._log.read_text(errors="replace")
         return (
             [f"the log has {text.count('Traceback')} tracebacks: {self._log}"] if "Traceback" in text else []
         )
 
     def judge(self) -> list[str]:
-        """Memory of long lives; descriptors and threads beside those of processes that are new."""
+        """Memory of long lives; descriptors and threads compared with those of new processes."""
         for name, noted in self._soak.memory.items():
             grown = self._soak.growth_mb(name)
             if grown is not None and grown > MOST_GROWTH_MB and noted[-1][0] - noted[0][0] > LONG_S:
@@ -206,7 +206,7 @@ class Host:
         return found
 
     def close(self) -> list[str]:
-        """End it, and say what outlives it."""
+        """End the daemon, and return what outlives it."""
         self._daemon.send_signal(signal.SIGTERM)
         try:
             self._daemon.wait(END_S)
@@ -259,8 +259,8 @@ def _words(process: psutil.Process) -> str:
 
 
 def _mapped() -> set[str]:
-    """Names of shared memory that somebody on this host is using: it is theirs."""
-    found = set()  # others test here at the same time, and their memory is no leak of ours
+    """Names of shared memory that other processes on this host are using."""
+    found = set()  # other tests may run here at the same time; their memory is not our leak
     for maps in Path("/proc").glob("[0-9]*/maps"):
         with contextlib.suppress(OSError):
             found |= {name for line in maps.read_text().splitlines() for name in _SHARED.findall(line)}

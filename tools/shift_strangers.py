@@ -1,4 +1,4 @@
-"""Who disturbs in `tools/shifts.py`: clients that stall, flood and lie, and browsers that come and go."""
+"""Disturbances for `tools/shifts.py`: clients that stall, flood and lie, and browsers that come and go."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ FLOOD_S = 6.0
 STALL_S = (2.0, 40.0)
 SEEN_MS = 30_000
 ADDRESSES = {"stall": "127.0.0.11", "flood": "127.0.0.12", "lie": "127.0.0.13"}
-"""Each from an address of its own, as from other computers: the limits of rates are by address."""
+"""Each client has its own address, as if on another computer: rates are limited by address."""
 
 
 def stall(host: Host, counts: Counter[str], chance: random.Random, ending: threading.Event) -> None:
-    """Asks for the stream of pictures, or of news, and never reads."""
+    """Request the stream of pictures or events, and never read it."""
     while not ending.is_set():
         with contextlib.suppress(OSError), _connected(host, chance, ADDRESSES["stall"]) as connection:
             by_page = connection.family == socket.AF_INET
@@ -39,7 +39,7 @@ def stall(host: Host, counts: Counter[str], chance: random.Random, ending: threa
 
 
 def flood(host: Host, counts: Counter[str], chance: random.Random, ending: threading.Event) -> None:
-    """As many requests as it can for some seconds, half of them with the token."""
+    """Send as many requests as possible for some seconds, half of them with the token."""
     while not ending.wait(chance.uniform(5.0, 25.0)):
         end_s, with_token = time.monotonic() + FLOOD_S, chance.random() < 0.5
         while time.monotonic() < end_s and not ending.is_set():
@@ -59,14 +59,14 @@ def flood(host: Host, counts: Counter[str], chance: random.Random, ending: threa
 
 
 def lie(host: Host, counts: Counter[str], chance: random.Random, ending: threading.Event) -> None:
-    """What is no request, or half of one, or JSON that is none."""
+    """Send invalid or incomplete requests, or invalid JSON."""
     while not ending.wait(chance.uniform(0.2, 2.0)):
         with contextlib.suppress(OSError), _connected(host, chance, ADDRESSES["lie"]) as connection:
             prefix = "/api" if connection.family == socket.AF_INET else ""
             connection.sendall(_lie(host, chance, prefix))
             counts["lied"] += 1
             if chance.random() < 0.3:
-                ending.wait(chance.uniform(0.0, 15.0))  # and goes on standing there
+                ending.wait(chance.uniform(0.0, 15.0))  # and stays connected
             connection.settimeout(0.5)
             _note_failure(connection.recv(2**16), counts)
 
@@ -89,7 +89,7 @@ def _lie(host: Host, chance: random.Random, prefix: str) -> bytes:
     whole = f"POST {prefix}/{path} HTTP/1.1\r\n{head}Content-Length: {len(body)}\r\n\r\n{body}".encode()
     return chance.choice(
         [
-            whole if path != "arm" else whole.replace(b"/arm", b"/mark"),  # an operator's work is not undone
+            whole if path != "arm" else whole.replace(b"/arm", b"/mark"),  # an operator's work is left alone
             whole[: chance.randint(1, len(whole) - 1)],
             f"POST {prefix}/mark HTTP/1.1\r\n{head}Content-Length: 99999999999\r\n\r\n{{".encode(),
             f"GET {prefix}/recordings/{'x' * 20000}/picture HTTP/1.1\r\n{head}\r\n".encode(),
@@ -101,7 +101,7 @@ def _lie(host: Host, chance: random.Random, prefix: str) -> bytes:
 
 
 def browse(host: Host, counts: Counter[str], chance: random.Random, ending: threading.Event) -> None:
-    """One to three tabs for a while, on any screen."""
+    """Open one to three tabs for a while, on any screen."""
     from playwright.sync_api import Error, sync_playwright
 
     screens = ("watch", "aim", "recordings", "health", "setup")
@@ -111,7 +111,7 @@ def browse(host: Host, counts: Counter[str], chance: random.Random, ending: thre
             browser = playwright.chromium.launch(
                 executable_path=which("chromium"), args=[*flags, "--disable-gpu"]
             )
-            with contextlib.suppress(Error):  # a page that is killed meanwhile, or a host that is too busy
+            with contextlib.suppress(Error):  # the page was killed in the meantime, or the host is too busy
                 context = browser.new_context()
                 for _ in range(chance.randint(1, 3)):
                     tab = context.new_page()
@@ -125,7 +125,7 @@ def browse(host: Host, counts: Counter[str], chance: random.Random, ending: thre
 
 
 def _connected(host: Host, chance: random.Random, address: str) -> socket.socket:
-    """With the page or with the daemon's socket."""
+    """Connect to the page or to the daemon's socket."""
     if chance.random() < 0.6:
         return socket.create_connection(("127.0.0.1", host.port), CONNECT_S, (address, 0))
     connection = socket.socket(socket.AF_UNIX)
@@ -139,7 +139,7 @@ def _connected(host: Host, chance: random.Random, address: str) -> socket.socket
 
 
 def _note_failure(answer: bytes, counts: Counter[str]) -> None:
-    """A server that fails says so by 5xx; 503 is that there is no daemon behind the page."""
+    """A failing server answers 5xx; 503 means that there is no daemon behind the page."""
     status = answer[9:12] if answer.startswith(b"HTTP/1.1 ") else b""
     if status.startswith(b"5") and status != b"503":
         words = answer.partition(b"\r\n\r\n")[2][:200].decode(errors="replace")

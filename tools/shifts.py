@@ -3,12 +3,12 @@
 ::
 
     operator   arm ─▶ record with pre-trigger ─▶ mark ─▶ stop ─▶ cut, reconstruct ─▶ … by socket and by page
-    beside it  browsers that come and go, clients that stall, flood, and send what is no request
-    kill -9    page, daemon, recorder, grabbers, at random; the daemon comes back as systemd brings it back
+    others     browsers that come and go, clients that stall, flood, and send invalid requests
+    kill -9    page, daemon, recorder, grabbers, at random; the daemon restarts as under systemd
     in the end every acknowledged line and mark is there, nothing is left behind, nothing has grown
 
 ``python -m tools.shifts --minutes 30`` prints what was done and what was wrong. The cameras show a pattern
-without a zero in it, so that a row that was never written shows.
+without zeros, so that a row that was never written is noticed.
 """
 
 from __future__ import annotations
@@ -48,16 +48,16 @@ if TYPE_CHECKING:
 WAIT_S = 120.0
 JOB_S = 240.0
 SHIFT_S = 90.0
-"""Between two changes of shift: the operator leaves, and another one arms anew."""
+"""Time between two changes of shift: the operator leaves, and another one arms again."""
 TAKE_S = (1.0, 12.0)
 VICTIMS = {"page": 2, "daemon": 1, "recorder": 3, "a": 2, "b": 2}
-"""How often each of them is meant."""
+"""Relative frequency with which each is killed."""
 POLL_S = 0.2
 
 
 @dataclass
 class Night:
-    """What was done, and what was wrong: nothing, one hopes."""
+    """What was done, and what was wrong (nothing, if all is well)."""
 
     done: Counter[str] = field(default_factory=Counter)
     killed: Counter[str] = field(default_factory=Counter)
@@ -66,7 +66,7 @@ class Night:
     strangers: Counter[str] = field(default_factory=Counter)
     lines: int = 0
     marks: list[str] = field(default_factory=list)
-    """Acknowledged while it was recorded, and in no recording."""
+    """Acknowledged during a recording, but in no recording."""
     wrong: list[str] = field(default_factory=list)
     lock: threading.Lock = field(default_factory=threading.Lock)
 
@@ -82,7 +82,7 @@ class Night:
 
 @dataclass
 class Take:
-    """A recording as it was promised: where its acknowledged lines end, and which marks it was given."""
+    """What was acknowledged of a recording: the end of its lines, and its marks."""
 
     path: Path
     end: int = 0
@@ -90,7 +90,7 @@ class Take:
 
 
 class Books:
-    """What the daemon has acknowledged, read by somebody who does nothing but look."""
+    """What the daemon has acknowledged, as read by an observer."""
 
     def __init__(self, host: Host, night: Night) -> None:
         self._host, self._night = host, night
@@ -119,7 +119,7 @@ class Books:
 
 
 class Operator:
-    """Works shift by shift, whatever happens to the instrument."""
+    """An operator who works shift by shift, whatever happens to the instrument."""
 
     def __init__(self, host: Host, night: Night, books: Books, seed: int) -> None:
         self._host, self._night, self._books = host, night, books
@@ -137,19 +137,19 @@ class Operator:
                     self._hand_over()
 
     def _client(self) -> Client:
-        """By the socket, or by the page as from another computer."""
+        """Connect by the socket, or by the page as from another computer."""
         if self._chance.random() < 0.5:
             return Client(self._host.socket)
         return Client(self._host.address, token=self._host.token)
 
     @contextlib.contextmanager
     def _bears(self, what: str) -> Any:
-        """A refusal in words is borne; anything else is wrong."""
+        """Accept a refusal with a reason; anything else is a defect."""
         try:
             yield
         except AcquireError as error:
             self._night.refused[f"{what}: {type(error).__name__}"] += 1
-            if type(error) is AcquireError:  # of no kind that a user can do anything about
+            if type(error) is AcquireError:  # not a kind of error that a user can act on
                 self._night.wrong.append(f"{what}: {error}")
             time.sleep(0.5)
         except Exception as error:  # noqa: BLE001 - it is told
@@ -181,7 +181,7 @@ class Operator:
                 take.marks.append(text)
 
     def _end(self) -> None:
-        """Stopped, whoever has died meanwhile."""
+        """Stop the recording, whatever has died in the meantime."""
         deadline = time.monotonic() + WAIT_S
         while time.monotonic() < deadline:
             with self._bears("stop"):
@@ -195,7 +195,7 @@ class Operator:
         self._night.wrong.append(f"a recording could not be stopped within {WAIT_S:g} s")
 
     def _ready(self) -> None:
-        """Armed, from whatever state it is found in."""
+        """Arm the instrument from any state."""
         deadline = time.monotonic() + WAIT_S
         while time.monotonic() < deadline:
             with self._bears("arm"):
@@ -220,7 +220,7 @@ class Operator:
             self._check_and_remove(path)
 
     def finish(self) -> None:
-        """Everything that is left is looked at."""
+        """Check all remaining recordings."""
         self._ready()
         Client(self._host.socket).disarm()
         until(lambda: not self._host.unsealed())
@@ -230,7 +230,7 @@ class Operator:
     # ---- what was recorded
 
     def _look_at(self, take: Take) -> None:
-        """As an operator does on the page: cut a stretch, reconstruct it, look at the picture."""
+        """As an operator does on the page: cut a range, reconstruct it, fetch the picture."""
         kind = self._chance.choice(["cut", "reconstruct", "preview", "picture", "nothing"])
         if kind == "nothing":
             return
@@ -248,7 +248,7 @@ class Operator:
 
     @contextlib.contextmanager
     def _page(self) -> Any:
-        """The API of the page; a page that has just been killed is no fault of ours."""
+        """Call the API of the page; a page that was just killed is not a defect."""
         headers = {"Authorization": f"Bearer {self._host.token}"}
         try:
             with httpx.Client(base_url=self._host.address, headers=headers, timeout=WAIT_S) as page:
@@ -264,7 +264,7 @@ class Operator:
         while True:
             (job,) = [one for one in page.get("/api/jobs").json() if one["id"] == number] or [None]
             if job is None:
-                raise NoDaemonError("the page was started anew, and its jobs with it")
+                raise NoDaemonError("the page was restarted, and its jobs with it")
             if job["state"] == "done":
                 made = self._host.home / job["result"]
                 assert made.exists(), made
@@ -278,7 +278,7 @@ class Operator:
             time.sleep(0.3)
 
     def _check_and_remove(self, path: Path) -> None:
-        """The recording and those beside it that went on from it: rows, books, what was acknowledged."""
+        """Check a recording and its further segments: rows, ledgers, and what was acknowledged."""
         if self._host.first_part(path) != path:
             return
         with self._night.lock:
@@ -300,7 +300,7 @@ class Operator:
         self._night.done["recordings checked"] += 1
 
     def _held(self, parts: list[Recording], take: Take | None) -> list[str]:
-        """What of the promises was not kept."""
+        """Acknowledged lines and marks that are missing."""
         wrong, end = [], parts[0].first_line
         for each in parts:
             if each.first_line > end:
@@ -317,7 +317,7 @@ class Operator:
 
 
 class Killer:
-    """kill -9, at random moments."""
+    """Kill processes with kill -9 at random moments."""
 
     def __init__(self, host: Host, night: Night, seed: int, every_s: float) -> None:
         self._host, self._night, self._every_s = host, night, every_s
@@ -346,7 +346,7 @@ def until(condition: Callable[[], object]) -> None:
 
 
 def night_of(home: Path, minutes: float, seed: int, kill_s: float, *, browser: bool) -> tuple[Night, Host]:
-    """Work for so long, with everything that disturbs; then the books are closed."""
+    """Work for ``minutes`` with all disturbances; then check all recordings."""
     night, ending, strangers_out = Night(), threading.Event(), threading.Event()
     host = Host(home)
     books, killer = Books(host, night), Killer(host, night, seed + 1, kill_s)
@@ -386,7 +386,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--kill-s", type=float, default=25.0, help="between two kills, in the mean")
+    parser.add_argument("--kill-s", type=float, default=25.0, help="mean time between two kills")
     parser.add_argument("--out", type=Path, default=Path(tempfile.gettempdir()))
     parser.add_argument("--no-browser", action="store_true")
     options = parser.parse_args()

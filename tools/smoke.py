@@ -1,8 +1,8 @@
-"""A smoke test of an installed program: its first commands, as a user gives them, in a directory of its own.
+"""Smoke test of an installed program: a user's first commands, in a directory of its own.
 
-``python tools/smoke.py --program .venv/bin/acquire`` tries what the core does (a daemon that records two
-cameras' pattern, a check of what it recorded), and with ``--lab`` what the extra `report` adds (a simulated
-recording, a video of it). Nothing of the checkout is imported. Ends with 1 where a command fails.
+``python tools/smoke.py --program .venv/bin/acquire`` tries the core (a daemon that records the pattern of
+two cameras, and a check of the recording), and with ``--lab`` also the extra `report` (a simulated recording,
+and its video). Nothing is imported from the checkout. Ends with 1 if a command fails.
 """
 
 from __future__ import annotations
@@ -41,26 +41,26 @@ directory = "."
 socket = "c.sock"
 """
 LIMIT_S = 600
-"""For one command, some of which compile first."""
+"""Time limit for one command; some compile first."""
 START_S = 120.0
 END_S = 60
 NO_DAEMON = 3
-"""Exit code of commands for which no daemon is there yet."""
+"""Exit code of commands without a daemon."""
 
 
 class StepError(Exception):
-    """A command did not do what it should; the text says what it said."""
+    """A command failed; the text contains its output."""
 
 
 @dataclass(frozen=True)
 class Program:
-    """An installed ``acquire``, called in ``home``."""
+    """An installed ``acquire``, run in ``home``."""
 
     path: Path
     home: Path
 
     def run(self, *words: str) -> str:
-        """What a command prints. Raises StepError when it does not end with 0."""
+        """Return what a command prints. Raises StepError unless it ends with 0."""
         ended = self.ended(*words)
         if ended.returncode:
             raise StepError(f"ended with {ended.returncode}: {_last(ended.stdout + ended.stderr)}")
@@ -84,7 +84,7 @@ class Program:
 
     @contextmanager
     def daemon(self) -> Iterator[subprocess.Popen[str]]:
-        """One that listens."""
+        """Start a daemon and wait until it listens."""
         with (self.home / "serve.log").open("w") as log:
             serving = subprocess.Popen(
                 [self.path, "serve", "--config", "rig.toml"],
@@ -113,7 +113,7 @@ class Program:
 
 
 def own_environment() -> dict[str, str]:
-    """Ours, without what would lead a program to modules, settings or a daemon of ours."""
+    """Our environment without variables that lead to our modules, settings or daemon."""
     return {key: value for key, value in os.environ.items() if not key.startswith(("PYTHON", "ACQUIRE_"))}
 
 
@@ -121,7 +121,7 @@ def _last(text: str, most_lines: int = 12) -> str:
     return "\n".join(text.strip().splitlines()[-most_lines:]) or "it said nothing"
 
 
-# ---- what is tried
+# ---- the steps
 
 
 def _version(program: Program) -> str:
@@ -129,7 +129,7 @@ def _version(program: Program) -> str:
 
 
 def _capture(program: Program) -> str:
-    """A daemon records, is told to end, and what it recorded is whole."""
+    """A daemon records and is told to end, and its recording is complete."""
     (program.home / "rig.toml").write_text(RIG, encoding="utf-8")
     program.run("config", "check", "rig.toml")
     at = ("--socket", "c.sock")
@@ -164,15 +164,15 @@ def _whole(program: Program, name: str, lines: int) -> str:
 
 
 Steps = dict[str, Callable[[Program], str]]
-"""What is tried, by name: says what came of it, or raises StepError."""
+"""Steps by name: each returns its result in words, or raises StepError."""
 CORE: Steps = {"version": _version, "capture": _capture}
-"""What everybody has who installs the program."""
+"""Steps that need only the program itself."""
 LAB: Steps = {"simulate": _simulate, "reconstruct": _reconstruct}
-"""What needs the extra `report`."""
+"""Steps that need the extra `report`."""
 
 
 def try_out(program: Path, steps: Steps) -> Iterator[tuple[str, str, bool]]:
-    """Name, words, and whether it went well, of each step; what follows is tried anyway."""
+    """Yield the name, result and success of each step; later steps are tried even after a failure."""
     with tempfile.TemporaryDirectory(prefix="acquire-smoke-") as home:
         for name, step in steps.items():
             try:
@@ -183,8 +183,8 @@ def try_out(program: Path, steps: Steps) -> Iterator[tuple[str, str, bool]]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--program", type=Path, required=True, help="the acquire that is installed")
-    parser.add_argument("--lab", action="store_true", help="also what the extra `report` adds")
+    parser.add_argument("--program", type=Path, required=True, help="the installed acquire")
+    parser.add_argument("--lab", action="store_true", help="also try the extra `report`")
     asked = parser.parse_args()
     good = True
     for name, said, went in try_out(asked.program.absolute(), CORE | (LAB if asked.lab else {})):

@@ -1,15 +1,15 @@
-"""Hours of capture in minutes, with a seeded schedule of faults: does anything grow, where is every line?
+"""Simulate hours of capture in minutes with seeded faults: does memory grow, is every line accounted for?
 
 ::
 
     pattern cameras, time-compressed ─▶ … armed, recorded, stopped, again and again …
-    meanwhile: a camera goes and comes back · a camera drops blocks · the recorder is stopped for a while,
-               or until the rings are full and the recording has to go on in a further segment
+    faults: a camera disappears and returns · a camera drops blocks · the recorder is stopped for a while, or
+            until the rings are full and the recording has to continue in a further segment
 
-``python -m tools.soak --hours 8 --minutes 4`` simulates 8 hours of lines at 2 kHz. At the end of every cycle,
-and every other second of it, the memory of each process is noted; of the owner, which alone outlives a cycle,
-descriptors and threads as well. ``--cycle 60`` lets the others live longer. Every recording is read again to
-the line by a process of its own: what malloc keeps of that is not the capture's.
+``python -m tools.soak --hours 8 --minutes 4`` simulates 8 hours of lines at 2 kHz. Every other second
+and at the end of every cycle the memory of each process is recorded; for the owner, the only process that
+outlives a cycle, also descriptors and threads. ``--cycle 60`` lets the others live longer. Every recording is
+read again completely by a separate process, so that its memory does not count as the capture's.
 """
 
 from __future__ import annotations
@@ -60,16 +60,16 @@ CYCLE_S = 4.0
 SAMPLE_S = 2.0
 LEAST_SAMPLES = 20
 MOST_GROWTH_MB = 2.0
-"""In the second half of what was noted of one process, if there is enough of it: less is called flat."""
+"""Allowed growth in the second half of a process's record, if that is long enough."""
 LONGEST_PAUSE_S = 0.3
 LONGEST_RING_S = 5.0
-"""A longer one is not filled: a freeze is a pause then."""
+"""A longer ring is not filled: then a freeze is only a pause."""
 WAIT_S = 60.0
 
 
 @dataclass(frozen=True)
 class FaultyOpener:
-    """Opens a camera on which faults are thrown by hand, through shared memory."""
+    """Opens a camera whose faults are switched on through shared memory."""
 
     opener: CameraOpener
     faults: Counters
@@ -80,7 +80,7 @@ class FaultyOpener:
 
 
 class FaultyCamera:
-    """A simulated camera that leaves out a block, or is gone, when it is told to."""
+    """A simulated camera that skips a block, or disappears, on request."""
 
     def __init__(self, given: FaultyOpener) -> None:
         self._given = given
@@ -107,7 +107,7 @@ class FaultyCamera:
 
 @dataclass
 class Soak:
-    """What was simulated, and what was found."""
+    """What was simulated, and the results."""
 
     cycles: int = 0
     segments: int = 0
@@ -117,16 +117,16 @@ class Soak:
     wrong: list[str] = field(default_factory=list)
     usage: list[tuple[int, int]] = field(default_factory=list)
     memory: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
-    """Process → real time in seconds and MB of its own memory, without what it shares."""
+    """Process → real time in seconds and MB of its private memory."""
 
     def note_memory(self, pids: dict[str, int | None]) -> None:
-        """Of this process and the others."""
+        """Record the memory of this process and the others."""
         for name, pid in {"owner": os.getpid(), **pids}.items():
             if pid is not None and (own := own_mb(pid)):
                 self.memory.setdefault(name, []).append((time.monotonic(), own))
 
     def growth_mb(self, name: str) -> float | None:
-        """Of a process in the second half, by the median of slopes; None: too little was noted."""
+        """Growth of a process in the second half, by the median of slopes; None: too few values."""
         noted = self.memory[name]
         late = np.array(noted[len(noted) // 2 :])
         if len(noted) < LEAST_SAMPLES:
@@ -136,7 +136,7 @@ class Soak:
         return float(np.median(slopes) * (late[-1, 0] - late[0, 0]))
 
     def judge(self) -> None:
-        """What grows is wrong."""
+        """Report growth as a defect."""
         for name in self.memory:
             growth = self.growth_mb(name)
             if growth is not None and growth > MOST_GROWTH_MB:
@@ -164,7 +164,7 @@ class Soak:
 
 
 def soak(home: Path, lines: int, line_rate_hz: float, seed: int, cycle_s: float = CYCLE_S) -> Soak:
-    """Simulate ``lines`` lines in cycles of arm, record, stop, each with faults of its own."""
+    """Simulate ``lines`` lines in cycles of arm, record, stop, each with its own faults."""
     chance, found = random.Random(seed), Soak()
     load = Load(8, "uint16", line_rate_hz, substeps=2, stages=8, block_lines=512, ring_slots=1024)
     place = home / "cycle"
@@ -175,7 +175,7 @@ def soak(home: Path, lines: int, line_rate_hz: float, seed: int, cycle_s: float 
             _examine(seen, reader.submit(check_parts, place).result(), found)
             shutil.rmtree(place)
             found.cycles += 1
-            # Counted after a collection: what is only garbage is no leak.
+            # Count after a collection, since garbage is not a leak.
             gc.collect()
             handles = sum(1 for _ in Path("/proc/self/fd").iterdir())
             found.usage.append((handles, threading.active_count()))
@@ -212,7 +212,7 @@ def _cycle(path: Path, load: Load, chance: random.Random, found: Soak, cycle_s: 
 
 
 def has_gone_on(now: CaptureStatus, before: CaptureStatus) -> bool:
-    """In a further segment; or it is over, for another reason that the books tell."""
+    """Whether it continues in a further segment, or has ended for a reason that the ledger gives."""
     return now.done or (now.path != before.path and now.committed_lines > 0)
 
 
@@ -251,7 +251,7 @@ def _throw(
 
 @dataclass
 class Parts:
-    """A recording and the segments in which it went on: what they hold together, what is wrong with them."""
+    """Check a recording with its further segments: their lines, and their defects."""
 
     count: int = 0
     lines: int = 0
@@ -260,7 +260,7 @@ class Parts:
 
 
 def check_parts(place: Path) -> Parts:
-    """Of everything that lies in a directory."""
+    """Check every recording in a directory."""
     found = Parts()
     for path in sorted(place.glob("*.zarr")):
         recording = open_recording(path)
@@ -272,7 +272,7 @@ def check_parts(place: Path) -> Parts:
 
 
 def _examine(seen: CaptureStatus, parts: Parts, found: Soak) -> None:
-    """The books to the line: of what was delivered and of what the recordings hold."""
+    """Account for every line, as delivered and as recorded."""
     wrong = [*parts.wrong, *([seen.fault] if seen.fault else [])]
     for name, account in seen.accounts.items():
         if not account.balanced or account.stored != parts.stored[name]:
@@ -284,7 +284,7 @@ def _examine(seen: CaptureStatus, parts: Parts, found: Soak) -> None:
 
 
 def own_mb(pid: int) -> float:
-    """MB of memory of a process that it shares with no other and no file; 0 once it has ended."""
+    """MB of a process's private memory, shared with no process or file; 0 once it has ended."""
     try:
         _, resident, shared, *_ = Path(f"/proc/{pid}/statm").read_text().split()
     except (FileNotFoundError, ProcessLookupError):
@@ -302,9 +302,9 @@ def _until(condition: Any) -> None:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--hours", type=float, default=8.0, help="simulated")
-    parser.add_argument("--minutes", type=float, default=4.0, help="real, of recording")
-    parser.add_argument("--cycle", type=float, default=CYCLE_S, help="seconds of a recording, real")
+    parser.add_argument("--hours", type=float, default=8.0, help="simulated hours")
+    parser.add_argument("--minutes", type=float, default=4.0, help="real minutes of recording")
+    parser.add_argument("--cycle", type=float, default=CYCLE_S, help="real seconds per recording")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     lines = round(options.hours * 3600 * SIMULATED_HZ)

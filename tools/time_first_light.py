@@ -1,12 +1,12 @@
-"""How long first light takes: every command of FIRST_LIGHT.md on the practice instrument, in their order.
+"""Time first light: carry out every command of FIRST_LIGHT.md on the practice instrument, in order.
 
 Usage: python -m tools.time_first_light [--until 5] [--json FILE]
 
-Takes the document's commands as they stand there, in a directory of its own, puts the scenes that it names
-before the cameras, enters the delays into the rig file as a person would, and starts the daemon anew where it
-says so. Columns: seconds on the clock; processor seconds of the command and of the daemon with its processes;
-and the seconds in which none of them could have used a processor: waiting, for lines or a timer. What is left
-they lost to others that had the processors. ``--until`` ends behind that step; 5 is the calibration.
+It runs the document's commands unchanged in a directory of its own, puts the scenes that it names in front of
+the cameras, enters the delays into the rig file as a person would, and restarts the daemon where the document
+says so. Columns: wall-clock seconds; processor seconds of the command and of the daemon with its processes;
+and the seconds in which none of them could have used a processor, because they waited for lines or a timer.
+The rest was lost to other processes. ``--until`` ends after that step; 5 is the calibration.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ LOOK_EVERY_S = 0.03
 
 @dataclass(frozen=True)
 class Took:
-    """One command."""
+    """Times of one command."""
 
     step: int
     command: str
@@ -52,7 +52,7 @@ class Took:
 
 
 class Watch(threading.Thread):
-    """Looks again and again whether a thread of a process below this one runs, or could."""
+    """Sample repeatedly whether a thread of a child process runs, or could run."""
 
     def __init__(self) -> None:
         super().__init__(daemon=True)
@@ -72,7 +72,7 @@ class Watch(threading.Thread):
 
 
 def states(pid: int) -> list[str]:
-    """Of a process's threads; none where it has just ended."""
+    """States of a process's threads; none if it has just ended."""
     found = []
     for stat in Path(f"/proc/{pid}/task").glob("*/stat"):
         try:
@@ -106,7 +106,7 @@ class Bench:
         subprocess.run(words, cwd=self.directory, env=self.environment, check=True, stdout=subprocess.DEVNULL)
 
     def serve(self, words: list[str]) -> None:
-        """Until it answers."""
+        """Start the daemon, and wait until it answers."""
         with (self.directory / "serve.log").open("ab") as log:
             self.daemon = subprocess.Popen(
                 words, cwd=self.directory, env=self.environment, stdout=log, stderr=log
@@ -118,7 +118,7 @@ class Bench:
             time.sleep(0.05)
 
     def enter_delays(self) -> None:
-        """What a person does who is told the delays, and starts the daemon anew."""
+        """Enter the delays as a person would, and restart the daemon."""
         found = open_calibration(self.directory / "cal.zarr").steps["delay"]["rig"]
         rig, table, lines = self.directory / "rig.toml", "", []
         for line in rig.read_text(encoding="utf-8").splitlines():
@@ -130,7 +130,7 @@ class Bench:
         self.run(["acquire", "serve", "--config", "rig.toml", "&"])
 
     def processor_s(self) -> float:
-        """Of all commands that have ended, and of the daemon with its processes."""
+        """Processor time of all commands that have ended, and of the daemon with its processes."""
         spent = os.times()
         total = spent.children_user + spent.children_system
         if self.daemon is not None and self.daemon.poll() is None:
@@ -152,7 +152,7 @@ class Bench:
 
 
 def steps(text: str) -> Iterator[tuple[int, str, list[str]]]:
-    """Step of the document, scene to put or "", words of a command."""
+    """Yield the step of the document, the scene to show or "", and the words of a command."""
     step = 0
     for number, scene, block in PARTS.findall(text):
         step = int(number or step)

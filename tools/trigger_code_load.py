@@ -1,7 +1,8 @@
-"""How long 64 kbit of code take to the trigger's code memory at 3 Mbaud, checked by the device.
+"""Time to load 64 kbit of code into the trigger's code memory at 3 Mbaud, with the device's check.
 
-``python tools/trigger_code_load.py [LATENCY_MS]``: bytes are paced as on the line in both directions, answers
-come LATENCY_MS late, as from a USB adapter. The gateware, where it can be compiled, counts its own clocks.
+``python tools/trigger_code_load.py [LATENCY_MS]``: bytes are paced as on the line in both directions, and
+answers come LATENCY_MS late, as from a USB adapter. The gateware, if it can be compiled, counts its own
+clocks.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _PIECE = 64
 
 
 class PacedTransport(TwinTransport):
-    """No byte arrives sooner than the line can carry it."""
+    """A stream in which no byte arrives sooner than the line can carry it."""
 
     def __init__(self, twin: Twin, latency_s: float) -> None:
         super().__init__(twin, f"{BAUD} baud")
@@ -60,7 +61,7 @@ class PacedTransport(TwinTransport):
 
 
 def load(device: Device) -> float:
-    """Seconds of the host."""
+    """Time in seconds on the host."""
     bits = prbs(23, 5, 0, BITS)
     begun_s = time.monotonic()
     device.load_code(bits)
@@ -70,7 +71,7 @@ def load(device: Device) -> float:
 
 
 def on_the_model(latency_s: float) -> float:
-    """The best of five: this machine has others to serve."""
+    """The best of five, because of other load on the machine."""
     with wired_model() as model:
         transport = PacedTransport(model, latency_s)
         link = Link(transport)
@@ -81,7 +82,7 @@ def on_the_model(latency_s: float) -> float:
 
 
 def on_the_gateware() -> float:
-    """By the gateware's own clock, which knows nothing of how slowly it is simulated."""
+    """Time by the gateware's own clock, independent of the speed of the simulation."""
     from firmware.device import RtlDevice
     from firmware.top import Build
 

@@ -1,7 +1,7 @@
-"""Commands over a link that damages one byte in a hundred, against the behavioural model.
+"""Send commands to the behavioural model over a link that damages one byte in a hundred.
 
-``python tools/trigger_link_storm.py [COMMANDS]``: how many wrong values are accepted (none), and how long a
-request waits at most (never beyond the link's limit).
+``python tools/trigger_link_storm.py [COMMANDS]``: prints the number of wrong values accepted (none) and the
+longest wait for an answer (never beyond the link's limit).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Procedural scenes (`acquire.sim.procedural`) to look at.
+"""Write pictures of the procedural scenes (`acquire.sim.procedural`).
 
 python tools/trust_scenes.py --pictures DIRECTORY        frames of every scene
 """

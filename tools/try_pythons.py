@@ -1,17 +1,17 @@
-"""Does the program install and run on every Python that it claims? In fresh environments, from packages.
+"""Try whether the packages install and run on every supported Python, in fresh environments.
 
 ::
 
     checkout ─▶ wheel, source distribution ─▶ for each Python, an environment of its own:
-        the wheel alone            ─▶ what a capture host does
-        the wheel with [report]    ─▶ what the README's first command does
+        the wheel alone            ─▶ the work of a capture host
+        the wheel with [report]    ─▶ the README's first command
         the source distribution    ─▶ built by pip, and the same again, briefly
 
-``python tools/try_pythons.py`` tries those of the classifiers in pyproject.toml, found on the path as
-python3.11 and so on; ``--python PROGRAM``, repeated, those that are named instead. Versions are those of
-tools/constraints.txt; should they not suit a Python, it is said, and pip chooses. Needs a package index, the
-package `build`, and about a gigabyte of disk for each environment, which is removed. Ends with 1 where a
-Python is not found or something fails.
+``python tools/try_pythons.py`` tries the versions of the classifiers in pyproject.toml, found on the path as
+python3.11 and so on, or instead those given by ``--python PROGRAM`` (repeatable). Library versions are those
+of tools/constraints.txt; if they do not suit a Python, this is reported and pip chooses. It needs a package
+index, the package `build`, and about a gigabyte of disk for each environment, which is removed afterwards.
+Ends with 1 if a Python is not found or something fails.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ from tools.smoke import CORE, LAB, Steps, own_environment, try_out
 
 CONSTRAINTS = ROOT / "tools/constraints.txt"
 LIMIT_S = 1800
-"""For one call of pip, which may compile where there is no wheel."""
+"""Time limit of one call of pip, which may compile if there is no wheel."""
 QUESTION = "import sys; print(*sys.version_info[:3], sep='.')"
 STAGES = (("core", "", CORE), ("report", "[report]", CORE | LAB))
 
 
 class TrialError(Exception):
-    """What cannot go on, in words."""
+    """The trial cannot continue; the text gives the reason."""
 
 
 @dataclass(frozen=True)
 class Python:
-    """An interpreter that answers."""
+    """A working interpreter."""
 
     program: str
     version: str
@@ -50,7 +50,7 @@ class Python:
 
 @dataclass
 class Tally:
-    """Prints what is tried as it comes; remembers what failed."""
+    """Print results as they come, and remember failures."""
 
     failed: list[str] = field(default_factory=list)
 
@@ -63,14 +63,14 @@ class Tally:
 
 
 def claimed() -> list[str]:
-    """As in python3.11: what the classifiers promise."""
+    """Versions in the classifiers, as in python3.11."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     last_words = [line.rpartition(" :: ")[2] for line in project["classifiers"]]
     return [f"python{word}" for word in last_words if re.fullmatch(r"3\.\d+", word)]
 
 
 def ask(program: str) -> Python:
-    """Which Python it is. Raises TrialError for a program that is none, or does not run."""
+    """Version of a Python. Raises TrialError for a program that is no Python or does not run."""
     try:
         said = _run([program, "-c", QUESTION], 60)
     except OSError as error:
@@ -84,7 +84,7 @@ def ask(program: str) -> Python:
 
 
 def try_python(python: Python, made: Packages, tally: Tally) -> None:
-    """In two environments, one after the other."""
+    """Try one Python in two environments, one after the other."""
     name = f"Python {python.version}"
     for stage, extra, steps in STAGES:
         with tempfile.TemporaryDirectory(prefix="acquire-python-") as home:
@@ -106,7 +106,7 @@ def _make_environment(python: Python, place: Path) -> None:
 
 
 def install(name: str, place: Path, what: str, tally: Tally, *options: str) -> None:
-    """With the versions that are known to go together; if they do not here, with those that pip finds."""
+    """Install with the constrained versions, or with those that pip chooses if they do not fit."""
     words = [str(place / "bin/python"), "-m", "pip", "install", "-q", "--disable-pip-version-check", *options]
     begun = time.monotonic()
     try:
@@ -157,7 +157,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--python", action="append", metavar="PROGRAM", help="one to try; repeatable")
+    parser.add_argument("--python", action="append", metavar="PROGRAM", help="Python to try; repeatable")
     programs = parser.parse_args().python or claimed()
     tally = Tally()
     with tempfile.TemporaryDirectory(prefix="acquire-packages-") as home:

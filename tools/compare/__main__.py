@@ -1,10 +1,9 @@
-"""The same stream through other people's writers and ours, one after the other, in one run.
+"""Write the same stream with other libraries' writers and ours, one after the other, in one run.
 
 ``python -m tools.compare --out DIR`` makes an environment per peer (pip, kept in ``--environments``), has
-each write the same blocks flat out, and prints rates, processor time, and ratios to a bare O_DIRECT write and
-to us.
-Rounds alternate, the best of each peer counts: what the neighbours of a machine do only ever costs.
-odin-data, which is C++ and on no package index, is not among them.
+each write the same blocks at full speed, and prints rates, processor time, and ratios to a bare O_DIRECT
+write and to ours. Rounds alternate, and the best of each peer counts, since other load can only slow it.
+odin-data is not included, because it is C++ and in no package index.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ LIMIT_S = 300
 
 
 def interpreter(peer: str, environments: Path) -> Path:
-    """Of the peer's environment, made now if there is none."""
+    """Python of the peer's environment, which is made if it does not exist."""
     packages = PEERS[peer]
     if packages is None:
         return Path(sys.executable)
@@ -49,7 +48,7 @@ def interpreter(peer: str, environments: Path) -> Path:
 
 
 def run(peer: str, environments: Path, out: Path, gigabytes: float) -> dict[str, Any]:
-    """One peer writes; what it wrote is removed."""
+    """Let one peer write, and remove what it wrote."""
     python = interpreter(peer, environments)
     directory = Path(tempfile.mkdtemp(prefix=f"compare-{peer}-", dir=out))
     command = [python, HERE / f"peer_{peer}.py", directory, str(round(gigabytes / 2 / BLOCK_GB))]
@@ -72,7 +71,7 @@ def run(peer: str, environments: Path, out: Path, gigabytes: float) -> dict[str,
 
 
 def table(found: dict[str, list[dict[str, Any]]]) -> str:
-    """Markdown; the best rate and the least processor time of each peer's rounds."""
+    """Markdown table of the best rate and the least processor time of each peer's rounds."""
     best = {
         peer: {
             "rate": max(one["mb_per_s"] for one in rounds),

@@ -1,4 +1,4 @@
-"""tensorstore: one zarr3 array per arm that grows by whole chunks, crc32c; four writes under way."""
+"""tensorstore: one zarr3 array per arm that grows by whole chunks, crc32c; four writes at a time."""
 
 import sys
 from collections import deque

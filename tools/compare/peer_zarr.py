@@ -1,4 +1,4 @@
-"""zarr-python: one array per arm that grows by whole chunks, crc32c, empty chunks not looked for (faster)."""
+"""zarr-python: one array per arm that grows by whole chunks, crc32c, no test for empty chunks (faster)."""
 
 import sys
 from pathlib import Path

@@ -1,7 +1,7 @@
-"""The stream that every writer gets, and what is measured of it; needs numpy only.
+"""The stream that every writer gets, and its measurement; needs only numpy.
 
-Blocks of 1024 lines of 4640 px, 8 bit, of arm a and b in turn, from touched memory, as fast as they go.
-The clock stops when everything is closed and forced to the medium: a page cache is no disk.
+Blocks of 1024 lines of 4640 px, 8 bit, of arm a and b in turn, from touched memory, as fast as possible.
+The clock stops when everything is closed and forced to the medium, since a page cache is not a disk.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ DIFFERENT = 8
 
 
 class Writer(Protocol):
-    """What a peer's script supplies."""
+    """Interface of a peer's script."""
 
     def append(self, arm: str, block: np.ndarray) -> None: ...
     def close(self) -> None: ...
 
 
 def blocks() -> list[np.ndarray]:
-    """Page-aligned, and different from one another."""
+    """Page-aligned blocks that differ from one another."""
     rng = np.random.default_rng(1)
     memory = np.empty((DIFFERENT + 1) * BLOCK_BYTES, np.uint8)
     start = -memory.ctypes.data % 4096
@@ -42,7 +42,7 @@ def blocks() -> list[np.ndarray]:
 
 
 def measure(writer: Writer, directory: Path, count: int) -> None:
-    """Write ``count`` blocks of each arm, and print what that took as JSON."""
+    """Write ``count`` blocks of each arm, and print the cost as JSON."""
     stack, slowest_s = blocks(), 0.0
     begun_s, begun_cpu_s = time.perf_counter(), _cpu_s()
     for k in range(count):
@@ -51,7 +51,7 @@ def measure(writer: Writer, directory: Path, count: int) -> None:
             writer.append(arm, stack[k % DIFFERENT])
             slowest_s = max(slowest_s, time.perf_counter() - before_s)
     writer.close()
-    # Every writer is timed until its bytes are on the medium, whatever it leaves to the system itself.
+    # Time every writer until its bytes are on the medium, even if it leaves that to the system.
     for path in directory.rglob("*"):
         if path.is_file():
             fd = os.open(path, os.O_RDONLY)
