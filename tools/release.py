@@ -61,7 +61,7 @@ def version_is_new(root: Path) -> str:
     try:
         Version(version)
     except InvalidVersion:
-        raise Undone(f"{version!r} is no version after PEP 440", "mend __version__") from None
+        raise Undone(f"{version!r} is not a version after PEP 440", "correct __version__") from None
     if f"v{version}" in _git(root, "tag").split():
         raise Undone(f"{version} is released: it has a tag", "raise __version__ in acquire/__init__.py")
     return f"{version}, of which there is no tag"
@@ -76,14 +76,15 @@ def changelog_tells_it(root: Path) -> str:
     newest, end = headings[0], headings[1].start() if len(headings) > 1 else len(text)
     if newest[1] != version:
         raise Undone(
-            f"its newest section is of {newest[1]}, the program is {version}", f"tell what {version} brings"
+            f"its newest section is of {newest[1]}, the program is {version}",
+            f"describe the changes of {version}",
         )
     if "\n- " not in text[newest.end() : end]:
-        raise Undone(f"the section of {version} has no entry", "tell what it brings")
+        raise Undone(f"the section of {version} has no entry", "describe its changes")
     if newest[2] == "unreleased":
         return f"tells of {version}; write the date in place of (unreleased) in the commit that is tagged"
     if _date(newest[2]) > date.today():
-        raise Undone(f"{newest[2]} has not come yet", "mend the date")
+        raise Undone(f"{newest[2]} has not come yet", "correct the date")
     return f"tells of {version}, {newest[2]}"
 
 
@@ -114,7 +115,7 @@ def constraints_suit(root: Path) -> str:
             wrong.append(f"{wanted.name} {here} is installed here, and not {pin}")
     if wrong:
         raise Undone(
-            "; ".join(wrong), "pip install -c tools/constraints.txt -e '.[dev]', or mend the versions"
+            "; ".join(wrong), "pip install -c tools/constraints.txt -e '.[dev]', or correct the versions"
         )
     return f"{count} libraries are installed in the versions of {CONSTRAINTS.name}"
 
@@ -126,7 +127,7 @@ def packages_are_whole(root: Path) -> str:
         except subprocess.CalledProcessError as error:
             raise Undone(_end(error.stdout.decode(errors="replace")), "python -m build") from None
         if wrong := faults(made, root):
-            raise Undone("; ".join(wrong), "mend [tool.hatch.build] in pyproject.toml")
+            raise Undone("; ".join(wrong), "correct [tool.hatch.build] in pyproject.toml")
         return f"{made.sdist.name} and {made.wheel.name} hold the checkout and nothing else"
 
 
@@ -264,7 +265,7 @@ def main() -> int:
     left = [] if asked.tests else ["the whole suite (--tests)"]
     left += [] if asked.all_pythons else ["the other Pythons (--all-pythons)"]
     if left:
-        print(f"– not looked at: {', '.join(left)}")
+        print(f"– not checked: {', '.join(left)}")
     version = version_of(ROOT)
     print(
         f"{undone} to do"
