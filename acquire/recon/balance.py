@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.recon.outliers import outliers
-from acquire.recon.suspects import black_level_off
+from acquire.recon.sanity import black_level_off
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

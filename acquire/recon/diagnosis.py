@@ -10,8 +10,8 @@ import numpy as np
 from acquire.cores import limit_threads
 from acquire.recon.balance import balance_of
 from acquire.recon.hypotheses import Hypothesis, Turn, Witness, compare
+from acquire.recon.sanity import Suspicion, black_level_off, suspicions, unusable
 from acquire.recon.search import Candidate, Inquiry, Standing, inquire
-from acquire.recon.suspects import Suspicion, black_level_off, suspicions, unusable
 
 if TYPE_CHECKING:
     from collections.abc import Callable

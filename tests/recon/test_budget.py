@@ -90,7 +90,7 @@ def test_time_is_kept_for_what_goes_on_after_the_last_iteration(wall: Wall) -> N
     for _ in clock.run(1000, "solve"):
         wall.now += 0.1
     assert 8.3 < clock.seconds <= 9.0
-    for _ in clock.afterwards(1000):
+    for _ in clock.run_reserved(1000):
         wall.now += 0.1
     assert 9.3 < clock.seconds <= 10.0
     clock = IterationClock(1000, 10.0)
@@ -104,7 +104,7 @@ def test_one_long_iteration_in_five_does_not_end_what_goes_on_after_the_last(wal
     clock = IterationClock(1000, 10.0)
     wall.now += 8.0
     made = 0
-    for made in clock.afterwards(1000):
+    for made in clock.run_reserved(1000):
         wall.now += 0.5 if made % 5 == 4 else 0.02
     assert made > 8
     assert clock.seconds <= 10.0
@@ -114,7 +114,7 @@ def test_the_fewest_after_the_last_are_made_where_they_fit(wall: Wall) -> None:
     for least, expected in ((0, 1), (2, 2)):
         clock = IterationClock(1000, 10.0)
         wall.now += 8.5
-        for _ in clock.afterwards(1000, least):
+        for _ in clock.run_reserved(1000, least):
             wall.now += 0.6
         assert clock.seconds == pytest.approx(8.5 + 0.6 * expected)
 
@@ -126,9 +126,9 @@ def test_what_is_to_be_made_twice_leaves_time_for_the_second(wall: Wall, left_s:
         wall.now += 0.1
     wall.now += 9.9 - left_s
     made = again = 0
-    for made, _ in enumerate(clock.afterwards(15, twice=4), 1):  # noqa: B007
+    for made, _ in enumerate(clock.run_reserved(15, repeat=4), 1):  # noqa: B007
         wall.now += 0.1
-    for again, _ in enumerate(clock.afterwards(max(made, 4), 2), 1):  # noqa: B007
+    for again, _ in enumerate(clock.run_reserved(max(made, 4), 2), 1):  # noqa: B007
         wall.now += 0.1
     assert made == first
     assert again == max(made, 4)
@@ -177,7 +177,7 @@ def test_looking_on_shows_the_answer_to_be_and_takes_no_time(solver: str) -> Non
 
 def test_who_looks_on_takes_none_of_the_budget(wall: Wall) -> None:
     clock = IterationClock(1000, 5.0)
-    clock.looks = lambda _: setattr(wall, "now", wall.now + 2.0)
+    clock.on_look = lambda _: setattr(wall, "now", wall.now + 2.0)
     for _ in clock.run(30, "solve", video=lambda: np.zeros((1, 1, 1))):
         wall.now += 0.1
     assert (clock.done, clock.ended) == (30, "done")

@@ -7,8 +7,8 @@ import pytest
 
 from acquire.forward import DualArm
 from acquire.recon import Reconstruction, reconstruct
+from acquire.recon.aliasing import detect_unresolved_light
 from acquire.recon.clock import IterationClock
-from acquire.recon.faster import tell_faster_light
 from acquire.recon.problem import build_problem
 from acquire.sim.procedural import Recorded, record
 
@@ -35,7 +35,9 @@ def held_against(recorded: Recorded, result: Reconstruction, clock: IterationClo
     lines = DualArm(segment.geometry, segment.code, 3, 1).forward(result.video.astype(np.float32))
     predicted = lines / (problem.norm * problem.scale)
     resolved_hz = result.parameters["resolved_hz"]
-    return tell_faster_light(segment, problem, predicted, result.video, resolved_hz, clock)
+    return detect_unresolved_light(
+        segment, problem, predicted, result.video, resolved_hz=resolved_hz, clock=clock
+    )
 
 
 @pytest.mark.parametrize("scene", ["still", "leds", "splash", "flame", "spark", "disc", "bullet"])
