@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from acquire.lines import Segment
     from acquire.recon.gaussian import Model
-    from acquire.recon.hypotheses import Hypothesis, Witness
+    from acquire.recon.hypotheses import Hypothesis, LineModel
 
     Floats = NDArray[np.float64]
 
@@ -91,11 +91,11 @@ def black_level_off(segment: Segment) -> list[Suspicion]:
     return found
 
 
-def suspicions(witness: Witness, hypothesis: Hypothesis) -> list[Suspicion]:
+def suspicions(model: LineModel, hypothesis: Hypothesis) -> list[Suspicion]:
     """Find a wrong black level, ambient light and too little light."""
-    views = [witness.view(hypothesis, arm) for arm in (0, 1)]
+    views = [model.view(hypothesis, arm) for arm in (0, 1)]
     found = []
-    for name, lines, view in zip("ab", witness.arms, views, strict=True):
+    for name, lines, view in zip("ab", model.arms, views, strict=True):
         mean = float(lines.mean())
         found += _constant(name, lines, view.model, mean)
         found += _little_light(name, lines, view.model, mean)

@@ -12,7 +12,7 @@ from acquire.calibrate import calibrated
 from acquire.plugins import SOLVERS
 from acquire.recon import reconstruct
 from acquire.recon.balance import divided
-from acquire.recon.diagnosis import put_right
+from acquire.recon.diagnosis import undo_turn
 from acquire.recon.error import error_facts, regions_of
 from acquire.recon.hypotheses import AS_BUILT
 from acquire.recon.judge import POOR_MISFIT
@@ -196,7 +196,7 @@ def as_read(lines: Segment, options: Options) -> Segment:
     """With the calibration, and the arms put right."""
     if options.calibration is not None:
         lines = calibrated(lines, options.calibration)
-    return put_right(lines, options.turn)
+    return undo_turn(lines, options.turn)
 
 
 def _why_not_trusted(result: Reconstruction, segment: SubSegment) -> str | None:

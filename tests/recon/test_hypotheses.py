@@ -12,7 +12,7 @@ from acquire.codes import mix_seed, prbs
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
 from acquire.lines import Segment
-from acquire.recon.hypotheses import AS_BUILT, TURNS, Hypothesis, Turn, Witness, compare
+from acquire.recon.hypotheses import AS_BUILT, TURNS, Hypothesis, LineModel, Turn, compare
 from acquire.recon.search import Inquiry, Standing, inquire
 
 GEOMETRY = Geometry(24, 3, 120)
@@ -47,13 +47,13 @@ def recorded(scene_seed: int = 1, *, texture: float = 3.0) -> Segment:
 
 
 def found(segment: Segment) -> Inquiry:
-    return inquire(Witness(segment))
+    return inquire(LineModel(segment))
 
 
 def test_what_is_right_is_left_alone() -> None:
     inquiry = found(recorded())
     assert inquiry.standing is Standing.RIGHT
-    assert inquiry.best is inquiry.said
+    assert inquiry.best is inquiry.described
 
 
 def test_a_late_code_is_named_to_the_substep() -> None:
