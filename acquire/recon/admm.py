@@ -139,7 +139,7 @@ class Admm:
         """Set up the preconditioner for the present operator and penalties."""
         p = self._parameters
         known = self._operator.near_inverse(p.tv_penalty + p.sign_penalty) if p.preconditioned else None
-        self._precondition: Callable[[Array], Array] = known or _same
+        self._precondition: Callable[[Array], Array] = known or (lambda lines: lines)
 
     def step(self) -> None:
         """One iteration.
@@ -189,7 +189,3 @@ class Admm:
             if energy <= enough:
                 return
             direction = scaled + (energy / before) * direction
-
-
-def _same(lines: Array) -> Array:
-    return lines

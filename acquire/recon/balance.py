@@ -128,15 +128,16 @@ def _light(segment: Segment) -> _Light | None:
     if geometry.lines < FEWEST_PASSES * geometry.stages or masked > MOST_MASKED:
         return None
     arms = [_filled(lines, good) for lines, good in zip(samples, usable, strict=True)]
-    a, b = (0.0, 0.0) if segment.alignment is not None else map(_slope, arms)
-    return _Light(np.stack([arm.sum(1) for arm in arms]), (a, b), masked)
-
-
-def _slope(lines: Floats) -> float:
-    profile = lines.mean(0)
-    begin, end = (np.cumsum(each[: max(1, round(EDGE * len(each)))]) for each in (profile, profile[::-1]))
-    steepest, mean = np.abs((end - begin) / np.arange(1, len(end) + 1)).max(), float(profile.mean())
-    return float(steepest) / mean if mean > 0 else 0.0
+    slopes = [0.0, 0.0]
+    if segment.alignment is None:
+        # the steepest mean difference between the outermost columns at either end of an arm
+        for k, arm in enumerate(arms):
+            profile = arm.mean(0)
+            width = max(1, round(EDGE * len(profile)))
+            begin, end = np.cumsum(profile[:width]), np.cumsum(profile[::-1][:width])
+            steepest, mean = np.abs((end - begin) / np.arange(1, width + 1)).max(), float(profile.mean())
+            slopes[k] = float(steepest) / mean if mean > 0 else 0.0
+    return _Light(np.stack([arm.sum(1) for arm in arms]), (slopes[0], slopes[1]), masked)
 
 
 def _filled(lines: Floats, usable: NDArray[np.bool_]) -> Floats:

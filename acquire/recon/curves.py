@@ -66,7 +66,7 @@ class CurveFit:
         """
         self._segment, self._problem, self._cosines = segment, problem, cosines
         self._merge, self._ridge, self._calls = temporal_merge, ridge, 0
-        self._precondition: Callable[[Array], Array] = _same
+        self._precondition: Callable[[Array], Array] = lambda x: x
         self._damping = 0.0
 
     def __call__(self, patterns: Array, start: NDArray[Any]) -> NDArray[np.float64]:
@@ -190,10 +190,6 @@ def _preconditioner(
         return xp.reshape(apply(xp.reshape(right.T, (-1,))), shape[::-1]).T
 
     return solve, damping
-
-
-def _same(x: Array) -> Array:
-    return x
 
 
 def _conjugate_gradients(

@@ -47,9 +47,11 @@ class Checked:
 
     def prox(self, frames: Array, weight: float | Array) -> Array:
         cleaned = self._denoiser.prox(frames, weight)
-        if getattr(cleaned, "shape", None) != frames.shape:
+        shape = getattr(cleaned, "shape", None)
+        if shape != frames.shape:
+            what = f"a {type(cleaned).__name__}" if shape is None else f"shape {tuple(shape)}"
             raise UsageError(
-                f"denoiser {self._name} gave back {_what(cleaned)} for frames of shape {tuple(frames.shape)}",
+                f"denoiser {self._name} gave back {what} for frames of shape {tuple(frames.shape)}",
                 possible="an array of the same shape",
             )
         if not bool(namespace(cleaned).all(namespace(cleaned).isfinite(cleaned))):
@@ -57,11 +59,6 @@ class Checked:
                 f"denoiser {self._name} gave back values that are not finite", hint="another denoiser, or TV"
             )
         return cleaned
-
-
-def _what(given: object) -> str:
-    shape = getattr(given, "shape", None)
-    return f"a {type(given).__name__}" if shape is None else f"shape {tuple(shape)}"
 
 
 class HaarShrink:
@@ -97,9 +94,11 @@ def _level(smooth: Array, step: int, threshold: Array) -> tuple[Array, Array]:
     for part in parts:
         below = namespace(part).roll(part, -step, axis=1)
         bands += [(part + below) / 2, (part - below) / 2]
-    kept = [
-        _undo(_soft(band, threshold / 2), step, sign) for band, sign in zip(bands[1:], _SIGNS, strict=True)
-    ]
+    kept = []
+    for band, sign in zip(bands[1:], _SIGNS, strict=True):
+        xp = namespace(band)
+        shrunk = xp.sign(band) * xp.maximum(xp.abs(band) - threshold / 2, 0)
+        kept.append(_undo(shrunk, step, sign))
     return _undo(bands[0], step, (1, 1)), sum(kept[1:], kept[0])
 
 
@@ -111,8 +110,3 @@ def _undo(band: Array, step: int, sign: tuple[int, int]) -> Array:
     """A band back in pixels: the mean over the shifts, which for Haar is the transposed filter."""
     rows = (band + sign[0] * namespace(band).roll(band, step, axis=1)) / 2
     return (rows + sign[1] * namespace(rows).roll(rows, step, axis=2)) / 2
-
-
-def _soft(band: Array, threshold: Array) -> Array:
-    xp = namespace(band)
-    return xp.sign(band) * xp.maximum(xp.abs(band) - threshold, 0)

@@ -147,22 +147,18 @@ def name_of(hypothesis: Hypothesis) -> str:
         parts.append(f"the lines have {hypothesis.substeps} sub-steps (S)")
     if hypothesis.inverted:
         parts.append("the code is inverted: the light is on where the code is 0")
-    parts += _delay(*hypothesis.late)
+    a, b = hypothesis.late
+    if a == b != 0:
+        parts.append(f"the lines are {_late(a)} against the code")
+    elif a != b:
+        each = [f"arm {arm}'s are {_late(by)}" for arm, by in (("A", a), ("B", b)) if by]
+        parts.append(
+            f"of the lines, {' and '.join(each)} against the code, or the image is displaced by as many fine "
+            "pixels"
+        )
     if hypothesis.turn in TURNED:
         parts.append(TURNED[hypothesis.turn])
     return "; ".join(parts) or "as described"
-
-
-def _delay(a: int, b: int) -> list[str]:
-    if a == b == 0:
-        return []
-    if a == b:
-        return [f"the lines are {_late(a)} against the code"]
-    each = [f"arm {arm}'s are {_late(by)}" for arm, by in (("A", a), ("B", b)) if by]
-    return [
-        f"of the lines, {' and '.join(each)} against the code, or the image is displaced by as many fine "
-        "pixels"
-    ]
 
 
 def _late(by: int) -> str:

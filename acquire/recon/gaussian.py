@@ -81,8 +81,10 @@ class Response:
         cosines = np.sqrt(2) * np.cos(np.pi * k * (np.arange(len(code)) + 0.5) / len(code))
         cosines[0] = 1
         lit = (cosines * code).T
-        summed = _window_sums(lit, substeps)
-        running = np.concatenate([np.zeros((1, FAST)), np.cumsum(summed, axis=0)])
+        # light in each window of S sub-steps, summed over time
+        running = np.concatenate([np.zeros((1, FAST)), np.cumsum(lit, axis=0)])
+        windows = running[substeps:] - running[:-substeps]
+        running = np.concatenate([np.zeros((1, FAST)), np.cumsum(windows, axis=0)])
         first = (np.arange(lines) * substeps)[:, None]
         # float32: the products with these take most of the time, and the noise is far above its rounding
         tiers = ((0, FINE, pixels * finer), (FINE, SLOW, pixels), (SLOW, FAST, min(pixels, FAST_ROWS)))
@@ -100,11 +102,6 @@ class Response:
             smoothed = (near @ factor) * prior.spectrum[cosines].astype(np.float32)
             total += smoothed.reshape(self.lines, -1) @ factor.reshape(self.lines, -1).T
         return total.astype(np.float64)
-
-
-def _window_sums(values: Floats, width: int) -> Floats:
-    running = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
-    return np.asarray(running[width:] - running[:-width])
 
 
 def _block_sums(running: Floats, first: NDArray[np.int64], rows: int, blocks: int) -> Floats:

@@ -79,7 +79,13 @@ class HeldOut:
         labels[1] = np.where(labels[1] > 0, labels[1] + labels[0].max(), 0)
         self._block = np.stack(labels)[mask]
         self._samples = problem.samples[mask].astype(np.float64)
-        self._weight = np.broadcast_to(_trusted_share(geometry)[:, None], mask.shape)[mask]
+        trusted, share = geometry.trusted_frames(1), np.ones(geometry.lines)
+        if trusted.start < trusted.stop:  # otherwise no sub-step is trusted, and all lines count alike
+            first = np.arange(geometry.lines) * geometry.substeps
+            length = geometry.size + geometry.substeps - 1
+            overlap = np.minimum(first + length, trusted.stop) - np.maximum(first, trusted.start)
+            share = np.maximum(overlap, 0) / length
+        self._weight = np.broadcast_to(share[:, None], mask.shape)[mask]
         self._mask = mask
         self._level = float(np.sum(self._weight * self._samples**2))
 
@@ -100,14 +106,3 @@ class HeldOut:
         """Whether ``errors`` are smaller by more than the standard error of the blocks' differences."""
         less = others - errors
         return bool(less.mean() > less.std() / max(len(less) - 1, 1) ** 0.5)
-
-
-def _trusted_share(geometry: Geometry) -> NDArray[np.float64]:
-    """Share of each line's sub-steps in the trusted interval; 1 for all lines if no sub-step is trusted."""
-    trusted = geometry.trusted_frames(1)
-    if trusted.stop <= trusted.start:
-        return np.ones(geometry.lines)
-    first = np.arange(geometry.lines) * geometry.substeps
-    length = geometry.size + geometry.substeps - 1
-    overlap = np.minimum(first + length, trusted.stop) - np.maximum(first, trusted.start)
-    return np.asarray(np.maximum(overlap, 0) / length)

@@ -216,8 +216,10 @@ def prepared_lines(segment: Segment) -> tuple[int, tuple[Floats, Floats]]:
     first = (segment.geometry.lines - length) // 2
     samples = segment.samples(np.float64)[:, first : first + length]
     mask = segment.mask[:, first : first + length] & np.isfinite(samples)
+    stages = segment.geometry.stages
+    edges = np.linspace(0, stages, min(MOST_PIXELS, stages) + 1).round().astype(int)
     a, b = (
-        _merged(_filled(arm, known), min(MOST_PIXELS, segment.geometry.stages))
+        np.asarray(np.add.reduceat(_filled(arm, known), edges[:-1], axis=1) / np.diff(edges))
         for arm, known in zip(samples, mask, strict=True)
     )
     return first, (a, b)
@@ -231,11 +233,6 @@ def _filled(lines: Floats, known: NDArray[np.bool_]) -> Floats:
         good = known[:, pixel]
         out[:, pixel] = np.interp(at, at[good], lines[good, pixel]) if good.any() else 0.0
     return out
-
-
-def _merged(lines: Floats, pixels: int) -> Floats:
-    edges = np.linspace(0, lines.shape[1], pixels + 1).round().astype(int)
-    return np.asarray(np.add.reduceat(lines, edges[:-1], axis=1) / np.diff(edges))
 
 
 def compare(one: Floats, other: Floats) -> tuple[float, float]:

@@ -65,24 +65,15 @@ def _stuck(samples: NDArray[np.float64], left: NDArray[np.bool_]) -> NDArray[np.
     low = np.where(left, samples, np.inf).min(axis=1, keepdims=True)
     high = np.where(left, samples, -np.inf).max(axis=1, keepdims=True)
     usual = (high > low).mean(axis=2, keepdims=True) > FEWEST_VARYING
-    brightest = np.abs(samples).max(axis=(1, 2), keepdims=True)
-    dark = (high <= low) & (np.abs(high - _darkness(low, high)) <= 1e-3 * brightest)
-    lonely = _between_lit(dark, samples)
-    return np.asarray(np.broadcast_to((high <= low) & usual & (~dark | lonely), samples.shape))
-
-
-def _darkness(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Value of an arm's unlit columns: 0, or with a wrong black level the lowest, which several share."""
-    still = np.where(high <= low, high, np.nan)
+    still = high <= low
+    # unlit columns are at 0 or, if the black level is wrong, several of them share the lowest value
     lowest = np.where(np.isfinite(low), low, np.inf).min(axis=2, keepdims=True)
-    together = (still == lowest).sum(axis=2, keepdims=True) >= FEWEST_TOGETHER
-    return np.where(together, lowest, 0.0)
-
-
-def _between_lit(dark: NDArray[np.bool_], samples: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Dark columns (arm, 1, pixel) between lit ones: dark parts of a scene are mostly wider."""
-    lit = np.median(np.abs(samples), axis=1, keepdims=True) > 0.1 * np.abs(samples).max(
-        axis=(1, 2), keepdims=True
-    )
+    shared = (still & (high == lowest)).sum(axis=2, keepdims=True) >= FEWEST_TOGETHER
+    darkness = np.where(shared, lowest, 0.0)
+    brightest = np.abs(samples).max(axis=(1, 2), keepdims=True)
+    dark = still & (np.abs(high - darkness) <= 1e-3 * brightest)
+    # a single dark column between lit ones is stuck: dark parts of a scene are mostly wider
+    lit = np.median(np.abs(samples), axis=1, keepdims=True) > 0.1 * brightest
     padded = np.pad(lit, ((0, 0), (0, 0), (1, 1)), mode="edge")
-    return np.asarray(dark & padded[:, :, :-2] & padded[:, :, 2:])
+    lonely = dark & padded[:, :, :-2] & padded[:, :, 2:]
+    return np.asarray(np.broadcast_to(still & usual & (~dark | lonely), samples.shape))

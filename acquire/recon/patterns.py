@@ -154,7 +154,16 @@ class Refinement:
             self._fit_curves()
             self._admm.rebase(*self._operators(), self.found.patterns)
             self.found = Patterns(self.found.curves, self._admm.theta)
-            self._loosen()
+            # lower the weights for the next round
+            now, first = self.parameters, self._first
+            penalty = max(PENALTY_DECAY * now.tv_penalty, LEAST_PENALTY * first.tv_penalty)
+            self.parameters = replace(
+                now,
+                tv_weight=max(WEIGHT_DECAY * now.tv_weight, LEAST_WEIGHT * first.tv_weight),
+                tv_penalty=penalty,
+                sign_penalty=first.sign_penalty * penalty / first.tv_penalty,
+            )
+            self._admm.reweigh(self.parameters)
 
     def return_to(self, found: Patterns) -> None:
         """Make ``found``, the result of an earlier round, the estimate."""
@@ -209,15 +218,3 @@ class Refinement:
         self.found = Patterns(
             (left @ right).astype(arrays.dtype), arrays.xp.reshape(arrays.asarray(rotated), patterns.shape)
         )
-
-    def _loosen(self) -> None:
-        """Lower the weights for the next round."""
-        now, first = self.parameters, self._first
-        penalty = max(PENALTY_DECAY * now.tv_penalty, LEAST_PENALTY * first.tv_penalty)
-        self.parameters = replace(
-            now,
-            tv_weight=max(WEIGHT_DECAY * now.tv_weight, LEAST_WEIGHT * first.tv_weight),
-            tv_penalty=penalty,
-            sign_penalty=first.sign_penalty * penalty / first.tv_penalty,
-        )
-        self._admm.reweigh(self.parameters)

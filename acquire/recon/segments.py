@@ -239,7 +239,13 @@ class Grid:
     def resample(self, video: NDArray[Any], segment: SubSegment, substeps: int) -> NDArray[np.float32]:
         """A sub-segment's voxels (T/T_m, n′, n′), from its first line's first sub-step on, on this grid."""
         timed = self.resample_time(video, segment, substeps)
-        return _resample_plane(timed, self.size, segment.voxels.spatial_merge, self.voxels.spatial_merge)
+        have, want = segment.voxels.spatial_merge, self.voxels.spatial_merge
+        if have == want:
+            return timed
+        edges = [np.append(np.arange(0, self.size, merge), self.size) for merge in (have, want)]
+        rows = _means(np.moveaxis(timed, 1, 0), *edges)  # (row, t, column)
+        planes = _means(np.moveaxis(rows, 2, 0), *edges)  # (column, row, t)
+        return np.ascontiguousarray(planes.transpose(2, 1, 0))
 
     def resample_time(self, values: NDArray[Any], segment: SubSegment, substeps: int) -> NDArray[np.float32]:
         """Values of a sub-segment's frames (T/T_m, …), in the frames of this grid."""
@@ -274,16 +280,6 @@ def _means(values: NDArray[np.float32], have: NDArray[np.int64], want: NDArray[n
     return means
 
 
-def _resample_plane(video: NDArray[np.float32], size: int, have: int, want: int) -> NDArray[np.float32]:
-    """Resample rows and columns of ``have`` pixels to those of ``want``."""
-    if have == want:
-        return video
-    edges = [np.append(np.arange(0, size, merge), size) for merge in (have, want)]
-    rows = _means(np.moveaxis(video, 1, 0), *edges)  # (row, t, column)
-    planes = _means(np.moveaxis(rows, 2, 0), *edges)  # (column, row, t)
-    return np.ascontiguousarray(planes.transpose(2, 1, 0))
-
-
 class Stitcher:
     """Adds up sub-segments in order, and returns the frames that no later one contributes to."""
 
@@ -298,7 +294,7 @@ class Stitcher:
         """Add a sub-segment's ``channels`` (video, quality …) on the grid, and return the finished frames."""
         frames = self.grid.frames_of(segment)
         weights = self.grid.weights(segment)
-        weighted = [_scaled(channel, weights) for channel in channels]
+        weighted = [each * weights.reshape(-1, *[1] * (each.ndim - 1)) for each in channels]
         if self._waiting is not None:
             for channel, waiting in zip(weighted, self._waiting, strict=True):
                 channel[: len(waiting)] += waiting
@@ -307,8 +303,3 @@ class Stitcher:
         self._waiting = [channel[done:].copy() for channel in weighted]
         self.frames = stop
         return [channel[:done] for channel in weighted]
-
-
-def _scaled(values: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[np.float32]:
-    scaled: NDArray[np.float32] = values * weights.reshape(-1, *[1] * (values.ndim - 1))
-    return scaled

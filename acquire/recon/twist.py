@@ -95,7 +95,10 @@ class Twist:
         NumericsError : the objective is not finite
         """
         target = self.theta + self._operator.adjoint(self._gap)
-        shrunk = self._non_negative(self._tv.prox(target, self._lambda))
+        shrunk = self._tv.prox(target, self._lambda)
+        if self._grid is not None:  # set negative light to 0, as far as the band allows
+            values = self._xp.maximum(self._xp.tensordot(self._grid.T, shrunk, axes=1), 0)
+            shrunk = self._xp.tensordot(self._grid, values, axes=1)
         alpha, beta = self._alpha, self._beta
         self.ceiling += (1 - MEMORY) * (self.objective - self.ceiling)
         two_step = (1 - alpha) * self._before + (alpha - beta) * self.theta + beta * shrunk
@@ -116,13 +119,6 @@ class Twist:
             return False
         self._before, self.theta, self._gap, self.objective = self.theta, theta, gap, objective
         return True
-
-    def _non_negative(self, theta: Array) -> Array:
-        """The iterate with negative light set to 0, as far as the band allows."""
-        if self._grid is None:
-            return theta
-        values = self._xp.maximum(self._xp.tensordot(self._grid.T, theta, axes=1), 0)
-        return self._xp.tensordot(self._grid, values, axes=1)
 
     def _objective_of(self, theta: Array, gap: Array) -> float:
         value = 0.5 * float(dot(gap, gap)) + self._lambda * self._tv.value(theta)

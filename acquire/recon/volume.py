@@ -121,22 +121,19 @@ class Smooth:
             raise UsageError(f"a smooth volume cannot have pace {pace}", possible="a number of at least 0")
         self.pace = pace
         self._cosines: tuple[Array, Array] | None = None
+        """The cosines of a frame's side (n′, n′), and (k_r² + k_c² + μ²·k_t²)² for each coefficient."""
 
     def prox(self, frames: Array, weight: float | Array) -> Array:
         """argmin_θ ½‖θ − frames‖² + weight/2·Σ (k_r² + k_c² + μ²·k_t²)²·θ̂² for θ (K, row, column)."""
         xp, weight = namespace(frames), _one(weight)
         if self._cosines is None:
-            self._cosines = self._prepare(frames)
+            count, side, _ = frames.shape
+            k = np.square(np.pi * np.arange(side) / side)
+            t = np.square(self.pace * np.pi * np.arange(count) / side)
+            square = np.square(t[:, None, None] + k[:, None] + k)
+            matrix = TemporalBasis(side, side, Arrays(dtype="float64")).matrix()
+            made = [xp.asarray(each, dtype=frames.dtype, device=frames.device) for each in (matrix, square)]
+            self._cosines = made[0], made[1]
         along, square = self._cosines
         spectrum = along @ frames @ along.T
         return along.T @ (spectrum / (1 + weight * square)) @ along if weight else xp.asarray(frames)
-
-    def _prepare(self, frames: Array) -> tuple[Array, Array]:
-        """The cosines of a frame's side (n′, n′), and (k_r² + k_c² + μ²·k_t²)² for each coefficient."""
-        xp, (count, side, _) = namespace(frames), frames.shape
-        k = np.square(np.pi * np.arange(side) / side)
-        t = np.square(self.pace * np.pi * np.arange(count) / side)
-        square = np.square(t[:, None, None] + k[:, None] + k)
-        matrix = TemporalBasis(side, side, Arrays(dtype="float64")).matrix()
-        made = [xp.asarray(each, dtype=frames.dtype, device=frames.device) for each in (matrix, square)]
-        return made[0], made[1]

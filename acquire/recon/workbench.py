@@ -75,6 +75,32 @@ class Candidate:
     fine: bool = False
     robust: bool = False
 
+    def denoiser(self) -> Denoiser:
+        """The denoiser of this prior."""
+        if self.prior == "still":
+            return FrameTv(10)
+        return VolumeTv(self.pace) if self.prior == "volume" else Smooth(self.pace)
+
+    def is_stronger_than(self, other: Candidate) -> bool:
+        """Whether it leaves the video less freedom than ``other``, which differs in one parameter."""
+        return self.weight > other.weight or self.pace > other.pace or self.coefficients < other.coefficients
+
+    def with_weight(self, factor: float) -> Candidate | None:
+        """The candidate with another weight; None beyond the limits."""
+        weight = rounded(self.weight * factor)
+        return replace(self, weight=weight) if LEAST_WEIGHT <= weight <= LARGEST_WEIGHT else None
+
+    def with_pace(self, factor: float) -> Candidate | None:
+        """The candidate with another pace; None beyond the limits."""
+        pace = self.pace * factor
+        return replace(self, pace=pace) if LEAST_PACE <= pace <= LARGEST_PACE else None
+
+    def with_cosines(self, step: int, frames: int) -> Candidate | None:
+        """The candidate with the next number of cosines in either direction; None beyond the limits."""
+        counts = sorted({min(count, frames) for count in COSINES})
+        at = counts.index(self.coefficients) + step
+        return replace(self, coefficients=counts[at]) if 0 <= at < len(counts) else None
+
 
 STILL = Candidate("still", 1, 2e-3)
 SMOOTH = Candidate("smooth", 24, 3e-3, 1.0)
@@ -211,7 +237,7 @@ class Workbench:
         basis = TemporalBasis(self.frames, candidate.coefficients, self.problem.arrays)
         brightness = self._brightness if candidate.brightness else None
         operator = self._operator(basis, brightness)
-        shape, denoiser = (basis.count, self._side, self._side), _denoiser(candidate)
+        shape, denoiser = (basis.count, self._side, self._side), candidate.denoiser()
         admm = Admm(
             self.problem.masked(operator),
             self.problem.used_samples,
@@ -287,32 +313,28 @@ class Workbench:
         improved = True
         while improved:
             improved = False
-            for step in self._steps(best.candidate):
+            for step in self._steps(best.candidate.prior):
                 while (candidate := step(best.candidate)) is not None and candidate not in tried:
                     if len(tried) > trials or self.clock.spent(SEARCH_SHARE):
                         return best
                     tried.add(candidate)
                     found = self.attempt(candidate, NEXT_ITERATIONS, best)
-                    gain = 0.0 if _stronger(candidate, best.candidate) else LEAST_GAIN
+                    gain = 0.0 if candidate.is_stronger_than(best.candidate) else LEAST_GAIN
                     if not found.error < (1 - gain) * best.error:
                         break
                     best, improved = found, True
         return best
 
-    def _steps(self, candidate: Candidate) -> Sequence[Callable[[Candidate], Candidate | None]]:
-        """Ways to change a candidate; each returns None at its limit."""
-        factor = WEIGHT_STEP**2 if candidate.prior == "smooth" else WEIGHT_STEP
-        weights = [partial(_weighed, by) for by in (1 / factor, factor)]
-        if candidate.prior == "still":
+    def _steps(self, prior: str) -> Sequence[Callable[[Candidate], Candidate | None]]:
+        """Ways to change a candidate with this prior; each returns None at its limit."""
+        factor = WEIGHT_STEP**2 if prior == "smooth" else WEIGHT_STEP
+        weights = [partial(Candidate.with_weight, factor=by) for by in (1 / factor, factor)]
+        if prior == "still":
             return weights
-        stride = PACE_STEP if candidate.prior == "volume" else 2.0
-        paces = [partial(_paced, by) for by in (1 / stride, stride)]
-        return [*weights, *paces, partial(self._resized, 1), partial(self._resized, -1)]
-
-    def _resized(self, by: int, candidate: Candidate) -> Candidate | None:
-        sizes = sorted({min(count, self.frames) for count in COSINES})
-        at = sizes.index(candidate.coefficients) + by
-        return replace(candidate, coefficients=sizes[at]) if 0 <= at < len(sizes) else None
+        stride = PACE_STEP if prior == "volume" else 2.0
+        paces = [partial(Candidate.with_pace, factor=by) for by in (1 / stride, stride)]
+        counts = [partial(Candidate.with_cosines, step=step, frames=self.frames) for step in (1, -1)]
+        return [*weights, *paces, *counts]
 
     def finish(self, best: Trial) -> Chosen:
         """Solve the best trial with all samples, none held out, on the bench where it was tried."""
@@ -412,30 +434,9 @@ def _with_problem(trial: Trial, problem: Problem, heavier: float) -> Trial:
     return replace(trial, admm=trial.admm.with_problem(operator, problem.used_samples, heavier))
 
 
-def _denoiser(candidate: Candidate) -> Denoiser:
-    if candidate.prior == "still":
-        return FrameTv(10)
-    return VolumeTv(candidate.pace) if candidate.prior == "volume" else Smooth(candidate.pace)
-
-
-def _stronger(one: Candidate, other: Candidate) -> bool:
-    """Whether ``one`` leaves the video less freedom than ``other``, which differs in one parameter."""
-    return one.weight > other.weight or one.pace > other.pace or one.coefficients < other.coefficients
-
-
 def rounded(weight: float) -> float:
     """A weight to three digits, so that a search recognises candidates it has tried."""
     return float(f"{weight:.3g}")
-
-
-def _weighed(by: float, candidate: Candidate) -> Candidate | None:
-    weight = rounded(candidate.weight * by)
-    return replace(candidate, weight=weight) if LEAST_WEIGHT <= weight <= LARGEST_WEIGHT else None
-
-
-def _paced(by: float, candidate: Candidate) -> Candidate | None:
-    pace = candidate.pace * by
-    return replace(candidate, pace=pace) if LEAST_PACE <= pace <= LARGEST_PACE else None
 
 
 def parameters(candidate: Candidate, frames: int, response: float) -> AdmmParameters:
