@@ -1,4 +1,4 @@
-"""The estimated error of a video, beside the truth, and where nothing is claimed."""
+"""The estimated error of a video compared with the truth, and cases in which none is claimed."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def solved(scene: str) -> Reconstruction:
 
 
 @pytest.mark.parametrize("scene", ["splash", "leds", "runner"])
-def test_it_is_about_the_error_and_knows_where_it_is_large(scene: str) -> None:
+def test_it_is_close_to_the_error_and_shows_where_it_is_large(scene: str) -> None:
     result = solved(scene)
     assert isinstance(result.error, VideoError)
     off = result.video[result.trusted] - recorded(scene).truth(3, 1)
@@ -72,7 +72,7 @@ def test_it_has_the_unit_of_the_video() -> None:
     assert brighter.error.rms == pytest.approx(7 * error.rms, rel=0.02)
 
 
-def test_nothing_is_claimed_where_nothing_can_be_known() -> None:
+def test_no_estimate_is_made_without_a_basis() -> None:
     segment = recorded("splash").segment
     paper = reconstruct(segment, 3, 1, solver="twist", iterations=3)
     assert paper.error == "its solver offers no way to estimate it"
@@ -90,8 +90,8 @@ def test_nothing_is_claimed_where_nothing_can_be_known() -> None:
 
 
 @pytest.mark.parametrize("scene", ["splash", "leds", "still"])
-def test_a_budget_leaves_time_to_tell_it(scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the processor time of one thread: a busy machine leaves a budget of wall time with one iteration."""
+def test_a_budget_leaves_time_for_the_estimate(scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Time is processor time of one thread: wall time on a busy machine may allow one iteration only."""
     own = SimpleNamespace(monotonic=time.process_time, process_time=time.process_time)
     monkeypatch.setattr(clocks, "time", own)
     monkeypatch.setattr(api, "time", own)
@@ -106,7 +106,7 @@ def test_a_budget_leaves_time_to_tell_it(scene: str, monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("side", [1, 5, 8, 20, 33])
-def test_regions_hold_all_voxels_alike(side: int) -> None:
+def test_regions_weigh_all_voxels_equally(side: int) -> None:
     frames = np.random.default_rng(side).random((3, side, side))
     means = in_regions(frames)
     assert means.shape == (3, REGIONS, REGIONS)
@@ -132,7 +132,7 @@ def test_an_error_has_degree_one_in_its_indicators() -> None:
     assert np.sqrt(np.square(once.frames).mean()) == pytest.approx(once.rms)
 
 
-def test_sub_segments_are_told_combined_facts() -> None:
+def test_errors_of_sub_segments_are_combined() -> None:
     parts = [
         {"rms": 0.03, "low": 0.02, "high": 0.05, "full_scale": 1.0},
         {"rms": 0.04, "low": 0.03, "high": 0.08, "full_scale": 2.0},
@@ -146,7 +146,7 @@ def test_sub_segments_are_told_combined_facts() -> None:
 
 @pytest.mark.parametrize("camera", [CLEAN, Camera()], ids=["clean", "1e4"])
 def test_a_still_finer_than_pixels_is_judged_by_its_prior(camera: Camera) -> None:
-    """Its lines are explained to a part in a thousand where the picture is some percent off."""
+    """Its lines are explained to a part in a thousand while the picture is some percent off."""
     made = record("still", 72, stages=24, lines=120, camera=camera)
     result = reconstruct(made.segment, 2, 8, "fast")
     assert isinstance(result.error, VideoError)
@@ -156,8 +156,8 @@ def test_a_still_finer_than_pixels_is_judged_by_its_prior(camera: Camera) -> Non
 
 
 @pytest.mark.parametrize("scene", ["leds", "leds_dot"])
-def test_what_is_cut_drifts_and_is_not_told_to_be_near(scene: str) -> None:
-    """Its lines are explained long before the picture is right: they say less of it than of others."""
+def test_a_video_that_was_cut_short_drifts_and_is_not_underestimated(scene: str) -> None:
+    """Its lines are explained long before the picture is right: the residual shows less than for others."""
     made = record(scene, 73, stages=24, lines=120, camera=CLEAN)
     cut = reconstruct(made.segment, 3, 1, "best", iterations=40)
     assert cut.ended == "done"

@@ -1,4 +1,4 @@
-"""What rests is solved in fine pixels, and not pulled at by what passes; what changes is found beside it."""
+"""Stills are solved in fine pixels, robust against passing objects; these are solved as a change."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_a_still_with_detail_below_the_voxel_is_solved_in_fine_pixels(camera: Ca
     assert db(coarse.video, whole, 3) > db(direct.video, whole, 3) + gain_db
 
 
-def test_a_flash_does_not_pull_at_a_still() -> None:
+def test_a_flash_does_not_distort_a_still() -> None:
     whole = scene("spark", 42)
     result = reconstruct(whole.segment, 3, whole.segment.geometry.span, "fast", check=False)
     alike = [each for each in result.parameters["candidates"] if not each["robust"]]
@@ -44,7 +44,7 @@ def test_a_flash_does_not_pull_at_a_still() -> None:
     assert result.quality.prediction < 0.8 * min(each["error"] for each in alike)
 
 
-def test_what_passes_before_a_still_is_found_beside_it() -> None:
+def test_an_object_before_a_still_is_solved_as_a_change() -> None:
     whole = scene("bullet", 43)
     still = reconstruct(whole.segment, 3, whole.segment.geometry.span, "fast", check=False)
     result = reconstruct(whole.segment, 3, 1, "fast", check=False)
@@ -67,7 +67,7 @@ def test_samples_with_large_residuals_get_less_weight() -> None:
     assert problem.with_robust_weights(problem.samples) is problem, "there is no residual"
 
 
-def test_a_change_may_be_darker_than_nothing_beside_light_that_is_there() -> None:
+def test_a_change_may_be_negative_if_its_sum_with_the_background_is_not() -> None:
     segment = scene("bullet", 45).segment
     problem = build_problem(segment, 3, 1, hold_out=0.0)
     frames, side, _ = segment.geometry.video_shape(3, 1)
