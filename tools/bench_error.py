@@ -29,7 +29,7 @@ from scipy.stats import spearmanr
 from acquire.cores import limit_threads
 from acquire.recon import error as estimation
 from acquire.recon import reconstruct
-from acquire.recon.error import Clues, Powers, VideoError, from_clues, in_regions
+from acquire.recon.error import Exponents, Indicators, VideoError, error_from, in_regions
 from acquire.sim import procedural
 from acquire.sim.procedural import Camera, Recorded
 from tools import error_scenes
@@ -54,7 +54,7 @@ NINE_OF_TEN = (0.05, 0.95)
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """``true`` are RMS errors (time, 8, 8) of the trusted frames, as the clues are in ``shown``."""
+    """``true`` are RMS errors (time, 8, 8) of the trusted frames, as the indicators are in ``shown``."""
 
     name: str
     scene: str
@@ -160,14 +160,16 @@ def judge(cases: Iterable[Case], run: Run) -> None:
     )
 
 
-def signs(clues: Clues, shown: slice) -> np.ndarray:
-    """Logarithms of the whole video's predictors, whose exponents are `Powers.whole`."""
-    return estimation.signs(float(np.sqrt(np.square(clues.moved[shown]).mean())), clues)
+def signs(indicators: Indicators, shown: slice) -> np.ndarray:
+    """Logarithms of the whole video's predictors, whose exponents are `Exponents.whole`."""
+    return estimation.log_indicators(
+        float(np.sqrt(np.square(indicators.sensitivity[shown]).mean())), indicators
+    )
 
 
-def signs_here(clues: Clues, shown: slice) -> np.ndarray:
+def signs_here(indicators: Indicators, shown: slice) -> np.ndarray:
     """Logarithms of the regions' predictors relative to the whole (64, 3)."""
-    maps = (np.sqrt(np.square(clues.moved[shown]).mean(0)), clues.change, clues.edge)
+    maps = (np.sqrt(np.square(indicators.sensitivity[shown]).mean(0)), indicators.change, indicators.edge)
     return np.stack([np.log(each / np.sqrt(np.square(each).mean())).ravel() for each in maps], 1)
 
 
@@ -193,31 +195,33 @@ def _shares(scenes: list[str]) -> np.ndarray:
     return np.asarray(1 / count[place])
 
 
-def fit(cases: list[Case]) -> Powers:
+def fit(cases: list[Case]) -> Exponents:
     """Fit the exponents in use; keep the factors, which come from scenes left out of the fit."""
-    told = [(case, case.error.clues) for case in cases if isinstance(case.error, VideoError)]
+    told = [(case, case.error.indicators) for case in cases if isinstance(case.error, VideoError)]
     scenes = [case.scene for case, _ in told]
-    known = told[0][1].powers
+    known = told[0][1].exponents
     there = known.whole != 0
     whole = np.zeros(len(there))
     whole[there] = robust(
-        [signs(clues, case.shown)[None, there] for case, clues in told],
-        [np.log([case.rms / clues.missed]) for case, clues in told],
+        [signs(indicators, case.shown)[None, there] for case, indicators in told],
+        [np.log([case.rms / indicators.residual]) for case, indicators in told],
         scenes,
     )
-    true = [np.maximum(case.regions, clues.powers.faint * clues.scale) for case, clues in told]
+    true = [
+        np.maximum(case.regions, indicators.exponents.floor * indicators.scale) for case, indicators in told
+    ]
     here = robust(
-        [signs_here(clues, case.shown) for case, clues in told],
+        [signs_here(indicators, case.shown) for case, indicators in told],
         [np.log(each / np.sqrt(np.square(each).mean())) for each in true],
         scenes,
     )
-    moved = [np.sqrt(np.square(clues.moved[case.shown]).mean((1, 2))) for case, clues in told]
+    moved = [np.sqrt(np.square(indicators.sensitivity[case.shown]).mean((1, 2))) for case, indicators in told]
     now = robust(
         [np.log(each / np.sqrt(np.square(each).mean()))[:, None] for each in moved],
         [np.log(case.frames / case.rms) for case, _ in told],
         scenes,
     )
-    names = [each.name for each in fields(Powers) if each.type == "float" and each.name != "faint"]
+    names = [each.name for each in fields(Exponents) if each.type == "float" and each.name != "floor"]
     powers = dict(zip(names, np.concatenate([whole, here, now]).tolist(), strict=True))
     return replace(known, **powers)
 
@@ -232,13 +236,13 @@ def nine_of_ten(off: list[np.ndarray], scenes: list[str]) -> tuple[float, float]
     return float(low), float(high)
 
 
-def calibrate(cases: list[Case], name: str, known: Powers) -> None:
+def calibrate(cases: list[Case], name: str, known: Exponents) -> None:
     """Print the exponents, and the factors between true error and estimate on scenes left out of the fit."""
     told = [
         case
         for case in cases
         if isinstance(case.error, VideoError)
-        and case.error.clues.powers is known
+        and case.error.indicators.exponents is known
         and case.scene != BEYOND_THE_BAND
     ]
     print(f"{name}: {len(told)} cases")
@@ -247,10 +251,10 @@ def calibrate(cases: list[Case], name: str, known: Powers) -> None:
     wholes, here, now, alike = [], [], [], []
     for case in told:
         assert isinstance(case.error, VideoError)
-        found = from_clues(case.error.clues, case.shown, others[case.scene])
+        found = error_from(case.error.indicators, case.shown, others[case.scene])
         regions = np.sqrt(np.square(found.regions[case.shown]).mean(0)).ravel()
         wholes.append(np.array([case.rms / found.rms]))
-        here.append(np.maximum(case.regions, known.faint * case.error.full_scale) / regions)
+        here.append(np.maximum(case.regions, known.floor * case.error.full_scale) / regions)
         now.append(case.frames / found.frames[case.shown])
         alike.append(correlation(regions, case.regions))
     for scene in others:

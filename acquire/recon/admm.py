@@ -9,10 +9,10 @@ over the coefficients θ (K, n′, n′), with the splits  z = θ  (TV prox, or 
 
 is solved in the space of the lines by a few conjugate-gradient steps from the last w. For the whole video
 that system is well conditioned (the rows of Λ′ are nearly orthogonal); the difficulty of the problem is its
-null space, which the two priors fill. In a few cosines, lines next to each other are nearly equal, and a
-preconditioner (`band.BandOperator.near_inverse`) takes the place of hundreds of steps. BᵀW·w is carried
-along, so that an iteration costs one product with B and, per gradient step, one with B and one with Bᵀ.
-Over-relaxed by 1.7 (Eckstein and Bertsekas, Math. Program. 55, 293 (1992)).
+null space, which the two priors fill. In a basis of a few cosines, neighbouring lines are nearly equal, and a
+preconditioner (`band.BandOperator.near_inverse`) replaces hundreds of steps. BᵀW·w is updated along with w,
+so that an iteration costs one product with B and, per gradient step, one with B and one with Bᵀ. The
+iteration is over-relaxed by 1.7 (Eckstein and Bertsekas, Math. Program. 55, 293 (1992)).
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ class AdmmParameters:
     """Weights are relative to samples and operator as `problem.build_problem` scales them.
 
     ``tv_weight`` is λ; ``tv_penalty`` and ``sign_penalty`` are the splits' ρ. ``preconditioned`` makes the
-    data step nearly exact in a few gradient steps; without it the iterates come to weak details last, which
-    holds back noise as a higher weight would. Of ``gradient_steps`` no more are made than leave
-    ``gradient_share`` of the residual.
+    data step nearly exact in a few gradient steps; without it the iterates reach weak details last, which
+    suppresses noise as a higher weight would. The data step ends after ``gradient_steps``, or as soon as
+    ``gradient_share`` of the residual is left.
     """
 
     tv_weight: float = 1e-3
@@ -60,8 +60,8 @@ class Admm:
     """Holds the iterates; `step` is one iteration, `theta` the current estimate (K, n′, n′).
 
     ``samples`` are 0 where the operator's weight is. ``start`` is a first estimate, ``emphasis`` (K,)
-    multiplies λ per coefficient frame, ``denoiser`` takes the place of total variation. ``beside``
-    (K, n′, n′) is light that is there already: the sum with it is not negative.
+    multiplies λ per coefficient frame, ``denoiser`` replaces total variation. ``background`` (K, n′, n′) is
+    light that is known already: its sum with the estimate is not negative.
     """
 
     def __init__(
@@ -75,9 +75,9 @@ class Admm:
         start: Array | None = None,
         emphasis: Array | float = 1.0,
         denoiser: Denoiser | None = None,
-        beside: Array | None = None,
+        background: Array | None = None,
     ) -> None:
-        self._samples, self._parameters, self._beside = samples, parameters, beside
+        self._samples, self._parameters, self._background = samples, parameters, background
         self._denoiser = Checked(denoiser) if denoiser else FrameTv(parameters.tv_iterations)
         self._xp, arrays = namespace(samples), basis.arrays
         self._emphasis = arrays.asarray(emphasis)
@@ -89,20 +89,21 @@ class Admm:
         self._sign_multiplier = arrays.zeros(self._sign.shape)
 
     def rebase(self, operator: MaskedOperator, basis: Basis, theta: Array) -> None:
-        """Go on in another basis of as many rows and cosines, not far from the last.
+        """Continue in another basis with the same number of rows and cosines, close to the last one.
 
-        Multipliers and w stay: those of the sign live on instants, w on the lines, and TV's follow slowly.
+        Multipliers and w stay valid: those of the sign belong to instants, w to the lines, and those of TV
+        follow slowly.
         """
         self._operator, self.theta = operator, basis.arrays.asarray(theta)
         grid = min(basis.frames, self._parameters.grid_per_coefficient * basis.cosines)
         self._grid = basis.arrays.asarray(basis.matrix(grid))
-        beside = self._beside
-        self._least = 0 if beside is None else -self._xp.tensordot(self._grid.T, beside, axes=1)
+        background = self._background
+        self._least = 0 if background is None else -self._xp.tensordot(self._grid.T, background, axes=1)
         self._lifted = operator.adjoint(self._w)  # BᵀW·w
         self._prepare()
 
     def reweigh(self, parameters: AdmmParameters) -> None:
-        """Go on with other weights; multipliers, which are kept divided by ρ, stay what they are."""
+        """Continue with other weights; the multipliers, which are stored divided by ρ, keep their value."""
         old, self._parameters = self._parameters, parameters
         self._tv_multiplier *= old.tv_penalty / parameters.tv_penalty
         self._sign_multiplier *= old.sign_penalty / parameters.sign_penalty
@@ -110,7 +111,7 @@ class Admm:
         self._prepare()
 
     def resume(self, other: Admm) -> None:
-        """Begin where another solver of as many coefficients ended, under its own or other weights."""
+        """Start from the state of another solver with as many coefficients, whatever its weights."""
         old, new = other._parameters, self._parameters
         self.theta = self._xp.asarray(other.theta, copy=True)
         self._w = self._xp.asarray(other._w, copy=True)
@@ -119,9 +120,11 @@ class Admm:
         self._sign = self._xp.asarray(other._sign, copy=True)
         self._sign_multiplier = other._sign_multiplier * (old.sign_penalty / new.sign_penalty)
 
-    def on(self, operator: MaskedOperator, samples: Array, heavier: float = 1.0) -> Admm:
-        """A solver that goes on from here with other samples, or others of them masked, and a ``heavier``
-        prior; this one stays as it is, but for the dual field of the denoiser, which they share."""
+    def with_problem(self, operator: MaskedOperator, samples: Array, heavier: float = 1.0) -> Admm:
+        """A solver that continues from here with other samples or another mask, and a ``heavier`` prior.
+
+        This one stays as it is, except for the denoiser's dual field, which both share.
+        """
         other = copy(self)
         other._parameters = replace(self._parameters, tv_weight=heavier * self._parameters.tv_weight)
         other._strength = self._strength * heavier
@@ -133,10 +136,10 @@ class Admm:
         return other
 
     def _prepare(self) -> None:
-        """The preconditioner of the operator and penalties that are now in use."""
+        """Set up the preconditioner for the present operator and penalties."""
         p = self._parameters
         known = self._operator.near_inverse(p.tv_penalty + p.sign_penalty) if p.preconditioned else None
-        self._precondition: Callable[[Array], Array] = known or _same
+        self._precondition: Callable[[Array], Array] = known or (lambda lines: lines)
 
     def step(self) -> None:
         """One iteration.
@@ -162,13 +165,13 @@ class Admm:
         residual = self._samples - self._operator.forward(centre + self._lifted) - rho * self._w
         if not self._xp.isfinite(dot(residual, residual)):
             raise NumericsError(
-                "ADMM left the finite numbers", hint="check the segment's samples and weights"
+                "ADMM diverged: its iterates are not finite", hint="check the segment's samples and weights"
             )
         self._descend(residual, rho)
         return centre + self._lifted
 
     def _descend(self, residual: Array, rho: float) -> None:
-        """Conjugate-gradient steps on (W·B·BᵀW + ρ)·w; ``residual`` is used up."""
+        """Make conjugate-gradient steps on (W·B·BᵀW + ρ)·w; ``residual`` is overwritten."""
         scaled = self._precondition(residual)
         direction, energy = self._xp.asarray(scaled, copy=True), dot(residual, scaled)
         enough = self._parameters.gradient_share**2 * energy
@@ -186,7 +189,3 @@ class Admm:
             if energy <= enough:
                 return
             direction = scaled + (energy / before) * direction
-
-
-def _same(lines: Array) -> Array:
-    return lines

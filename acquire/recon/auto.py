@@ -1,8 +1,8 @@
-"""Voxels without the truth: how slow a stretch is, by tentative reconstruction (Section 4 of the paper).
+"""Choice of voxels by the tempo of the scene, from tentative reconstructions (Section 4 of the paper).
 
-A stretch is first taken to be at rest, which leaves all its samples to fine pixels. If this does not explain
-the lines, shorter and shorter frames are tried, as long as each explains them clearly better than the last.
-Explained are samples that the solver does not see.
+The scene is first assumed to be at rest, so that all samples go to fine pixels. If a still does not explain
+the lines, shorter and shorter frames are tried, as long as each explains the held-out samples clearly better
+than the last.
 """
 
 from __future__ import annotations
@@ -23,33 +23,34 @@ if TYPE_CHECKING:
 TEMPORAL_MERGES = (64, 16, 4, 1)
 ITERATIONS = 40
 BETTER = 1.25
-"""Shorter frames have to explain the lines so much better to be taken: they cost accuracy elsewhere."""
+"""Factor by which shorter frames must explain the lines better to be chosen: they cost accuracy elsewhere."""
 EXPLAINED = 0.015
-"""Relative error at which nothing shorter is tried."""
+"""Relative error below which nothing shorter is tried."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tempo:
-    """The voxels for a stretch; ``tried`` holds (T_m, relative error), with T_m 0 for a still."""
+    """The voxels for a range; ``tried`` holds (T_m, relative error), with T_m 0 for a still."""
 
     voxels: Voxels
     tried: tuple[tuple[int, float], ...]
 
     @property
     def why(self) -> str:
-        """For people."""
+        """The reason in words."""
         words = ", ".join(
             f"{'a still' if merge == 0 else f'T_m {merge}'} {error:.1%}" for merge, error in self.tried
         )
-        return f"unseen samples are predicted with an error of: {words}"
+        return f"unseen samples are predicted with errors of: {words}"
 
 
 def tempo(
     segment: Segment, progress: Callable[[float], object] | None = None, side: int | None = None
 ) -> Tempo:
-    """How fast a segment changes, from its lines alone; ``progress`` takes the share of it that is done.
+    """Find out how fast a segment changes, from its lines alone; ``progress`` receives the share that is
+    done.
 
-    ``side`` is that of the voxels of what moves, in fine pixels; None: S.
+    ``side`` is the side of voxels for a moving scene, in fine pixels; S if None.
     """
     most = 1 + len(TEMPORAL_MERGES)
 

@@ -1,10 +1,11 @@
-"""The arms' shares of the scene's light, from the lines themselves: a beam splitter and gains that differ.
+"""The arms' shares of the scene's light, from the lines: beam splitters and gains that differ.
 
-Every pixel of the scene is seen once by each arm in every sub-step, so that the lines of both arms hold the
-same light in total but for the ends of a stretch, where for one arm only some of it is in the lines before or
-after. Code, its place and the arms' orientation do not matter. The gains of single columns cannot be had in
-this way: what a column gets is the scene. Arms that are not aligned do not see the same field: what is
-brighter at one edge of it than at the opposite one counts as a difference, and as an uncertainty.
+Each arm sees every pixel of the scene once in every sub-step, so that the lines of both arms hold the same
+light in total, except at the ends of a range of lines, where part of one arm's light is in the lines before
+or after. Neither the code and its position nor the arms' orientation matter. The gains of single columns
+cannot be found in this way, because the light of a column depends on the scene. Arms that are not aligned do
+not see the same field: a scene that is brighter at one edge of it than at the opposite one contributes to the
+difference, and to its uncertainty.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.recon.outliers import outliers
-from acquire.recon.suspects import black_level_off
+from acquire.recon.sanity import black_level_off
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -27,58 +28,60 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 FEWEST_PASSES = 2
-"""Times that light crosses a sensor during the stretch: of fewer, the ends are all that there is."""
+"""Fewest passes of the scene over a sensor: with fewer, the range consists of its ends."""
 ENDS = 0.006
-"""Standard error that no residual shows: what drifts through a whole stretch stays in the ratio, 0.006 of a
+"""Standard error that no residual shows: a drift through the whole range remains in the ratio, 0.006 for a
 figure that crosses textured ground."""
 FIELD = 0.02
-"""Standard deviation of arm B's place beside arm A's where nobody has measured it, of the field's side: 4 of
-192 fine pixels."""
+"""Standard deviation of arm B's position relative to arm A's if it was not measured, as a share of the
+field's side: 4 of 192 fine pixels."""
 EDGE = 1 / 8
-"""Of an arm's columns, at either end: the widest margin that is looked at."""
+"""Share of an arm's columns, at either end, that the widest margin covers."""
 SURE = 3.0
 """Standard errors from 1 at which a difference is corrected."""
 WORTH = 0.02
-"""A difference that costs a reconstruction less than the ends cost the estimate."""
+"""Smallest difference that is corrected: a smaller one costs a reconstruction less than the ends cost the
+estimate."""
 MOST_MASKED = 0.1
 
 
 @dataclass(frozen=True, slots=True)
 class Balance:
-    """Arm B's light beside arm A's and its standard error."""
+    """Ratio of arm B's light to arm A's, and its standard error."""
 
     ratio: float
     error: float
 
     @property
     def clear(self) -> bool:
-        """The arms differ beyond doubt, and by enough to matter."""
+        """Whether the arms differ significantly, and by enough to matter."""
         return abs(self.ratio - 1) > max(SURE * self.error, WORTH)
 
     @property
     def words(self) -> str:
-        """For people."""
+        """The balance in words."""
         return f"arm b gets {self.ratio:.3f} ± {self.error:.3f} times the light of arm a"
 
     @property
     def corrected_words(self) -> str:
-        """For those whose lines it was taken out of."""
-        return f"{self.words}, as their lines tell: corrected (`acquire calibrate flat` measures it)"
+        """The balance in words, for lines that were corrected for it."""
+        return f"{self.words}, judging by their lines: corrected (`acquire calibrate flat` measures it)"
 
     def facts(self, *, corrected: bool) -> dict[str, Any]:
-        """As JSON."""
+        """The balance as JSON."""
         return {**{name: round(value, 5) for name, value in asdict(self).items()}, "corrected": corrected}
 
 
 def balance_of(segments: Sequence[Segment]) -> Balance | None:
-    """Of stretches of one recording; None: cannot tell.
+    """Estimate the balance from ranges of one recording; None if that is impossible.
 
-    Let C be the light of an arm (2, L_R) from a stretch's first line to line ℓ. What one arm has seen and the
-    other has not yet is in flight across the sensors: it is bounded, and where the scene is as bright on the
-    way as at the start, in proportion to the light y of a line. Least squares of C_B = c + ratio·C_A + κ·y_A
-    with a c for each stretch gives the ratio; what is left is correlated over the passage of the scene, M
-    lines, and so is the error. To it comes what a shift of the field would change, unless arm B's place is
-    known. Masked samples are taken to be as their neighbours, and counted as not known.
+    Let C be the cumulated light of an arm (2, L_R) from the first line of a range to line ℓ. The light that
+    one arm has seen and the other has not yet seen is in flight across the sensors: it is bounded, and
+    proportional to the light y of a line if the scene is equally bright along the way. Least squares of C_B =
+    c + ratio·C_A + κ·y_A, with one c per range, gives the ratio. The residual is correlated over the passage
+    of the scene, M lines, which the standard error takes into account. The effect of a displaced field is
+    added to it, unless arm B's position is known. Masked samples are replaced by their neighbours, and their
+    share is added to the error.
     """
     seen = [each for each in map(_light, segments) if each is not None]
     if not seen or any(black_level_off(segment) for segment in segments):
@@ -105,8 +108,10 @@ def balance_of(segments: Sequence[Segment]) -> Balance | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Light:
-    """``lines``: of each arm in each line (2, L_R). ``slopes``: by how much an arm's outermost columns differ
-    between its ends, relative to its mean; 0 where the arms are aligned. ``masked``: share that is not known.
+    """Light of a range.
+
+    ``lines``: of each arm in each line (2, L_R). ``slopes``: difference between the outermost columns at an
+    arm's two ends, relative to its mean; 0 if the arms are aligned. ``masked``: share of masked samples.
     """
 
     lines: Floats
@@ -123,20 +128,21 @@ def _light(segment: Segment) -> _Light | None:
     if geometry.lines < FEWEST_PASSES * geometry.stages or masked > MOST_MASKED:
         return None
     arms = [_filled(lines, good) for lines, good in zip(samples, usable, strict=True)]
-    a, b = (0.0, 0.0) if segment.alignment is not None else map(_slope, arms)
-    return _Light(np.stack([arm.sum(1) for arm in arms]), (a, b), masked)
-
-
-def _slope(lines: Floats) -> float:
-    profile = lines.mean(0)
-    begin, end = (np.cumsum(each[: max(1, round(EDGE * len(each)))]) for each in (profile, profile[::-1]))
-    steepest, mean = np.abs((end - begin) / np.arange(1, len(end) + 1)).max(), float(profile.mean())
-    return float(steepest) / mean if mean > 0 else 0.0
+    slopes = [0.0, 0.0]
+    if segment.alignment is None:
+        # the steepest mean difference between the outermost columns at either end of an arm
+        for k, arm in enumerate(arms):
+            profile = arm.mean(0)
+            width = max(1, round(EDGE * len(profile)))
+            begin, end = np.cumsum(profile[:width]), np.cumsum(profile[::-1][:width])
+            steepest, mean = np.abs((end - begin) / np.arange(1, width + 1)).max(), float(profile.mean())
+            slopes[k] = float(steepest) / mean if mean > 0 else 0.0
+    return _Light(np.stack([arm.sum(1) for arm in arms]), (slopes[0], slopes[1]), masked)
 
 
 def _filled(lines: Floats, usable: NDArray[np.bool_]) -> Floats:
-    """Lines (line, column) with the column's mean where a sample is masked, that of its neighbours where all
-    of a column are."""
+    """Lines (line, column) with masked samples replaced by their column's mean, or by the neighbouring
+    columns' if all of a column are masked."""
     if usable.all():
         return lines
     count = usable.sum(0)
@@ -147,9 +153,9 @@ def _filled(lines: Floats, usable: NDArray[np.bool_]) -> Floats:
 
 
 def divided(segment: Segment, balance: Balance) -> Segment:
-    """The segment with responsivities that take the difference out of `samples`; their mean stays.
+    """The segment with responsivities that remove the difference from its `samples`; their mean is unchanged.
 
-    2/(1 + r) and 2r/(1 + r) are a beam splitter's shares of the light beside one half.
+    2/(1 + r) and 2r/(1 + r) are a beam splitter's shares of the light, relative to one half.
     """
     ratio = balance.ratio
     shares = np.array([2 / (1 + ratio), 2 * ratio / (1 + ratio)])

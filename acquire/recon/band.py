@@ -1,9 +1,9 @@
 """Λ′ restricted to a temporal subspace: B = Λ′·Dᵀ, coefficients (K, n′, n′) → lines (2, L_R, M).
 
-Line ``i`` weighs the voxels of row block ``q`` with m(d)·E(t) along a staircase in time (forward.kernels);
-against the cosines that is one number per (line, row block, cosine). So B is two dense matrix products
-with one factor of shape (L_R, n′·K), the same for both arms up to the order of the rows: for K ≪ T far less
-work than synthesising the video and shearing it.
+Line ``i`` weighs the voxels of row block ``q`` with m(d)·E(t) along a staircase in time (forward.kernels). In
+the cosines this is one number per (line, row block, cosine), so that B is two dense matrix products with one
+factor of shape (L_R, n′·K), which is the same for both arms up to the order of the rows. For K ≪ T this is
+far less work than synthesising the video and shearing it.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def band_operator(
     alignment: Alignment | None = None,
     blur: Blur | None = None,
 ) -> BandOperator | InBasis:
-    """B = Λ′·Dᵀ, by the dense factors where these take at most 1 GiB, else by way of the video."""
+    """B = Λ′·Dᵀ, by dense factors if these take at most 1 GiB, otherwise by synthesising the video."""
     side = geometry.video_shape(spatial_merge, temporal_merge)[1]
     itemsize = np.dtype(basis.arrays.dtype).itemsize
     if 2 * geometry.lines * side * basis.count * itemsize <= LARGEST_FACTORS_BYTES:
@@ -81,7 +81,8 @@ class BandOperator:
         factors = [staircase(lit, order, lengths, geometry) for order in (starts, flipped)]
         mergings: list[NDArray[Any]] = [merging, merging]
         if blur is not None:
-            # along the transfer it is the factor's, across it that of the merging: frames cost nothing more
+            # along the transfer the blur goes into the factor, across it into the merging: it costs no time
+            # per frame
             (along_a, across_a), (across_b, along_b) = blur_matrices(blur, geometry.size, spatial_merge)
             factors = [
                 np.einsum("lqk,qp->lpk", factor, along.astype(factor.dtype), optimize=True)
@@ -93,9 +94,9 @@ class BandOperator:
 
     def forward(self, theta: Array) -> Array:
         """B·θ."""
-        seen = theta if self._registration is None else self._registration.forward(theta)
+        view_b = theta if self._registration is None else self._registration.forward(theta)
         views = (  # (block, K, across)
-            self._xp.permute_dims(each, axes) for each, axes in ((theta, (1, 0, 2)), (seen, (2, 0, 1)))
+            self._xp.permute_dims(each, axes) for each, axes in ((theta, (1, 0, 2)), (view_b, (2, 0, 1)))
         )
         return self._xp.stack(
             [self._arm(*each) for each in zip(self._factors, self._mergings, views, strict=True)]
@@ -108,16 +109,16 @@ class BandOperator:
             self._xp.reshape(self._arm_adjoint(*pair, lines[arm, ...]), (side, K, side))
             for arm, pair in enumerate(zip(self._factors, self._mergings, strict=True))
         )
-        seen = self._xp.permute_dims(columns, (1, 2, 0))
-        back = seen if self._registration is None else self._registration.adjoint(seen)
+        view_b = self._xp.permute_dims(columns, (1, 2, 0))
+        back = view_b if self._registration is None else self._registration.adjoint(view_b)
         return self._xp.permute_dims(rows, (1, 0, 2)) + back
 
     def near_inverse(self, damping: float) -> Callable[[Array], Array]:
-        """About (B·Bᵀ + damping)⁻¹, lines to lines: exact for either arm alone where N_m divides S.
+        """Approximate (B·Bᵀ + damping)⁻¹, lines to lines: exact for each arm alone if N_m divides S.
 
-        Pixels of one arm share no voxel then, so that B·Bᵀ of an arm is one matrix between its lines, for all
-        pixels the same. Next to each other those lines are nearly equal, which is what makes B·Bᵀ so badly
-        conditioned; what the arms have in common is little but the mean, and left to whoever iterates.
+        Pixels of one arm share no voxel then, so that B·Bᵀ of an arm is one matrix between its lines, the
+        same for all pixels. Neighbouring lines are nearly equal, which makes B·Bᵀ ill-conditioned; the arms
+        have little more than the mean in common, which is left to the iterations.
         """
         xp, damped = self._xp, damping * np.eye(self.lines_shape[1])
         inverses = [self._asarray(np.linalg.inv(gram + damped)) for gram in self._grams]
@@ -125,13 +126,13 @@ class BandOperator:
 
     @cached_property
     def _grams(self) -> list[NDArray[np.float64]]:
-        """B·Bᵀ of either arm between the lines (L_R, L_R)."""
+        """B·Bᵀ of each arm, between lines (L_R, L_R)."""
         each = [np.square(host(m), dtype=np.float64).sum(axis=0).mean() for m in self._mergings]
         exact = [host(factor).astype(np.float64) for factor in self._factors]
         return [float(size) * (factor @ factor.T) for size, factor in zip(each, exact, strict=True)]
 
     def _arm(self, factor: Array, merging: Array, view: Array) -> Array:
-        """Columns are merged into pixels on that side of the product where it is the smaller."""
+        """Lines of an arm; columns are merged into pixels on the smaller side of the product."""
         side, pixels = merging.shape
         blocks = self._xp.reshape(view, (-1, side))
         return factor @ (blocks @ merging) if side > pixels else (factor @ blocks) @ merging

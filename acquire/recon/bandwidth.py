@@ -1,13 +1,13 @@
-"""How fast the scene changes, from the lines alone: as coarse voxels show it, and to the fastest lamp.
+"""Estimate of the scene's bandwidth from the lines alone: from coarse voxels, and from the fastest lamp.
 
-A few iterations on about 24 × 24 voxels with a quarter of all cosines cost a second. What the coarse voxels
-cannot hold spreads over all coefficients evenly, so the upper half of them shows how high that floor reaches;
-the bandwidth ends with the last coefficient that rises above it, with a margin. A scene that reaches into the
-upper half gives itself away by peaks there; then all of the quarter is used.
+A few iterations on about 24 × 24 voxels with a quarter of all cosines take a second. What the coarse voxels
+cannot represent spreads evenly over all coefficients, so that their upper half shows the height of that
+floor; the bandwidth ends with the last coefficient that rises above it, plus a margin. A scene whose light
+reaches into the upper half shows by peaks there; then the whole quarter is used.
 
-On a large sensor a coarse voxel is of many pixels, and the floor so high that a lamp of a few thousand hertz
-drowns in it. A lamp of steady rhythm stands out in the covariance of the lines (`lamps`) on sensors of any
-size, and there the bandwidth reaches to the fastest of them at least.
+On a large sensor a coarse voxel covers many pixels, and a lamp of a few thousand hertz drowns in a floor that
+is so high. A lamp of steady rhythm stands out in the covariance of the lines (`lamps`) on sensors of any
+size, and there the bandwidth reaches at least to the fastest of them.
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ if TYPE_CHECKING:
 
 COARSE_SIDE = 24
 HELD_BY = 3
-"""Stages across a coarse voxel, to which the floor is low enough without the search for lamps (M = 72).
-There, of six codes of blinking lamps within 12 s, one gained 6.6 dB by it and one lost 3.4, and scenes that
-are no lamps lost up to 0.5 by the seconds it takes and by wider bands than they need."""
+"""Largest number of stages across a coarse voxel for which the floor is low enough without a search for lamps
+(M = 72). There, of six codes of blinking lamps within 12 s, one gained 6.6 dB by the search and one lost 3.4,
+and scenes without lamps lost up to 0.5 by the seconds it takes and by wider bands than they need."""
 ITERATIONS, FEWEST_ITERATIONS = 12, 10
 PEAK = 25.0
-"""The floor's highest coefficient is 5 to 15 times its median; beyond this it is no floor."""
+"""Largest ratio of the floor's highest coefficient to its median: 5 to 15 for a floor, more for light."""
 MARGIN = 1.25
 FEWEST_COEFFICIENTS = 32
 WINDOW, STANDS_OUT = 61, 9.0
-"""Cosines about one whose median is its floor, and how far light rises above it; the rest
-reaches 5 to 8."""
+"""Number of neighbouring cosines whose median is the floor, and the ratio to it above which light is
+detected; residuals without light reach 5 to 8."""
 LARGEST_SHARE = 0.25
 
 
@@ -57,10 +57,10 @@ def estimate_coefficients(
     hurry: Callable[[], bool] = lambda: False,
     affords: Callable[[float], bool] = lambda _: True,
 ) -> int:
-    """How many of the first cosines of the frames' time axis hold the scene; sooner done where ``hurry()``.
+    """Estimate the number of cosines that the scene needs; with fewer iterations once ``hurry()``.
 
-    At least 32 (or as many as there are frames), at most a quarter of them (or 32). ``problem`` is that of
-    the segment; lamps are looked for on large sensors, where it ``affords`` the seconds of a processor.
+    It is at least 32 (or the number of frames), at most a quarter of the frames (or 32). ``problem`` is that
+    of the segment; lamps are searched for on large sensors if ``affords`` accepts the processor time.
     """
     spatial_merge, temporal_merge = merges
     frames = segment.geometry.video_shape(spatial_merge, temporal_merge)[0]
@@ -71,7 +71,7 @@ def estimate_coefficients(
     arrays = replace(problem.arrays, dtype="float32")
     theta = _tentative(segment, (merge, temporal_merge), most, hurry, arrays)
     last = _end_of_signal(np.square(theta, dtype=np.float64).sum((1, 2)))
-    # a criterion that knows no truth: how large the coarse voxels are beside what they stand for
+    # a criterion that needs no truth: the size of the coarse voxels relative to those they stand for
     held = merge <= max(spatial_merge, HELD_BY * segment.geometry.substeps)
     if not held and affords(search_seconds(segment.geometry, temporal_merge, LARGEST_SHARE)):
         last = max(last, last_lamp(segment, problem, temporal_merge, LARGEST_SHARE, hurry))
@@ -81,10 +81,11 @@ def estimate_coefficients(
 def light_beyond(
     segment: Segment, problem: Problem, predicted: NDArray[Any], temporal_merge: int, count: int
 ) -> int | None:
-    """The cosine beyond the first ``count`` that stands out in what a prediction leaves of the lines.
+    """The cosine beyond the first ``count`` that stands out in the residual of a prediction.
 
-    A search may overlook a lamp that is small or fast; once the rest is explained, it is the brightest thing
-    that is left. ``predicted`` is as `Problem.samples`. None where no cosine up to half of them stands out.
+    The search for the band may overlook a lamp that is small or fast; once everything else is explained, the
+    lamp dominates the residual. ``predicted`` is as `Problem.samples`. None if no cosine in the lower half
+    stands out.
     """
     merge = -(-segment.geometry.size // COARSE_SIDE)
     frames = segment.geometry.video_shape(merge, temporal_merge)[0]
@@ -94,8 +95,8 @@ def light_beyond(
     operator = band_operator(
         segment.geometry, segment.code, basis, merge, temporal_merge, segment.alignment, segment.blur
     )
-    left = np.where(problem.weight > 0, problem.samples - predicted, 0).astype(np.float32)
-    energy = np.square(operator.adjoint(left), dtype=np.float64).sum((1, 2))
+    residual = np.where(problem.weight > 0, problem.samples - predicted, 0).astype(np.float32)
+    energy = np.square(operator.adjoint(residual), dtype=np.float64).sum((1, 2))
     floor = np.maximum(median_filter(energy, WINDOW, mode="nearest"), np.finfo(float).tiny)
     ratio = energy / floor
     ratio[:count] = 0
@@ -106,6 +107,7 @@ def light_beyond(
 def _tentative(
     segment: Segment, merges: tuple[int, int], count: int, hurry: Callable[[], bool], arrays: Arrays
 ) -> NDArray[Any]:
+    """Coefficients (``count``, row, column) of a few iterations in coarse voxels."""
     merge, temporal_merge = merges
     frames, side, _ = segment.geometry.video_shape(merge, temporal_merge)
     basis = TemporalBasis(frames, count, arrays)
@@ -125,7 +127,7 @@ def _tentative(
 
 
 def _end_of_signal(energy: NDArray[np.float64]) -> int:
-    """The coefficient after the last that rises above the floor; all of them if there is no floor."""
+    """The number of coefficients up to the last above the floor; all of them if there is no floor."""
     floor = energy[len(energy) // 2 :]
     if floor.max() > PEAK * np.median(floor):
         return len(energy)

@@ -1,8 +1,8 @@
 """The temporal subspace: the first K cosines of the segment's time axis (orthonormal DCT-II).
 
 A video of T frames whose coefficients beyond K are 0 is band-limited to K/(2T) of the frame rate. Working
-with the K coefficient frames instead of T frames is what makes the solvers fast. Where a scene is a few
-patterns with a curve each, a `LearnedBasis` of these curves, combined out of the cosines, is smaller still.
+with K coefficient frames instead of T frames makes the solvers fast. If a scene is a few patterns with a
+curve each, a `LearnedBasis` of these curves, which are combinations of the cosines, is smaller still.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ class Basis(Protocol):
 
     @property
     def cosines(self) -> int:
-        """The bandwidth: cosines that the rows are made of."""
+        """The bandwidth: number of cosines that the rows are combinations of."""
         ...
 
     @property
     def arrays(self) -> Arrays:
-        """Where coefficients and videos live; D itself is the host's, in their dtype."""
+        """Library and device of coefficients and videos; D itself is on the host, in their dtype."""
         ...
 
     def matrix(self, grid: int | None = None) -> NDArray[Any]: ...
@@ -50,7 +50,7 @@ class Basis(Protocol):
 class TemporalBasis:
     """D (K, T), orthonormal rows: θ = D·x analyses, x = Dᵀ·θ synthesises, along axis 0.
 
-    By fast transforms on the host; elsewhere by the matrix, which a GPU does as soon.
+    It uses fast transforms on the host, and the matrix elsewhere, which is as fast on a GPU.
     """
 
     def __init__(self, frames: int, count: int, arrays: Arrays = HOST) -> None:
@@ -88,7 +88,7 @@ class TemporalBasis:
 
 
 class LearnedBasis:
-    """R orthonormal combinations of a basis' K rows: D = curvesᵀ·D_K, with ``curves`` (K, R)."""
+    """R orthonormal combinations of the K rows of a basis: D = curvesᵀ·D_K, with ``curves`` (K, R)."""
 
     def __init__(self, within: TemporalBasis, curves: NDArray[Any]) -> None:
         self._within, self.curves = within, curves.astype(within.arrays.dtype)
@@ -110,12 +110,12 @@ class LearnedBasis:
 
 
 def _product(arrays: Arrays, matrix: NDArray[Any], frames: Array) -> Array:
-    """``matrix`` of the host along the first axis."""
+    """Product of a ``matrix`` on the host with the first axis of ``frames``."""
     return arrays.xp.tensordot(arrays.asarray(matrix), frames, axes=1)
 
 
 def resized(theta: Array, basis: TemporalBasis) -> Array:
-    """Coefficients of another number of cosines."""
+    """Coefficients cut or zero-padded to the number of cosines of ``basis``."""
     xp, kept = basis.arrays.xp, theta[: min(basis.count, theta.shape[0]), ...]
     missing = basis.arrays.zeros((basis.count - kept.shape[0], *theta.shape[1:]))
     return xp.concat([kept, missing])

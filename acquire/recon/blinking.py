@@ -1,10 +1,10 @@
-"""Scenes that blink: cosines of the whole band first, then patterns and curves where they are of a few.
+"""Scenes that blink: first cosines of the whole band, then patterns and curves if a few hold the scene.
 
     cosines ── few patterns? ── yes ─▶ patterns and curves at full resolution
-                └────────────── no ──▶ more of the same
+                └────────────── no ──▶ more iterations in the cosines
 
-Held-out samples end the refinement, and the round that predicted them best is the result: at full resolution
-the model has no error of its own to fit, so they are predicted better as long as the picture gets better.
+The held-out samples end the refinement, and the round that predicted them best is the result: at full
+resolution there is no model error to fit, so that they are predicted better as long as the picture improves.
 """
 
 from __future__ import annotations
@@ -31,62 +31,62 @@ if TYPE_CHECKING:
     from acquire.recon.problem import Problem
 
 FIRST_LOOK, LONGER_LOOK = 60, 90
-"""Iterations in the cosines before patterns are looked for; longer where these are in doubt."""
+"""Number of iterations in the cosines before patterns are looked for; the latter if patterns are in doubt."""
 FIRST_LOOK_SHARE = 0.7
-"""Of a budget, the most that the first look may take."""
+"""Upper limit on the first look's share of the budget."""
 BEYOND_S = 2e-6
-"""What it takes to look for light beyond the band, for each line and frame; not done with less to spare."""
+"""Time per line and frame of the search for light beyond the band, which is skipped if less is left."""
 WIDER_SHARE = 0.5
-"""Of a budget, after which nothing is made again in a wider band."""
+"""Share of the budget after which nothing is solved again in a wider band."""
 TENTATIVE_SHARE = 0.15
-"""Of a budget, after which the search for the bandwidth hurries."""
+"""Share of the budget after which the search for the bandwidth hurries."""
 LAMPS_SHARE = 0.3
-"""Of a budget: where the fastest lamp would not be found before, it is not looked for."""
+"""Share of the budget within which the search for the fastest lamp must end; otherwise it is skipped."""
 UNSEARCHED_SHARE = 0.4
-"""Of a budget: where posing the problem alone took more, the bandwidth is not looked for."""
+"""Share of the budget that posing the problem may take; beyond it, the bandwidth is not searched for."""
 PLAIN_ITERATIONS = 90
-"""Of scenes that are not a few patterns: from here on, more iterations fit what voxels cannot hold."""
+"""Number of iterations for scenes without patterns: more of them fit what voxels cannot represent."""
 USUAL_FRAMES = 980
 FEW_FRAMES = 32
 HELD_BACK = 100.0
-"""Factor of the penalties for few frames, as long as they do not explain the lines."""
+"""Factor of the penalties for few frames unless they explain the lines."""
 TRIAL = 20
-"""Iterations after which few frames are asked whether they do."""
+"""Number of iterations after which it is decided whether few frames explain the lines."""
 EXPLAINED = 0.1
-"""Relative error of prediction below which they do, and a still is what cosines begin from."""
+"""Relative prediction error below which they do, and below which cosines start from a still."""
 STILL = AdmmParameters(tv_weight=5e-6, tv_penalty=1e-5, sign_penalty=3e-6, gradient_steps=6)
-"""For a single frame. All sub-steps add up in it, so that the mean light has an eigenvalue some thousand
-times that of a detail: lower penalties let details through, more gradient steps reach them."""
+"""Parameters for a single frame. All sub-steps add up in it, so that the mean light has an eigenvalue some
+thousand times that of a detail: lower penalties admit details, and more gradient steps reach them."""
 LEAST_GAIN = 0.003
-"""Relative gain of the held-out prediction in a round below which the round was in vain."""
+"""Smallest relative gain of the held-out prediction for which a round counts as an improvement."""
 PATIENCE = 6
-"""Rounds in vain that end a refinement."""
+"""Number of rounds without improvement that end a refinement."""
 
 
-def solve_blinking(
+def solve_in_cosines(
     segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock
 ) -> Estimate:
-    """Cosines first, then patterns and curves where the scene is of a few."""
-    return go_on(segment, problem, options, clock, look_in_cosines(segment, problem, options, clock))
+    """Solve in cosines, then as patterns and curves if the scene consists of a few."""
+    return refine(segment, problem, options, clock, first_look(segment, problem, options, clock))
 
 
-def look_in_cosines(
+def first_look(
     segment: Segment,
     problem: Problem,
     options: SolveOptions,
     clock: IterationClock,
     still: Array | None = None,
 ) -> InBand:
-    """A first look in the band that was asked for or found, from the coefficients (1, n′, n′) of a still."""
+    """A first look in the requested or estimated band, from the coefficients (1, n′, n′) of a still."""
     count = find_band(segment, problem, options, clock)
-    return _look(segment, problem, options, clock, count, still)
+    return _look(segment, problem, options, clock, count=count, still=still)
 
 
-def go_on(
+def refine(
     segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock, first: InBand
 ) -> Estimate:
-    """Patterns, or more of the same; once more in a wider band where the lines show light beyond this one."""
-    found = _go_on(segment, problem, options, clock, first)
+    """Refine a first look, and solve again in a wider band if the lines show light beyond this one."""
+    found = _refine(segment, problem, options, clock, first)
     if not clock.affords(BEYOND_S * segment.geometry.lines * first.basis.frames):
         return found
     predicted = found.predict()
@@ -96,35 +96,23 @@ def go_on(
     if options.bandwidth is not None or clock.spent(WIDER_SHARE):
         rate_hz = 1e9 / (segment.substep_ns * options.temporal_merge)
         clock.shortcuts.append(
-            f"the lines hold light of about {beyond * rate_hz / (2 * first.basis.frames):.3g} Hz, which is "
-            "faster than what the video may hold: a longer budget or another bandwidth shows it"
+            f"the lines contain light of about {beyond * rate_hz / (2 * first.basis.frames):.3g} Hz, faster "
+            "than the band of the video: a longer budget or a higher bandwidth shows it"
         )
         return found
-    clock.begin_anew()
-    still = first.solver.theta[:1, ...]
-    first = _look(segment, problem, options, clock, round(MARGIN * (beyond + 1)), still)
-    wider = _go_on(segment, problem, options, clock, first)
+    clock.reset()
+    count = round(MARGIN * (beyond + 1))
+    first = _look(segment, problem, options, clock, count=count, still=first.solver.theta[:1, ...])
+    wider = _refine(segment, problem, options, clock, first)
     better = problem.prediction_error(wider.predict()) < problem.prediction_error(predicted)
     return wider if better else found
 
 
-def _look(
-    segment: Segment,
-    problem: Problem,
-    options: SolveOptions,
-    clock: IterationClock,
-    count: int,
-    still: Array | None = None,
-) -> InBand:
-    frames = segment.geometry.video_shape(options.spatial_merge, options.temporal_merge)[0]
-    basis = TemporalBasis(frames, min(frames, count), problem.arrays)
-    return _first_look(segment, problem, options, basis, clock, still)
-
-
-def _go_on(
+def _refine(
     segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock, first: InBand
 ) -> Estimate:
-    refined = None if options.denoiser else _refine(segment, problem, options, first, clock)
+    """Patterns and curves, or more iterations in the cosines if the scene does not consist of a few."""
+    refined = None if options.denoiser else _in_patterns(segment, problem, options, first, clock)
     if refined is not None:
         return refined
     for _ in clock.run(PLAIN_ITERATIONS - clock.done, "solve", video=first.video):
@@ -132,26 +120,30 @@ def _go_on(
     return first
 
 
-def _first_look(
+def _look(
     segment: Segment,
     problem: Problem,
     options: SolveOptions,
-    basis: TemporalBasis,
     clock: IterationClock,
+    *,
+    count: int,
     still: Array | None,
 ) -> InBand:
-    """In the cosines; few frames with lower penalties from where they turn out to explain the lines.
+    """Solve in ``count`` cosines; few frames get lower penalties if they turn out to explain the lines.
 
-    From darkness the least video that explains the lines is lit with the code, since they say nothing of
-    sub-steps without light, and total variation leaves flat light as it is. From a still, the least change
-    that explains them is looked for.
+    From zero, the smallest video that explains the lines contains the code, since they carry no information
+    about sub-steps without light, and total variation ignores flat light. From a still, the solver finds the
+    smallest change that explains them.
     """
     N_m, T_m = options.spatial_merge, options.temporal_merge
     frames, side, _ = segment.geometry.video_shape(N_m, T_m)
+    basis = TemporalBasis(frames, min(frames, count), problem.arrays)
     operator = band_operator(segment.geometry, segment.code, basis, N_m, T_m, segment.alignment, segment.blur)
 
     def begin(start: Array | None, *, explained: bool = False) -> InBand:
-        parameters = _weighted(_defaults(frames, explained=explained), options.tv_weight)
+        parameters = _defaults(frames, explained=explained)
+        if options.tv_weight is not None:
+            parameters = replace(parameters, tv_weight=options.tv_weight)
         solver = Admm(
             problem.masked(operator),
             problem.used_samples,
@@ -181,16 +173,17 @@ def _first_look(
     return estimate
 
 
-def _refine(
+def _in_patterns(
     segment: Segment,
     problem: Problem,
     options: SolveOptions,
     first: InBand,
     clock: IterationClock,
 ) -> Estimate | None:
-    """Patterns and curves from a first look; None where the scene is not made of a few."""
-    goes_on = clock.done < clock.iterations and clock.affords(ROUND * clock.longest_s)
-    found = find_patterns(host(first.solver.theta)) if goes_on else None
+    """Patterns and curves from a first look; None if the scene does not consist of a few."""
+    if clock.done >= clock.iterations or not clock.affords(ROUND * clock.longest_s):
+        return None
+    found = find_patterns(host(first.solver.theta))
     if found is None:
         return None
     basis = TemporalBasis(first.basis.frames, first.basis.count, problem.arrays)
@@ -201,10 +194,11 @@ def _refine(
         refinement.step()
         if not refinement.at_round_end:
             continue
-        now = problem.prediction_error(refinement.predict())
-        idle = idle + 1 if now >= (1 - LEAST_GAIN) * best else 0  # without held-out samples: NaN, go on
-        if not now >= best:
-            best, kept = now, refinement.found
+        error = problem.prediction_error(refinement.predict())
+        # without held-out samples the error is NaN, which never counts as idle
+        idle = idle + 1 if error >= (1 - LEAST_GAIN) * best else 0
+        if not error >= best:
+            best, kept = error, refinement.found
         if idle == PATIENCE:
             clock.converged()
             break
@@ -215,34 +209,34 @@ def _refine(
 
 
 def find_band(segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock) -> int:
+    """Number of cosines: as requested, or as the lines show, or a few if the budget leaves no time."""
     N_m, T_m = options.spatial_merge, options.temporal_merge
-    if options.bandwidth is None and clock.spent(UNSEARCHED_SHARE):
-        frames = segment.geometry.video_shape(N_m, T_m)[0]
+    frames = segment.geometry.video_shape(N_m, T_m)[0]
+    if options.bandwidth is not None:
+        return min(frames, max(1, round(options.bandwidth * frames)))
+    if clock.spent(UNSEARCHED_SHARE):
         few = min(frames, FEWEST_COEFFICIENTS)
         limit_hz = few / (2e-9 * segment.substep_ns * T_m * frames)
         clock.shortcuts.append(
-            f"the budget left no time to look for the scene's bandwidth: only what is slower than "
-            f"{limit_hz:.3g} Hz is in the video"
+            "the budget left no time to search for the scene's bandwidth: the video holds only changes "
+            f"slower than {limit_hz:.3g} Hz"
         )
         return few
-    if options.bandwidth is None:
-        return estimate_coefficients(
-            segment,
-            problem,
-            (N_m, T_m),
-            hurry=lambda: clock.spent(TENTATIVE_SHARE),
-            affords=lambda seconds: clock.affords(seconds, LAMPS_SHARE),
-        )
-    frames = segment.geometry.video_shape(N_m, T_m)[0]
-    return min(frames, max(1, round(options.bandwidth * frames)))
+    return estimate_coefficients(
+        segment,
+        problem,
+        (N_m, T_m),
+        hurry=lambda: clock.spent(TENTATIVE_SHARE),
+        affords=lambda seconds: clock.affords(seconds, LAMPS_SHARE),
+    )
 
 
 def _defaults(frames: int, *, explained: bool = False) -> AdmmParameters:
-    """Parameters for a video of so many frames.
+    """Parameters for a video of this many frames.
 
-    Coefficients grow with the root of the frames, and so does the threshold λ/ρ that suits them. A handful
-    of frames of a moving scene cannot explain its lines: its penalties are higher, which fits less of that.
-    Where they do (``explained``), the scene rests, as a still does.
+    Coefficients scale with the square root of the number of frames, and so does the suitable threshold λ/ρ. A
+    handful of frames of a moving scene cannot explain its lines: higher penalties fit less of the motion. If
+    they do (``explained``), the scene is at rest and is solved as a still is.
     """
     if frames == 1:
         return STILL
@@ -256,7 +250,3 @@ def _defaults(frames: int, *, explained: bool = False) -> AdmmParameters:
         sign_penalty=usual.sign_penalty * penalty / usual.tv_penalty,
         gradient_steps=STILL.gradient_steps if explained else usual.gradient_steps,
     )
-
-
-def _weighted(parameters: AdmmParameters, tv_weight: float | None) -> AdmmParameters:
-    return parameters if tv_weight is None else replace(parameters, tv_weight=tv_weight)

@@ -1,7 +1,7 @@
 """The brightness of a whole scene over time: g in X(r, c, t) = g(t)·V(r, c, t), from all lines at once.
 
 With V known, a line is linear in g: Y(i, ·) = Σ_t g(t)·E(t)·V's light along the line's staircase (Eq. 1).
-A few hundred unknowns stand against all samples, so that least squares does; where V holds part of the
+There are a few hundred unknowns for all samples, so that least squares is enough; if V contains part of the
 brightness already, g stays near 1.
 """
 
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from acquire.recon.problem import Problem
 
 RIDGE = 1e-3
-"""Of the mean eigenvalue: draws g to 1 where lines say nothing of it."""
+"""Ridge relative to the mean eigenvalue: it draws g to 1 where the lines carry no information about it."""
 DIMMEST = 0.02
-"""Of the mean; dimmer instants would not be seen at all."""
+"""Smallest brightness relative to the mean; dimmer instants would not be seen at all."""
 
 
 def fit_brightness(
@@ -33,9 +33,10 @@ def fit_brightness(
     merges: tuple[int, int],
     cosines: int,
 ) -> NDArray[np.float64]:
-    """g (frames,) of mean 1 in so many cosines, for which g·``video`` (frames, n′, n′) fits the lines best.
+    """Fit g (frames,) of mean 1, in this many cosines, so that g·``video`` (frames, n′, n′) explains the
+    lines.
 
-    ``video`` is dimensionless, as the solvers have it; ``merges`` are N_m and T_m.
+    ``video`` is dimensionless, as in the solvers; ``merges`` are N_m and T_m.
     """
     spatial_merge, temporal_merge = merges
     geometry, frames = segment.geometry, len(video)

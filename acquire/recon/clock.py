@@ -1,7 +1,7 @@
-"""Iterations within limits: their number, a budget of wall time, and a stop from outside.
+"""Limits on iterations: their number, a budget of wall time, and a stop from outside.
 
-A budget is kept by looking at the wall before each iteration: whether one as long as the longest of late
-still fits before what comes after the last. A core that is shared makes all of them longer alike.
+A budget is kept by checking the wall clock before each iteration: an iteration as long as the longest recent
+one must still fit before the work that follows the last one. On a shared core all of them get longer alike.
 """
 
 from __future__ import annotations
@@ -22,31 +22,32 @@ if TYPE_CHECKING:
     from acquire.recon.options import Stop
 
 FINISH_SHARE = 0.02
-"""Of a budget, kept for what comes after the last iteration (the video and its quality), and"""
+"""Share of the budget kept for the work after the last iteration (the video and its quality), in addition
+to"""
 FINISH_ITERATIONS = 1.5
-"""as long as so many iterations."""
+"""the time of this many iterations."""
 REMEMBERED = 20
-"""Iterations of which the longest is what the next may take; some do more than others, as every 20th of a
-refinement."""
+"""Number of recent iterations whose longest is the estimate for the next; some do more work than others, as
+every 20th of a refinement."""
 RESERVED_SHARE = 0.15
-"""Of a budget, the most that is kept for iterations after the last."""
+"""Upper limit on the share of the budget that is reserved for iterations after the solver's last."""
 SLOWER = 1.1
-"""Than the longest before it an iteration of these may be."""
+"""Factor by which a reserved iteration may be longer than the longest before it."""
 FIRST_OF_STAGE = 4.0
-"""The first of another stage may take so many times the longest before it."""
+"""Factor by which the first iteration of a new stage may be longer than the longest before it."""
 
 
 class IterationClock:
-    """Counts iterations over all stages of a solver and says when they must end, and why (``ended``).
+    """Counts the iterations of all stages of a solver, decides when they end, and records why (``ended``).
 
-    ``done`` are those that the limit is for, ``made`` all, those of trials too.
+    ``done`` counts the iterations that the limit applies to, ``made`` all of them, trials included.
 
-    Its time is the wall's since ``began`` (`time.monotonic`; else now), without what compiling took.
-    ``shortcuts`` are sentences about what was left out for want of time. ``looks`` is called after iterations
-    of what has a video already; the time it takes does not count.
+    Time is wall time since ``began`` (`time.monotonic`; now if None), without compilation and without the
+    time spent in ``on_look``, which is called after iterations that have a video. ``shortcuts`` are sentences
+    for the user about what was left out for lack of time.
     """
 
-    looks: Callable[[Look], object] | None = None
+    on_look: Callable[[Look], object] | None = None
 
     def __init__(
         self,
@@ -61,150 +62,150 @@ class IterationClock:
         self.shortcuts: list[str] = []
         self._budget_s, self._progress, self._stop = budget_s, progress, stop
         self._began = time.monotonic() if began is None else began
-        self._compiled_before, self._aside_s = compiled_s(), 0.0
+        self._compiled_before, self._excluded_s = compiled_s(), 0.0
         self._processor_began_s = time.process_time()
-        self._lately_s: deque[float] = deque(maxlen=REMEMBERED)
+        self._recent_s: deque[float] = deque(maxlen=REMEMBERED)
         self._reserved = 0.0
 
     @property
     def seconds(self) -> float:
-        return time.monotonic() - self._began - self.compiled_s - self._aside_s
+        return time.monotonic() - self._began - self.compiled_s - self._excluded_s
 
     @property
     def processor_s(self) -> float:
-        """Of all threads of this process, whatever it compiled."""
+        """Processor time of all threads of this process, compilation included."""
         return time.process_time() - self._processor_began_s
 
     @property
-    def asked(self) -> bool:
-        """Whether who looks on wants the answer now."""
+    def stop_requested(self) -> bool:
+        """Whether the caller wants the answer now."""
         return self._stop is not None and self._stop.is_set()
 
     @property
     def compiled_s(self) -> float:
-        """What compiling took meanwhile: once after an installation, and no part of a budget."""
+        """Time spent compiling since the start: once after an installation, and not part of a budget."""
         return compiled_s() - self._compiled_before
 
     @property
     def longest_s(self) -> float:
-        """The longest iteration of late; 0 before the first."""
-        return max(self._lately_s, default=0.0)
+        """Duration of the longest recent iteration; 0 before the first."""
+        return max(self._recent_s, default=0.0)
 
     @property
     def mean_s(self) -> float:
-        """An iteration of late in the mean; 0 before the first."""
-        return sum(self._lately_s) / max(1, len(self._lately_s))
+        """Mean duration of the recent iterations; 0 before the first."""
+        return sum(self._recent_s) / max(1, len(self._recent_s))
 
     def reserve(self, iterations: float) -> None:
-        """Keep time for so many after the last of the solver's (`afterwards`), as long as those of late."""
+        """Reserve the time of this many recent iterations for `run_reserved`, after the solver's last one."""
         self._reserved = iterations
 
-    def afterwards(self, most: int, least: int = 0, twice: int = 0) -> Iterator[int]:
-        """Yields before each iteration that time was kept for: nothing is kept from now on.
+    def run_reserved(self, most: int, least: int = 0, repeat: int = 0) -> Iterator[int]:
+        """Yield before each iteration that time was reserved for, and release the reservation.
 
-        What comes after the last of these is told by their mean: only some of them, as a refinement's every
-        fifth, are much longer. The first ``least`` are made where they fit themselves. With ``twice``, as
-        many again are to follow: none is made where not that many fit twice.
+        The work after the last of these is estimated from their mean duration, because only some of them, as
+        every fifth of a refinement, are much longer. The first ``least`` run if they themselves fit. With
+        ``repeat``, as many iterations will be run a second time (at least ``repeat``): none starts unless
+        both passes fit.
         """
         self._reserved = 0.0
-        before, lately = self._lately_s, deque[float](maxlen=REMEMBERED)
-        expected_s, self._lately_s = self.mean_s, lately
+        before, recent = self._recent_s, deque[float](maxlen=REMEMBERED)
+        expected_s, self._recent_s = self.mean_s, recent
         for made in range(most):
             needed_s, after_s = SLOWER * self.longest_s, self.mean_s if made >= least else 0.0
-            if twice:
+            if repeat:
                 one_s = self.mean_s or expected_s
-                needed_s = max(needed_s, one_s) + one_s * (max(twice, made + 1) + max(twice - made - 1, 0))
-            if self.asked or not self._fits(needed_s, after_s):
+                passes = max(repeat, made + 1) + max(repeat - made - 1, 0)
+                needed_s = max(needed_s, one_s) + one_s * passes
+            if self.stop_requested or not self._fits(needed_s, after_s):
                 break
             begun = self.seconds
             yield made
             if made == 1:
-                lately.clear()  # the first prepares what the others have
-            lately.append(self.seconds - begun)
-        if not lately:
-            self._lately_s = before
+                recent.clear()  # the first iteration also sets up what the others reuse
+            recent.append(self.seconds - begun)
+        if not recent:
+            self._recent_s = before
 
     def run(
         self, most: int, stage: str, share: float = 1.0, video: Callable[[], NDArray[Any]] | None = None
     ) -> Iterator[int]:
-        """Yields before each iteration of a stage that may take ``share`` of the budget.
+        """Yield before each iteration of a stage that may take ``share`` of the budget.
 
-        ``video`` gives the answer as it is after an iteration, dimensionless, to who looks on.
+        ``video`` returns the current answer, dimensionless; it is passed to ``on_look`` after an iteration.
 
-        The very first iteration of all is always made, so that there is something to show.
+        The very first iteration always runs, so that there is a result.
         """
         last = min(self.done + most, self.iterations)
         expected = FIRST_OF_STAGE * self.longest_s
-        before, lately = self._lately_s, deque[float](maxlen=REMEMBERED)
-        self._lately_s = lately
-        while self.done < last and self._may_go_on(expected, share):
+        before, recent = self._recent_s, deque[float](maxlen=REMEMBERED)
+        self._recent_s = recent
+        while self.done < last and self._may_continue(expected, share):
             begun = self.seconds
             yield self.done
             self.done += 1
-            self.made += 1
-            lately.append(self.seconds - begun)
+            self._count(self.seconds - begun, stage)
             expected = self.longest_s
-            if self._progress is not None:
-                self._progress(Progress(self.made, max(self.made, self.iterations), self.seconds, stage))
             if video is not None:
                 self.show(stage, video)
-        if not lately:
-            self._lately_s = before
+        if not recent:
+            self._recent_s = before
 
     def attempt(self, most: int, stage: str, share: float = 1.0) -> Iterator[int]:
-        """As `run`, for iterations beside the limit, of a trial that may come to nothing; one is made.
+        """Yield as `run` does, for a trial that may be discarded: its iterations do not count as ``done``.
 
-        Nobody sees them: `show` what is the best after a trial.
+        At least one runs. They are not shown: call `show` with the best candidate after a trial.
         """
-        lately = self._lately_s = deque(maxlen=REMEMBERED)
+        self._recent_s = deque(maxlen=REMEMBERED)
         for tried in range(most):
             if tried and (self._stopped() or not self.affords(self.longest_s, share)):
                 return
             begun = self.seconds
             yield tried
-            self.made += 1
-            lately.append(self.seconds - begun)
-            if self._progress is not None:
-                self._progress(Progress(self.made, max(self.made, self.iterations), self.seconds, stage))
+            self._count(self.seconds - begun, stage)
 
     def show(self, stage: str, video: Callable[[], NDArray[Any]]) -> None:
-        """The answer as it would be now, dimensionless, to who looks on."""
-        if self.looks is not None:
-            self._show(self.looks, stage, video)
+        """Pass the current answer, dimensionless, to ``on_look``; its time does not count."""
+        if self.on_look is None:
+            return
+        seconds, wall, processor = self.seconds, time.monotonic(), time.process_time()
+        self.on_look(Look(self.made, seconds, self.processor_s, stage, video))
+        self._excluded_s += time.monotonic() - wall
+        self._processor_began_s += time.process_time() - processor
 
     def spent(self, share: float) -> bool:
-        """Whether that share of the budget is gone, or all is to stop."""
+        """Whether this share of the budget is used up, or a stop was requested."""
         if self.made and self._stopped():
             return True
         return self._budget_s is not None and self.seconds > share * self._budget_s
 
     def affords(self, seconds: float, share: float = 1.0) -> bool:
-        """Whether work of so long fits before the end, or into that share of the budget."""
+        """Whether work of this duration fits before the end, and into ``share`` of the budget."""
         return self._fits(seconds, self.longest_s, share)
 
+    def reset(self) -> None:
+        """Restart the count against the limit of iterations."""
+        self.done = 0
+
+    def converged(self) -> None:
+        """Record that more iterations would gain nothing."""
+        self.ended = "converged"
+
+    def _count(self, seconds: float, stage: str) -> None:
+        self.made += 1
+        self._recent_s.append(seconds)
+        if self._progress is not None:
+            self._progress(Progress(self.made, max(self.made, self.iterations), self.seconds, stage))
+
     def _fits(self, seconds: float, iteration_s: float, share: float = 1.0) -> bool:
-        """As `affords`, where what comes after the last iteration is told by one of so long."""
+        """As `affords`, with the final work estimated from an iteration of ``iteration_s``."""
         if self._budget_s is None:
             return True
         finish_s = FINISH_SHARE * self._budget_s + FINISH_ITERATIONS * iteration_s
         finish_s += min(self._reserved * self.mean_s, RESERVED_SHARE * self._budget_s)
         return self.seconds + seconds <= min(share * self._budget_s, self._budget_s - finish_s)
 
-    def begin_anew(self) -> None:
-        """What was done so far does not count against the limit of iterations."""
-        self.done = 0
-
-    def converged(self) -> None:
-        """Nothing is to be gained from more iterations."""
-        self.ended = "converged"
-
-    def _show(self, looks: Callable[[Look], object], stage: str, video: Callable[[], NDArray[Any]]) -> None:
-        seconds, wall, processor = self.seconds, time.monotonic(), time.process_time()
-        looks(Look(self.made, seconds, self.processor_s, stage, video))
-        self._aside_s += time.monotonic() - wall
-        self._processor_began_s += time.process_time() - processor
-
-    def _may_go_on(self, expected: float, share: float) -> bool:
+    def _may_continue(self, expected: float, share: float) -> bool:
         if self.made and self._stopped():
             return False
         if not self.made or self.affords(expected, share):
@@ -214,7 +215,7 @@ class IterationClock:
         return False
 
     def _stopped(self) -> bool:
-        if not self.asked:
+        if not self.stop_requested:
             return False
         self.ended = "stopped"
         return True

@@ -1,7 +1,7 @@
-"""How long this process has compiled.
+"""Time that this process has spent compiling.
 
-The loops are compiled where they are first called, and kept in a cache beside them: it happens once after an
-installation, takes ten seconds or more, and says nothing of what a reconstruction takes.
+The loops are compiled when they are first called and cached next to their source. This happens once after an
+installation, takes ten seconds or more, and does not count as time of a reconstruction.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from numba.core import event
 
 
 class _Stopwatch(event.Listener):
-    """Runs while a loop is compiled. Numba compiles one at a time; those that it calls lie within."""
+    """Runs while a loop is compiled. Numba compiles one at a time; the loops that it calls are nested."""
 
     def __init__(self) -> None:
         self._total_s, self._depth, self._begun = 0.0, 0, 0.0

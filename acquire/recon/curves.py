@@ -1,14 +1,14 @@
-"""The light of known patterns: what each shone at every instant, from all lines by least squares.
+"""The light curves of known patterns, from all lines by least squares.
 
     y = Σ_k Λ·(u_k ⊗ Z_k),     u_k = Dᵀ·(column k of the unknown),     no prior on the amplitudes
 
 Line i is Σ_{k,s} E(iS + s)·u_k(iS + s)·P_k(s), with P_k the pattern's rows summed over S steps. The system is
-small, R·K unknowns for all samples, but fast light hides in the sum over n steps: plain conjugate gradients
+small, R·K unknowns for all samples, but the sum over n steps attenuates fast light: plain conjugate gradients
 need hundreds of steps. With all samples in use the normal matrix is known in closed form, for sub-steps t, t'
 
     G[t, k; t', k'] = E(t)·E(t')·Σ_i Q_{kk'}(t − iS, t' − iS),     Q_{kk'} = P_k·P_{k'}ᵀ of both arms
 
-and its Cholesky factor is the preconditioner that makes a few steps enough where some samples are masked.
+and with its Cholesky factor as preconditioner a few steps are enough if some samples are masked.
 """
 
 from __future__ import annotations
@@ -33,22 +33,22 @@ if TYPE_CHECKING:
     from acquire.recon.problem import Problem
 
 RIDGE = 1e-5
-"""Of the mean eigenvalue: what no line sees stays as it was."""
+"""Ridge relative to the mean eigenvalue: light that no line sees stays unchanged."""
 STEPS = 6
 PLAIN_STEPS = 60
 REFRESH = 4
-"""Calls that share a preconditioner."""
+"""Number of calls that share a preconditioner."""
 LARGEST_SPAN = 8192
-"""Sub-steps; beyond, the normal matrix takes too much memory and plain steps are made."""
+"""Largest number of sub-steps for which the normal matrix is formed; it would take too much memory beyond."""
 LARGEST_UNKNOWNS = 4096
 
 
 class CurveFit:
     """Fits the curves of patterns that change little from call to call.
 
-    The normal matrix costs ten times the rest, and as a preconditioner an old one is as good as new: it is
-    made for every `REFRESH`-th call. Patterns and cosines are where the problem's arrays are, curves on the
-    host.
+    The normal matrix costs ten times the rest, and an old one is as good a preconditioner as a new one: it is
+    computed in every `REFRESH`-th call. Patterns and cosines are on the device of the problem's arrays,
+    curves on the host.
     """
 
     def __init__(
@@ -59,18 +59,20 @@ class CurveFit:
         temporal_merge: int,
         ridge: float = RIDGE,
     ) -> None:
-        """Light to which the lines respond less than ``ridge``, relative to the mean eigenvalue, hardly moves
-        in a call: to be set as high as the patterns are wrong.
+        """Set up the fit.
+
+        Light to which the lines respond less than ``ridge``, relative to the mean eigenvalue, hardly changes
+        in one call: the larger the error of the patterns, the larger it should be.
         """
         self._segment, self._problem, self._cosines = segment, problem, cosines
         self._merge, self._ridge, self._calls = temporal_merge, ridge, 0
-        self._precondition: Callable[[Array], Array] = _same
+        self._precondition: Callable[[Array], Array] = lambda x: x
         self._damping = 0.0
 
     def __call__(self, patterns: Array, start: NDArray[Any]) -> NDArray[np.float64]:
-        """Curves (K, R) that explain the samples best with ``patterns`` (R, n, n), near ``start``.
+        """Fit curves (K, R) to the samples with ``patterns`` (R, n, n), near ``start``.
 
-        Patterns of like size make it well conditioned.
+        The fit is well conditioned if the patterns are of similar size.
         """
         arrays, exact = self._problem.arrays, self._problem.arrays.exact()
         whole = CurveOperator(self._segment, patterns, self._cosines, self._merge)
@@ -92,7 +94,7 @@ class CurveFit:
 
 
 class CurveOperator:
-    """Lines of patterns whose curves are the unknown: (K, R) → (2, L_R, M), and the transpose."""
+    """Lines of patterns as a function of their curves: (K, R) → (2, L_R, M), and the transpose."""
 
     def __init__(
         self, segment: Segment, patterns: Array, cosines: TemporalBasis, temporal_merge: int
@@ -106,11 +108,11 @@ class CurveOperator:
         self._windows = self._arrays.indices(windows.ravel())
         self._code = self._arrays.asarray(segment.code)
         aligned = registration(segment.alignment, segment.geometry, 1, self._arrays)
-        seen = patterns if aligned is None else aligned.forward(patterns)
+        view_b = patterns if aligned is None else aligned.forward(patterns)
         blurred = blurring(segment.blur, segment.geometry, 1, self._arrays)
         if blurred is not None:
-            patterns, seen = blurred.forward(0, patterns), blurred.forward(1, seen)
-        views = (patterns, self._xp.flip(self._xp.permute_dims(seen, (0, 2, 1)), axis=1))
+            patterns, view_b = blurred.forward(0, patterns), blurred.forward(1, view_b)
+        views = (patterns, self._xp.flip(self._xp.permute_dims(view_b, (0, 2, 1)), axis=1))
         merging = self._arrays.asarray(column_merging(segment.geometry, 1))
         self._profiles = [_profiles(self._xp, view, merging, segment.geometry.substeps) for view in views]
         self._matrix = self._arrays.asarray(cosines.matrix())
@@ -137,7 +139,7 @@ class CurveOperator:
         """The normal matrix of all samples in float64, unknowns in the order of (R, K)."""
         K, R, exact = self._matrix.shape[0], self._rank, self._arrays.exact()
         gram = exact.zeros((R, K, R, K))
-        # float64: congruence keeps it positive definite only as far as rounding does
+        # float64: rounding in float32 could make it indefinite
         shaped = [self._xp.reshape(exact.asarray(each), (R, self._width, -1)) for each in self._profiles]
         for k in range(R):
             for other in range(k + 1):
@@ -173,7 +175,7 @@ def _preconditioner(
 ) -> tuple[Callable[[Array], Array], float]:
     """Solver of (G + damping)·x = b for x, b of ``shape`` (K, R), and the damping.
 
-    The standard has no triangular solver: elsewhere than on the host the inverse stands in.
+    The array API standard has no triangular solver: the inverse replaces it on other devices than the host.
     """
     xp, count = arrays.xp, gram.shape[0]
     damping = max(ridge * float(xp.linalg.trace(gram)) / count, float(np.finfo(np.float32).tiny))
@@ -188,10 +190,6 @@ def _preconditioner(
         return xp.reshape(apply(xp.reshape(right.T, (-1,))), shape[::-1]).T
 
     return solve, damping
-
-
-def _same(x: Array) -> Array:
-    return x
 
 
 def _conjugate_gradients(

@@ -1,8 +1,8 @@
-"""The plug-in point for priors: anything that cleans coefficient frames can stand where TV stands.
+"""Plug-in point for priors: any denoiser of coefficient frames can replace total variation.
 
-ADMM calls ``prox(frames, weight)`` once an iteration. A convex prior's proximal operator keeps the minimum
-of `admm`; any other denoiser makes it plug-and-play ADMM (Venkatakrishnan, Bouman and Wohlberg, GlobalSIP
-2013), which has no objective but often a good fixed point.
+ADMM calls ``prox(frames, weight)`` once per iteration. With the proximal operator of a convex prior, it
+minimises the objective of `admm`; any other denoiser makes it plug-and-play ADMM (Venkatakrishnan, Bouman and
+Wohlberg, GlobalSIP 2013), which has no objective but often a good fixed point.
 
     class Mine:
         def prox(self, frames, weight):   # (K, row, column), strength: one number or (K,)
@@ -10,7 +10,7 @@ of `admm`; any other denoiser makes it plug-and-play ADMM (Venkatakrishnan, Boum
 
     reconstruct(segment, 3, 1, denoiser=Mine())
 
-One that an entry point of the group ``acquire.denoisers`` names, made without arguments, goes by its name:
+A denoiser that is an entry point of the group ``acquire.denoisers`` is created without arguments by its name:
 ``reconstruct(…, denoiser="haar")``, ``acquire reconstruct --denoiser haar``.
 """
 
@@ -28,28 +28,30 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class Denoiser(Protocol):
-    """Cleans frames (K, row, column); ``weight`` says how strongly, in the units of TV's."""
+    """Denoises frames (K, row, column) with a strength ``weight``, in the units of TV's."""
 
     def prox(self, frames: Array, weight: float | Array, /) -> Array: ...
 
 
 def open_denoiser(name: str) -> Denoiser:
-    """The installed denoiser of that name. Raises ConfigError where there is none that works."""
+    """Create the installed denoiser of that name. Raises ConfigError if there is none that works."""
     found: Denoiser = DENOISERS.load(name)()
     return found
 
 
 class Checked:
-    """A denoiser that is held to its contract, so that what breaks it is told and named."""
+    """A denoiser whose results are checked, so that an error names the denoiser that caused it."""
 
     def __init__(self, denoiser: Denoiser) -> None:
         self._denoiser, self._name = denoiser, type(denoiser).__name__
 
     def prox(self, frames: Array, weight: float | Array) -> Array:
         cleaned = self._denoiser.prox(frames, weight)
-        if getattr(cleaned, "shape", None) != frames.shape:
+        shape = getattr(cleaned, "shape", None)
+        if shape != frames.shape:
+            what = f"a {type(cleaned).__name__}" if shape is None else f"shape {tuple(shape)}"
             raise UsageError(
-                f"denoiser {self._name} gave back {_what(cleaned)} for frames of shape {tuple(frames.shape)}",
+                f"denoiser {self._name} gave back {what} for frames of shape {tuple(frames.shape)}",
                 possible="an array of the same shape",
             )
         if not bool(namespace(cleaned).all(namespace(cleaned).isfinite(cleaned))):
@@ -59,16 +61,11 @@ class Checked:
         return cleaned
 
 
-def _what(given: object) -> str:
-    shape = getattr(given, "shape", None)
-    return f"a {type(given).__name__}" if shape is None else f"shape {tuple(shape)}"
-
-
 class HaarShrink:
     """Soft thresholding of Haar wavelets at all shifts, ``levels`` deep (Coifman and Donoho, 1995).
 
-    One level of the undecimated transform, rebuilt, is the mean over its shifts of the decimated one; the
-    smooth part goes on to the next level with twice the spacing. Edges wrap around.
+    One level of the undecimated transform, inverted, is the mean of the decimated one over its shifts; the
+    smooth part enters the next level with twice the spacing. Edges wrap around.
     """
 
     def __init__(self, levels: int = 3) -> None:
@@ -77,7 +74,7 @@ class HaarShrink:
         self._levels = levels
 
     def prox(self, frames: Array, weight: float | Array) -> Array:
-        """Details are shrunk by ``weight``."""
+        """Shrink the details by ``weight``."""
         threshold = (namespace(frames).zeros_like(frames[:, 0, 0]) + weight)[:, None, None]
         smooth, details = frames, namespace(frames).zeros_like(frames)
         for level in range(self._levels):
@@ -90,29 +87,26 @@ class HaarShrink:
 
 
 def _level(smooth: Array, step: int, threshold: Array) -> tuple[Array, Array]:
-    """The next smooth part and the kept details, which add up to ``smooth`` where nothing is shrunk."""
+    """The next smooth part and the shrunk details, which add up to ``smooth`` for a threshold of 0."""
     a, b = smooth, namespace(smooth).roll(smooth, -step, axis=2)
     parts = [(a + b) / 2, (a - b) / 2]
     bands = []
     for part in parts:
         below = namespace(part).roll(part, -step, axis=1)
         bands += [(part + below) / 2, (part - below) / 2]
-    kept = [
-        _undo(_soft(band, threshold / 2), step, sign) for band, sign in zip(bands[1:], _SIGNS, strict=True)
-    ]
+    kept = []
+    for band, sign in zip(bands[1:], _SIGNS, strict=True):
+        xp = namespace(band)
+        shrunk = xp.sign(band) * xp.maximum(xp.abs(band) - threshold / 2, 0)
+        kept.append(_undo(shrunk, step, sign))
     return _undo(bands[0], step, (1, 1)), sum(kept[1:], kept[0])
 
 
 _SIGNS = ((-1, 1), (1, -1), (-1, -1))
-"""Of the second row and column, for the details down, across and diagonal."""
+"""Signs of the second row and column, for vertical, horizontal and diagonal details."""
 
 
 def _undo(band: Array, step: int, sign: tuple[int, int]) -> Array:
-    """Back to pixels: the mean over the shifts, which for Haar is the transposed filter."""
+    """A band back in pixels: the mean over the shifts, which for Haar is the transposed filter."""
     rows = (band + sign[0] * namespace(band).roll(band, step, axis=1)) / 2
     return (rows + sign[1] * namespace(rows).roll(rows, step, axis=2)) / 2
-
-
-def _soft(band: Array, threshold: Array) -> Array:
-    xp = namespace(band)
-    return xp.sign(band) * xp.maximum(xp.abs(band) - threshold, 0)

@@ -1,32 +1,32 @@
-"""How far a video is from the truth, without it: an estimate, calibrated on scenes whose truth is known.
+"""Estimate of a video's error without the truth, calibrated on scenes whose truth is known.
 
-Lines leave part of a scene open, so that a small residual proves little (`judge.frame_error`). What goes with
-the error, and needs no truth:
+The lines leave part of a scene undetermined, so that a small residual proves little (`judge.frame_error`).
+These indicators need no truth and vary with the error:
 
-    missed  what held-out blocks of the lines are missed by, as that error of every voxel, independent of the
-            others, which would be missed by as much
-    moved   how far the picture moves when a further quarter of the lines is withheld, and it goes on from
-            where it is: what few lines decide is what is least sure
-    change  where it changes in time, and edge, where in space: priors give way there
+    residual     RMS residual of the held-out blocks, expressed as the error of every voxel, independent of
+                 the others, that would cause it
+    sensitivity  change of the video when another quarter of the lines is held out and the solver continues
+                 from where it is: what few lines determine is least certain
+    change       contrast of the video in time, and edge, in space: priors fail there first
 
     log error = b₀ + log of a product of powers of these, of degree 1: in the video's own unit
 
-So by lines that are withheld. What was cut, what was fitted as patterns with a few curves, and what rests in
-voxels that are smaller than a camera's pixel explain the lines long before the picture is right, fewer of
-them as well as all. Such are judged by their prior, with powers of their own:
+Three kinds of video explain the lines long before the picture is right, with fewer lines as well as with all:
+those that were cut short, those fitted as patterns with a few curves, and stills in voxels smaller than a
+camera's pixel. They are judged by their prior instead, with exponents of their own:
 
-    missed  is what is missed of held-out blocks or of those used, whichever is more
-    moved   is how far the picture moves under a prior some times heavier: what the prior decides, not the
-            lines. It says more where it is more than missed: the lines of a still hang together, so that they
-            are explained by what is wrong
-    drifts  whether it moves on as it is, farther and farther: what was cut does
-    fine    whether it is for its voxels that it is judged so: clean lines are explained to a part in a
-            thousand where they are some percent off
+    residual     the residual of the held-out blocks or of those used, whichever is larger
+    sensitivity  change of the video under a prior several times heavier: what the prior determines, not the
+                 lines. It counts more where it exceeds the residual: neighbouring lines of a still are so
+                 alike that a wrong still explains them, too
+    drift        whether the video moves farther and farther as its solver continues, as one cut short does
+    fine         whether small voxels are the reason for judging by the prior: they explain clean lines to a
+                 part in a thousand while they are some percent off
 
-The powers, and how far estimates are off in nine of ten cases, are found by ``tools/bench_error.py --fit`` on
-scenes of motion, lamps, photographs and stills, each estimated by powers fitted to the others. No estimate
-is made of light beyond the band, nor of lines that are not what their description says: neither shows in
-these.
+The exponents, and the factors within which nine of ten estimates lie, are fitted by
+``tools/bench_error.py --fit`` to scenes of motion, lamps, photographs and stills, each estimated with
+exponents fitted to the others. No error is estimated where light is faster than the band or where the lines
+contradict their description: neither shows in these indicators.
 """
 
 from __future__ import annotations
@@ -44,93 +44,101 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 REGIONS = 8
-"""Along rows and along columns, of equal size."""
+"""Number of regions along rows and along columns, of equal size."""
 BRIGHT = 0.999
-"""Quantile of the voxels that is the full scale."""
+"""Quantile of the voxels that defines the full scale."""
 
 
 @dataclass(frozen=True, slots=True)
-class Powers:
-    """Of what an error is estimated from: of the whole video's, and of each region's beside the whole's."""
+class Exponents:
+    """Exponents of the indicators: of the whole video, and of a region or a frame relative to the whole."""
 
     constant: float
-    moved: float
-    beyond: float
-    """Of what the picture moved by, as far as that is more than what the lines are missed by."""
-    drifts: float
+    sensitivity: float
+    excess: float
+    """Of the sensitivity over the residual, where it is larger."""
+    drift: float
     fine: float
-    fine_beyond: float
-    moved_here: float
-    change_here: float
-    edge_here: float
-    moved_now: float
-    """Of a frame's beside the whole's."""
-    faint: float
-    """Of the full scale: what a region is at least taken to move or change by."""
+    fine_excess: float
+    local_sensitivity: float
+    local_change: float
+    local_edge: float
+    frame_sensitivity: float
+    """Of a frame relative to the whole."""
+    floor: float
+    """Smallest sensitivity, change and edge of a region, as a share of the full scale."""
     factors: tuple[float, float]
-    """By which the whole's error is smaller and larger than its estimate at the ends of nine of ten cases."""
+    """Interval of the whole's error, relative to its estimate, that holds nine of ten cases."""
     region_factors: tuple[float, float]
     frame_factors: tuple[float, float]
 
     @property
     def whole(self) -> NDArray[np.float64]:
-        powers = (self.constant, self.moved, self.beyond, self.drifts, self.fine, self.fine_beyond)
-        return np.array(powers)
+        exponents = (
+            self.constant,
+            self.sensitivity,
+            self.excess,
+            self.drift,
+            self.fine,
+            self.fine_excess,
+        )
+        return np.array(exponents)
 
 
-BY_LINES = Powers(
+BY_LINES = Exponents(
     constant=-0.002,
-    moved=0.49,
-    beyond=0.0,
-    drifts=0.0,
+    sensitivity=0.49,
+    excess=0.0,
+    drift=0.0,
     fine=0.0,
-    fine_beyond=0.0,
-    moved_here=0.244,
-    change_here=0.237,
-    edge_here=0.224,
-    moved_now=0.129,
-    faint=1e-3,
+    fine_excess=0.0,
+    local_sensitivity=0.244,
+    local_change=0.237,
+    local_edge=0.224,
+    frame_sensitivity=0.129,
+    floor=1e-3,
     factors=(0.59, 1.96),
     region_factors=(0.42, 2.13),
     frame_factors=(0.51, 1.74),
 )
-"""Fitted to 195 cases of 24 scenes (``tools/bench_error.py --fit``), which count alike. The factors are those
-of scenes that were left out of the fit."""
-BY_PRIOR = Powers(
+"""Fitted to 195 cases of 24 scenes of equal weight (``tools/bench_error.py --fit``). The factors are those of
+scenes that were left out of the fit."""
+BY_PRIOR = Exponents(
     constant=0.156,
-    moved=0.616,
-    beyond=0.281,
-    drifts=0.324,
+    sensitivity=0.616,
+    excess=0.281,
+    drift=0.324,
     fine=0.144,
-    fine_beyond=0.112,
-    moved_here=0.651,
-    change_here=0.117,
-    edge_here=0.187,
-    moved_now=0.373,
-    faint=2e-4,
+    fine_excess=0.112,
+    local_sensitivity=0.651,
+    local_change=0.117,
+    local_edge=0.187,
+    frame_sensitivity=0.373,
+    floor=2e-4,
     factors=(0.47, 2.45),
     region_factors=(0.262, 2.26),
     frame_factors=(0.42, 1.94),
 )
-"""Fitted likewise to 67 cases of 11 scenes. The whole's factors are not the fit's 0.64 and 1.65: codes that
-came later reached 0.47 and 2.41."""
+"""Fitted likewise to 67 cases of 11 scenes. The whole's factors are wider than the fit's 0.64 and 1.65,
+because codes tried later reached 0.47 and 2.41."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Clues:
+class Indicators:
     """What an error is estimated from, in the video's unit: RMS of frames and regions (time, 8, 8).
 
-    ``powers`` are for clues found like these. ``drifts`` is the power of the iterations made with which the
-    picture goes on to move: 1 for steady, 0 and less for what has ended.
+    ``exponents`` are those for indicators measured in this way. ``drift`` is the exponent with which the
+    change of the video grows with the number of further iterations: 1 for a steady drift, 0 or less for a
+    solver that has converged.
     """
 
-    powers: Powers
-    missed: float
+    exponents: Exponents
+    residual: float
     scale: float
-    moved: NDArray[np.float64]
+    sensitivity: NDArray[np.float64]
     change: NDArray[np.float64]
     edge: NDArray[np.float64]
-    drifts: float = 0.0
+    drift: float = 0.0
     fine: bool = False
 
 
@@ -140,12 +148,12 @@ class VideoError:
 
     Attributes
     ----------
-    rms : of all voxels of the trusted frames; ``low`` and ``high`` hold it in nine of ten scenes
-    full_scale : the brightest voxels, for shares
-    regions : (time, 8, 8) of each frame's regions, rows and columns in equal parts; calibrated for the
-        trusted frames alone. One region's error is within ``region_factors`` times it in nine of ten, that
-        of a frame within ``frame_factors``: which frame is worse than another is hardly told.
-    clues : what it was estimated from; ``processor_s`` what that took
+    rms : over all voxels of the trusted frames; ``low`` and ``high`` enclose it in nine of ten scenes
+    full_scale : the brightest voxels, to express errors as shares
+    regions : (time, 8, 8), of each frame's regions, rows and columns in equal parts; calibrated for the
+        trusted frames only. The error of a region is within ``region_factors`` times it in nine of ten cases,
+        that of a frame within ``frame_factors``. It ranks frames poorly.
+    indicators : what it was estimated from; ``processor_s`` is the processor time of that
     """
 
     rms: float
@@ -155,39 +163,39 @@ class VideoError:
     regions: NDArray[np.float32]
     region_factors: tuple[float, float]
     frame_factors: tuple[float, float]
-    clues: Clues
+    indicators: Indicators
     processor_s: float = 0.0
 
     @property
     def frames(self) -> NDArray[np.float32]:
-        """(time,) of each frame."""
+        """Error of each frame (time,)."""
         return np.asarray(np.sqrt(np.square(self.regions).mean((1, 2))), np.float32)
 
     @property
     def sentence(self) -> str:
-        """As ``about 3 % of full scale (2 to 5 % in nine of ten)``."""
+        """The error in words, as ``about 3 % of full scale (2 to 5 % in nine of ten)``."""
         return error_in_words(self.facts())
 
     def facts(self) -> dict[str, Any]:
-        """As JSON, without the frames."""
+        """The error as JSON, without the frames."""
         whole = {"rms": self.rms, "low": self.low, "high": self.high, "full_scale": self.full_scale}
         return whole | {"region_factors": self.region_factors, "frame_factors": self.frame_factors}
 
 
 def error_facts(error: VideoError | str) -> dict[str, Any]:
-    """As JSON; ``unknown`` is why it cannot be told."""
+    """The error as JSON; ``unknown`` is the reason why there is no estimate."""
     return {"unknown": error} if isinstance(error, str) else error.facts()
 
 
-def in_frames(error: VideoError | str, frames: int) -> NDArray[np.float32]:
-    """(time, 8, 8) of every frame's regions; NaN where it cannot be told."""
+def regions_of(error: VideoError | str, frames: int) -> NDArray[np.float32]:
+    """Errors (time, 8, 8) of every frame's regions; NaN if there is no estimate."""
     if isinstance(error, str):
         return np.full((frames, REGIONS, REGIONS), np.nan, np.float32)
     return error.regions
 
 
-def together(parts: Sequence[Mapping[str, Any]], weights: Sequence[float]) -> dict[str, Any]:
-    """The facts of a video of several sub-segments, which count with ``weights``; unknown where one's is."""
+def combined_facts(parts: Sequence[Mapping[str, Any]], weights: Sequence[float]) -> dict[str, Any]:
+    """The facts of a video of several sub-segments with these ``weights``; unknown if that of one is."""
     for part in parts:
         if "unknown" in part:
             return dict(part)
@@ -198,87 +206,86 @@ def together(parts: Sequence[Mapping[str, Any]], weights: Sequence[float]) -> di
     return {**parts[0], **found, "full_scale": max(part["full_scale"] for part in parts)}
 
 
-def find_clues(
+def measure_indicators(
     video: NDArray[Any],
-    moved: NDArray[Any],
-    missed: float,
+    changed: NDArray[Any],
+    residual: float,
     trusted: slice,
-    powers: Powers,
+    exponents: Exponents,
     *,
-    grown: float = 1.0,
-    drifts: float = 0.0,
+    growth: float = 1.0,
+    drift: float = 0.0,
     fine: bool = False,
-) -> Clues | None:
-    """From a video, and what it moved to; ``grown`` times as far had no budget ended it.
+) -> Indicators | None:
+    """Measure the indicators of a video and of what it ``changed`` to.
 
-    None for one that is dark or explained without any error.
+    ``growth`` is the factor by which the change would be larger if no budget had cut the iterations. None if
+    the video is dark or its residual is 0.
     """
     shown = video[trusted]
     scale = full_scale(shown)
-    if not (scale > 0 and missed > 0):
+    if not (scale > 0 and residual > 0):
         return None
-    faint = powers.faint * scale
+    floor = exponents.floor * scale
     change, edge = shown - shown.mean(0), np.zeros_like(shown)
     edge[:, :-1] += np.square(np.diff(shown, axis=1))
     edge[:, :, :-1] += np.square(np.diff(shown, axis=2))
-    return Clues(
-        powers,
-        missed,
+    return Indicators(
+        exponents,
+        residual,
         scale,
-        np.sqrt(grown**2 * in_regions(np.square(moved - video)) + faint**2),
-        np.sqrt(in_regions(np.square(change)).mean(0) + faint**2),
-        np.sqrt(in_regions(edge).mean(0) + faint**2),
-        drifts,
-        fine,
+        sensitivity=np.sqrt(growth**2 * in_regions(np.square(changed - video)) + floor**2),
+        change=np.sqrt(in_regions(np.square(change)).mean(0) + floor**2),
+        edge=np.sqrt(in_regions(edge).mean(0) + floor**2),
+        drift=drift,
+        fine=fine,
     )
 
 
-def from_clues(clues: Clues, trusted: slice, powers: Powers | None = None) -> VideoError:
-    """What the clues amount to; with other powers than theirs, where given."""
-    powers = powers or clues.powers
-    here = np.sqrt(np.square(clues.moved[trusted]).mean(0))
-    whole, change, edge = (rms_of(each) for each in (here, clues.change, clues.edge))
-    off = np.exp(signs(whole, clues) @ powers.whole) * clues.missed
-    beside = (
-        (here / whole) ** powers.moved_here
-        * (clues.change / change) ** powers.change_here
-        * (clues.edge / edge) ** powers.edge_here
+def error_from(indicators: Indicators, trusted: slice, exponents: Exponents | None = None) -> VideoError:
+    """Estimate the error from its indicators, with their own exponents unless others are given."""
+    exponents = exponents or indicators.exponents
+    sensitivity = np.sqrt(np.square(indicators.sensitivity[trusted]).mean(0))
+    whole, change, edge = (rms_of(each) for each in (sensitivity, indicators.change, indicators.edge))
+    error = np.exp(log_indicators(whole, indicators) @ exponents.whole) * indicators.residual
+    relative = (
+        (sensitivity / whole) ** exponents.local_sensitivity
+        * (indicators.change / change) ** exponents.local_change
+        * (indicators.edge / edge) ** exponents.local_edge
     )
-    regions = off * beside / rms_of(beside)
-    now = (np.sqrt(np.square(clues.moved).mean((1, 2))) / whole) ** powers.moved_now
-    now /= rms_of(now[trusted])
-    low, high = powers.factors
+    regions = error * relative / rms_of(relative)
+    frame_rms = np.sqrt(np.square(indicators.sensitivity).mean((1, 2)))
+    frames = (frame_rms / whole) ** exponents.frame_sensitivity
+    frames /= rms_of(frames[trusted])
+    low, high = exponents.factors
     return VideoError(
-        float(off),
-        float(low * off),
-        float(high * off),
-        clues.scale,
-        (now[:, None, None] * regions).astype(np.float32),
-        powers.region_factors,
-        powers.frame_factors,
-        clues,
+        rms=float(error),
+        low=float(low * error),
+        high=float(high * error),
+        full_scale=indicators.scale,
+        regions=(frames[:, None, None] * regions).astype(np.float32),
+        region_factors=exponents.region_factors,
+        frame_factors=exponents.frame_factors,
+        indicators=indicators,
     )
 
 
-def signs(moved: float, clues: Clues) -> NDArray[np.float64]:
-    """Of the whole: logarithms beside what the lines are missed by, each to one of ``Powers.whole``."""
-    more = np.log(moved / clues.missed)
-    beyond = max(more, 0.0)
-    return np.array([1.0, more, beyond, clues.drifts, clues.fine, clues.fine * beyond])
+def log_indicators(sensitivity: float, indicators: Indicators) -> NDArray[np.float64]:
+    """Logarithms of the whole video's indicators over the residual, one for each of ``Exponents.whole``."""
+    log_ratio = np.log(sensitivity / indicators.residual)
+    excess = max(log_ratio, 0.0)
+    fine = indicators.fine
+    return np.array([1.0, log_ratio, excess, indicators.drift, fine, fine * excess])
 
 
 def in_regions(frames: NDArray[Any]) -> NDArray[np.float64]:
-    """Means (time, 8, 8) of frames (time, row, column); voxels that two share count with their shares."""
-    share = _shares(frames.shape[1])
-    return np.asarray(np.einsum("ay,tyx,bx->tab", share, frames, share, optimize=True), np.float64)
-
-
-def _shares(side: int) -> NDArray[np.float64]:
-    """Of each voxel in each region (8, side), summing to 1."""
+    """Means (time, 8, 8) of frames (time, row, column); a voxel in two regions counts with its shares."""
+    side = frames.shape[1]
     edges, voxel = np.linspace(0, side, REGIONS + 1), np.arange(side)
     overlap = np.minimum(edges[1:, None], voxel + 1) - np.maximum(edges[:-1, None], voxel)
     held = np.maximum(overlap, 0)
-    return np.asarray(held / held.sum(1, keepdims=True))
+    share = np.asarray(held / held.sum(1, keepdims=True))
+    return np.asarray(np.einsum("ay,tyx,bx->tab", share, frames, share, optimize=True), np.float64)
 
 
 def rms_of(values: NDArray[Any]) -> float:
@@ -286,9 +293,6 @@ def rms_of(values: NDArray[Any]) -> float:
 
 
 def full_scale(video: NDArray[Any]) -> float:
-    return float(np.quantile(video[:, :: _thin(video), :: _thin(video)], BRIGHT))
-
-
-def _thin(video: NDArray[Any]) -> int:
-    """Every how many rows and columns are enough to find a quantile: some millions of voxels."""
-    return max(1, int((video.size / 4e6) ** 0.5))
+    """Brightness of the brightest voxels: a quantile of some millions of them, which is enough."""
+    step = max(1, int((video.size / 4e6) ** 0.5))
+    return float(np.quantile(video[:, ::step, ::step], BRIGHT))

@@ -1,4 +1,4 @@
-"""What solvers end with: a video and the lines that it predicts, however they hold it."""
+"""Estimates, the results of solvers: a video and the lines that it predicts, however they are stored."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 
 class Estimate(Protocol):
-    """A solver's state of knowledge: dimensionless video, and the lines that it predicts."""
+    """A solver's result: a dimensionless video, and the lines that it predicts."""
 
     held_out_error: float | None
-    """Relative error of the samples held out while they were; None: that of `predict`."""
+    """Relative error of the held-out samples before they were put to use; None: that of `predict`."""
 
     def predict(self) -> NDArray[Any]: ...
 
@@ -31,8 +31,8 @@ class Estimate(Protocol):
     def facts(self) -> dict[str, Any]: ...
 
 
-class Onward(Protocol):
-    """A solver that goes on from an estimate: an iteration, and the dimensionless video as it is now."""
+class Continuation(Protocol):
+    """A solver that continues an estimate: `step` is an iteration, `video` the dimensionless video so far."""
 
     def step(self) -> None: ...
 
@@ -40,17 +40,22 @@ class Onward(Protocol):
 
 
 @runtime_checkable
-class GoesOn(Protocol):
-    """An estimate that can be gone on with, which is how the error of a video is estimated (`error`)."""
+class Continuable(Protocol):
+    """An estimate whose solver can be continued, which is how the error of a video is estimated (`error`)."""
 
-    def onward(self, problem: Problem, heavier: float = 1.0, *, still: bool = False) -> Onward | None:
-        """On a problem's samples, with a prior that is so many times ``heavier``; with ``still``, that which
-        a change is beside, too. None where this one cannot. The estimate stays as it is."""
+    def continue_with(
+        self, problem: Problem, heavier: float = 1.0, *, still: bool = False
+    ) -> Continuation | None:
+        """Continue with a problem's samples and a prior that is ``heavier`` by this factor; None if
+        impossible.
+
+        With ``still``, the still that a change is added to continues as well. The estimate stays as it is.
+        """
         ...
 
 
 class InBand:
-    """Coefficient frames of an iterative solver as an estimate."""
+    """Estimate held as the coefficient frames of an iterative solver."""
 
     held_out_error: float | None = None
 
@@ -77,21 +82,21 @@ class InBand:
     def step(self) -> None:
         self.solver.step()
 
-    def onward(
+    def continue_with(
         self,
         problem: Problem,
         heavier: float = 1.0,
         *,
-        still: bool = False,  # noqa: ARG002
+        still: bool = False,  # noqa: ARG002 (the protocol's; nothing here is added to a still)
     ) -> InBand | None:
         if not isinstance(self.solver, Admm):
             return None
-        solver = self.solver.on(problem.masked(self._operator), problem.used_samples, heavier)
+        solver = self.solver.with_problem(problem.masked(self._operator), problem.used_samples, heavier)
         return InBand(solver, self._operator, self.basis, problem, self._parameters)
 
 
 class Refined:
-    """A refinement as an estimate."""
+    """Estimate held as the patterns and curves of a refinement."""
 
     held_out_error: float | None = None
 
@@ -108,18 +113,18 @@ class Refined:
         found = {"temporal_coefficients": self._coefficients, "patterns": self._refinement.rank}
         return found | asdict(self._refinement.parameters)
 
-    def onward(
+    def continue_with(
         self,
         problem: Problem,
         heavier: float = 1.0,
         *,
-        still: bool = False,  # noqa: ARG002
+        still: bool = False,  # noqa: ARG002 (the protocol's; nothing here is added to a still)
     ) -> Refinement:
-        return self._refinement.on(problem, heavier)
+        return self._refinement.with_problem(problem, heavier)
 
 
 class Preferred:
-    """An estimate with the candidates that it was preferred to."""
+    """An estimate together with the record of the candidates that it was preferred to."""
 
     def __init__(self, estimate: Estimate, record: list[dict[str, Any]]) -> None:
         self._estimate, self._record, self.held_out_error = estimate, record, estimate.held_out_error
@@ -128,6 +133,9 @@ class Preferred:
     def facts(self) -> dict[str, Any]:
         return self._estimate.facts() | {"prior": "cosines", "candidates": self._record}
 
-    def onward(self, problem: Problem, heavier: float = 1.0, *, still: bool = False) -> Onward | None:
-        estimate = self._estimate
-        return estimate.onward(problem, heavier, still=still) if isinstance(estimate, GoesOn) else None
+    def continue_with(
+        self, problem: Problem, heavier: float = 1.0, *, still: bool = False
+    ) -> Continuation | None:
+        if not isinstance(self._estimate, Continuable):
+            return None
+        return self._estimate.continue_with(problem, heavier, still=still)

@@ -1,14 +1,14 @@
-"""One arm's lines as a Gaussian process: what a code and a geometry say of them, in closed form.
+"""Gaussian process model of one arm's lines under a code and a geometry, in closed form.
 
-Scene light is taken to be Gaussian, with a covariance that is a product over rows, columns and time::
+The light of the scene is taken as Gaussian, with a covariance that is a product over rows, columns and time::
 
     x(r, c, t) = u + Σ_k cos_k(t)·θ_k(r, c),    cov θ_k = a_k·exp(−|Δr|/ℓ)·exp(−|Δc|/ℓ)
 
-Lines are linear in it, the same map F for every pixel of both arms, so that their covariance is
-G(line, line') ⊗ exp(−|Δc|/ℓ) + noise: two small eigendecompositions give the likelihood of all samples, the
-most likely scene, and what each arm alone foretells of the other, without an iteration. Level u and scale are
-fitted. No such prior makes a good picture; but lines that a code did not make are unlikely under any of them,
-and that is what is asked here.
+Lines are linear in it, by the same map F for every pixel of both arms, so that their covariance is G(line,
+line') ⊗ exp(−|Δc|/ℓ) + noise: two small eigendecompositions give the likelihood of all samples, the most
+likely scene, and each arm's prediction of the other, without iterations. The level u and the scale are
+fitted. No such prior makes a good picture; but lines that were made by another code are unlikely under any of
+them, which is all that is needed here.
 """
 
 from __future__ import annotations
@@ -25,18 +25,21 @@ if TYPE_CHECKING:
     Floats = NDArray[np.float64]
 
 FINE, SLOW, FAST = 4, 16, 128
-"""Cosines that are seen in fine rows, in rows as wide as pixels, and in few: sharp edges that stand still
-would look like a delay if they lay between blocks."""
+"""Numbers of cosines that are resolved in fine rows, in rows as wide as pixels, and in few rows: sharp edges
+at rest would look like a delay if they fell between blocks."""
 FAST_ROWS = 16
 BLOCK_LINES = 24
-"""Evidence is counted in blocks of lines, whose spread is its uncertainty."""
+"""Length of the blocks of lines in which evidence is counted; their spread gives its uncertainty."""
 SMALLEST = 1e-30
 
 
 @dataclass(frozen=True, slots=True)
 class Prior:
-    """``length``: ℓ as a share of the picture; a_k = ``change``/(1 + (k/``fast``)²) beside a_0 = 1;
-    ``noise``: variance of a sample's noise beside that of its light."""
+    """Parameters of the covariance.
+
+    ``length``: ℓ as a share of the picture; a_0 = 1 and a_k = ``change``/(1 + (k/``fast``)²); ``noise``:
+    variance of a sample's noise relative to that of its light.
+    """
 
     length: float
     change: float
@@ -55,21 +58,21 @@ LADDER = tuple(
     for length in (0.02, 0.06, 0.2)
     for change, fast in ((1e-4, 1.0), (0.03, 3.0), (0.3, 3.0), (1.0, 3.0), (0.03, 40.0), (0.3, 40.0))
 )
-"""From a fine still to all that is smooth and fast; the noise of each is the best of `NOISES`."""
+"""From a fine still to a smooth and fast scene; the noise of each is the best of `NOISES`."""
 NOISES = (1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 
 
 def correlation(count: int, length: float) -> Floats:
-    """exp(−|Δ|/ℓ) of ``count`` neighbours that tile the picture."""
+    """Matrix of exp(−|Δ|/ℓ) between ``count`` neighbours that tile the picture."""
     at = (np.arange(count) + 0.5) / count
     return np.exp(-np.abs(at[:, None] - at) / length)
 
 
 class Response:
-    """F: what lines see of each row block and cosine, if ``code`` (T,) is what was shone.
+    """F: response of the lines to each row block and cosine, under ``code`` (T,).
 
-    ``rows`` are fine rows of the scene, ``substeps`` those of a line, ``lines`` how many, ``pixels`` those
-    of a line, and ``finer`` row blocks to each of them are the finest.
+    ``rows`` is the number of fine rows of the scene, ``substeps`` that of a line, ``pixels`` that of a line,
+    and ``finer`` the number of finest row blocks per pixel.
     """
 
     def __init__(self, code: Floats, rows: int, substeps: int, lines: int, pixels: int, finer: int) -> None:
@@ -78,10 +81,12 @@ class Response:
         cosines = np.sqrt(2) * np.cos(np.pi * k * (np.arange(len(code)) + 0.5) / len(code))
         cosines[0] = 1
         lit = (cosines * code).T
-        summed = _window_sums(lit, substeps)
-        running = np.concatenate([np.zeros((1, FAST)), np.cumsum(summed, axis=0)])
+        # light in each window of S sub-steps, summed over time
+        running = np.concatenate([np.zeros((1, FAST)), np.cumsum(lit, axis=0)])
+        windows = running[substeps:] - running[:-substeps]
+        running = np.concatenate([np.zeros((1, FAST)), np.cumsum(windows, axis=0)])
         first = (np.arange(lines) * substeps)[:, None]
-        # float32: the products with these are where the time goes, and the noise is far above its rounding
+        # float32: the products with these take most of the time, and the noise is far above its rounding
         tiers = ((0, FINE, pixels * finer), (FINE, SLOW, pixels), (SLOW, FAST, min(pixels, FAST_ROWS)))
         self.tiers = [
             (slice(begin, end), _block_sums(running[:, begin:end], first, rows, blocks).astype(np.float32))
@@ -99,30 +104,25 @@ class Response:
         return total.astype(np.float64)
 
 
-def _window_sums(values: Floats, width: int) -> Floats:
-    running = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
-    return np.asarray(running[width:] - running[:-width])
-
-
 def _block_sums(running: Floats, first: NDArray[np.int64], rows: int, blocks: int) -> Floats:
-    """(line, block, cosine) of running sums in time: row r is exposed r sub-steps after a line's first."""
+    """Sums (line, block, cosine) of running sums in time: row r is exposed r sub-steps after the first."""
     edges = np.linspace(0, rows, blocks + 1).round().astype(np.int64)
     return np.diff(running[first + edges], axis=1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Fit:
-    """One arm under a model: ``level`` u, ``scale`` (variance), log likelihood ``blocks`` by blocks of lines.
+    """Fit of one arm: ``level`` u, ``scale`` (variance), log likelihood in ``blocks`` of lines.
 
-    ``modes`` are the lines about their level in the covariance's eigenvectors; ``told``: the amount of what
-    somebody foretold.
+    ``modes`` are the lines minus their level in the covariance's eigenvectors; ``amount`` is the coefficient
+    of the other arm's prediction.
     """
 
     modes: Floats
     level: float
     scale: float
     blocks: Floats
-    told: float = 0.0
+    amount: float = 0.0
 
     @property
     def evidence(self) -> float:
@@ -162,7 +162,7 @@ class Model:
 
     @cached_property
     def _level(self) -> Floats:
-        """A uniform steady scene's lines, as modes."""
+        """Modes of the lines of a uniform steady scene."""
         return self.modes(np.broadcast_to(self.response.flat[:, None], (self.response.lines, self.pixels)))
 
     @property
@@ -176,17 +176,17 @@ class Model:
         """The likelihood of ``lines``."""
         return self._explained(self.modes(lines), [self._level])
 
-    def informed(self, fit: Fit, foretold: Floats) -> Fit:
-        """The same lines where part is ``foretold`` by somebody, believed as far as that is worth it."""
-        better = self._explained(fit.modes, [self._level, self.modes(foretold)])
-        return better if better.told > 0 else fit
+    def informed(self, fit: Fit, predicted: Floats) -> Fit:
+        """The fit of the same lines with a prediction as a regressor, if its coefficient is positive."""
+        better = self._explained(fit.modes, [self._level, self.modes(predicted)])
+        return better if better.amount > 0 else fit
 
     def _explained(self, modes: Floats, regressors: list[Floats]) -> Fit:
         amounts, _ = self.regress(modes, regressors)
         rest = modes - sum(amount * each for amount, each in zip(amounts, regressors, strict=True))
         scale = max(float((rest**2 / self._variance).mean()), SMALLEST)
-        told = float(amounts[1]) if len(amounts) > 1 else 0.0
-        return Fit(rest, float(amounts[0]), scale, self._blocks(rest, scale), told)
+        amount = float(amounts[1]) if len(amounts) > 1 else 0.0
+        return Fit(rest, float(amounts[0]), scale, self._blocks(rest, scale), amount)
 
     def evidence(self, modes: Floats) -> float:
         """Log likelihood of lines given as modes."""
@@ -196,7 +196,7 @@ class Model:
         return -0.5 * float(rest.size * (1 + np.log(scale)) + np.log(self._variance).sum())
 
     def regress(self, modes: Floats, regressors: list[Floats]) -> tuple[Floats, Floats]:
-        """Amounts of ``regressors`` that explain ``modes`` best, and their covariance for a scale of 1."""
+        """Least-squares coefficients of ``regressors``, and their covariance for a scale of 1."""
         weighted = [each / self._variance for each in regressors]
         normal = np.array([[float((a * b).sum()) for b in regressors] for a in weighted])
         inverse = np.linalg.inv(normal + SMALLEST * np.eye(len(normal)))
@@ -204,7 +204,7 @@ class Model:
         return amounts.astype(np.float64), inverse.astype(np.float64)
 
     def _blocks(self, rest: Floats, scale: float) -> Floats:
-        """Log likelihood, shared among blocks of lines by their part in the quadratic form."""
+        """Log likelihood, divided among blocks of lines by their share of the quadratic form."""
         lines = self.response.lines
         values, pulled = self._vectors @ rest, self._vectors @ (rest / self._variance)
         per_line = (values * pulled).sum(1) / scale
@@ -225,7 +225,7 @@ class Model:
         parts[0][:, 0] += np.float32(fit.level)
         return np.concatenate(parts, axis=1)
 
-    def foretell(self, scene: NDArray[np.float32]) -> Floats:
+    def predict(self, scene: NDArray[np.float32]) -> Floats:
         """Lines (line, pixel) of a scene (fine row, cosine, pixel)."""
         total = np.zeros((self.response.lines, scene.shape[2]), np.float32)
         for cosines, factor in self.response.tiers[:2]:
@@ -235,7 +235,7 @@ class Model:
         return total.astype(np.float64)
 
     def constant(self, lines: Floats) -> tuple[float, float]:
-        """What every sample has that follows no code, and its standard error."""
+        """Constant light of every sample that does not follow the code, and its standard error."""
         modes = self.modes(lines)
         amounts, covariance = self.regress(modes, [self._level, self.modes(np.ones_like(lines))])
         rest = modes - amounts[0] * self._level - amounts[1] * self.modes(np.ones_like(lines))
@@ -244,7 +244,7 @@ class Model:
 
 
 def best_model(response: Response, arms: list[Floats]) -> Model:
-    """With the prior of the ladder under which the lines of all ``arms`` are likeliest."""
+    """The model with the prior of the ladder under which the lines of all ``arms`` are likeliest."""
     best: tuple[float, Model] | None = None
     for step in LADDER:
         model = Model.of(response, step, arms[0].shape[1])

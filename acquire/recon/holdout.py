@@ -1,8 +1,8 @@
-"""Samples kept from a solver to judge it: blocks of lines and pixels, not single samples.
+"""Held-out samples, by which a solver is judged: blocks of lines and pixels, not single samples.
 
-Line i ± 1 shares (n − S)/n of its light with line i, so that a single sample is told by its neighbours
-whatever the video is: predicting it is interpolation. Inside a block there are no such neighbours, and what
-predicts it is the scene.
+Line i ± 1 shares (n − S)/n of its light with line i, so that its neighbours predict a single sample whatever
+the video is: that is interpolation. Inside a block there are no such neighbours, and only the scene predicts
+it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 BLOCK_LINES, BLOCK_PIXELS = 24, 4
 FEWEST_BLOCKS = 8
-"""Fewer say too little: blocks of a small segment are made smaller until there are as many."""
+"""Fewer blocks are not significant: those of a small segment are made smaller until there are as many."""
 
 
 def held_out_blocks(
@@ -32,10 +32,12 @@ def held_out_blocks(
     lines: int = BLOCK_LINES,
     pixels: int = BLOCK_PIXELS,
 ) -> NDArray[np.bool_]:
-    """Usable samples in blocks of ``lines`` × ``pixels`` that hold about ``share`` of all: (2, L_R, M).
+    """Draw usable samples in blocks of ``lines`` × ``pixels`` that hold about ``share`` of all: (2, L_R, M).
 
-    Both arms are tiled, each from an origin of its own, and tiles drawn by ``seed``. None for a share of 0,
-    nor where so few would be drawn that not even single samples make it up.
+    Each arm is tiled from a random origin of its own, and its tiles are drawn by ``seed``. No sample is held
+    out for a share of 0, or if it amounts to less than single samples would.
+
+    Raises UsageError if the share is not in [0, 0.5], or a side of the blocks is not positive.
     """
     if not 0 <= share <= 0.5:
         raise UsageError(f"the held-out share cannot be {share}", possible="0 to 0.5")
@@ -44,22 +46,17 @@ def held_out_blocks(
             f"held-out blocks cannot have {lines} lines × {pixels} pixels", possible="1 or more of each"
         )
     rng = np.random.default_rng(seed)
-    size = _fitting(usable.size * share, lines, pixels)
-    drawn = np.stack([_drawn(arm.shape, size, share, rng) for arm in usable])
-    return usable & drawn
-
-
-def _fitting(samples: float, lines: int, pixels: int) -> tuple[int, int]:
-    """The block's size, halved along its longer side until enough blocks make up so many samples."""
-    while lines * pixels > 1 and samples < FEWEST_BLOCKS * lines * pixels:
+    # halve the longer side until there are enough blocks
+    while lines * pixels > 1 and usable.size * share < FEWEST_BLOCKS * lines * pixels:
         lines, pixels = (-(-lines // 2), pixels) if lines >= pixels else (lines, -(-pixels // 2))
-    return lines, pixels
+    drawn = np.stack([_drawn(arm.shape, (lines, pixels), share, rng) for arm in usable])
+    return usable & drawn
 
 
 def _drawn(
     shape: tuple[int, ...], size: tuple[int, int], share: float, rng: np.random.Generator
 ) -> NDArray[np.bool_]:
-    """One arm's tiles of ``size``, each drawn with probability ``share``, spread as evenly as a shuffle."""
+    """Mask of one arm's tiles of ``size``: a share of them, rounded at random, is drawn."""
     tiles = [-(-length // side) + 1 for length, side in zip(shape, size, strict=True)]
     count = tiles[0] * tiles[1]
     chosen = np.zeros(count, bool)
@@ -70,10 +67,10 @@ def _drawn(
 
 
 class HeldOut:
-    """Scores predictions of held-out blocks; samples count as far as the light they saw is trusted.
+    """Scores predictions of the held-out blocks, each sample weighted by the trusted share of its light.
 
-    The lines at a segment's ends see frames that few lines saw, which nothing can predict and nobody is
-    shown.
+    The lines at a segment's ends also integrate frames that few lines see: nothing can predict these, and
+    they are not shown.
     """
 
     def __init__(self, problem: Problem, geometry: Geometry) -> None:
@@ -82,35 +79,30 @@ class HeldOut:
         labels[1] = np.where(labels[1] > 0, labels[1] + labels[0].max(), 0)
         self._block = np.stack(labels)[mask]
         self._samples = problem.samples[mask].astype(np.float64)
-        self._weight = np.broadcast_to(_trusted_share(geometry)[:, None], mask.shape)[mask]
+        trusted, share = geometry.trusted_frames(1), np.ones(geometry.lines)
+        if trusted.start < trusted.stop:  # otherwise no sub-step is trusted, and all lines count alike
+            first = np.arange(geometry.lines) * geometry.substeps
+            length = geometry.size + geometry.substeps - 1
+            overlap = np.minimum(first + length, trusted.stop) - np.maximum(first, trusted.start)
+            share = np.maximum(overlap, 0) / length
+        self._weight = np.broadcast_to(share[:, None], mask.shape)[mask]
         self._mask = mask
         self._level = float(np.sum(self._weight * self._samples**2))
 
     def __bool__(self) -> bool:
-        """Whether there is anything to score by."""
+        """Whether there are held-out samples with light."""
         return self._level > 0
 
     def errors(self, predicted: NDArray[Any]) -> NDArray[np.float64]:
-        """Weighted sum of squares of each block."""
-        off = self._weight * (predicted[self._mask] - self._samples) ** 2
-        return np.asarray(np.bincount(self._block, off)[1:], np.float64)
+        """Weighted sum of squared errors of each block."""
+        squares = self._weight * (predicted[self._mask] - self._samples) ** 2
+        return np.asarray(np.bincount(self._block, squares)[1:], np.float64)
 
     def relative(self, errors: NDArray[np.float64]) -> float:
-        """Relative RMS error of all blocks."""
+        """Relative RMS error over all blocks."""
         return float(np.sqrt(errors.sum() / self._level)) if self._level > 0 else float("nan")
 
     def clearly_less(self, errors: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
-        """Whether errors are less by more than the standard error of the blocks' difference."""
+        """Whether ``errors`` are smaller by more than the standard error of the blocks' differences."""
         less = others - errors
         return bool(less.mean() > less.std() / max(len(less) - 1, 1) ** 0.5)
-
-
-def _trusted_share(geometry: Geometry) -> NDArray[np.float64]:
-    """Of each line's sub-steps, the share in the trusted interval; 1 where no sub-step is trusted."""
-    trusted = geometry.trusted_frames(1)
-    if trusted.stop <= trusted.start:
-        return np.ones(geometry.lines)
-    first = np.arange(geometry.lines) * geometry.substeps
-    length = geometry.size + geometry.substeps - 1
-    seen = np.minimum(first + length, trusted.stop) - np.maximum(first, trusted.start)
-    return np.asarray(np.maximum(seen, 0) / length)

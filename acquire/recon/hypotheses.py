@@ -1,12 +1,12 @@
-"""How well the lines agree with what is said of them: code, its place, arms' orientation, geometry.
+"""Evidence for hypotheses about the lines: code, its position, orientation of the arms, geometry.
 
-Two sorts of evidence, both log likelihoods in blocks of lines (`gaussian`):
+There are two kinds of evidence, both log likelihoods in blocks of lines (`gaussian`):
 
-    own       of each arm's lines, if that code was shone: no matter how the arm looks at the scene
-    mutual    what each arm's lines gain when the other arm's scene, turned as said, foretells them
+    own       likelihood of each arm's lines under the code, whatever the arm's orientation
+    mutual    gain of each arm's likelihood if the scene of the other arm, turned accordingly, predicts it
 
-An arm alone cannot tell a code that is late by d sub-steps from a scene that lies d rows off, nor a mirrored
-scene from one that is not: only the other arm, whose pixels are this one's rows, can.
+One arm alone cannot distinguish a code that is late by d sub-steps from a scene displaced by d rows, nor a
+mirrored scene from one that is not: only the other arm, whose pixels are this one's rows, can.
 """
 
 from __future__ import annotations
@@ -30,18 +30,20 @@ if TYPE_CHECKING:
     Scene = NDArray[np.float32]
 
 MOST_LINES = 320
-"""From the segment's middle: more cost more and tell little more."""
+"""Largest number of lines, from the segment's middle: more cost more and add little."""
 MOST_PIXELS = 64
-"""More are averaged to as many."""
+"""Largest number of pixels of a line; more are averaged to as many."""
 MOST_BLOCKS = 192
-"""Of rows: fine rows as far as these."""
+"""Largest number of row blocks; below it there is one for each fine row."""
 UNKNOWN_BIT = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """How arm B sees the scene of arm A: ``across``: along the other axis, as it should; then its rows
-    and its pixels in the other order than they should be."""
+    """How arm B sees the scene of arm A.
+
+    ``across``: along the other axis, as it should; ``rows`` and ``pixels``: with these in reverse order.
+    """
 
     across: bool = True
     rows: bool = False
@@ -49,19 +51,19 @@ class Turn:
 
     def to_b(self, scene: Scene) -> Scene:
         """Arm A's scene (row, cosine, pixel) as arm B sees it."""
-        seen = _transposed(scene)[::-1] if self.across else scene
-        seen = seen[::-1] if self.rows else seen
-        return seen[:, :, ::-1] if self.pixels else seen
+        view = _transposed(scene)[::-1] if self.across else scene
+        view = view[::-1] if self.rows else view
+        return view[:, :, ::-1] if self.pixels else view
 
     def to_a(self, scene: Scene) -> Scene:
-        """Arm B's as arm A sees it."""
-        seen = scene[:, :, ::-1] if self.pixels else scene
-        seen = seen[::-1] if self.rows else seen
-        return _transposed(seen[::-1]) if self.across else seen
+        """Arm B's scene as arm A sees it."""
+        view = scene[:, :, ::-1] if self.pixels else scene
+        view = view[::-1] if self.rows else view
+        return _transposed(view[::-1]) if self.across else view
 
 
 def _transposed(scene: Scene) -> Scene:
-    """Rows, which are as many times finer, for pixels, whose light is held over them."""
+    """The scene with rows and pixels exchanged; rows are several times finer: averaged and repeated."""
     rows, cosines, pixels = scene.shape
     finer = rows // pixels
     merged = scene.reshape(pixels, finer, cosines, pixels).mean(1, dtype=np.float32)
@@ -79,28 +81,31 @@ TURNS = tuple(
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """What may be the case. ``late``: sub-steps by which the lines of arm A, B are late against the code;
-    ``substeps``: S, where it is not the segment's; ``strange``: a random code of that number in its place."""
+    """A possible description of the lines.
+
+    ``late``: sub-steps by which the lines of arm A, B are late against the code; ``substeps``: S, if it is
+    not the segment's; ``random_code``: number of a random code that replaces the segment's, or 0.
+    """
 
     inverted: bool = False
     late: tuple[int, int] = (0, 0)
     turn: Turn = AS_BUILT
     substeps: int | None = None
-    strange: int = 0
+    random_code: int = 0
 
     @property
     def changes(self) -> int:
-        """In how many points it differs from what is said."""
+        """Number of points in which it differs from the segment's description."""
         return self.inverted + (self.late != (0, 0)) + (self.turn != AS_BUILT)
 
 
-Said = tuple[bool, int, int, int]
-"""A hypothesis without turn, of one arm, as `Witness` remembers it."""
+Exposure = tuple[bool, int, int, int]
+"""The part of a hypothesis that affects one arm alone: inverted, late, S, random code."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Evidence:
-    """Log likelihoods in blocks of lines (2·blocks,), arm A's first; see the module."""
+    """Log likelihoods in blocks of lines (2·blocks,), those of arm A first; see the module."""
 
     own: Floats
     mutual: Floats
@@ -110,11 +115,11 @@ class Evidence:
         return self.own + self.mutual
 
 
-class Witness:
-    """The lines of both arms of a segment, to be asked about hypotheses; remembers what it worked out.
+class LineModel:
+    """Gaussian model of the lines of both arms, which gives the evidence for hypotheses; caches its results.
 
-    ``bits(start, length)`` are the code's, counted from the segment's first; else those of the segment, and
-    what lies beyond it is unknown.
+    ``bits(start, length)`` returns bits of the code, counted from the segment's first one; if None, bits
+    beyond the segment's are unknown.
     """
 
     def __init__(self, segment: Segment, bits: Callable[[int, int], NDArray[np.uint8]] | None = None) -> None:
@@ -126,17 +131,16 @@ class Witness:
         self._view = lru_cache(maxsize=64)(self._make_view)
         self._prior: Prior | None = None
 
-    def settle(self, hypothesis: Hypothesis = Hypothesis()) -> Prior:
-        """From now on everything is judged under the prior that suits this hypothesis best."""
-        said = (hypothesis.inverted, hypothesis.late[0], hypothesis.substeps or self.substeps, 0)
-        response = self._response(*said)
-        found = best_model(response, list(self.arms)).prior
+    def fit_prior(self, hypothesis: Hypothesis = Hypothesis()) -> Prior:
+        """Judge everything from now on under the prior that suits this hypothesis best, and return it."""
+        exposure = (hypothesis.inverted, hypothesis.late[0], hypothesis.substeps or self.substeps, 0)
+        found = best_model(self._response(*exposure), list(self.arms)).prior
         self.prior = found
         return found
 
     @property
     def prior(self) -> Prior | None:
-        """What everything is judged under; None before anything was settled."""
+        """The prior that everything is judged under; None before one was fitted."""
         return self._prior
 
     @prior.setter
@@ -148,33 +152,31 @@ class Witness:
         views = [self.view(hypothesis, arm) for arm in (0, 1)]
         own = [view.fits[arm].blocks for arm, view in enumerate(views)]
         turn = hypothesis.turn
-        told = (turn.to_a(views[1].scene(1)), turn.to_b(views[0].scene(0)))
-        gain = [view.gain(arm, each) for arm, (view, each) in enumerate(zip(views, told, strict=True))]
+        scenes = (turn.to_a(views[1].scene(1)), turn.to_b(views[0].scene(0)))
+        gain = [view.gain(arm, each) for arm, (view, each) in enumerate(zip(views, scenes, strict=True))]
         return Evidence(np.concatenate(own), np.concatenate(gain))
 
     def view(self, hypothesis: Hypothesis, arm: int) -> View:
         substeps = hypothesis.substeps or self.substeps
-        return self._view(hypothesis.inverted, hypothesis.late[arm], substeps, hypothesis.strange)
+        return self._view(hypothesis.inverted, hypothesis.late[arm], substeps, hypothesis.random_code)
 
-    def _make_view(self, *said: *Said) -> View:
-        if self.prior is None:
-            self.settle()
-        assert self.prior is not None
-        return View(Model.of(self._response(*said), self.prior, self.pixels), self.arms)
+    def _make_view(self, *exposure: *Exposure) -> View:
+        prior = self.prior or self.fit_prior()
+        return View(Model.of(self._response(*exposure), prior, self.pixels), self.arms)
 
-    def _response(self, inverted: bool, late: int, substeps: int, strange: int) -> Response:
+    def _response(self, inverted: bool, late: int, substeps: int, random_code: int) -> Response:
         rows = self.stages * substeps
         span = substeps * (self.lines + self.stages) - 1
         code = self._bits(substeps * self.first - late, span).astype(np.float64)
-        if strange:
-            code = np.random.default_rng(strange).integers(0, 2, span).astype(np.float64)
+        if random_code:
+            code = np.random.default_rng(random_code).integers(0, 2, span).astype(np.float64)
         finer = max(1, min(rows, MOST_BLOCKS) // self.pixels)
         lit = 1 - code if inverted else code
         return Response(lit, rows, substeps, self.lines, self.pixels, finer)
 
 
 class View:
-    """Both arms under one code: their fits, and the scenes that these imply."""
+    """Both arms under one code: their fits, and the scenes that follow from them."""
 
     def __init__(self, model: Model, arms: tuple[Floats, Floats]) -> None:
         self.model = model
@@ -186,14 +188,14 @@ class View:
             self._scenes[arm] = self.model.scene(self.fits[arm])
         return self._scenes[arm]
 
-    def gain(self, arm: int, told: Scene) -> Floats:
-        """What an arm's lines gain in likelihood by a scene that the other tells, in blocks of lines."""
-        informed = self.model.informed(self.fits[arm], self.model.foretell(told))
+    def gain(self, arm: int, scene: Scene) -> Floats:
+        """Gain of an arm's log likelihood by the other arm's ``scene``, in blocks of lines."""
+        informed = self.model.informed(self.fits[arm], self.model.predict(scene))
         return np.asarray(informed.blocks - self.fits[arm].blocks)
 
 
 def padded(code: NDArray[np.uint8]) -> Callable[[int, int], NDArray[np.float64]]:
-    """The bits of a segment by index; half lit where they are not known."""
+    """The bits of a segment by index; 0.5 where they are unknown."""
 
     def bits(start: int, length: int) -> NDArray[np.float64]:
         found = np.full(length, UNKNOWN_BIT)
@@ -206,16 +208,18 @@ def padded(code: NDArray[np.uint8]) -> Callable[[int, int], NDArray[np.float64]]
 
 
 def prepared_lines(segment: Segment) -> tuple[int, tuple[Floats, Floats]]:
-    """The first line, and the lines (line, pixel) of each arm that are looked at, in units of the scene.
+    """The first of the lines that are used, and these lines (line, pixel) of each arm, in units of the scene.
 
-    Samples that are masked are interpolated along the lines: few do no harm.
+    Masked samples are interpolated along time, which does no harm for a few.
     """
     length = min(segment.geometry.lines, MOST_LINES)
     first = (segment.geometry.lines - length) // 2
     samples = segment.samples(np.float64)[:, first : first + length]
     mask = segment.mask[:, first : first + length] & np.isfinite(samples)
+    stages = segment.geometry.stages
+    edges = np.linspace(0, stages, min(MOST_PIXELS, stages) + 1).round().astype(int)
     a, b = (
-        _merged(_filled(arm, known), min(MOST_PIXELS, segment.geometry.stages))
+        np.asarray(np.add.reduceat(_filled(arm, known), edges[:-1], axis=1) / np.diff(edges))
         for arm, known in zip(samples, mask, strict=True)
     )
     return first, (a, b)
@@ -231,13 +235,8 @@ def _filled(lines: Floats, known: NDArray[np.bool_]) -> Floats:
     return out
 
 
-def _merged(lines: Floats, pixels: int) -> Floats:
-    edges = np.linspace(0, lines.shape[1], pixels + 1).round().astype(int)
-    return np.asarray(np.add.reduceat(lines, edges[:-1], axis=1) / np.diff(edges))
-
-
 def compare(one: Floats, other: Floats) -> tuple[float, float]:
-    """By how much ``one`` is likelier than ``other``, and that in standard errors over the blocks."""
+    """Log likelihood of ``one`` over ``other``, and the same in standard errors over the blocks."""
     difference = one - other
     spread = float(difference.std(ddof=1)) if len(difference) > 1 else np.inf
     total = float(difference.sum())

@@ -1,4 +1,4 @@
-"""What can be said of a video without the truth: an error per frame, and what a user should be told."""
+"""Judgement of a video without the truth: a residual for each frame, and warnings for the user."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from acquire.recon.suspects import black_level_off, unusable
+from acquire.recon.sanity import black_level_off, unusable
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -17,62 +17,66 @@ if TYPE_CHECKING:
     from acquire.recon.result import Quality
 
 POOR_MISFIT = 0.15
-"""Too few iterations, and lines that are no TDI's, end above it. Below it all may be wrong nevertheless: a
-wrong code or orientation ends at 2 to 7 %, since the voxels are many; `diagnosis` tells them apart."""
+"""Relative residual above which a video is bad for certain: too few iterations, and lines that are not from
+TDI cameras, end above it. A video below it may still be wrong: a wrong code or orientation ends at 2 to 7 %,
+because there are many voxels; `diagnosis` tells these apart."""
 WORTH_SAYING = 0.01
-"""Of the lines, beyond their noise: less is a detail, 40 dB below them, which noise-free lines have, too."""
+"""Smallest relative residual to report: less is a detail, 40 dB below the lines, that noise-free lines have,
+too."""
 POOR_COVERAGE = 0.8
 DENSITY = (0.1, 0.9)
-"""Codes outside leave frames unseen, or all alike."""
+"""Range of the share of lit sub-steps; codes outside leave frames unseen, or make them all alike."""
 
 
 def frame_error(
     problem: Problem, predicted: NDArray[Any], geometry: Geometry, temporal_merge: int
 ) -> NDArray[np.float32]:
-    """Relative RMS residual of the samples that saw each frame (⌈T/T_m⌉,); NaN where none did.
+    """Relative RMS residual of the samples that saw each frame (⌈T/T_m⌉,); NaN if none did.
 
-    It tells lines that are not explained from those that are, and no more. Lines cannot see all of a frame:
-    on simulated scenes the voxels' relative error was 1.5 to 13 times it, and the frames with the largest
-    residual were not always the worst.
+    It separates lines that are explained from those that are not, and no more, because lines do not determine
+    all of a frame: on simulated scenes the voxels' relative error was 1.5 to 13 times this residual, and the
+    frames with the largest residual were not always the worst.
     """
-    usable = (problem.weight > 0) | problem.held_out
-    off = np.where(usable, predicted - problem.samples, 0).astype(np.float64)
+    usable = problem.usable
+    error = np.where(usable, predicted - problem.samples, 0).astype(np.float64)
     per_line = np.stack(
-        [np.square(off).sum((0, 2)), np.square(np.where(usable, problem.samples, 0.0)).sum((0, 2))]
+        [np.square(error).sum((0, 2)), np.square(np.where(usable, problem.samples, 0.0)).sum((0, 2))]
     )
-    begun = np.concatenate([np.zeros((2, 1)), np.cumsum(per_line, axis=1)], axis=1)
+    running = np.concatenate([np.zeros((2, 1)), np.cumsum(per_line, axis=1)], axis=1)
+    # the lines whose exposure overlaps each frame are first .. last − 1
     S, L = geometry.substeps, geometry.lines
     begins = np.arange(0, geometry.span, temporal_merge)
     ends = np.minimum(begins + temporal_merge, geometry.span)
     first = np.clip(-(-(begins - (geometry.size + S - 2)) // S), 0, L)
     last = np.clip((ends - 1) // S + 1, 0, L)
-    residual, level = begun[:, last] - begun[:, first]
+    residual, level = running[:, last] - running[:, first]
     with np.errstate(invalid="ignore", divide="ignore"):
         ratio = np.sqrt(np.maximum(residual, 0) / level)
     return np.where(level > 0, ratio, np.nan).astype(np.float32)
 
 
 def judge(segment: Segment, problem: Problem, quality: Quality, trusted: slice) -> tuple[str, ...]:
-    """Sentences for the user: why this video may not be believed."""
+    """Return the reasons not to trust this video, as sentences for the user."""
     found = [
         each.words for each in (*unusable(segment), *black_level_off(segment)) if each.kind != "constant_code"
     ]
-    missed = float(np.nanmax([quality.misfit, quality.prediction]))
-    if missed > POOR_MISFIT:
+    residual = float(np.nanmax([quality.misfit, quality.prediction]))
+    if residual > POOR_MISFIT:
         found.append(
-            f"the video misses the lines by {missed:.0%}: too few iterations, or the code's place, "
-            "the arms' orientation or the black level is wrong"
+            f"the video misses the lines by {residual:.0%}: there were too few iterations, or the code's "
+            "position, the arms' orientation or the black level is wrong"
         )
     if quality.standing == "over-fitted":
         found.append(
-            f"the video follows the noise of its lines: it misses {quality.misfit:.2%} of the samples used, "
-            f"where noise alone is {quality.noise:.2%}, and {quality.prediction:.2%} of those kept from the "
-            "solver; larger voxels have less of it"
+            f"the video fits the noise of its lines: it misses the used samples by {quality.misfit:.2%}, "
+            f"where noise alone is {quality.noise:.2%}, and the held-out samples by "
+            f"{quality.prediction:.2%}; larger voxels have less noise"
         )
-    if quality.standing == "not explained" and WORTH_SAYING < missed <= POOR_MISFIT:
+    if quality.standing == "not explained" and WORTH_SAYING < residual <= POOR_MISFIT:
         found.append(
-            f"the video misses {missed:.2%} of the lines, and noise is {quality.noise:.2%} of them: what is "
-            "left may be light faster than the frames, finer than the pixels, or in need of more time"
+            f"the video misses the lines by {residual:.2%}, and their noise is {quality.noise:.2%}: the rest "
+            "may be light that changes faster than the frames or is finer than the pixels, or more time is "
+            "needed"
         )
     if quality.coverage < POOR_COVERAGE:
         causes = ", ".join(f"{cause} {count}" for cause, count in problem.masked_by.items() if count)

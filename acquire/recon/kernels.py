@@ -3,9 +3,9 @@
     prox(b) = argmin_x ½‖x − b‖² + λ·TV(x),    TV(x) = Σ √((x_{r+1,c} − x_{r,c})² + (x_{r,c+1} − x_{r,c})²)
 
 by fast gradient projection on the dual field (p, q), |(p, q)| ≤ 1 (Beck and Teboulle, IEEE Trans. Image
-Process. 18, 2419 (2009)): x = b + λ·div(p, q). The dual field is kept by the caller, so that successive
-calls on slowly changing frames start where the last one ended. Frames are independent and run in parallel.
-An own kernel because library versions are several times slower (tools/bench_tv.py).
+Process. 18, 2419 (2009)): x = b + λ·div(p, q). The caller keeps the dual field, so that successive calls on
+slowly changing frames start where the last one ended. Frames are independent and run in parallel. Library
+versions are several times slower (tools/bench_tv.py).
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 SMALLEST_WEIGHT = 1e-12
-"""Below it the prox is taken as the identity: it moves no pixel by more than 4·λ, and 1/λ² would overflow."""
+"""Weight below which the prox is the identity: it changes no pixel by more than 4·λ, and 1/λ² would
+overflow."""
 
 _FAST = {"contract", "reassoc", "nsz", "arcp"}
 
@@ -73,7 +74,7 @@ def _dual_step(
 ) -> None:
     """One projected step of length 1/(8·weight) from the point ahead; (p, q) becomes the new point.
 
-    The last row and column have no neighbour ahead; they are done apart, so that the rest is free of
+    The last row and column have no neighbour ahead; they are treated separately, so that the rest is free of
     branches and the compiler can use vector instructions.
     """
     rows, columns = x.shape
@@ -203,4 +204,4 @@ def _volume_dual_step(
 
 volume_prox = numba.njit(_volume_prox, cache=True, fastmath=_FAST)
 volume_prox_parallel = numba.njit(_volume_prox, parallel=True, cache=True, fastmath=_FAST)
-"""The same, for volumes that outweigh its three meetings of the threads an iteration."""
+"""As `volume_prox`, for volumes so large that three synchronisations of threads per iteration pay off."""

@@ -1,20 +1,21 @@
-"""The fastest lamp of a scene, from the covariance of its lines.
+"""Detection of the fastest lamp of a scene, from the covariance of its lines.
 
-Every cosine k of the frames' time axis adds to the lines y (L_R,) of a pixel a covariance that is known but
-for one number, how much of the light changes with it: with rows of light taken as independent and alike,
+Every cosine k of the frames' time axis contributes to the lines y (L_R,) of a pixel a covariance that is
+known except for one number, the power of the light at that frequency. With rows of light that are independent
+and alike,
 
     C = σ²·I + Σ_k p_k·F_k·F_kᵀ,     F_k (L_R, rows): what cosine k of each row adds to each line (`band`)
 
-and every pixel of either arm is a sample of it. The p_k that make them likely are climbed to by the
-minorisation of Zhou, Hu, Zhou and Lange (J. Comput. Graph. Stat. 28, 350 (2019)). Then each cosine is asked
-what it would explain of the lines if it were not in C, over what that would be if it held no light. C⁻¹
-takes away what is slow and bright, under whose remains a fast lamp hides, more so the larger the sensor.
+and every pixel of either arm is a sample of it. The p_k of maximum likelihood are approached by the
+minorisation of Zhou, Hu, Zhou and Lange (J. Comput. Graph. Stat. 28, 350 (2019)). Then the energy that each
+cosine would explain if it were not in C is compared with that for a cosine without light. C⁻¹ removes what is
+slow and bright, whose residuals hide a fast lamp, more so the larger the sensor.
 
-Rows are alike in truth, so that what rests and what is slow leave a floor that falls with k and is rough. A
-lamp is what stands out of the cosines about it: one of steady rhythm is a peak of two or three of them. How
-far the others scatter tells how high the highest of so many comes by chance. Light of all frequencies up to
-some has no peak, and is not found here. The rows are those of pixels; coarser ones cannot hold bright edges,
-and what they leave of these looks like light of all frequencies.
+Rows of real scenes are alike, not independent, so that rest and slow motion leave a rough floor that falls
+with k. A lamp stands out of its neighbouring cosines: one of steady rhythm is a peak of two or three of them.
+The scatter of the others shows how high the highest of so many is by chance. Light of all frequencies up to
+some limit has no peak and is not found here. The rows are as wide as pixels; coarser ones cannot represent
+bright edges, whose residuals look like light of all frequencies.
 """
 
 from __future__ import annotations
@@ -41,30 +42,33 @@ if TYPE_CHECKING:
 
 ITERATIONS, FEWEST_ITERATIONS = 5, 3
 WINDOW, PEAK_WIDTH = 61, 3
-"""Cosines about one whose median is its floor, and over how many the light of a lamp spreads."""
+"""Number of neighbouring cosines whose median is the floor, and number over which the light of a lamp
+spreads."""
 FALSE_ALARMS = 1e-3
-"""Of so many searches, one that takes chance for light, were the logarithms about the floor normal."""
+"""Share of searches that mistake chance for light, if the logarithms about the floor were normal."""
 USUAL = 0.9
-"""The quantile that says how far they scatter upwards."""
+"""Quantile that measures their upward scatter."""
 LONGEST = 520
-"""Lines that are looked at together, at most: the time grows with their square."""
+"""Largest number of lines that are analysed together: the time grows with their square."""
 SECONDS = 6e-10
-"""Of a processor for each cosine, row and pair of lines."""
+"""Processor time for each cosine, row and pair of lines."""
 LARGEST_FACTOR_BYTES, CHUNK_BYTES = 1 << 29, 1 << 26
 LEAST_NOISE = 1e-7
-"""Variance, of the samples' mean square: rounding of float32 would be light below it."""
+"""Smallest noise variance relative to the samples' mean square: below it, rounding of float32 would be
+light."""
 LEAST_RESPONSE = 1e-6
-"""Of a cosine beside the strongest, below which the lines do not see it; none where the code is dark."""
+"""Smallest response to a cosine, relative to the strongest, that the lines resolve; none is if the code is
+dark."""
 FEWEST_LOOKED_AT = 128
-"""Cosines, of up to half of all: a floor of few that holds a lamp besides is none."""
+"""Fewest cosines to analyse, up to half of all: too few that include a lamp give no floor."""
 
 
 def search_seconds(geometry: Geometry, temporal_merge: int, share: float) -> float:
-    """About what `last_lamp` takes of a processor."""
-    stretches = -(-geometry.lines // LONGEST)
-    one = replace(geometry, lines=-(-geometry.lines // stretches))
+    """Approximate processor time of `last_lamp`."""
+    parts = -(-geometry.lines // LONGEST)
+    one = replace(geometry, lines=-(-geometry.lines // parts))
     cosines = share * one.video_shape(1, temporal_merge)[0]
-    return float(SECONDS * stretches * cosines * one.stages * one.lines**2)
+    return float(SECONDS * parts * cosines * one.stages * one.lines**2)
 
 
 def last_lamp(
@@ -74,10 +78,10 @@ def last_lamp(
     share: float,
     hurry: Callable[[], bool] = lambda: False,
 ) -> int:
-    """How many of the first cosines of the frames' time axis reach the fastest lamp; 0 where none stands out.
+    """Number of cosines of the frames' time axis up to the fastest lamp; 0 if none stands out.
 
-    Looked for in the first ``share`` of them; sooner done where ``hurry()``. ``problem`` is that of the
-    segment, whatever its voxels.
+    The search covers the first ``share`` of them, with fewer iterations once ``hurry()``. ``problem`` is that
+    of the segment, whatever its voxels.
     """
     frames = segment.geometry.video_shape(1, temporal_merge)[0]
     last = 0.0
@@ -90,20 +94,20 @@ def last_lamp(
             looked_at = geometry.video_shape(1, temporal_merge)[0]
             most = int(share * looked_at)
             factor = _factor(geometry, code, temporal_merge, most)
-            surprise = _surprise(factor, problem.samples[:, lines], seen, hurry)
-            last = max(last, _end_of_peaks(surprise, most) / looked_at)
+            energy = _relative_energy(factor, problem.samples[:, lines], seen, hurry)
+            last = max(last, _end_of_peaks(energy, most) / looked_at)
     return round(last * frames)
 
 
-def _surprise(
+def _relative_energy(
     factor: NDArray[np.float32],
     samples: NDArray[Any],
     usable: NDArray[np.bool_],
     hurry: Callable[[], bool],
 ) -> NDArray[np.float64]:
-    """What each cosine would explain beside the others (K,), over what it would if it held no light.
+    """Energy that each cosine would explain in addition to the others (K,), relative to one without light.
 
-    0 where the lines say nothing of one beside the others.
+    All 0 if the lines do not separate the cosines.
     """
     K, rows, L = factor.shape
     pixels, seen = np.hstack(list(samples)), np.hstack(list(usable))
@@ -129,7 +133,9 @@ def _surprise(
         samples_each = seen.mean() * seen.shape[1]
         largest = float(np.finfo(np.float32).max) * min(trace, float(expected.min())) * samples_each
         if not (light * explained).max() < largest:
-            return np.zeros(K)  # rounding: under a code that hardly changes the lines tell no cosines apart
+            return np.zeros(
+                K
+            )  # rounding error: under a code that hardly changes, the lines do not separate cosines
         light *= np.sqrt(explained / (samples_each * expected))
         left = np.square(white, dtype=np.float64).sum() / samples_each
         noise = max(LEAST_NOISE, noise * float(np.sqrt(left / trace)))
@@ -137,14 +143,13 @@ def _surprise(
             break
     inverse = _inverse(factor, chunks, light, noise)
     white = _whitened(inverse, pixels, seen)
-    surprise = [_left_out(flat, light[k], inverse, white) for k, flat in enumerate(factor)]
-    return np.array(surprise)
+    return np.array([_left_out(flat, light[k], inverse, white) for k, flat in enumerate(factor)])
 
 
 def _factor(
     geometry: Geometry, code: NDArray[np.uint8], temporal_merge: int, most: int
 ) -> NDArray[np.float32]:
-    """F_k of at least ``most`` cosines: (K, rows, L_R). The other arm's has its rows in the other order."""
+    """F_k of at least ``most`` cosines: (K, rows, L_R). The other arm's has its rows in reverse order."""
     frames = geometry.video_shape(1, temporal_merge)[0]
     count = max(most, min(frames // 2, FEWEST_LOOKED_AT))
     basis, merge = TemporalBasis(frames, count), geometry.substeps
@@ -171,7 +176,7 @@ def _inverse(
 def _whitened(
     inverse: NDArray[np.float32], pixels: NDArray[np.float32], seen: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
-    """C⁻¹·y of every pixel, for what is not ``seen`` of y what the rest foretells; 0 there."""
+    """C⁻¹·y of every pixel, with samples of y that are not ``seen`` predicted from the rest; 0 there."""
     white = inverse @ np.where(seen, pixels, 0)
     holes = ~seen
     if not holes.any():
@@ -190,7 +195,7 @@ def _whitened(
 def _left_out(
     flat: NDArray[np.float32], light: float, inverse: NDArray[np.float32], white: NDArray[np.float32]
 ) -> float:
-    """For one cosine (rows, L_R): what it explains where C is without it, over what it would by chance."""
+    """For one cosine (rows, L_R): energy that it explains if C is without it, relative to that by chance."""
     own = (flat @ inverse @ flat.T).astype(np.float64)
     # F_kᵀ·(C − p·F_k·F_kᵀ)⁻¹ = (I − p·F_kᵀ·C⁻¹·F_k)⁻¹·F_kᵀ·C⁻¹
     without = np.linalg.inv((1 + 1e-6) * np.eye(len(own)) - light * own)
@@ -199,11 +204,11 @@ def _left_out(
     return explained / (white.shape[1] * expected) if expected > 0 else 0.0
 
 
-def _end_of_peaks(surprise: NDArray[np.float64], most: int) -> int:
-    """The cosine after the last of the first ``most`` that stands out of those about it."""
-    if not surprise.min() > 0:
+def _end_of_peaks(energy: NDArray[np.float64], most: int) -> int:
+    """Number of cosines up to the last of the first ``most`` that stands out of its neighbours."""
+    if not energy.min() > 0:
         return 0
-    level = np.log(uniform_filter1d(surprise, PEAK_WIDTH, mode="nearest"))
+    level = np.log(uniform_filter1d(energy, PEAK_WIDTH, mode="nearest"))
     level -= median_filter(level, WINDOW, mode="nearest")
     spread = np.quantile(level, USUAL) / ndtri(USUAL)
     above = np.flatnonzero(level[:most] > ndtri(1 - FALSE_ALARMS / len(level)) * spread)

@@ -1,4 +1,4 @@
-"""A checked call of `reconstruct`: what is asked, and its limits."""
+"""Checked options of a call of `reconstruct`."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from acquire.recon.denoisers import Denoiser
-    from acquire.recon.handed import Choice
+    from acquire.recon.reuse import Choice
 
 NEGATIVE_SHARE = 0.01
-"""Of the largest value: what solvers without a sign leave below zero is no mistake."""
+"""Largest negative value, relative to the largest value, in a given array: signed solvers leave some."""
 
 
 class Stop(Protocol):
-    """Asked after every iteration; a `threading.Event` is one."""
+    """Stop request, checked after every iteration; a `threading.Event` is one."""
 
     def is_set(self) -> bool: ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SolveOptions:
-    """What is asked of a reconstruction, refused here if it cannot be."""
+    """Options of a reconstruction. Raises UsageError for impossible ones."""
 
     spatial_merge: int
     temporal_merge: int
@@ -47,7 +47,7 @@ class SolveOptions:
         if self.bandwidth is not None and not 0 < self.bandwidth <= 1:
             raise UsageError(
                 f"bandwidth {self.bandwidth} is out of range",
-                possible="more than 0, up to 1 (frames' Nyquist)",
+                possible="more than 0, up to 1 (the frames' Nyquist frequency)",
             )
         if self.tv_weight is not None and not 0 <= self.tv_weight < float("inf"):
             raise UsageError(
@@ -67,7 +67,7 @@ class SolveOptions:
             if given is not None and option not in SOLVERS.load(self.solver).takes:
                 able = [repr(name) for name, each in SOLVERS.working().items() if option in each.takes]
                 raise UsageError(
-                    f"{option} for solver {self.solver!r} is not known", possible=f"solver {', '.join(able)}"
+                    f"solver {self.solver!r} takes no {option}", possible=f"solver {', '.join(able)}"
                 )
 
     def check_shapes(self, size: int, video_shape: tuple[int, int, int]) -> None:
@@ -75,7 +75,9 @@ class SolveOptions:
         _check_array("initial video", self.initial, video_shape)
         _check_array("static image", self.static_image, (size, size))
         if self.static_image is not None and not np.any(self.static_image):
-            raise UsageError("the static image is dark everywhere", possible="the scene at rest, lit")
+            raise UsageError(
+                "the static image is dark everywhere", possible="an image of the lit scene at rest"
+            )
 
 
 def _check_array(what: str, given: NDArray[Any] | None, shape: tuple[int, ...]) -> None:

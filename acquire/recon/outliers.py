@@ -1,7 +1,7 @@
 """Samples that cannot be light of the scene, found before anything is solved.
 
 One sample of 1e7, or one dead column, ruins every solver; masked, it costs a tenth of a decibel. The tests
-are wide: a sample is called an outlier only when no scene explains it.
+are tolerant: a sample is an outlier only if no scene explains it.
 
     not finite    NaN or infinite
     spike         far from the median of its column's neighbouring lines, which share nearly all their light
@@ -22,18 +22,18 @@ if TYPE_CHECKING:
 SPIKE_LINES = 5
 SPIKE_DEVIATIONS = 20.0
 SPIKE_LEVEL = 0.5
-"""A spike also differs by this share of the samples' 99th percentile, so that quiet scenes have none."""
+"""Smallest height of a spike, relative to the samples' 99th percentile, so that quiet scenes have none."""
 HOT_RATIO = 10.0
 FEWEST_VARYING = 0.1
-"""Share of an arm's columns that must vary for one that does not to be suspicious."""
+"""Share of an arm's columns that must vary for a constant one to be suspicious."""
 FEWEST_TOGETHER = 3
-"""Columns that stand still at one value, the lowest, before this is taken for darkness."""
+"""Number of columns that must be constant at the lowest value for that to count as darkness."""
 FEWEST_LINES = 16
-"""Of fewer lines, columns say too little about themselves."""
+"""Fewest lines for which columns are tested."""
 
 
 def outliers(samples: NDArray[Any], mask: NDArray[np.bool_]) -> dict[str, NDArray[np.bool_]]:
-    """Outliers among the samples (arm, line, pixel) that ``mask`` allows, by cause; no sample has two."""
+    """Find outliers among the samples (arm, line, pixel) that ``mask`` admits; each has one cause."""
     found = {"not finite": mask & ~np.isfinite(samples)}
     left = mask & ~found["not finite"]
     for cause, test in (("hot column", _hot), ("stuck column", _stuck), ("spike", _spikes)):
@@ -45,10 +45,10 @@ def outliers(samples: NDArray[Any], mask: NDArray[np.bool_]) -> dict[str, NDArra
 def _spikes(samples: NDArray[np.float64], left: NDArray[np.bool_]) -> NDArray[np.bool_]:
     if samples.shape[1] < SPIKE_LINES or not left.any():
         return np.zeros_like(left)
-    off = np.abs(samples - median_filter(samples, size=(1, SPIKE_LINES, 1), mode="nearest"))
-    spread = 1.4826 * np.median(off[left])
+    deviation = np.abs(samples - median_filter(samples, size=(1, SPIKE_LINES, 1), mode="nearest"))
+    spread = 1.4826 * np.median(deviation[left])
     level = np.quantile(np.abs(samples[left]), 0.99)
-    return np.asarray(off > SPIKE_DEVIATIONS * spread + SPIKE_LEVEL * level)
+    return np.asarray(deviation > SPIKE_DEVIATIONS * spread + SPIKE_LEVEL * level)
 
 
 def _hot(samples: NDArray[np.float64], left: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -65,27 +65,15 @@ def _stuck(samples: NDArray[np.float64], left: NDArray[np.bool_]) -> NDArray[np.
     low = np.where(left, samples, np.inf).min(axis=1, keepdims=True)
     high = np.where(left, samples, -np.inf).max(axis=1, keepdims=True)
     usual = (high > low).mean(axis=2, keepdims=True) > FEWEST_VARYING
-    dark = (high <= low) & (np.abs(high - _darkness(low, high)) <= 1e-3 * _brightest(samples))
-    lonely = _between_lit(dark, samples)
-    return np.asarray(np.broadcast_to((high <= low) & usual & (~dark | lonely), samples.shape))
-
-
-def _darkness(low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Where an arm's unlit columns stand: at 0, or, if the black level is wrong, together at its lowest."""
-    still = np.where(high <= low, high, np.nan)
+    still = high <= low
+    # unlit columns are at 0 or, if the black level is wrong, several of them share the lowest value
     lowest = np.where(np.isfinite(low), low, np.inf).min(axis=2, keepdims=True)
-    together = (still == lowest).sum(axis=2, keepdims=True) >= FEWEST_TOGETHER
-    return np.where(together, lowest, 0.0)
-
-
-def _brightest(samples: NDArray[np.float64]) -> NDArray[np.float64]:
-    return np.asarray(np.abs(samples).max(axis=(1, 2), keepdims=True))
-
-
-def _between_lit(dark: NDArray[np.bool_], samples: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Dark columns (arm, 1, pixel) between lit ones: a scene's own darkness is mostly wider."""
-    lit = np.median(np.abs(samples), axis=1, keepdims=True) > 0.1 * np.abs(samples).max(
-        axis=(1, 2), keepdims=True
-    )
+    shared = (still & (high == lowest)).sum(axis=2, keepdims=True) >= FEWEST_TOGETHER
+    darkness = np.where(shared, lowest, 0.0)
+    brightest = np.abs(samples).max(axis=(1, 2), keepdims=True)
+    dark = still & (np.abs(high - darkness) <= 1e-3 * brightest)
+    # a single dark column between lit ones is stuck: dark parts of a scene are mostly wider
+    lit = np.median(np.abs(samples), axis=1, keepdims=True) > 0.1 * brightest
     padded = np.pad(lit, ((0, 0), (0, 0), (1, 1)), mode="edge")
-    return np.asarray(dark & padded[:, :, :-2] & padded[:, :, 2:])
+    lonely = dark & padded[:, :, :-2] & padded[:, :, 2:]
+    return np.asarray(np.broadcast_to(still & usual & (~dark | lonely), samples.shape))

@@ -1,17 +1,17 @@
-"""Scenes of a few patterns with a curve each, solved at full spatial resolution.
+"""Scenes that are a sum of a few patterns, each with its curve, solved at full spatial resolution.
 
     X(r, c, t) = Σ_k u_k(t)·Z_k(r, c)             LEDs behind masks, displays, a blade before a target
 
-A first reconstruction in voxels shows how many patterns there are; from then on patterns and curves are
-refined in turn, each against all samples:
+A first reconstruction in voxels shows how many patterns there are; then patterns and curves are refined in
+turn, each against all samples:
 
     Z given u    ADMM in the basis of the curves, with TV and sign       R·n² unknowns
-    u given Z    least squares in the cosines, nothing that flattens     R·K unknowns
+    u given Z    least squares in the cosines, without a prior           R·K unknowns
 
-Two gains: the curves are not biased by a prior (total variation takes a quarter of a 5 kHz amplitude), and
-edges lie where they are. A voxel of N_m > 1 that holds an edge cannot explain its lines: that error is some
-percent, ten to fifty times the noise, and a solver that fits it spoils the picture (semi-convergence). At
-N_m = 1 it is gone; voxels are averaged afterwards.
+There are two gains. The curves are not biased by a prior (total variation takes a quarter of a 5 kHz
+amplitude), and edges keep their position. A voxel of N_m > 1 that holds an edge cannot explain its lines:
+this model error is some percent, ten to fifty times the noise, and fitting it spoils the picture
+(semi-convergence). At N_m = 1 it is gone; voxels are averaged afterwards.
 """
 
 from __future__ import annotations
@@ -39,35 +39,37 @@ if TYPE_CHECKING:
 
 LARGEST_RANK = 12
 TAIL = 16
-"""Singular values from here on are taken as the floor of what the first reconstruction left over."""
+"""Index of the singular value that is taken as the error floor of the first reconstruction."""
 ABOVE_TAIL = 3.0
 GAP = 3.0
-"""Ratio of neighbouring singular values beyond which patterns end. A pattern too many is not harmless: it
-takes light from the others wherever the lines do not tell them apart, and the picture drifts away."""
+"""Smallest ratio of neighbouring singular values at which patterns end. An extra pattern is harmful: it
+absorbs light that belongs to the others wherever the lines do not separate them, and the picture drifts
+away."""
 LARGEST_REST = 0.035
-"""Share of the energy that the patterns may leave out; more, and the scene is not one of a few patterns."""
+"""Largest share of the energy that the patterns may leave out for the scene to consist of a few of them."""
 LARGEST_REST_AT_GAP = 0.005
-"""The same for patterns that end at a gap, lest a bright still hides what moves before it."""
+"""The same for patterns that end at a gap; it is smaller, because a bright still can hide what moves before
+it."""
 FADING = 0.5
-"""λ of a pattern is relative to (largest / its) singular value to this power: weak patterns are smoother."""
+"""Power of (largest / own singular value) by which a pattern's λ is larger: weak patterns are smoother."""
 
 PARAMETERS = AdmmParameters(tv_penalty=2e-3, sign_penalty=6e-4, grid_per_coefficient=1)
 ROUND = 5
-"""ADMM iterations before the curves are fitted again."""
+"""Number of ADMM iterations between two fits of the curves."""
 RIDGE = 1e-2
-"""Levenberg's damping of the curves' fit: it slows them down, for the patterns to follow, but leaves the
-end where it is. With a tenth of it the two chase each other and part from the truth."""
+"""Levenberg's damping of the curves' fit: it slows the curves down, so that the patterns can follow, and does
+not change the fixed point. With a tenth of it the two chase each other and diverge from the truth."""
 PENALTY_DECAY, LEAST_PENALTY = 0.8, 1 / 4
 WEIGHT_DECAY, LEAST_WEIGHT = 0.75, 1 / 16
-"""Of the penalties ρ and of λ, round by round: what holds the iterates together while patterns and curves
-are wrong flattens them when they are right."""
+"""Factors of the penalties ρ and of λ from round to round, and their limits: weights that stabilise the
+iterates while patterns and curves are wrong would flatten them once they are right."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Patterns:
-    """Θ = curves·patterns: (K, R) orthonormal columns, and (R, row, column) that fall off in energy.
+    """Θ = curves·patterns: (K, R) orthonormal columns, and (R, row, column) of decreasing energy.
 
-    Curves are the host's; patterns are where they were made.
+    Curves are on the host; patterns are on the device where they were computed.
     """
 
     curves: NDArray[Any]
@@ -75,9 +77,9 @@ class Patterns:
 
 
 def find_patterns(theta: NDArray[Any], *, beyond_doubt: bool = False) -> Patterns | None:
-    """The patterns of coefficient frames (K, n′, n′); None where a few do not hold the scene.
+    """Find the patterns of coefficient frames (K, n′, n′); None if the scene is not a sum of a few patterns.
 
-    ``beyond_doubt`` asks for a gap behind them, not only for a tail that they stand out of.
+    With ``beyond_doubt``, a gap has to follow them; otherwise it is enough that they rise above the floor.
     """
     count, side, _ = theta.shape
     if count <= TAIL:
@@ -85,30 +87,25 @@ def find_patterns(theta: NDArray[Any], *, beyond_doubt: bool = False) -> Pattern
     flat = theta.reshape(count, -1).astype(np.float64)
     energy, vectors = np.linalg.eigh(flat @ flat.T)
     energy, vectors = np.maximum(energy[::-1], 0), vectors[:, ::-1]
-    rank = _rank_at_gap(energy) or (None if beyond_doubt else _rank_above_tail(energy))
-    if rank is None:
-        return None
+    gaps = np.flatnonzero(energy[: TAIL - 1] > GAP**2 * energy[1:TAIL]) + 1
+    rank = int(gaps[-1]) if len(gaps) else 0
+    if not _is_enough(rank, energy, LARGEST_REST_AT_GAP):
+        if beyond_doubt:
+            return None
+        rank = int(np.count_nonzero(energy[:TAIL] > ABOVE_TAIL**2 * energy[TAIL - 1]))
+        if not _is_enough(rank, energy, LARGEST_REST):
+            return None
     curves = vectors[:, :rank].astype(theta.dtype)
     return Patterns(curves, (curves.T @ theta.reshape(count, -1)).reshape(rank, side, side))
 
 
-def _rank_at_gap(energy: NDArray[np.float64]) -> int | None:
-    """How many squared singular values, falling, come before the last gap; None if they leave much out."""
-    gaps = np.flatnonzero(energy[: TAIL - 1] > GAP**2 * energy[1:TAIL]) + 1
-    return _if_enough(int(gaps[-1]), energy, LARGEST_REST_AT_GAP) if len(gaps) else None
-
-
-def _rank_above_tail(energy: NDArray[np.float64]) -> int | None:
-    above = np.count_nonzero(energy[:TAIL] > ABOVE_TAIL**2 * energy[TAIL - 1])
-    return _if_enough(int(above), energy, LARGEST_REST)
-
-
-def _if_enough(rank: int, energy: NDArray[np.float64], rest: float) -> int | None:
-    return rank if 0 < rank <= LARGEST_RANK and energy[rank:].sum() <= rest * energy.sum() else None
+def _is_enough(rank: int, energy: NDArray[np.float64], rest: float) -> bool:
+    """Whether the first ``rank`` squared singular values are few and leave out at most a share ``rest``."""
+    return bool(0 < rank <= LARGEST_RANK and energy[rank:].sum() <= rest * energy.sum())
 
 
 class Refinement:
-    """Refines patterns and curves in turn; `step` is an ADMM iteration, a round ends with the curves' fit."""
+    """Refines patterns and curves in turn: `step` is an ADMM iteration; a round ends with the curves' fit."""
 
     def __init__(
         self,
@@ -120,11 +117,24 @@ class Refinement:
         parameters: AdmmParameters = PARAMETERS,
     ) -> None:
         self._segment, self._problem, self._cosines = segment, problem, cosines
-        self._spatial_merge, self._temporal_merge = merges
+        self._spatial_merge, self._temporal_merge = merge, temporal_merge = merges
         self.parameters, self._first, self._steps = parameters, parameters, 0
-        self.found = Patterns(found.curves, _hold(found.patterns, segment.geometry.size, merges[0]))
-        self._fit = CurveFit(segment, problem, cosines, merges[1], RIDGE)
-        self._admm = self._begin()
+        self._fit = CurveFit(segment, problem, cosines, temporal_merge, RIDGE)
+        n = segment.geometry.size
+        fine = found.patterns.repeat(merge, axis=1).repeat(merge, axis=2)[:, :n, :n]
+        self.found = Patterns(found.curves, fine)
+        operator, basis = self._operators()
+        size = np.sqrt(np.square(fine, dtype=np.float64).sum((1, 2)))
+        emphasis = (size.max() / np.maximum(size, 1e-6 * size.max() + 1e-30)) ** FADING
+        self._admm = Admm(
+            operator,
+            problem.used_samples,
+            (self.rank, n, n),
+            basis,
+            parameters,
+            start=fine,
+            emphasis=emphasis,
+        )
         self.found = Patterns(found.curves, self._admm.theta)
 
     @property
@@ -136,7 +146,7 @@ class Refinement:
         return self._steps % ROUND == 0
 
     def step(self) -> None:
-        """One iteration. Raises NumericsError for iterates that are not finite."""
+        """Make one iteration. Raises NumericsError if the iterates are not finite."""
         self._admm.step()
         self.found = Patterns(self.found.curves, self._admm.theta)
         self._steps += 1
@@ -144,23 +154,34 @@ class Refinement:
             self._fit_curves()
             self._admm.rebase(*self._operators(), self.found.patterns)
             self.found = Patterns(self.found.curves, self._admm.theta)
-            self._loosen()
+            # lower the weights for the next round
+            now, first = self.parameters, self._first
+            penalty = max(PENALTY_DECAY * now.tv_penalty, LEAST_PENALTY * first.tv_penalty)
+            self.parameters = replace(
+                now,
+                tv_weight=max(WEIGHT_DECAY * now.tv_weight, LEAST_WEIGHT * first.tv_weight),
+                tv_penalty=penalty,
+                sign_penalty=first.sign_penalty * penalty / first.tv_penalty,
+            )
+            self._admm.reweigh(self.parameters)
 
     def return_to(self, found: Patterns) -> None:
-        """Take ``found``, of an earlier round, as the estimate."""
+        """Make ``found``, the result of an earlier round, the estimate."""
         self.found = found
         self._operators()
 
-    def on(self, problem: Problem, heavier: float = 1.0) -> Refinement:
-        """A refinement that goes on from here with another problem's samples and a ``heavier`` prior; this
-        one stays as it is."""
+    def with_problem(self, problem: Problem, heavier: float = 1.0) -> Refinement:
+        """A refinement that continues from here with another problem's samples and a ``heavier`` prior.
+
+        This one stays as it is.
+        """
         other = copy(self)
         other.parameters = replace(self.parameters, tv_weight=heavier * self.parameters.tv_weight)
         other._first = replace(self._first, tv_weight=heavier * self._first.tv_weight)
         other._problem, other._steps = problem, 0
         other._fit = CurveFit(self._segment, problem, self._cosines, self._temporal_merge, RIDGE)
         operator, basis = other._operators()
-        other._admm = self._admm.on(operator, problem.used_samples, heavier)
+        other._admm = self._admm.with_problem(operator, problem.used_samples, heavier)
         other._admm.rebase(operator, basis, self.found.patterns)
         return other
 
@@ -175,7 +196,7 @@ class Refinement:
         return host(basis.synthesize(basis.arrays.asarray(merged)))
 
     def _operators(self) -> tuple[MaskedOperator, LearnedBasis]:
-        """The patterns' operator and the basis of their curves, as these are now."""
+        """The patterns' operator and the basis of their curves, for the present curves."""
         basis = LearnedBasis(self._cosines, self.found.curves)
         geometry, code = self._segment.geometry, self._segment.code
         self._operator: Operator = band_operator(
@@ -183,49 +204,17 @@ class Refinement:
         )
         return self._problem.masked(self._operator), basis
 
-    def _begin(self) -> Admm:
-        operator, basis = self._operators()
-        size = np.sqrt(np.square(self.found.patterns, dtype=np.float64).sum((1, 2)))
-        emphasis = (size.max() / np.maximum(size, 1e-6 * size.max() + 1e-30)) ** FADING
-        n = self._segment.geometry.size
-        return Admm(
-            operator,
-            self._problem.used_samples,
-            (self.rank, n, n),
-            basis,
-            self.parameters,
-            start=self.found.patterns,
-            emphasis=emphasis,
-        )
-
     def _fit_curves(self) -> None:
-        """New curves for the patterns, made orthonormal again with as little turning as possible."""
+        """Fit the curves to the patterns, and make them orthonormal again with the least rotation."""
         patterns, arrays, exact = self.found.patterns, self._problem.arrays, self._problem.arrays.exact()
         flat = exact.xp.reshape(exact.asarray(patterns), (self.rank, -1))
         gram = host(flat @ flat.T)
         root = np.linalg.cholesky(gram + 1e-6 * np.trace(gram) * np.eye(self.rank))
-        # orthonormal patterns make the fit well conditioned; their sizes go to the curves meanwhile
+        # orthonormal patterns make the fit well conditioned; the curves take over their sizes for it
         unit = arrays.xp.reshape(arrays.asarray(exact.asarray(np.linalg.inv(root)) @ flat), patterns.shape)
         fitted = self._fit(unit, self.found.curves @ root)
         left, middle, right = np.linalg.svd(np.linalg.solve(root.T, fitted.T).T, full_matrices=False)
-        turned = exact.asarray((right.T * middle) @ right) @ flat
+        rotated = exact.asarray((right.T * middle) @ right) @ flat
         self.found = Patterns(
-            (left @ right).astype(arrays.dtype), arrays.xp.reshape(arrays.asarray(turned), patterns.shape)
+            (left @ right).astype(arrays.dtype), arrays.xp.reshape(arrays.asarray(rotated), patterns.shape)
         )
-
-    def _loosen(self) -> None:
-        """Lower weights for the next round."""
-        now, first = self.parameters, self._first
-        penalty = max(PENALTY_DECAY * now.tv_penalty, LEAST_PENALTY * first.tv_penalty)
-        self.parameters = replace(
-            now,
-            tv_weight=max(WEIGHT_DECAY * now.tv_weight, LEAST_WEIGHT * first.tv_weight),
-            tv_penalty=penalty,
-            sign_penalty=first.sign_penalty * penalty / first.tv_penalty,
-        )
-        self._admm.reweigh(self.parameters)
-
-
-def _hold(patterns: NDArray[Any], n: int, merge: int) -> NDArray[Any]:
-    """Coarse frames at full resolution, every voxel held over its block."""
-    return patterns.repeat(merge, axis=1).repeat(merge, axis=2)[:, :n, :n]

@@ -1,8 +1,8 @@
-"""What the solvers work on: samples made dimensionless, with a mask and an operator of norm at most 1.
+"""The problem that solvers solve: dimensionless samples, with a mask and an operator of norm at most 1.
 
 Dividing by the operator's norm bound and by the scene's mean makes λ mean the same for every segment,
-whatever the camera's gain or the light. Samples that are lost, saturated or no light at all (outliers) are
-masked: their weight is 0 and their value is never looked at.
+whatever the camera's gain or the light. Samples that are lost, saturated or outliers are masked: their weight
+is 0 and their value is never used.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 
 
 HUBER, NORMAL = 1.345, 1.4826
-"""Standard deviations from which residuals are doubted (95 % efficient where all is normal noise: Huber,
-Robust Statistics), and one of them over the median of normal noise's size."""
+"""Standard deviations from which residuals get less weight (95 % efficient for normal noise: Huber, Robust
+Statistics), and the ratio of the standard deviation to the median absolute value of normal noise."""
 
 
 class Operator(Protocol):
@@ -47,15 +47,15 @@ class Problem:
     Attributes
     ----------
     samples : (2, L_R, M) dimensionless, 0 where masked
-    weight : (2, L_R, M) 1 where the sample counts, else 0
-    held_out : (2, L_R, M) bool, samples kept from the solver to judge its prediction
+    weight : (2, L_R, M) 1 where the sample is used, else 0
+    held_out : (2, L_R, M) bool, samples withheld from the solver to judge its prediction
     norm : upper bound of ‖Λ′‖₂
     scale : scene units per dimensionless voxel
     coverage : share of the samples that are usable
-    masked_by : samples left out, by cause
+    masked_by : number of masked samples, by cause
     arrays : library, device and dtype of the solvers' arrays
-    known : lines of light that is known already, as ``samples``; solved for is what comes to it
-    doubt : share of its weight that each sample keeps, in what is solved for; None: all of it
+    known_lines : lines of light that is known already, as ``samples``; the solver finds the difference
+    robust_weight : factor of each sample's weight in the solver; None: 1
     """
 
     samples: NDArray[Any]
@@ -66,75 +66,75 @@ class Problem:
     coverage: float
     masked_by: dict[str, int] = field(default_factory=dict)
     arrays: Arrays = HOST
-    known: NDArray[Any] | None = None
-    doubt: NDArray[Any] | None = None
+    known_lines: NDArray[Any] | None = None
+    robust_weight: NDArray[Any] | None = None
 
     @property
     def usable(self) -> NDArray[np.bool_]:
-        """Samples that count, those held out among them."""
+        """Samples that are not masked, including the held-out ones."""
         return (self.weight > 0) | self.held_out
 
     @property
     def used_samples(self) -> Array:
-        """``weight·samples``: what the solvers are given."""
-        left = self.samples if self.known is None else self.samples - self.known
-        return self.arrays.asarray(left * self._believed)
+        """``weight·samples``, the solvers' right-hand side."""
+        unknown = self.samples if self.known_lines is None else self.samples - self.known_lines
+        return self.arrays.asarray(unknown * self._total_weight)
 
     @property
-    def _believed(self) -> NDArray[Any]:
-        return self.weight if self.doubt is None else self.weight * self.doubt
+    def _total_weight(self) -> NDArray[Any]:
+        return self.weight if self.robust_weight is None else self.weight * self.robust_weight
 
-    def lines_of(self, seen: NDArray[Any]) -> NDArray[Any]:
-        """All lines, as ``samples``, where ``seen`` = B·x is of what is solved for."""
-        lines = seen / self.norm
-        return lines if self.known is None else lines + self.known
+    def lines_of(self, image: NDArray[Any]) -> NDArray[Any]:
+        """All lines, as ``samples``, of a solution x whose ``image`` is B·x."""
+        lines = image / self.norm
+        return lines if self.known_lines is None else lines + self.known_lines
 
     def masked(self, operator: Operator) -> MaskedOperator:
         """The solvers' operator: weighted, of norm at most 1."""
-        return MaskedOperator(operator, self.arrays.asarray(self._believed / self.norm))
+        return MaskedOperator(operator, self.arrays.asarray(self._total_weight / self.norm))
 
-    def doubting(self, predicted: NDArray[Any]) -> Problem:
-        """The same where samples that ``predicted`` misses by far count for less.
+    def with_robust_weights(self, predicted: NDArray[Any]) -> Problem:
+        """The same problem with less weight on samples far from ``predicted``.
 
-        Huber's weights with his constant: what passes before a still, or flashes, is no normal noise and
-        would pull at all of it. As roots, since a weight is squared in the least squares.
+        These are Huber's weights with his constant: the residual of an object that passes before a still, or
+        of a flash, is not normal noise and would distort every pixel. Square roots of them, since the least
+        squares square a weight.
         """
-        off = np.abs(predicted - self.samples)
-        usable = (self.weight > 0) | self.held_out
-        usual = HUBER * NORMAL * float(np.median(off[usable]))
+        residual = np.abs(predicted - self.samples)
+        usual = HUBER * NORMAL * float(np.median(residual[self.usable]))
         if not usual > 0:
             return self
-        doubt = np.sqrt(usual / np.maximum(off, usual)).astype(self.weight.dtype)
-        return replace(self, doubt=doubt)
+        weight = np.sqrt(usual / np.maximum(residual, usual)).astype(self.weight.dtype)
+        return replace(self, robust_weight=weight)
 
-    def whole(self) -> Problem:
-        """The same with all usable samples in use."""
+    def with_all_samples(self) -> Problem:
+        """The same problem with all usable samples in use and none held out."""
         everything = np.maximum(self.weight, self.held_out.astype(self.weight.dtype))
         return replace(self, weight=everything, held_out=np.zeros_like(self.held_out))
 
-    def keeping(self, samples: NDArray[np.bool_]) -> Problem:
-        """The same with these samples, and no others, kept from the solver, as far as they are usable."""
-        kept = self.usable & samples
-        return replace(self, weight=(self.usable & ~kept).astype(self.weight.dtype), held_out=kept)
+    def holding_out(self, samples: NDArray[np.bool_]) -> Problem:
+        """The same problem with exactly these samples held out, as far as they are usable."""
+        held_out = self.usable & samples
+        return replace(self, weight=(self.usable & ~held_out).astype(self.weight.dtype), held_out=held_out)
 
     def on_host(self) -> Problem:
-        """The same, for what is solved on the host."""
+        """The same problem with its arrays on the host."""
         return replace(self, arrays=Arrays(dtype=self.arrays.dtype))
 
     def misfit(self, predicted: NDArray[Any]) -> float:
-        """RMS of ``predicted − samples`` over the samples used, relative to their RMS."""
+        """RMS of ``predicted − samples`` over the used samples, relative to their RMS."""
         return _relative_rms(predicted, self.samples, self.weight > 0)
 
     def noise(self, segment: Segment) -> float:
-        """RMS of the cameras' noise in all usable samples, relative to theirs; NaN where it is unknown."""
-        variance, usable = segment.variance(), (self.weight > 0) | self.held_out
+        """RMS of the cameras' noise in all usable samples, relative to theirs; NaN if it is unknown."""
+        variance, usable = segment.variance(), self.usable
         if variance is None or not usable.any():
             return float("nan")
         level = np.square(segment.samples(np.float64)[usable]).mean()
         return float(np.sqrt(variance[usable].mean() / level)) if level > 0 else float("inf")
 
     def prediction_error(self, predicted: NDArray[Any]) -> float:
-        """The same over the samples held out; NaN without any."""
+        """As `misfit`, over the held-out samples; NaN without any."""
         return _relative_rms(predicted, self.samples, self.held_out)
 
 
@@ -159,9 +159,9 @@ class MaskedOperator:
         return self.operator.adjoint(y * self.weight)
 
     def near_inverse(self, damping: float) -> Callable[[Array], Array] | None:
-        """About (W·B·BᵀW + damping)⁻¹ for lines that are 0 where masked; None where B knows none.
+        """Approximate (W·B·BᵀW + damping)⁻¹ for lines that are 0 where masked; None if B offers none.
 
-        What is masked counts as seen: its lines hang together with those beside them.
+        Masked samples are treated as measured, because they are correlated with the neighbouring lines.
         """
         whole = getattr(self.operator, "near_inverse", None)
         if whole is None:
@@ -182,9 +182,9 @@ def build_problem(
     seed: int = 0,
     arrays: Arrays = HOST,
 ) -> Problem:
-    """The problem of a segment, to be solved in ``arrays``.
+    """Pose the problem of a segment, to be solved in ``arrays``.
 
-    ``hold_out`` is the share of usable samples kept from the solver, in blocks drawn by ``seed``.
+    ``hold_out`` is the share of usable samples withheld from the solver, in blocks drawn by ``seed``.
 
     Raises
     ------
@@ -195,7 +195,7 @@ def build_problem(
     bad = outliers(samples, segment.mask)
     usable = segment.mask & ~np.logical_or.reduce([np.zeros_like(segment.mask), *bad.values()])
     if not usable.any():
-        raise UsageError("no sample of the segment is usable", hint="another line range")
+        raise UsageError("no sample of the segment is usable", hint="try another range of lines")
     operator = DualArm(
         segment.geometry,
         segment.code,
@@ -224,10 +224,10 @@ def build_problem(
 
 
 def _scale(samples: NDArray[Any], flat: NDArray[Any]) -> float:
-    """Level of the uniform scene with the same mean; 1 for a black one, where any will do."""
+    """Level of the uniform scene with the same mean; 1 for a black one, for which any level will do."""
     level = float(np.mean(np.abs(samples), dtype=np.float64) / max(np.mean(flat, dtype=np.float64), 1e-30))
     if not np.isfinite(level):
         raise NumericsError(
-            "the samples overflow", hint="check black level and responsivity of the recording"
+            "the samples overflow", hint="check the black level and the responsivity of the recording"
         )
     return level or 1.0

@@ -1,4 +1,4 @@
-"""What a reconstruction gives back: the video, how it came about, and what can be said without the truth."""
+"""Result of a reconstruction: the video, its provenance, and its quality without knowledge of the truth."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 EXPLAINED, NEARLY = 1.25, 2.0
-"""Residuals, in units of the noise, up to which the video's own error is below 0.75 and 1.7 σ of a sample."""
+"""Residuals, in units of the noise, below which the video's own error is below 0.75 and 1.7 σ of a sample."""
 
 
 Standing = Literal["explained", "nearly explained", "over-fitted", "not explained", "unknown"]
@@ -26,7 +26,7 @@ Standing = Literal["explained", "nearly explained", "over-fitted", "not explaine
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """Where a reconstruction stands after an iteration; ``stage`` says what it is doing."""
+    """Progress of a reconstruction after an iteration; ``stage`` names the present stage."""
 
     iteration: int
     iterations: int
@@ -36,9 +36,9 @@ class Progress:
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """A reconstruction after an iteration, with its wall and processor time so far.
+    """State of a reconstruction after an iteration, with its wall and processor time so far.
 
-    ``video`` makes what would be the answer if it ended there; it is to be called at once or not at all.
+    ``video`` computes the answer as if it ended there; call it immediately or not at all.
     """
 
     iteration: int
@@ -50,11 +50,11 @@ class Look:
 
 @dataclass(frozen=True, slots=True)
 class Quality:
-    """What can be said without the truth.
+    """Quality without knowledge of the truth.
 
-    ``misfit`` is the relative RMS residual of the samples used, ``prediction`` that of samples kept from the
-    solver (NaN where none were), ``coverage`` the share of samples that were usable. ``noise`` is what the
-    cameras' noise alone gives of a residual, relative likewise; NaN where nothing is known of it.
+    ``misfit`` is the relative RMS residual of the used samples, ``prediction`` that of the held-out samples
+    (NaN without any), ``coverage`` the share of usable samples. ``noise`` is the relative residual that the
+    cameras' noise alone causes; NaN if it is unknown.
     """
 
     misfit: float
@@ -64,15 +64,14 @@ class Quality:
 
     @property
     def standing(self) -> Standing:
-        """What the residuals are beside the noise. Samples that were kept from the solver judge; without any,
-        those that it was given.
+        """The residuals compared with the noise: those of the held-out samples, else of the used ones.
 
-        explained : what is left is noise
-        nearly explained : what is left is noise for the greater part
-        over-fitted : the samples given are met more closely than their noise allows, those kept are missed:
-            a good part of the video is noise
-        not explained : more than noise is left even where the solver was given the samples
-        unknown : nothing is known of the noise
+        explained : the residual is noise
+        nearly explained : the residual is mostly noise
+        over-fitted : the used samples are met more closely than their noise allows, the held-out ones are
+            missed: a good part of the video is noise
+        not explained : even the residual of the used samples is more than noise
+        unknown : the noise is unknown
         """
         judged = self.misfit if math.isnan(self.prediction) else self.prediction
         if not self.noise > 0 or math.isnan(judged):
@@ -86,26 +85,26 @@ class Quality:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Reconstruction:
-    """A reconstructed video and how it came about.
+    """A reconstructed video with its provenance and quality.
 
     Attributes
     ----------
-    video : (time, row, column) in scene units and the dtype asked for, over the whole span; only the frames
+    video : (time, row, column) in scene units and the requested dtype, over the whole span; only the frames
         in ``trusted`` were sampled in full (Fig. 5). That interval is nominal: it follows from the geometry
-        alone, whatever lines were lost, samples masked, or the code does; ``quality`` says how well it went.
-    time_ns : the begin of each frame
-    seconds : wall time, without ``compiled_s``, which compiling took: once after an installation
-    processor_s : of all threads
-    iterations : all that were made, of trials too; those that ``iterations_asked`` limits may be fewer, where
-        the budget, ``stop`` or the data ended it (``ended``)
-    frame_error : (time,) relative RMS residual of the samples that saw each frame; NaN where none did. It is
-        no error of the frame, which may be many times larger; see `acquire.recon.judge.frame_error`
-    error : an estimate of how far the video is from the truth, of every frame and of 8 × 8 regions, in the
-        video's own unit, or a sentence on why it cannot be told; see `acquire.recon.error`
-    believed : False where the lines say that code, geometry or orientation are not the segment's: then no
-        frame is to be trusted, and ``warnings`` says what is wrong
-    masked : samples left out, by cause
-    warnings : what a user should know before believing the video, in sentences
+        alone, whatever lines were lost, samples masked, or the code does; ``quality`` shows how well it went.
+    time_ns : the beginning of each frame
+    seconds : wall time without ``compiled_s``, the time of compilation, once after an installation
+    processor_s : processor time of all threads
+    iterations : number of all iterations, trials included; those limited by ``iterations_asked`` may be fewer
+        if the budget, ``stop`` or the data ended them (``ended``)
+    frame_error : (time,) relative RMS residual of the samples that saw each frame; NaN if none did. It is not
+        the error of the frame, which may be many times larger; see `acquire.recon.judge.frame_error`
+    error : estimated error of the video, of every frame and of 8 × 8 regions, in the video's own unit, or a
+        sentence on why there is none; see `acquire.recon.error`
+    believed : False if the lines contradict the segment's code, geometry or orientation: no frame is to be
+        trusted then, and ``warnings`` names the contradiction
+    masked : number of masked samples, by cause
+    warnings : sentences that a user should know before trusting the video
     """
 
     video: NDArray[np.floating[Any]]
@@ -117,7 +116,7 @@ class Reconstruction:
     solver: str
     quality: Quality
     frame_error: NDArray[np.float32]
-    error: VideoError | str = "it was not asked for"
+    error: VideoError | str = "it was not requested"
     ended: str = "done"
     believed: bool = True
     masked: dict[str, int] = field(default_factory=dict)
@@ -130,14 +129,14 @@ class Reconstruction:
         return in_words("Reconstruction", **self._holds(), warnings=len(self.warnings))
 
     def _repr_html_(self) -> str:
-        """With the frame in the middle of those that are trusted."""
+        """The result as a table, with the frame in the middle of the trusted ones."""
         shown = range(len(self.video))[self.trusted] or range(len(self.video))
         number = shown[len(shown) // 2]
         words = {**self._holds(), "warnings": "; ".join(self.warnings) or None}
         return as_table("Reconstruction", words, as_picture(self.video[number], f"frame {number}"))
 
     def _holds(self) -> dict[str, str]:
-        """What it holds, in words."""
+        """Its properties in words."""
         frames, rows, columns = self.video.shape
         trusted = range(frames)[self.trusted] if self.believed else range(0)
         return {

@@ -1,8 +1,8 @@
-"""The hypothesis that explains a segment's lines best, and whether any does.
+"""Search for the hypothesis that explains a segment's lines best, and the decision whether any does.
 
-How well arms foretell each other under a code that has nothing to do with the lines tells what agreement
-comes of itself: two blurred pictures of one scene agree a little. A code that deserves to be believed makes
-them agree several times better, in one orientation and not in the others.
+Random codes, which have nothing to do with the lines, show how well the arms predict each other by chance:
+two blurred pictures of one scene agree a little. The right code makes them agree several times better, in one
+orientation and not in the others.
 """
 
 from __future__ import annotations
@@ -14,36 +14,37 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from acquire.recon.gaussian import Prior
-from acquire.recon.hypotheses import TURNS, Evidence, Hypothesis, Witness, compare
+from acquire.recon.hypotheses import TURNS, Evidence, Hypothesis, LineModel, compare
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
 DELAYS = (0, 3, -3, 6, -6, 10, -10)
-"""Sub-steps that are tried at first, both arms alike: pictures agree a little when they are this far off."""
+"""Delays in sub-steps to start from, equal for both arms: pictures agree a little when they are this far
+off."""
 FARTHEST = 24
-STRANGERS = 4
-"""Random codes that say what agreement comes of itself."""
+RANDOM_CODES = 4
+"""Number of random codes that show the agreement by chance."""
 LEAST_CONTRAST = 10.0
 VERIFIED_ALONE, VERIFIED, BEYOND = 4.0, 2.0, 3.0
-"""Agreement of the arms at which a code is believed; less is enough where it also explains each arm's lines
-better than wrong codes do, by so many of their standard deviations."""
+"""Agreement of the arms at which a code is verified; the second is enough if the code also explains each
+arm's own lines better than random codes do, by the third in their standard deviations."""
 DOUBTFUL = 3.0
-"""Agreement below which a code is foreign; between this and belief, nothing is claimed."""
+"""Agreement below which a code is foreign; from here to verification, nothing is claimed."""
 OTHER_SUBSTEPS = (1, 2, 3, 4, 5, 6)
 USUAL = Prior(0.06, 0.3, 3.0, 1e-2)
-"""Under which they are looked through, before the best has a prior that suits it."""
+"""Prior for the comparison of other S, before the best of them gets a prior that suits it."""
 APART, APART_SHARE = 15.0, 0.15
-"""Log likelihood, and share of the gain, by which delays that differ between the arms have to be better than
-a common one: smooth scenes fit a little better a little off."""
+"""Log likelihood, and share of the gain, by which delays that differ between the arms must exceed a common
+one: smooth scenes fit slightly better slightly off."""
 CLEAR, CLEAR_SHARE, CLEAR_ERRORS = 12.0, 0.11, 0.3
-"""Of two hypotheses the better is clearly so beyond this log likelihood, beyond this share of what it gains
-by the other arm's word, and beyond so many standard errors over the blocks of lines. Small delays, and arms
-turned before a scene that looks the same turned, come to 0.09 where all is right."""
+"""Log likelihood, share of the gain from the other arm, and standard errors over the blocks of lines by which
+a hypothesis is clearly better than another. For right descriptions, small delays, and turned arms of a scene
+that looks the same turned, reach a share of 0.09."""
 
 
 class Standing(StrEnum):
-    """What the evidence says of the segment as it is described."""
+    """Verdict on the segment's description."""
 
     RIGHT = "right"
     NAMED = "named"
@@ -55,9 +56,9 @@ class Standing(StrEnum):
 class Candidate:
     """A hypothesis with its evidence.
 
-    ``contrast``: gain of its orientation over the others'; ``agreement``: that, or the gain, over what wrong
-    codes reach;
-    ``beyond``: own evidence over that of wrong codes, in their standard deviations.
+    ``contrast``: gain of its orientation over the median of the others; ``agreement``: contrast or gain,
+    relative to that of random codes; ``beyond``: own evidence over that of random codes, in their standard
+    deviations.
     """
 
     hypothesis: Hypothesis
@@ -76,17 +77,17 @@ class Candidate:
 
     @property
     def verified(self) -> bool:
-        """The lines follow this code."""
+        """Whether the lines follow this code."""
         alone = self.agreement >= VERIFIED_ALONE
         return alone or (self.agreement >= VERIFIED and self.beyond >= BEYOND)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inquiry:
-    """What was found: what is ``said`` of the segment, and the best ``candidates``, best first."""
+    """Result of a search: the segment as ``described``, and the best ``candidates``, best first."""
 
     standing: Standing
-    said: Candidate
+    described: Candidate
     candidates: tuple[Candidate, ...]
 
     @property
@@ -95,98 +96,99 @@ class Inquiry:
 
     @property
     def rival(self) -> Candidate | None:
-        """Another that is as likely as the best and says as little."""
+        """Another candidate as likely as the best one that changes as little of the description."""
         for each in self.candidates[1:]:
-            alike = each.hypothesis.inverted == self.best.hypothesis.inverted
+            same_code = each.hypothesis.inverted == self.best.hypothesis.inverted
             simple = each.hypothesis.changes <= self.best.hypothesis.changes
-            if alike and simple and each.verified and not clearly(self.best, each):
+            if same_code and simple and each.verified and not clearly(self.best, each):
                 return each
         return None
 
 
-def inquire(witness: Witness) -> Inquiry:
-    """Try code, inversion, delays and orientations, and where none explains the lines, other S."""
-    inquiry = _inquire(witness, None)
+def inquire(model: LineModel) -> Inquiry:
+    """Try the code, its inversion, delays and orientations, and other S if none explains the lines."""
+    inquiry = _inquire(model, None)
     if inquiry.standing is not Standing.UNEXPLAINED:
         return inquiry
-    others = [Hypothesis(substeps=each) for each in OTHER_SUBSTEPS if each != witness.substeps]
-    witness.prior = USUAL
-    substeps = max(others, key=lambda each: _contrast(witness, each).contrast).substeps
-    other = _inquire(witness, substeps)
-    # nothing else may be wrong with it: with all delays to choose from, chance finds something
+    others = [Hypothesis(substeps=each) for each in OTHER_SUBSTEPS if each != model.substeps]
+    model.prior = USUAL
+    substeps = max(others, key=lambda each: _contrast(model, each).contrast).substeps
+    other = _inquire(model, substeps)
+    # no other change is accepted with another S: with all delays to choose from, chance finds something
     explained = other.best.agreement >= VERIFIED_ALONE and other.best.hypothesis.changes == 0
     if explained and other.best.gain > inquiry.best.gain + CLEAR:
-        return replace(other, standing=Standing.NAMED, said=inquiry.said)
+        return replace(other, standing=Standing.NAMED, described=inquiry.described)
     return inquiry
 
 
-def _inquire(witness: Witness, substeps: int | None) -> Inquiry:
-    """Of one S: the code as it is and, where that might be it, inverted, under the prior that suits it."""
-    said, straight = _search(witness, Hypothesis(substeps=substeps))
+def _inquire(model: LineModel, substeps: int | None) -> Inquiry:
+    """Search under one S: the code as it is and, unless that is clear, inverted, with suitable priors."""
+    described, straight = _search(model, Hypothesis(substeps=substeps))
     best = straight[0]
-    opposites = [replace(each.hypothesis, inverted=True) for each in (best, said)]
-    inverted = max(
-        (Candidate(each, witness.evidence(each)) for each in opposites), key=lambda each: each.total
-    )
+    opposites = [replace(each.hypothesis, inverted=True) for each in (best, described)]
+    inverted = max((Candidate(each, model.evidence(each)) for each in opposites), key=lambda each: each.total)
     if best.verified and inverted.total < best.total:
-        return Inquiry(_standing(said, straight), said, (*straight, inverted))
-    _, others = _search(witness, Hypothesis(substeps=substeps, inverted=True))
-    first, second = (straight, others) if straight[0].total >= others[0].total else (others, straight)
-    return Inquiry(_standing(said, (*first, *second)), said, (*first, *second))
+        found = (*straight, inverted)
+    else:
+        _, others = _search(model, Hypothesis(substeps=substeps, inverted=True))
+        first, second = (straight, others) if straight[0].total >= others[0].total else (others, straight)
+        found = (*first, *second)
+    return Inquiry(_standing(described, found), described, found)
 
 
-def _standing(said: Candidate, found: tuple[Candidate, ...]) -> Standing:
+def _standing(described: Candidate, found: tuple[Candidate, ...]) -> Standing:
     best = found[0]
     if not best.verified:
-        foreign = (
-            max(best.agreement, said.agreement) < DOUBTFUL and max(best.beyond, said.beyond) < VERIFIED_ALONE
-        )
+        agreement = max(best.agreement, described.agreement)
+        foreign = agreement < DOUBTFUL and max(best.beyond, described.beyond) < VERIFIED_ALONE
         return Standing.UNEXPLAINED if foreign else Standing.UNCLEAR
-    if best.hypothesis == said.hypothesis:
+    if best.hypothesis == described.hypothesis:
         return Standing.RIGHT
-    if clearly(best, said):
+    if clearly(best, described):
         return Standing.NAMED
-    return Standing.RIGHT if said.verified and said.gain >= best.gain else Standing.UNCLEAR
+    return Standing.RIGHT if described.verified and described.gain >= best.gain else Standing.UNCLEAR
 
 
 def clearly(one: Candidate, other: Candidate) -> bool:
     """Whether the evidence for ``one`` is clearly better."""
-    more, errors = _better(one, other)
+    more, errors = advantage(one, other)
     return more > max(CLEAR, CLEAR_SHARE * one.gain) and errors > CLEAR_ERRORS and one.total > other.total
 
 
-def _better(one: Candidate, other: Candidate) -> tuple[float, float]:
-    """By how much, and in standard errors. What the arms say on their own counts where codes differ in more
-    than their place: a delay is to an arm alone a scene that lies off, and what it says of that is chance."""
+def advantage(one: Candidate, other: Candidate) -> tuple[float, float]:
+    """Log likelihood by which ``one`` is likelier than ``other``, and the same in standard errors.
+
+    The arms' own evidence counts only if the codes differ in more than their delay: to an arm alone, a delay
+    is a displaced scene, and its preference for one of them is chance.
+    """
     a, b = one.hypothesis, other.hypothesis
     if (a.inverted, a.substeps) == (b.inverted, b.substeps):
         return compare(one.evidence.mutual, other.evidence.mutual)
     return compare(one.evidence.total, other.evidence.total)
 
 
-def _search(witness: Witness, plain: Hypothesis) -> tuple[Candidate, tuple[Candidate, ...]]:
-    """The plain hypothesis, and the best orientations with their delays, best first."""
-    witness.settle(plain)
-    strangers = Strangers.of(witness, plain)
-    said = strangers.judged(_contrast(witness, plain))
+def _search(model: LineModel, plain: Hypothesis) -> tuple[Candidate, tuple[Candidate, ...]]:
+    """The plain hypothesis, and the best orientations with their delays, best first.
+
+    Among candidates that are not clearly different, the one that changes least of the description is first.
+    """
+    model.fit_prior(plain)
+    chance = ByChance.of(model, plain)
+    described = chance.judged(_contrast(model, plain))
     found = []
-    for start in _first_look(witness, plain)[:2]:
-        climbed = _climb(witness, start.hypothesis)
-        found.append(said if climbed == plain else strangers.judged(_contrast(witness, climbed)))
-    return said, _simplest_first(found)
-
-
-def _simplest_first(found: list[Candidate]) -> tuple[Candidate, ...]:
-    """Best first; of those that cannot be told apart, the one that says least against the description."""
+    for start in _first_look(model, plain)[:2]:
+        climbed = _climb(model, start.hypothesis)
+        found.append(described if climbed == plain else chance.judged(_contrast(model, climbed)))
     best = max(found, key=lambda each: each.gain)
     equal = [each for each in found if each is best or not clearly(best, each)]
     first = min(equal, key=lambda each: (each.hypothesis.changes, -each.gain))
-    return first, *sorted((each for each in found if each is not first), key=lambda each: -each.gain)
+    others = sorted((each for each in found if each is not first), key=lambda each: -each.gain)
+    return described, (first, *others)
 
 
 @dataclass(frozen=True, slots=True)
-class Strangers:
-    """What codes reach that have nothing to do with the lines: contrast, gain, own evidence, its spread."""
+class ByChance:
+    """What random codes reach: contrast, gain, own evidence and its standard deviation."""
 
     contrast: float
     gain: float
@@ -194,8 +196,10 @@ class Strangers:
     spread: float
 
     @classmethod
-    def of(cls, witness: Witness, plain: Hypothesis) -> Strangers:
-        found = [_contrast(witness, replace(plain, strange=number)) for number in range(1, STRANGERS + 1)]
+    def of(cls, model: LineModel, plain: Hypothesis) -> ByChance:
+        found = [
+            _contrast(model, replace(plain, random_code=number)) for number in range(1, RANDOM_CODES + 1)
+        ]
         own = np.array([each.evidence.own.sum() for each in found])
         contrast = max(each.contrast for each in found)
         gain = max(each.gain for each in found)
@@ -203,19 +207,20 @@ class Strangers:
         return cls(max(contrast, floor), max(gain, floor), float(own.mean()), float(own.std(ddof=1)))
 
     def judged(self, candidate: Candidate) -> Candidate:
+        """The candidate with its agreement, and its own evidence, relative to chance."""
         beyond = (float(candidate.evidence.own.sum()) - self.own) / max(self.spread, 1e-9)
         # a scene that looks the same turned has no contrast, and yet the arms agree on it
         agreement = max(candidate.contrast / self.contrast, candidate.gain / self.gain)
         return replace(candidate, agreement=agreement, beyond=beyond)
 
 
-def _first_look(witness: Witness, plain: Hypothesis) -> list[Candidate]:
+def _first_look(model: LineModel, plain: Hypothesis) -> list[Candidate]:
     """The best delay of each orientation, best first."""
     across = [turn for turn in TURNS if turn.across]
     best: dict[object, Candidate] = {}
     for delay in DELAYS:
         tried = [replace(plain, late=(delay, delay), turn=turn) for turn in across]
-        found = _with_contrast([Candidate(each, witness.evidence(each)) for each in tried])
+        found = _with_contrast([Candidate(each, model.evidence(each)) for each in tried])
         for each in found:
             turn = each.hypothesis.turn
             if turn not in best or each.gain > best[turn].gain:
@@ -223,15 +228,16 @@ def _first_look(witness: Witness, plain: Hypothesis) -> list[Candidate]:
     return sorted(best.values(), key=lambda each: -each.gain)
 
 
-def _contrast(witness: Witness, hypothesis: Hypothesis) -> Candidate:
+def _contrast(model: LineModel, hypothesis: Hypothesis) -> Candidate:
+    """The hypothesis with its contrast to other orientations; a random code in its best orientation."""
     turns = [hypothesis.turn, *(turn for turn in TURNS if turn.across and turn != hypothesis.turn)]
     tried = [replace(hypothesis, turn=turn) for turn in turns]
-    found = _with_contrast([Candidate(each, witness.evidence(each)) for each in tried])
-    return max(found, key=lambda each: each.gain) if hypothesis.strange else found[0]
+    found = _with_contrast([Candidate(each, model.evidence(each)) for each in tried])
+    return max(found, key=lambda each: each.gain) if hypothesis.random_code else found[0]
 
 
 def _with_contrast(found: list[Candidate]) -> list[Candidate]:
-    """Each against the median of the others."""
+    """Each candidate with its gain over the median of the others."""
     gains = np.array([each.gain for each in found])
     return [
         replace(each, contrast=each.gain - float(np.median(np.delete(gains, i))))
@@ -239,12 +245,12 @@ def _with_contrast(found: list[Candidate]) -> list[Candidate]:
     ]
 
 
-def _climb(witness: Witness, start: Hypothesis) -> Hypothesis:
-    """The delays about ``start`` for which the arms foretell each other best: common, then each arm's."""
+def _climb(model: LineModel, start: Hypothesis) -> Hypothesis:
+    """The delays near ``start`` with which the arms predict each other best: common, then one per arm."""
 
     def gain(late: tuple[int, int]) -> float:
         if late not in known:
-            known[late] = float(witness.evidence(replace(start, late=late)).mutual.sum())
+            known[late] = float(model.evidence(replace(start, late=late)).mutual.sum())
         return known[late]
 
     known: dict[tuple[int, int], float] = {}
@@ -257,11 +263,12 @@ def _climb(witness: Witness, start: Hypothesis) -> Hypothesis:
 def _uphill(
     gain: Callable[[tuple[int, int]], float], start: tuple[int, int], steps: tuple[tuple[int, int], ...]
 ) -> tuple[int, int]:
-    best, moved = start, True
-    while moved:
+    """Climb from ``start`` by any of the ``steps``, in either direction, while the gain increases."""
+    best, improved = start, True
+    while improved:
         near = [(best[0] + sign * a, best[1] + sign * b) for a, b in steps for sign in (1, -1)]
         near = [each for each in near if max(map(abs, each)) <= FARTHEST]
         better = max(near, key=gain, default=best)
-        moved = gain(better) > gain(best)
-        best = better if moved else best
+        improved = gain(better) > gain(best)
+        best = better if improved else best
     return best

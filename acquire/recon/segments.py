@@ -10,9 +10,9 @@ Sub-steps are counted in the whole stream: line ℓ begins at sub-step S·ℓ. S
                                  overlap                     overlap
 
 On either side of b_k at least n − 1 sub-steps are dropped, up to whole voxels (`Geometry.seam_substeps`).
-About b_k, where both neighbours are sampled in full, one fades into the other.
+Around b_k, where both neighbours are sampled in full, one fades into the other.
 
-All of them are brought to one `Grid`, whose voxels take the mean of those that lie over them.
+All of them are resampled to one `Grid`, whose voxels are the means of those that overlap them.
 """
 
 from __future__ import annotations
@@ -54,16 +54,17 @@ class Stretch:
     def __post_init__(self) -> None:
         if self.end <= self.begin:
             raise UsageError(
-                f"a stretch cannot go from sub-step {self.begin} to {self.end}", possible="1 or more"
+                f"a stretch cannot go from sub-step {self.begin} to {self.end}",
+                possible="an end after the beginning",
             )
 
 
 @dataclass(frozen=True, slots=True)
 class SubSegment:
-    """What is kept, what is faded in and out, and the lines that it is reconstructed from.
+    """The sub-steps that are kept, the fades to the neighbours, and the lines to reconstruct from.
 
     ``begin`` to ``end`` is kept; the neighbours fade over ``fade_in`` sub-steps before and after ``begin``,
-    and over ``fade_out`` about ``end``. Its frames are taken from ``seen`` where that is less.
+    and over ``fade_out`` around ``end``. Frames are limited to the sub-steps ``seen``, if given.
     """
 
     begin: int
@@ -77,13 +78,13 @@ class SubSegment:
 
     @property
     def shown(self) -> tuple[int, int]:
-        """Sub-steps of which the video takes something from here."""
+        """Sub-steps to which it contributes in the video."""
         return self.begin - self.fade_in, self.end + self.fade_out
 
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """Lines ``first_line`` to ``end_line`` of a recording, and what of it can be shown."""
+    """Lines ``first_line`` to ``end_line`` of a recording, and the sub-steps that they show."""
 
     stages: int
     substeps: int
@@ -96,10 +97,10 @@ class Stream:
         )
 
     def extent(self, first: Voxels, last: Voxels, *, whole: bool) -> tuple[int, int]:
-        """First sub-step and the one after the last that a video of all lines has.
+        """First sub-step, and the one after the last, of a video of all lines.
 
-        These are sampled in full, in whole voxels unless slow; with ``whole`` all that the lines touch.
-        UsageError when that is nothing.
+        They are sampled in full, in whole voxels unless these are slow; with ``whole``, all that the lines
+        touch. Raises UsageError if there are none.
         """
         origin, geometry = self.substeps * self.first_line, self.geometry()
         if whole:
@@ -121,8 +122,8 @@ class Stream:
     def sub_segment(self, stretch: Stretch, fade_in: int = 0, fade_out: int = 0) -> SubSegment:
         """The lines for a stretch, as far as the stream has them.
 
-        These are the fewest whose whole voxels are sampled in full; for slow voxels (`is_slow`) those that
-        see nothing but the stretch.
+        These are the fewest that sample its whole voxels in full; for slow voxels (`is_slow`), those that see
+        nothing but the stretch.
         """
         S, T_m = self.substeps, stretch.voxels.temporal_merge
         begin, end = stretch.begin - fade_in, stretch.end + fade_out
@@ -138,24 +139,24 @@ class Stream:
         return SubSegment(stretch.begin, stretch.end, stretch.voxels, first_line, lines, fade_in, fade_out)
 
     def is_slow(self, voxels: Voxels) -> bool:
-        """Voxels so long that every row samples them wherever they lie.
+        """Whether voxels are so long that every row samples them, wherever they are.
 
-        They need no lines from beyond their ends, and these would show them what they cannot hold: the
+        They need no lines from beyond their ends, which would contain what they cannot represent: the
         neighbours' motion. So slow stretches share no lines with their neighbours and do not fade.
         """
         return voxels.temporal_merge >= self.geometry(1).size
 
     def evened(self, voxels: Voxels, substeps: int) -> Voxels:
-        """Slow voxels so that equal ones fill ``substeps``: a short one would be sampled by few rows."""
+        """Slow voxels of equal length that fill ``substeps``: few rows would sample a short remainder."""
         if not self.is_slow(voxels):
             return voxels
         count = max(1, round(substeps / voxels.temporal_merge))
         return Voxels(voxels.spatial_merge, -(-substeps // count))
 
     def arrange(self, stretches: Sequence[Stretch], fade: int = 0) -> tuple[SubSegment, ...]:
-        """Sub-segments for stretches that follow one another; ``fade`` sub-steps to either side of a seam.
+        """Sub-segments for consecutive stretches, with fades of ``fade`` sub-steps to either side of a seam.
 
-        A fade is cut to half of the shorter neighbour. UsageError for a gap between two stretches.
+        A fade is limited to half of the shorter neighbour. Raises UsageError for a gap between two stretches.
         """
         for before, after in pairwise(stretches):
             if before.end != after.begin:
@@ -172,7 +173,7 @@ class Stream:
 
 
 def split(begin: int, end: int, voxels: Voxels, longest: int) -> list[Stretch]:
-    """Equal stretches of at most ``longest`` sub-steps, in whole voxels counted from ``begin``."""
+    """Split a range into equal stretches of whole voxels, of at most ``longest`` sub-steps."""
     T_m = voxels.temporal_merge
     frames = -(-(end - begin) // T_m)
     count = -(-frames // max(1, longest // T_m))
@@ -182,7 +183,7 @@ def split(begin: int, end: int, voxels: Voxels, longest: int) -> list[Stretch]:
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """The voxels of the stitched video: ``frames`` of T_m sub-steps from ``begin`` on, ⌈n/N_m⌉ squared.
+    """The voxels of the stitched video: ``frames`` of T_m sub-steps from ``begin`` on, of side ⌈n/N_m⌉.
 
     The last frame may be shorter.
     """
@@ -197,7 +198,7 @@ class Grid:
 
     @classmethod
     def finest(cls, stretches: Sequence[Stretch], size: int, voxels: Voxels | None = None) -> Grid:
-        """Over all stretches, in the smallest N_m and T_m among them unless ``voxels`` says otherwise."""
+        """A grid over all stretches, in ``voxels`` or in the smallest N_m and T_m among them."""
         finest = Voxels(
             min(stretch.voxels.spatial_merge for stretch in stretches),
             min(stretch.voxels.temporal_merge for stretch in stretches),
@@ -213,21 +214,21 @@ class Grid:
         return -(-self.size // self.voxels.spatial_merge)
 
     def edges(self, frames: slice) -> NDArray[np.int64]:
-        """Sub-steps at which these frames begin, and at which the last ends."""
+        """Sub-steps at which these frames begin, and the one at which the last ends."""
         edges = self.begin + np.arange(frames.start, frames.stop + 1) * self.voxels.temporal_merge
         capped: NDArray[np.int64] = np.minimum(edges, self.end)
         return capped
 
     def frames_of(self, segment: SubSegment) -> slice:
-        """Frames that take something from a sub-segment."""
+        """Frames to which a sub-segment contributes."""
         begin, end = segment.shown
         T_m = self.voxels.temporal_merge
         return slice((begin - self.begin) // T_m, min(self.frames, -(-(end - self.begin) // T_m)))
 
     def weights(self, segment: SubSegment) -> NDArray[np.float32]:
-        """How much of each of its frames comes from a sub-segment; over all of them it adds up to 1.
+        """Weight of a sub-segment in each of its frames; the weights of all of them add up to 1.
 
-        Linear across a seam, by the mean over a frame's sub-steps.
+        It is the mean over a frame's sub-steps of a weight that is linear across a seam.
         """
         edges = self.edges(self.frames_of(segment))
         covered = np.diff(_rise(edges, segment.begin, segment.fade_in))
@@ -238,10 +239,16 @@ class Grid:
     def resample(self, video: NDArray[Any], segment: SubSegment, substeps: int) -> NDArray[np.float32]:
         """A sub-segment's voxels (T/T_m, n′, n′), from its first line's first sub-step on, on this grid."""
         timed = self.resample_time(video, segment, substeps)
-        return _resample_plane(timed, self.size, segment.voxels.spatial_merge, self.voxels.spatial_merge)
+        have, want = segment.voxels.spatial_merge, self.voxels.spatial_merge
+        if have == want:
+            return timed
+        edges = [np.append(np.arange(0, self.size, merge), self.size) for merge in (have, want)]
+        rows = _means(np.moveaxis(timed, 1, 0), *edges)  # (row, t, column)
+        planes = _means(np.moveaxis(rows, 2, 0), *edges)  # (column, row, t)
+        return np.ascontiguousarray(planes.transpose(2, 1, 0))
 
     def resample_time(self, values: NDArray[Any], segment: SubSegment, substeps: int) -> NDArray[np.float32]:
-        """What each of a sub-segment's frames has (T/T_m, …), in the frames of this grid."""
+        """Values of a sub-segment's frames (T/T_m, …), in the frames of this grid."""
         frames = self.frames_of(segment)
         origin = substeps * segment.first_line
         have = origin + np.arange(len(values) + 1) * segment.voxels.temporal_merge
@@ -255,7 +262,7 @@ class Grid:
 
 
 def _rise(edges: NDArray[np.int64], seam: int, fade: int) -> NDArray[np.float64]:
-    """Integral up to each edge of a step at ``seam`` that is a ramp from seam − fade to seam + fade."""
+    """Integral up to each edge of a ramp from 0 at seam − fade to 1 at seam + fade."""
     past = edges.astype(np.float64) - seam
     if not fade:
         return np.maximum(past, 0)
@@ -264,7 +271,7 @@ def _rise(edges: NDArray[np.int64], seam: int, fade: int) -> NDArray[np.float64]
 
 
 def _means(values: NDArray[np.float32], have: NDArray[np.int64], want: NDArray[np.int64]) -> NDArray[Any]:
-    """Mean over ``want[i] .. want[i+1]`` of values held over ``have[j] .. have[j+1]``, along axis 0."""
+    """Means over ``want[i] .. want[i+1]`` of values held over ``have[j] .. have[j+1]``, along axis 0."""
     low, high = np.maximum.outer(want[:-1], have[:-1]), np.minimum.outer(want[1:], have[1:])
     overlap = np.maximum(high - low, 0).astype(np.float32)
     total = overlap.sum(axis=1, keepdims=True)
@@ -273,18 +280,8 @@ def _means(values: NDArray[np.float32], have: NDArray[np.int64], want: NDArray[n
     return means
 
 
-def _resample_plane(video: NDArray[np.float32], size: int, have: int, want: int) -> NDArray[np.float32]:
-    """Rows and columns of ``have`` pixels in those of ``want``."""
-    if have == want:
-        return video
-    edges = [np.append(np.arange(0, size, merge), size) for merge in (have, want)]
-    rows = _means(np.moveaxis(video, 1, 0), *edges)  # (row, t, column)
-    planes = _means(np.moveaxis(rows, 2, 0), *edges)  # (column, row, t)
-    return np.ascontiguousarray(planes.transpose(2, 1, 0))
-
-
 class Stitcher:
-    """Adds sub-segments up, one after the other, and gives out the frames that no later one touches."""
+    """Adds up sub-segments in order, and returns the frames that no later one contributes to."""
 
     def __init__(self, grid: Grid) -> None:
         self.grid = grid
@@ -294,10 +291,10 @@ class Stitcher:
     def add(
         self, segment: SubSegment, channels: Iterable[NDArray[np.float32]], following: SubSegment | None
     ) -> list[NDArray[np.float32]]:
-        """Finished frames of each channel (video, quality …), given those of ``segment`` on the grid."""
+        """Add a sub-segment's ``channels`` (video, quality …) on the grid, and return the finished frames."""
         frames = self.grid.frames_of(segment)
         weights = self.grid.weights(segment)
-        weighted = [_scaled(channel, weights) for channel in channels]
+        weighted = [each * weights.reshape(-1, *[1] * (each.ndim - 1)) for each in channels]
         if self._waiting is not None:
             for channel, waiting in zip(weighted, self._waiting, strict=True):
                 channel[: len(waiting)] += waiting
@@ -306,8 +303,3 @@ class Stitcher:
         self._waiting = [channel[done:].copy() for channel in weighted]
         self.frames = stop
         return [channel[:done] for channel in weighted]
-
-
-def _scaled(values: NDArray[np.float32], weights: NDArray[np.float32]) -> NDArray[np.float32]:
-    scaled: NDArray[np.float32] = values * weights.reshape(-1, *[1] * (values.ndim - 1))
-    return scaled

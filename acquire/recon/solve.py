@@ -1,4 +1,4 @@
-"""Solvers that are asked for: the paper's, and the light of a known picture. The default is `choose`.
+"""Solvers other than the default, which is `choose`: the paper's, and the light of a known image.
 
 twist       the paper's, on all frames
 twist-band  the same algorithm with the default's band and sign
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 class TwistSolver(Solver):
-    """The paper's: TwIST on all frames, which knows neither a band nor a sign."""
+    """The paper's: TwIST on all frames, with neither a band nor a sign constraint."""
 
     passes: ClassVar[float] = 18.0
     signed: ClassVar[bool] = True
@@ -46,7 +46,7 @@ class TwistSolver(Solver):
 
 
 class BandedTwistSolver(Solver):
-    """The paper's algorithm with the band and the sign of the default."""
+    """The paper's algorithm with the band and the sign constraint of the default."""
 
     def solve(
         self, segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock
@@ -57,7 +57,7 @@ class BandedTwistSolver(Solver):
 def solve_twist(
     segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock, *, banded: bool
 ) -> Estimate:
-    """The paper's algorithm; ``banded`` in the band that the lines show."""
+    """Solve with the paper's algorithm; ``banded``: in the band that the lines show."""
     N_m, T_m = options.spatial_merge, options.temporal_merge
     shape = segment.geometry.video_shape(N_m, T_m)
     count = find_band(segment, problem, options, clock) if banded else shape[0]
@@ -81,9 +81,9 @@ def solve_twist(
 
 
 class KnownImage:
-    """A known image with a curve: X = s(t)·image.
+    """Estimate of a known image with an unknown curve: X = s(t)·image.
 
-    Frames that the code leaves dark are not observed: their light is interpolated from those beside them.
+    Frames that the code leaves dark are not observed: their light is interpolated from their neighbours.
     """
 
     held_out_error: float | None = None

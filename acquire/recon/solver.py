@@ -1,4 +1,4 @@
-"""What a solver is: options of its own, and a way from a posed problem to a video."""
+"""Interface of a solver: its own options, and a method that solves a posed problem."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ class Solver(FrozenModel, ABC):
 
     Attributes
     ----------
-    iterations : most iterations of each preset
-    passes : what one iteration and all around it take, in passes of the operator over all lines: a budget
-        that is shorter is refused
-    signed : it may find light below zero; else that is cut off at the end
-    holds_out : samples are kept from it, by which its prediction is judged
-    goes_on : its estimates can be gone on with (`acquire.recon.estimates.GoesOn`): of a budget, time is kept
-        for the error of the video, which is estimated by that
-    takes : which of ``initial`` and ``denoiser`` it knows
+    iterations : largest number of iterations of each preset
+    passes : time of one iteration and of all work around it, in passes of the operator over all lines: a
+        shorter budget is refused
+    signed : it may find light below zero; otherwise that is clipped at the end
+    holds_out : samples are held out, by which its prediction is judged
+    goes_on : its estimates can be continued (`acquire.recon.estimates.Continuable`), which is how a video's
+        error is estimated: time is reserved for it in a budget
+    takes : which of ``initial``, ``denoiser`` and ``choice`` it supports
     """
 
     iterations: ClassVar[Mapping[Preset, int]] = {"fast": 60, "balanced": 200, "best": 400}
@@ -50,13 +50,15 @@ class Solver(FrozenModel, ABC):
     def solve(
         self, segment: Segment, problem: Problem, options: SolveOptions, clock: IterationClock
     ) -> Estimate:
-        """A video that explains ``problem.samples`` where ``problem.weight`` is 1: what is masked or held out
-        is not looked at. Every iteration is one of ``clock.run``, which ends them for a budget or a stop.
+        """Find a video that explains ``problem.samples`` where ``problem.weight`` is 1.
+
+        Masked and held-out samples must not be used. Every iteration is one of ``clock.run``, which ends them
+        for a budget or a stop.
         """
 
 
 def open_solver(name: str, options: Mapping[str, Any] | None = None) -> Solver:
-    """The solver of that name with its options. Raises UsageError for a name or an option that is none."""
+    """The solver of that name with its options. Raises UsageError for an unknown name or option."""
     found: type[Solver] = SOLVERS.load(name)
     try:
         return found.model_validate(dict(options or {}))
@@ -65,7 +67,7 @@ def open_solver(name: str, options: Mapping[str, Any] | None = None) -> Solver:
 
 
 def preset_iterations(solver: str, preset: str) -> int:
-    """Most iterations of a preset; UsageError for names that are none."""
+    """Largest number of iterations of a preset. Raises UsageError for an unknown solver or preset."""
     counts: Mapping[str, int] = SOLVERS.load(solver).iterations
     if preset not in counts:
         raise UsageError(f"preset {preset!r} is not known", possible=", ".join(get_args(Preset)))

@@ -1,6 +1,6 @@
-"""Total variation of coefficient frames, with a prox that remembers its dual field between calls.
+"""Total variation of coefficient frames, with a prox that keeps its dual field between calls.
 
-For numpy by the compiled loops of `kernels`, for other arrays by the same algorithm on all frames at once.
+Numpy arrays use the compiled loops of `kernels`, other arrays the same algorithm on all frames at once.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from acquire.arrays import Array
 
 LARGEST_WEIGHT = 1e6
-"""Weights are capped here: every frame is flat long before, and 1/λ stays representable."""
+"""Limit of the weights, at which every frame has long been flat and 1/λ is still representable."""
 
 
 class FrameTv:
@@ -46,7 +46,7 @@ class FrameTv:
     def prox(self, frames: Array, weight: float | Array) -> Array:
         """argmin_x ½‖x − frames‖² + Σ_k weight_k·TV(x_k); ``weight`` is one number or (K,).
 
-        Frames keep their shape from call to call.
+        All calls need frames of the same shape.
         """
         xp = namespace(frames)
         capped = (
@@ -81,7 +81,7 @@ class FrameTv:
 
 
 def ahead(x: Array, axis: int) -> Array:
-    """x_{i+1} − x_i along an axis of three, 0 at its end."""
+    """x_{i+1} − x_i along one of three axes, 0 at its end."""
     return namespace(x).diff(x, axis=axis, append=x[layer(axis, -1)])
 
 
@@ -91,7 +91,7 @@ def layer(axis: int, at: int) -> tuple[slice, ...]:
 
 
 def _divergence(p: Array, q: Array) -> Array:
-    """The negative transpose of `_ahead` along both axes, for p and q that are 0 at their ends."""
+    """The negative transpose of `ahead` along both axes, for p and q that are 0 at their ends."""
     xp = namespace(p)
     return xp.diff(p, axis=1, prepend=xp.zeros_like(p[:, :1, :])) + xp.diff(
         q, axis=2, prepend=xp.zeros_like(q[:, :, :1])

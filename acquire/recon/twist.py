@@ -6,18 +6,18 @@ with φ the isotropic 2-D TV of every frame of the video's DCT along time (Secti
 
     θ_{k+1} = (1 − α)·θ_{k−1} + (α − β)·θ_k + β·Ψ_λ(θ_k + BᵀW(y − W·B·θ_k))
 
-(Bioucas-Dias and Figueiredo, IEEE Trans. Image Process. 16, 2992 (2007), Eq. 18, 22–27). Where the
-objective would rise above the running mean of its past (Zhang and Hager, SIAM J. Optim. 14, 1043 (2004)),
-the plain step Ψ_λ(…) is taken instead, which needs the norm to be a true upper bound. A stricter watch, the
-reference's monotone variant, costs 1 dB and more at equal time: the few iterations of the prox make the
-objective ripple, and every plain step throws the speed away.
+(Bioucas-Dias and Figueiredo, IEEE Trans. Image Process. 16, 2992 (2007), Eq. 18, 22–27). Where the objective
+would rise above the running mean of its past (Zhang and Hager, SIAM J. Optim. 14, 1043 (2004)), the plain
+step Ψ_λ(…) is taken instead, which requires a norm that is a true upper bound. The stricter criterion of the
+reference's monotone variant costs 1 dB and more at equal time: the few iterations of the prox make the
+objective ripple, and every plain step loses the acceleration.
 
 The paper's λ of 0.1 … 10 is for an operator that is not normalised and light of about 1: divided by
 norm² · scale (about 2000 for Fig. 9) it is 5e-5 … 5e-3 here.
 
-With a ``basis`` the default solver's prior is added, so that what its prior gains and what its algorithm
-gains can be told apart: θ in the band, and every shrunk iterate made non-negative on a grid of instants
-(the prox of the sum only approximately, so the plain step is taken even where the objective rises a little).
+With a ``basis`` the default solver's prior is added, so that the gains of its prior and of its algorithm can
+be distinguished: θ is in the band, and every shrunk iterate is made non-negative on a grid of instants. That
+is only approximately the prox of the sum, so the plain step is taken even if the objective rises a little.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ if TYPE_CHECKING:
     from acquire.recon.problem import MaskedOperator
 
 PROX_REPEATS = 5
-"""The plain step lowers the objective when its prox is exact enough; so often is it continued."""
+"""Largest number of times that the prox is continued: the plain step lowers the objective if it is exact
+enough."""
 MEMORY = 0.95
 """Weight of the past in the running mean that the objective must not exceed."""
 
@@ -45,9 +46,9 @@ MEMORY = 0.95
 class TwistParameters:
     """``tv_weight`` is λ, relative to samples and operator as `problem.build_problem` scales them.
 
-    ``smallest_eigenvalue`` is ξ₁ of the reference, its value for severely ill-conditioned operators: the
-    norm of a non-negative Λ′ is that of a flat scene, and all detail lies a hundred times below. Both
-    are the best compromise on a grid, λ = 1e-3 … 0.1, ξ₁ = 1e-5 … 1e-3, over Scene #1 and both voxel sizes
+    ``smallest_eigenvalue`` is ξ₁ of the reference, as for severely ill-conditioned operators: the norm of a
+    non-negative Λ′ is that of a flat scene, and all detail is a hundred times below it. Both are the best
+    compromise on a grid, λ = 1e-3 … 0.1, ξ₁ = 1e-5 … 1e-3, over Scene #1 and both voxel sizes
     of the goldfish at full size: within 1 dB of the best for each.
     """
 
@@ -94,21 +95,24 @@ class Twist:
         NumericsError : the objective is not finite
         """
         target = self.theta + self._operator.adjoint(self._gap)
-        shrunk = self._non_negative(self._tv.prox(target, self._lambda))
+        shrunk = self._tv.prox(target, self._lambda)
+        if self._grid is not None:  # set negative light to 0, as far as the band allows
+            values = self._xp.maximum(self._xp.tensordot(self._grid.T, shrunk, axes=1), 0)
+            shrunk = self._xp.tensordot(self._grid, values, axes=1)
         alpha, beta = self._alpha, self._beta
         self.ceiling += (1 - MEMORY) * (self.objective - self.ceiling)
         two_step = (1 - alpha) * self._before + (alpha - beta) * self.theta + beta * shrunk
-        if self._moved(two_step, self.ceiling):
+        if self._accepted(two_step, self.ceiling):
             return
         highest = self.objective if self._grid is None else math.inf
         for _ in range(PROX_REPEATS):
-            if self._moved(shrunk, highest):
+            if self._accepted(shrunk, highest):
                 return
-            shrunk = self._tv.prox(target, self._lambda)  # goes on from where it stopped: more exact
+            shrunk = self._tv.prox(target, self._lambda)  # continues from its last dual field: more exact
         self._before = self.theta
 
-    def _moved(self, theta: Array, highest: float) -> bool:
-        """Go to ``theta`` unless the objective would be above ``highest``."""
+    def _accepted(self, theta: Array, highest: float) -> bool:
+        """Move to ``theta`` unless the objective would be above ``highest``; return whether it did."""
         gap = self._samples - self._operator.forward(theta)
         objective = self._objective_of(theta, gap)
         if objective > highest:
@@ -116,15 +120,10 @@ class Twist:
         self._before, self.theta, self._gap, self.objective = self.theta, theta, gap, objective
         return True
 
-    def _non_negative(self, theta: Array) -> Array:
-        """Dark where the video would be negative, as far as the band holds it."""
-        if self._grid is None:
-            return theta
-        values = self._xp.maximum(self._xp.tensordot(self._grid.T, theta, axes=1), 0)
-        return self._xp.tensordot(self._grid, values, axes=1)
-
     def _objective_of(self, theta: Array, gap: Array) -> float:
         value = 0.5 * float(dot(gap, gap)) + self._lambda * self._tv.value(theta)
         if not math.isfinite(value):
-            raise NumericsError("TwIST left the finite numbers", hint="check the segment's samples and λ")
+            raise NumericsError(
+                "TwIST diverged: its objective is not finite", hint="check the segment's samples and λ"
+            )
         return value

@@ -1,11 +1,11 @@
-"""Total variation of a video as a volume: a prior for what moves, in place of that of coefficient frames.
+"""Total variation of a video as a volume: a prior for motion, in place of that of coefficient frames.
 
     TV₃(x) = Σ √( (∂x/∂row)² + (∂x/∂column)² + (μ·∂x/∂t)² )
 
 over as many instants as there are cosines. An edge that moves is one surface in that volume and costs no more
-than one at rest, while its coefficients are all busy; what blinks in place costs twice its contrast at every
-turn. So it serves moving things, and coefficient frames (`tv.FrameTv`) those that blink. ``pace`` is μ: the
-higher, the less a scene may change.
+than one at rest, although all its coefficients are large; light that blinks in place costs twice its contrast
+in every period. So it suits moving objects, and coefficient frames (`tv.FrameTv`) suit those that blink.
+``pace`` is μ: the higher it is, the less a scene may change.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ if TYPE_CHECKING:
     from acquire.arrays import Array
 
 PARALLEL_VOXELS = 1 << 20
-"""From here on, two threads are faster than one, also where another program has a core."""
+"""Number of voxels from which two threads are faster than one, even if another program uses a core."""
 
 
 class VolumeTv:
     """Isotropic 3-D TV of the first K cosines' volume on K instants, as a denoiser of their coefficients.
 
-    Between coefficients and instants lies an orthonormal transform, so that the prox of one is the prox of
-    the other. ``prox`` is approximate: ``iterations`` of fast gradient projection (Beck and Teboulle, IEEE
+    The transform between coefficients and instants is orthonormal, so that the prox of one is the prox of the
+    other. ``prox`` is approximate: ``iterations`` of fast gradient projection (Beck and Teboulle, IEEE
     Trans. Image Process. 18, 2419 (2009)) from where the last call ended.
     """
 
@@ -49,7 +49,7 @@ class VolumeTv:
         self._instants: Array = None
 
     def resume(self, other: VolumeTv) -> None:
-        """Begin with the dual field of another, of whatever pace."""
+        """Start from the dual field of another, whatever its pace."""
         self._instants = other._instants
         self._dual = None if other._dual is None else namespace(other._dual).asarray(other._dual, copy=True)
 
@@ -73,7 +73,7 @@ class VolumeTv:
         return xp.tensordot(self._instants, cleaned, axes=1)
 
     def _prox_of_any(self, volume: Array, weight: float) -> Array:
-        """As `kernels.volume_prox`, in the standard's operations."""
+        """As `kernels.volume_prox`, in operations of the array API standard."""
         xp, scales = namespace(volume), (1.0, 1.0, self.pace)
         step, momentum = 1 / ((8 + 4 * self.pace**2) * weight), 1.0
         dual, leading = self._dual, self._dual
@@ -89,7 +89,7 @@ class VolumeTv:
 
 
 def _one(weight: float | Array) -> float:
-    """A weight that may come as an array of one number."""
+    """A weight as a number; it may be an array of one."""
     return weight if isinstance(weight, float) else float(namespace(weight).max(weight))
 
 
@@ -113,7 +113,7 @@ class Smooth:
 
         weight/2·‖(∂²/∂row² + ∂²/∂column² + (μ·∂/∂t)²)·x‖²
 
-    In cosines of space and time, which coefficients are already, it is a number each (Wiener's filter).
+    In cosines of space and time, it is a factor for each coefficient (Wiener's filter).
     """
 
     def __init__(self, pace: float = 1.0) -> None:
@@ -121,22 +121,19 @@ class Smooth:
             raise UsageError(f"a smooth volume cannot have pace {pace}", possible="a number of at least 0")
         self.pace = pace
         self._cosines: tuple[Array, Array] | None = None
+        """The cosines of a frame's side (n′, n′), and (k_r² + k_c² + μ²·k_t²)² for each coefficient."""
 
     def prox(self, frames: Array, weight: float | Array) -> Array:
         """argmin_θ ½‖θ − frames‖² + weight/2·Σ (k_r² + k_c² + μ²·k_t²)²·θ̂² for θ (K, row, column)."""
         xp, weight = namespace(frames), _one(weight)
         if self._cosines is None:
-            self._cosines = self._prepare(frames)
+            count, side, _ = frames.shape
+            k = np.square(np.pi * np.arange(side) / side)
+            t = np.square(self.pace * np.pi * np.arange(count) / side)
+            square = np.square(t[:, None, None] + k[:, None] + k)
+            matrix = TemporalBasis(side, side, Arrays(dtype="float64")).matrix()
+            made = [xp.asarray(each, dtype=frames.dtype, device=frames.device) for each in (matrix, square)]
+            self._cosines = made[0], made[1]
         along, square = self._cosines
         spectrum = along @ frames @ along.T
         return along.T @ (spectrum / (1 + weight * square)) @ along if weight else xp.asarray(frames)
-
-    def _prepare(self, frames: Array) -> tuple[Array, Array]:
-        """The cosines of a frame's side (n′, n′), and (k_r² + k_c² + μ²·k_t²)² for each coefficient."""
-        xp, (count, side, _) = namespace(frames), frames.shape
-        k = np.square(np.pi * np.arange(side) / side)
-        t = np.square(self.pace * np.pi * np.arange(count) / side)
-        square = np.square(t[:, None, None] + k[:, None] + k)
-        matrix = TemporalBasis(side, side, Arrays(dtype="float64")).matrix()
-        made = [xp.asarray(each, dtype=frames.dtype, device=frames.device) for each in (matrix, square)]
-        return made[0], made[1]

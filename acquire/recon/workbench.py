@@ -1,7 +1,8 @@
-"""Where candidates for the prior are tried: solved for a while, and scored by the held-out blocks.
+"""Trials of candidate priors: each is solved for some iterations and scored by the held-out blocks.
 
-A search changes one thing of a candidate at a time (weight λ, pace μ, number of cosines), and each trial
-begins where the best ended. A scene whose brightness changes as a whole is tried as a volume times that.
+A search changes one parameter of a candidate at a time (weight λ, pace μ, number of cosines), and each trial
+starts from the best one so far. A scene whose brightness changes as a whole is tried as a volume times that
+brightness.
 """
 
 from __future__ import annotations
@@ -35,34 +36,34 @@ if TYPE_CHECKING:
     from acquire.recon.problem import Operator, Problem
 
 FIRST_ITERATIONS, NEXT_ITERATIONS = 30, 25
-"""Of a trial from nothing, and of one that begins where another ended."""
+"""Number of iterations of a trial that starts from zero, and of one that continues another."""
 LAST_ITERATIONS = 15
-"""Of the best, with all samples."""
+"""Number of final iterations of the best candidate, with all samples."""
 SEARCH_SHARE = 0.6
-"""Of a budget, the most that the search may take."""
+"""Upper limit on the search's share of the budget."""
 STILL_STEPS, STILL_SHARE = 60, 0.02
-"""Gradient steps at most, and the share of the residual at which they end, for one frame."""
+"""Largest number of gradient steps for a still, and the share of the residual at which they end."""
 COSINES = (8, 12, 16, 24, 36, 54)
 LEAST_PACE, LARGEST_PACE = 0.25, 64.0
 LEAST_WEIGHT, LARGEST_WEIGHT = 1e-7, 1e3
 WEIGHT_STEP, PACE_STEP = 10**0.5, 4.0
 LEAST_GAIN = 0.02
-"""Relative gain of the prediction below which a weaker prior is no better; a stronger one need only be as
-good."""
+"""Relative gain of the prediction that a weaker prior needs to be preferred; a stronger one needs none."""
 BRIGHT_STILLS, BRIGHT_ROUNDS = 2, 8
-"""Fits of a scene's brightness beside a still, and beside a volume."""
+"""Number of brightness fits in turn with a still, and in turn with a volume."""
 BRIGHTER = 0.85
-"""Of a still's error, what one of changing brightness must reach to be followed up."""
+"""Largest error of a still of changing brightness, relative to a constant still, for which it is pursued."""
 USUAL_FRAMES, USUAL_ENERGY = 980, 7.1e-3
-"""Of Fig. 9's voxels, in which the weights of candidates are told."""
+"""Number of frames and response to a voxel in Fig. 9, for which the candidates' weights are given."""
 
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A prior and how much of it: K cosines, weight λ, pace μ of a volume's time.
+    """A prior and its parameters: K cosines, weight λ, pace μ (scale of a volume's time axis).
 
-    ``change``: of what changes beside the best still; ``fine``: solved at N_m = 1, and merged; ``robust``:
-    samples that are missed by far count for less.
+    ``brightness``: times a free brightness of the whole scene; ``change``: the difference from the best
+    still; ``fine``: solved at N_m = 1, then merged; ``robust``: samples with large residuals have less
+    weight.
     """
 
     prior: Literal["still", "smooth", "volume"]
@@ -74,6 +75,32 @@ class Candidate:
     fine: bool = False
     robust: bool = False
 
+    def denoiser(self) -> Denoiser:
+        """The denoiser of this prior."""
+        if self.prior == "still":
+            return FrameTv(10)
+        return VolumeTv(self.pace) if self.prior == "volume" else Smooth(self.pace)
+
+    def is_stronger_than(self, other: Candidate) -> bool:
+        """Whether it leaves the video less freedom than ``other``, which differs in one parameter."""
+        return self.weight > other.weight or self.pace > other.pace or self.coefficients < other.coefficients
+
+    def with_weight(self, factor: float) -> Candidate | None:
+        """The candidate with another weight; None beyond the limits."""
+        weight = rounded(self.weight * factor)
+        return replace(self, weight=weight) if LEAST_WEIGHT <= weight <= LARGEST_WEIGHT else None
+
+    def with_pace(self, factor: float) -> Candidate | None:
+        """The candidate with another pace; None beyond the limits."""
+        pace = self.pace * factor
+        return replace(self, pace=pace) if LEAST_PACE <= pace <= LARGEST_PACE else None
+
+    def with_cosines(self, step: int, frames: int) -> Candidate | None:
+        """The candidate with the next number of cosines in either direction; None beyond the limits."""
+        counts = sorted({min(count, frames) for count in COSINES})
+        at = counts.index(self.coefficients) + step
+        return replace(self, coefficients=counts[at]) if 0 <= at < len(counts) else None
+
 
 STILL = Candidate("still", 1, 2e-3)
 SMOOTH = Candidate("smooth", 24, 3e-3, 1.0)
@@ -83,9 +110,9 @@ CALM = Candidate("volume", 24, 2e-3, 16.0)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Trial:
-    """A candidate as far as it has been solved; ``errors`` are those of the held-out blocks.
+    """A candidate and its solution so far; ``errors`` are those of the held-out blocks, ``error`` of all.
 
-    ``coefficients`` (K, n′, n′) are those of the voxels that were asked for, ``bench`` is where it was tried.
+    ``coefficients`` (K, n′, n′) are those of the requested voxels; ``bench`` is where it was tried.
     """
 
     bench: Workbench
@@ -100,20 +127,24 @@ class Trial:
 
     @property
     def coefficients(self) -> Array:
-        theta, beside = self.bench.merged(self.admm.theta), self.bench.beside
-        return theta if beside is None else theta + resized(beside, self.basis)
+        theta, background = self.bench.merged(self.admm.theta), self.bench.background
+        return theta if background is None else theta + resized(background, self.basis)
 
 
 @dataclass(slots=True)
-class Notes:
-    """What all workbenches of one problem have in common: a record of candidates, and the best so far."""
+class Shared:
+    """State shared by all workbenches of one reconstruction: the record of candidates and the best so far."""
 
     record: list[dict[str, Any]] = field(default_factory=list)
     best: Trial | None = None
 
 
 class Workbench:
-    """Tries candidates on one problem and keeps a record of them; ``fine``: at N_m = 1, and merged."""
+    """Tries candidates on one problem and keeps a record of them.
+
+    ``fine``: they are solved at N_m = 1 and merged. ``still``: they are the change relative to that trial,
+    whose coefficients are the ``background``.
+    """
 
     def __init__(
         self,
@@ -122,41 +153,44 @@ class Workbench:
         options: SolveOptions,
         clock: IterationClock,
         held_out: HeldOut,
-        notes: Notes | None = None,
+        shared: Shared | None = None,
         *,
         fine: bool = False,
         still: Trial | None = None,
     ) -> None:
         self._segment, self.problem, self.clock, self.held_out = segment, problem, clock, held_out
-        self._options, self._notes = options, notes or Notes()
+        self._options, self._shared = options, shared or Shared()
         self.fine, self.still = fine, still
-        self.beside = None if still is None else still.coefficients
+        self.background = None if still is None else still.coefficients
         self._merges = (1 if fine else options.spatial_merge, options.temporal_merge)
         self.merge = options.spatial_merge if fine else 1
         self.frames, self._side, _ = segment.geometry.video_shape(*self._merges)
         self._brightness: NDArray[Any] | None = None
-        self._operators: dict[tuple[int, bool], Operator] = {}  # neighbours mostly share one
-        self._response = self._energy_of_a_voxel() / USUAL_ENERGY
+        self._operators: dict[tuple[int, bool], Operator] = {}  # successive trials mostly share one
+        self._response = self._voxel_energy() / USUAL_ENERGY
 
     @property
     def record(self) -> list[dict[str, Any]]:
-        return self._notes.record
+        return self._shared.record
 
-    def on(self, problem: Problem, *, fine: bool | None = None, still: Trial | None = None) -> Workbench:
-        """Another for the same lines: with other weights, ``fine``, or of what changes beside a ``still``."""
-        kept = self._segment, problem, self._options, self.clock, self.held_out, self._notes
+    def with_problem(
+        self, problem: Problem, *, fine: bool | None = None, still: Trial | None = None
+    ) -> Workbench:
+        """Another bench for the same lines: with other weights, ``fine``, or for changes from a ``still``."""
+        kept = self._segment, problem, self._options, self.clock, self.held_out, self._shared
         return Workbench(*kept, fine=self.fine if fine is None else fine, still=still)
 
     def merged(self, theta: Array) -> Array:
-        """Coefficients of the voxels that were asked for."""
+        """Coefficients of the requested voxels."""
         if self.merge == 1:
             return theta
         return self.problem.arrays.asarray(merge_video(host(theta), self.merge, 1))
 
     def brighten(self, still: Trial, cosines: int, most: float = np.inf) -> Trial | None:
-        """A calm volume times the brightness of the whole scene, found in turn; None where there is none.
+        """Fit a calm volume and the brightness of the whole scene in turn; None if the brightness is
+        constant.
 
-        It is not followed up from an error of more than ``most``.
+        If the first volume's error exceeds ``most``, it is not refined.
         """
         if self.clock.spent(SEARCH_SHARE):
             return None
@@ -173,34 +207,37 @@ class Workbench:
             if not lit.error < (1 - LEAST_GAIN) * best.error:
                 break
             best = lit
-        self._brightness = best.brightness
-        self._operators = {key: kept for key, kept in self._operators.items() if not key[1]}
+        self._use_brightness(best.brightness)
         return best
 
     def _fit_brightness(self, trial: Trial, cosines: int) -> None:
-        """The brightness that goes with a trial's video from now on."""
+        """Fit the brightness to a trial's video, and use it in the trials that follow."""
         video = np.maximum(self.video(trial), 0)
         light = np.ones(self.frames) if trial.brightness is None else trial.brightness
         found = light * fit_brightness(self._segment, self.problem, video, self._merges, cosines)
-        self._brightness = found / found.mean()
+        self._use_brightness(found / found.mean())
+
+    def _use_brightness(self, brightness: NDArray[Any] | None) -> None:
+        self._brightness = brightness
+        # operators that contain the former brightness are out of date
         self._operators = {key: kept for key, kept in self._operators.items() if not key[1]}
 
     def fitting(self, candidate: Candidate) -> Candidate:
-        """The candidate with no more cosines than there are frames.
+        """Adapt a candidate to the number of frames: no more cosines than that, and a larger weight for few.
 
-        To a video of few frames all that changes within one is noise: the search begins at a larger weight,
-        which few trials would not reach.
+        Changes within a frame act as noise on a video of few frames: the search starts from a larger weight,
+        which it would not reach in a few trials.
         """
         larger = max(1.0, VOLUME.coefficients / self.frames) ** 2
         cosines = min(candidate.coefficients, self.frames)
         return replace(candidate, coefficients=cosines, weight=larger * candidate.weight)
 
     def attempt(self, candidate: Candidate, iterations: int, start: Trial | None = None) -> Trial:
-        """Solve a candidate for so many iterations, or as many as there is time for, from ``start``."""
+        """Solve a candidate from ``start`` for this many iterations, or as many as there is time for."""
         basis = TemporalBasis(self.frames, candidate.coefficients, self.problem.arrays)
         brightness = self._brightness if candidate.brightness else None
         operator = self._operator(basis, brightness)
-        shape, denoiser = (basis.count, self._side, self._side), _denoiser(candidate)
+        shape, denoiser = (basis.count, self._side, self._side), candidate.denoiser()
         admm = Admm(
             self.problem.masked(operator),
             self.problem.used_samples,
@@ -209,10 +246,14 @@ class Workbench:
             parameters(candidate, self.frames, self._response),
             start=None if start is None else resized(self._start(start), basis),
             denoiser=denoiser,
-            beside=self._beside(basis),
+            background=self._background(basis),
         )
-        same = start is not None and start.bench.fine == self.fine and start.bench.beside is self.beside
-        if start is not None and same and start.candidate.coefficients == candidate.coefficients:
+        if (
+            start is not None
+            and start.bench.fine == self.fine
+            and start.bench.background is self.background
+            and start.candidate.coefficients == candidate.coefficients
+        ):
             admm.resume(start.admm)
             if isinstance(denoiser, VolumeTv) and isinstance(start.denoiser, VolumeTv):
                 denoiser.resume(start.denoiser)
@@ -220,17 +261,17 @@ class Workbench:
         began = self.clock.seconds
         for _ in self.clock.attempt(iterations, "choose", SEARCH_SHARE):
             admm.step()
-        errors = self.note(asdict(trial.candidate), self.predict(trial), began)
+        errors = self.record_errors(asdict(trial.candidate), self.predict(trial), began)
         trial = replace(trial, errors=errors, error=self.held_out.relative(errors))
-        if self._notes.best is None or trial.error < self._notes.best.error:
-            self._notes.best = trial
+        if self._shared.best is None or trial.error < self._shared.best.error:
+            self._shared.best = trial
             self.clock.show("choose", partial(self.video, trial))
         return trial
 
-    def note(
+    def record_errors(
         self, candidate: dict[str, Any], predicted: NDArray[Any], began: float | None = None
     ) -> NDArray[np.float64]:
-        """The errors of a prediction, and a record of it."""
+        """Record a candidate with its held-out error, and return the errors of the blocks."""
         errors = self.held_out.errors(predicted)
         seconds = {} if began is None else {"seconds": self.clock.seconds - began}
         self.record.append(candidate | {"error": self.held_out.relative(errors)} | seconds)
@@ -241,7 +282,7 @@ class Workbench:
         return self.held_out.relative(self.held_out.errors(predicted))
 
     def video(self, trial: Trial) -> NDArray[Any]:
-        """Of a trial, dimensionless."""
+        """The dimensionless video of a trial."""
         video = host(trial.basis.synthesize(trial.coefficients))
         light = trial.brightness
         return video if light is None else video * light[:, None, None].astype(video.dtype)
@@ -251,10 +292,10 @@ class Workbench:
         return self.problem.lines_of(host(trial.operator.forward(trial.admm.theta)))
 
     def _start(self, trial: Trial) -> Array:
-        """A trial's coefficients in the voxels of this bench."""
+        """A trial's coefficients in the voxels of this bench, without its background."""
         theta = trial.coefficients
-        if self.beside is not None:
-            return theta - resized(self.beside, trial.basis)
+        if self.background is not None:
+            return theta - resized(self.background, trial.basis)
         if not self.fine:
             return theta
         if trial.bench.fine:
@@ -264,66 +305,65 @@ class Workbench:
         return self.problem.arrays.asarray(held)
 
     def climb(self, best: Trial, trials: int) -> Trial:
-        """Change one thing of a candidate at a time, in steps, for as long as the prediction gets better."""
-        seen = {best.candidate}
-        moving = True
-        while moving:
-            moving = False
-            for step in self._steps(best.candidate):
-                while (candidate := step(best.candidate)) is not None and candidate not in seen:
-                    if len(seen) > trials or self.clock.spent(SEARCH_SHARE):
+        """Hill-climb from a trial: change one parameter at a time while the prediction improves.
+
+        It ends after ``trials`` candidates or when the search's share of the budget is spent.
+        """
+        tried = {best.candidate}
+        improved = True
+        while improved:
+            improved = False
+            for step in self._steps(best.candidate.prior):
+                while (candidate := step(best.candidate)) is not None and candidate not in tried:
+                    if len(tried) > trials or self.clock.spent(SEARCH_SHARE):
                         return best
-                    seen.add(candidate)
+                    tried.add(candidate)
                     found = self.attempt(candidate, NEXT_ITERATIONS, best)
-                    gain = 0.0 if _stronger(candidate, best.candidate) else LEAST_GAIN
+                    gain = 0.0 if candidate.is_stronger_than(best.candidate) else LEAST_GAIN
                     if not found.error < (1 - gain) * best.error:
                         break
-                    best, moving = found, True
+                    best, improved = found, True
         return best
 
-    def _steps(self, candidate: Candidate) -> Sequence[Callable[[Candidate], Candidate | None]]:
-        """Ways to change a candidate; each gives None where there is nowhere to go."""
-        factor = WEIGHT_STEP**2 if candidate.prior == "smooth" else WEIGHT_STEP
-        weights = [partial(_weighed, by) for by in (1 / factor, factor)]
-        if candidate.prior == "still":
+    def _steps(self, prior: str) -> Sequence[Callable[[Candidate], Candidate | None]]:
+        """Ways to change a candidate with this prior; each returns None at its limit."""
+        factor = WEIGHT_STEP**2 if prior == "smooth" else WEIGHT_STEP
+        weights = [partial(Candidate.with_weight, factor=by) for by in (1 / factor, factor)]
+        if prior == "still":
             return weights
-        stride = PACE_STEP if candidate.prior == "volume" else 2.0
-        paces = [partial(_paced, by) for by in (1 / stride, stride)]
-        return [*weights, *paces, partial(self._resized, 1), partial(self._resized, -1)]
-
-    def _resized(self, by: int, candidate: Candidate) -> Candidate | None:
-        sizes = sorted({min(count, self.frames) for count in COSINES})
-        at = sizes.index(candidate.coefficients) + by
-        return replace(candidate, coefficients=sizes[at]) if 0 <= at < len(sizes) else None
+        stride = PACE_STEP if prior == "volume" else 2.0
+        paces = [partial(Candidate.with_pace, factor=by) for by in (1 / stride, stride)]
+        counts = [partial(Candidate.with_cosines, step=step, frames=self.frames) for step in (1, -1)]
+        return [*weights, *paces, *counts]
 
     def finish(self, best: Trial) -> Chosen:
-        """The best with all samples, which none were kept back for; on the bench where it was tried."""
+        """Solve the best trial with all samples, none held out, on the bench where it was tried."""
         if best.bench is not self:
             return best.bench.finish(best)
-        whole = self.problem.whole()
+        problem = self.problem.with_all_samples()
         admm = Admm(
-            whole.masked(best.operator),
-            whole.used_samples,
+            problem.masked(best.operator),
+            problem.used_samples,
             best.admm.theta.shape,
             best.basis,
             parameters(best.candidate, self.frames, self._response),
             denoiser=best.denoiser,
-            beside=self._beside(best.basis),
+            background=self._background(best.basis),
         )
         admm.resume(best.admm)
         last = replace(best, admm=admm)
-        self.clock.begin_anew()
+        self.clock.reset()
         for _ in self.clock.run(LAST_ITERATIONS, "solve", video=partial(self.video, last)):
             admm.step()
         if self.clock.ended == "done":
             self.clock.converged()
         return Chosen(self, last)
 
-    def _beside(self, basis: TemporalBasis) -> Array | None:
-        return None if self.beside is None else resized(self.beside, basis)
+    def _background(self, basis: TemporalBasis) -> Array | None:
+        return None if self.background is None else resized(self.background, basis)
 
-    def _energy_of_a_voxel(self) -> float:
-        """Σ of squares of the lines' response to a voxel in the middle, as the solvers have it."""
+    def _voxel_energy(self) -> float:
+        """Energy of the normalised lines' response to a voxel in the middle of the picture."""
         still = TemporalBasis(self.frames, 1, self.problem.arrays)
         point = np.zeros((1, self._side, self._side))
         point[0, self._side // 2, self._side // 2] = 1
@@ -343,7 +383,7 @@ class Workbench:
 
 
 class Chosen:
-    """The candidate that was chosen, as an estimate."""
+    """Estimate of the candidate that was chosen."""
 
     def __init__(self, bench: Workbench, trial: Trial) -> None:
         self._bench, self._trial = bench, trial
@@ -360,17 +400,17 @@ class Chosen:
         chosen["temporal_coefficients"] = chosen.pop("coefficients")
         return chosen | {"candidates": self._bench.record}
 
-    def onward(self, problem: Problem, heavier: float = 1.0, *, still: bool = False) -> Onwards:
-        beside = self._bench.still if still else None
-        return Onwards(
+    def continue_with(self, problem: Problem, heavier: float = 1.0, *, still: bool = False) -> ContinuedTrial:
+        background = self._bench.still if still else None
+        return ContinuedTrial(
             self._bench,
-            _on(self._trial, problem, heavier),
-            None if beside is None else _on(beside, problem, heavier),
+            _with_problem(self._trial, problem, heavier),
+            None if background is None else _with_problem(background, problem, heavier),
         )
 
 
-class Onwards:
-    """A trial that goes on, and the still that it changes beside, if that does: most of the picture is it."""
+class ContinuedTrial:
+    """A trial that continues, and the still that it is a change of, which is most of the picture."""
 
     def __init__(self, bench: Workbench, trial: Trial, still: Trial | None) -> None:
         self._bench, self._trial, self._still = bench, trial, still
@@ -383,50 +423,32 @@ class Onwards:
     def video(self) -> NDArray[Any]:
         if self._still is None:
             return self._bench.video(self._trial)
-        bench = self._bench.on(self._bench.problem, still=self._still)
+        bench = self._bench.with_problem(self._bench.problem, still=self._still)
         return bench.video(replace(self._trial, bench=bench))
 
 
-def _on(trial: Trial, problem: Problem, heavier: float) -> Trial:
+def _with_problem(trial: Trial, problem: Problem, heavier: float) -> Trial:
     own = trial.bench.problem
-    problem = replace(problem, known=own.known, doubt=own.doubt)
+    problem = replace(problem, known_lines=own.known_lines, robust_weight=own.robust_weight)
     operator = problem.masked(trial.operator)
-    return replace(trial, admm=trial.admm.on(operator, problem.used_samples, heavier))
-
-
-def _denoiser(candidate: Candidate) -> Denoiser:
-    if candidate.prior == "still":
-        return FrameTv(10)
-    return VolumeTv(candidate.pace) if candidate.prior == "volume" else Smooth(candidate.pace)
-
-
-def _stronger(one: Candidate, other: Candidate) -> bool:
-    """Whether one candidate leaves the video less freedom than another that differs in one thing."""
-    return one.weight > other.weight or one.pace > other.pace or one.coefficients < other.coefficients
+    return replace(trial, admm=trial.admm.with_problem(operator, problem.used_samples, heavier))
 
 
 def rounded(weight: float) -> float:
-    """To three digits, so that a search knows where it has been."""
+    """A weight to three digits, so that a search recognises candidates it has tried."""
     return float(f"{weight:.3g}")
 
 
-def _weighed(by: float, candidate: Candidate) -> Candidate | None:
-    weight = rounded(candidate.weight * by)
-    return replace(candidate, weight=weight) if LEAST_WEIGHT <= weight <= LARGEST_WEIGHT else None
-
-
-def _paced(by: float, candidate: Candidate) -> Candidate | None:
-    pace = candidate.pace * by
-    return replace(candidate, pace=pace) if LEAST_PACE <= pace <= LARGEST_PACE else None
-
-
 def parameters(candidate: Candidate, frames: int, response: float) -> AdmmParameters:
-    """The solver's. λ grows with the coefficients, which do with the root of the frames, and both λ and ρ
-    with the lines' ``response`` to a voxel, so that a candidate means the same whatever the voxels."""
+    """The solver's parameters for a candidate, scaled so that it means the same whatever the voxels.
+
+    λ scales with the coefficients, hence with the square root of the number of frames, and both λ and ρ with
+    the lines' ``response`` to a voxel.
+    """
     w, extent = candidate.weight, (frames / USUAL_FRAMES) ** 0.5
     if candidate.prior == "still":
-        # all sub-steps add up in one frame: its mean light outweighs a detail thousands of times, and small
-        # penalties with data steps made to the end are what lets details through
+        # all sub-steps add up in one frame, whose mean light outweighs a detail thousands of times: only
+        # small penalties and data steps run to their end recover the details
         weight, penalty, steps = w * extent, 0.1 * w, STILL_STEPS
     elif candidate.prior == "smooth":
         weight, penalty, steps = w, 2e-3, 2

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from acquire.cores import slowness
 from acquire.errors import UsageError
-from acquire.recon.least import MARGIN, MARGIN_S, least_seconds
+from acquire.recon.feasibility import MARGIN, MARGIN_S, least_seconds
 from acquire.reconstruct.work import LEAST_BUDGET_S
 
 if TYPE_CHECKING:

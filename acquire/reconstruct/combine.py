@@ -17,7 +17,7 @@ from acquire import __version__
 from acquire.calibrate.choose import provenance
 from acquire.errors import AcquireError
 from acquire.recon.diagnosis import TURNED
-from acquire.recon.error import together
+from acquire.recon.error import combined_facts
 from acquire.recon.segments import Stitcher
 from acquire.reconstruct.arms import balance_of_recording
 from acquire.reconstruct.budget import Budget
@@ -217,7 +217,7 @@ def describe_parts(
         "iterations_asked": sum(part["iterations_asked"] for part in parts),
         "compiled_s": round(max(part["compiled_s"] for part in parts), 3),
         "quality": {key: _rms([part["quality"][key] for part in parts]) for key in QUALITY_KEYS},
-        "error": together(
+        "error": combined_facts(
             [part["error"] for part in parts], [part["end_substep"] - part["begin_substep"] for part in parts]
         ),
         "segments": segments,

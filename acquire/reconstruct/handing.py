@@ -2,7 +2,7 @@
 
 The search for them is most of what a tile takes. It is made on the tile where most changes, by its lines
 alone, and handed to the others, which keep it where it predicts their own held-out samples as closely
-(`acquire.recon.handed`).
+(`acquire.recon.reuse`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from acquire.fibre import Tile
-    from acquire.recon.handed import Choice
+    from acquire.recon.reuse import Choice
     from acquire.recon.segments import Voxels
     from acquire.reconstruct.select import VideoRequest
     from acquire.reconstruct.work import Options, Part, Task

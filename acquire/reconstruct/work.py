@@ -12,11 +12,11 @@ from acquire.calibrate import calibrated
 from acquire.plugins import SOLVERS
 from acquire.recon import reconstruct
 from acquire.recon.balance import divided
-from acquire.recon.diagnosis import put_right
-from acquire.recon.error import error_facts, in_frames
-from acquire.recon.handed import Choice
+from acquire.recon.diagnosis import undo_turn
+from acquire.recon.error import error_facts, regions_of
 from acquire.recon.hypotheses import AS_BUILT
 from acquire.recon.judge import POOR_MISFIT
+from acquire.recon.reuse import Choice
 from acquire.store import open_recording
 
 if TYPE_CHECKING:
@@ -165,7 +165,7 @@ def solve(task: Task, watch: Watch) -> Part:
     return Part(
         video=task.grid.resample(result.video, segment, substeps),
         quality=task.grid.resample_time(result.frame_error, segment, substeps),
-        error=task.grid.resample_time(in_frames(result.error, len(result.video)), segment, substeps),
+        error=task.grid.resample_time(regions_of(result.error, len(result.video)), segment, substeps),
         facts={
             "first_line": segment.first_line,
             "lines": segment.lines,
@@ -196,7 +196,7 @@ def as_read(lines: Segment, options: Options) -> Segment:
     """With the calibration, and the arms put right."""
     if options.calibration is not None:
         lines = calibrated(lines, options.calibration)
-    return put_right(lines, options.turn)
+    return undo_turn(lines, options.turn)
 
 
 def _why_not_trusted(result: Reconstruction, segment: SubSegment) -> str | None:

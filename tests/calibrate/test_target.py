@@ -67,19 +67,19 @@ def test_a_scene_without_texture_does_not_tell(tmp_path: Path, which: str) -> No
 
 
 @pytest.mark.parametrize("view", [view for view in VIEWS if view.crosses], ids=lambda view: view.name)
-def test_lines_are_put_right(tmp_path: Path, view: View) -> None:
+def test_lines_are_undo_turn(tmp_path: Path, view: View) -> None:
     """What `oriented` gives is Eq. (4) of what the first of its cameras sees."""
     scene = dots(tmp_path, optics={"b": {"turn_deg": view.turn_deg, "mirror": view.mirrored}})
     path = record(tmp_path / "run.zarr", scene, "target", 80)
     segment = replace(open_recording(path).cut(0, 80), responsivity_dn=(8.0, 8.0))
-    put_right = oriented(segment, view)
+    undo_turn = oriented(segment, view)
     picture = build_scene(scene, N, 1e-5).frames(0, 1)[0]
     swapped = view.swapped
     seen = view.seen(picture) if swapped else picture
     seen = seen[:, ::-1] if swapped and view.mirrored else seen
     video = np.broadcast_to(seen, (segment.geometry.span, N, N)).astype(np.float32)
     expected = DualArm(segment.geometry, segment.code).forward(np.ascontiguousarray(video))
-    np.testing.assert_allclose(put_right.samples(), expected, atol=0.07)  # rounded to whole DN
+    np.testing.assert_allclose(undo_turn.samples(), expected, atol=0.07)  # rounded to whole DN
     if view != MODEL:
         assert np.abs(segment.samples() - expected).max() > 1
 
@@ -113,7 +113,7 @@ def test_shift_and_turn_to_some_hundredths(tmp_path: Path, off: dict[str, float]
         assert error < 8 * found.uncertainty[name]
 
 
-def test_a_flat_that_ends_at_the_fields_edge_is_put_right(
+def test_a_flat_that_ends_at_the_fields_edge_is_undo_turn(
     recordings: dict[str, Path], known: Calibration
 ) -> None:
     """Arm B looks beyond it: its part looks smaller, and its turn gives the gains a slope."""

@@ -18,7 +18,7 @@ from acquire.recon.twist import Twist, TwistParameters
 
 GEOMETRY = Geometry(16, 3, 80)
 GOOD_DB = 40.0
-"""An error of 1 % of full light, where rounding does not matter yet; unmasked, each fault leaves less."""
+"""PSNR of an error of 1 % of full light, where rounding does not matter; unmasked faults give less."""
 SOLVERS = ("admm", "twist", "twist-band")
 
 
@@ -112,7 +112,7 @@ def test_an_all_zero_code_is_refused(solver: str) -> None:
 
 
 @pytest.mark.parametrize("density", [0.01, 0.99, 1.0])
-def test_extreme_codes_are_solved_and_said(density: float) -> None:
+def test_extreme_codes_are_solved_with_a_warning(density: float) -> None:
     rng = np.random.default_rng(0)
     code = (rng.random(GEOMETRY.span) < density).astype(np.uint8)
     code[100] = 1
@@ -122,7 +122,7 @@ def test_extreme_codes_are_solved_and_said(density: float) -> None:
 
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("weight", [0.0, 1e-30, 1e8])
-def test_any_weight_is_finite(solver: str, weight: float) -> None:
+def test_any_weight_gives_a_finite_video(solver: str, weight: float) -> None:
     solve(segment(), solver, tv_weight=weight, iterations=5)
 
 
@@ -150,19 +150,19 @@ def test_merges_that_divide_nothing(merges: tuple[int, int]) -> None:
     assert result.frame_error.shape == result.video.shape[:1]
 
 
-def test_inconsistent_data_are_said() -> None:
+def test_inconsistent_data_give_a_warning() -> None:
     noise = np.random.default_rng(1).random(CLEAN.shape).astype(np.float32) * CLEAN.max()
     assert any("misses the lines" in warning for warning in solve(segment(noise), merges=(5, 287)).warnings)
 
 
-def test_a_wrong_orientation_is_said() -> None:
+def test_a_wrong_orientation_gives_a_warning() -> None:
     turned = np.stack([CLEAN[0], CLEAN[1, :, ::-1]])
     assert any("orientation" in warning for warning in solve(segment(turned)).warnings)
     assert not solve(segment()).warnings
 
 
 def test_twist_survives_an_underestimated_norm() -> None:
-    """Where the step is too long nothing is taken, so the objective never rises above its start."""
+    """A step that is too long is not taken, so that the objective never rises above its start."""
     problem = build_problem(segment(), 3, 1, hold_out=0.0)
     whole = DualArm(GEOMETRY, CODE, 3, 1)
     loud = MaskedOperator(whole, problem.weight / np.float32(0.7 * problem.norm))
@@ -175,7 +175,7 @@ def test_twist_survives_an_underestimated_norm() -> None:
 
 
 def test_a_million_substeps() -> None:
-    """In float32: sums as long as that are not left to it."""
+    """In float32: such long sums are computed in float64."""
     geometry = Geometry(2, 3, 333_333)
     code = prbs(64, mix_seed(1, 64), 0, geometry.span)
     whole = DualArm(geometry, code, 6, 1)
@@ -228,20 +228,20 @@ def test_images_without_light_and_below_it_are_refused(option: str) -> None:
 
 
 @pytest.mark.parametrize("given", [{"responsivity_dn": 0.0}, {"black_level_dn": (0.0, np.nan)}])
-def test_a_camera_that_turns_light_into_nothing_is_refused(given: dict[str, object]) -> None:
+def test_a_camera_without_responsivity_is_refused(given: dict[str, object]) -> None:
     with pytest.raises(UsageError, match="responsivity"):
         replace(segment(), **given)
 
 
-def test_a_stuck_camera_is_said() -> None:
+def test_a_stuck_camera_gives_a_warning() -> None:
     stuck = CLEAN.copy()
     stuck[1] = CLEAN[1].mean()
     assert any("arm b is stuck" in warning for warning in solve(segment(stuck), iterations=5).warnings)
 
 
 @pytest.mark.parametrize("share", [0.2, -0.2])
-def test_a_wrong_black_level_masks_nothing_and_is_said(share: float) -> None:
-    """Columns that see no light stand still at a wrong value together: they are dark, not stuck."""
+def test_a_wrong_black_level_masks_nothing_and_gives_a_warning(share: float) -> None:
+    """Unlit columns are all constant at one wrong value: they are dark, not stuck."""
     result = solve(segment(CLEAN + np.float32(share * CLEAN.mean())), iterations=10)
     assert "stuck column" not in result.masked
     assert any("the black level is too" in warning for warning in result.warnings)

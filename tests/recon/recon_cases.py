@@ -1,4 +1,4 @@
-"""What the operators are tried on: geometries small enough for their dense matrix, and codes by seed."""
+"""Cases for the operators: geometries small enough for their dense matrix, and codes by seed."""
 
 from __future__ import annotations
 

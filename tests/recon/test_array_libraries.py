@@ -35,19 +35,19 @@ DEVICE = array_api_strict.Device("device1")
 DOUBLE = open_arrays(dtype="float64")
 STRICT = Arrays(array_api_strict, DEVICE, "float64")
 ROUNDING = 1e-9
-"""Relative; of float64 over ten iterations."""
+"""Relative tolerance in float64 over ten iterations."""
 
 
 @pytest.fixture(params=["strict", pytest.param("gpu", marks=pytest.mark.needs_gpu)])
 def device(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """That device, and a GPU where there is one, by the name that `reconstruct` takes."""
+    """That device, and a GPU if there is one, by the name that `reconstruct` takes."""
     monkeypatch.setitem(arrays.DEVICES, "strict", lambda: (array_api_strict, DEVICE))
     return str(request.param)
 
 
 @pytest.fixture(scope="module")
 def segment() -> Segment:
-    """Two squares that blink, some samples missing."""
+    """Two blinking squares, with some missing samples."""
     code = prbs(64, mix_seed(5, 64), 0, GEOMETRY.span)
     mask = np.ones(GEOMETRY.lines_shape, bool)
     mask[0, 30], mask[1, 5, 3] = False, False
@@ -70,7 +70,7 @@ def scene() -> np.ndarray:
 
 
 def error(result: Reconstruction) -> float:
-    """Relative, against the truth at N_m = 3."""
+    """Relative error against the truth at N_m = 3."""
     truth = merge_video(scene(), 3, 1)[result.trusted]
     return float(np.linalg.norm(result.video[result.trusted] - truth) / np.linalg.norm(truth))
 
@@ -115,7 +115,7 @@ def test_the_band_operator_and_its_transpose(case: tuple[Geometry, int, int, int
 
 @pytest.mark.parametrize("weight", [0.0, 1e-30, 0.1, np.array([0.0, 0.05, 3.0]), 1e8])
 def test_total_variation_is_that_of_the_compiled_loops(weight: float | np.ndarray) -> None:
-    """Over three calls that go on from each other's dual field."""
+    """It is compared over three calls, each of which continues the dual field of the last."""
     frames = np.random.default_rng(2).random((3, 9, 7))
     here, there = FrameTv(10), FrameTv(10)
     given = weight if isinstance(weight, float) else STRICT.asarray(weight)

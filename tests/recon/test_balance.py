@@ -1,4 +1,4 @@
-"""The arms' shares of the light, found in lines of scenes that nothing was tuned on, or not claimed."""
+"""The arms' shares of the light: found in lines of scenes that nothing was tuned on, or not claimed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DIM = Camera(1e3)
 
 
 def split(segment: Segment, ratio: float) -> Segment:
-    """As recorded behind a splitter that gives arm B so many times the light of arm A."""
+    """A recording behind a splitter that gives arm B this many times the light of arm A."""
     shares = np.array([2 / (1 + ratio), 2 * ratio / (1 + ratio)])[:, None, None]
     pixels = np.clip((segment.lines - BLACK_DN) * shares + BLACK_DN, 0, 4095)
     return replace(segment, lines=np.rint(pixels).astype(np.uint16), mask=segment.mask & (pixels < 4095))
@@ -43,7 +43,7 @@ def test_a_splitter_is_found_within_its_error(scene: str, ratio: float) -> None:
     assert found.ratio == pytest.approx(ratio, abs=3 * found.error)
 
 
-def test_a_light_at_one_edge_is_less_sure_unless_arm_b_is_known_to_see_the_same_field() -> None:
+def test_a_light_at_one_edge_is_less_certain_unless_the_arms_are_aligned() -> None:
     segment = record("flame", 819, **SIZES).segment
     anywhere, aligned = (balance_of([replace(segment, alignment=known)]) for known in (None, Alignment()))
     assert anywhere is not None
@@ -52,7 +52,7 @@ def test_a_light_at_one_edge_is_less_sure_unless_arm_b_is_known_to_see_the_same_
     assert anywhere.error > 1.5 * aligned.error
 
 
-def test_several_stretches_are_surer_than_one() -> None:
+def test_several_ranges_are_more_certain_than_one() -> None:
     stretches = [split(record("leds", seed, **SIZES).segment, 1.08) for seed in range(820, 828)]
     one, all_of_them = balance_of(stretches[:1]), balance_of(stretches)
     assert one is not None
@@ -61,7 +61,7 @@ def test_several_stretches_are_surer_than_one() -> None:
     assert all_of_them.ratio == pytest.approx(1.08, abs=3 * all_of_them.error)
 
 
-def test_samples_that_are_masked_or_wild_are_not_light() -> None:
+def test_masked_samples_and_outliers_are_not_counted_as_light() -> None:
     segment = split(record("still", 814, **SIZES).segment, 1.2)
     mask = segment.mask.copy()
     mask[0, :, 7] = False
@@ -78,7 +78,7 @@ def test_samples_that_are_masked_or_wild_are_not_light() -> None:
     assert balance_of([replace(segment, mask=mask)]) is None
 
 
-def test_of_few_lines_of_darkness_or_with_a_wrong_black_level_nothing_is_claimed() -> None:
+def test_few_lines_darkness_or_a_wrong_black_level_give_no_balance() -> None:
     assert balance_of([]) is None
     assert balance_of([record("still", 815, stages=24, lines=40).segment]) is None
     segment = record("still", 815, **SIZES).segment
@@ -89,7 +89,7 @@ def test_of_few_lines_of_darkness_or_with_a_wrong_black_level_nothing_is_claimed
 
 
 @pytest.mark.parametrize("responsivity", [2.0, (2.0, 3.0), np.array([[2.0], [3.0]]) * np.ones((2, 24))])
-def test_dividing_takes_the_difference_out_and_leaves_the_mean(responsivity) -> None:
+def test_the_correction_removes_the_difference_and_keeps_the_mean(responsivity) -> None:
     segment = replace(split(record("still", 816, **SIZES).segment, 1.2), responsivity_dn=responsivity)
     before = balance_of([segment])
     assert before is not None
@@ -102,7 +102,7 @@ def test_dividing_takes_the_difference_out_and_leaves_the_mean(responsivity) -> 
     np.testing.assert_allclose((new / old).mean(1), 1)
 
 
-def test_a_reconstruction_corrects_it_and_says_so() -> None:
+def test_a_reconstruction_corrects_it_with_a_warning() -> None:
     recorded = record("splash", 817, **SIZES)
     truth = recorded.truth(2, 8)
 

@@ -1,4 +1,4 @@
-"""A budget is a promise: kept in wall time whatever iterations take, refused where it cannot be."""
+"""A budget is kept in wall time, however long iterations take, and refused if that is impossible."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from acquire.recon.clock import IterationClock
 
 
 class Wall:
-    """A wall clock that goes on only when it is told to."""
+    """A wall clock that only the test advances."""
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -51,7 +51,7 @@ def segment(geometry: Geometry) -> Segment:
 
 
 @pytest.mark.parametrize("each_s", [0.01, 0.1, 0.4])
-def test_what_comes_after_the_last_iteration_fits_as_well(wall: Wall, each_s: float) -> None:
+def test_the_work_after_the_last_iteration_fits_into_the_budget(wall: Wall, each_s: float) -> None:
     clock = IterationClock(1000, 5.0)
     for _ in clock.run(1000, "solve"):
         wall.now += each_s
@@ -60,7 +60,7 @@ def test_what_comes_after_the_last_iteration_fits_as_well(wall: Wall, each_s: fl
     assert clock.ended == "budget"
 
 
-def test_a_machine_that_gets_busy_ends_it_sooner(wall: Wall) -> None:
+def test_a_machine_that_gets_busy_ends_it_earlier(wall: Wall) -> None:
     clock = IterationClock(1000, 10.0)
     for number in clock.run(1000, "solve"):
         wall.now += 0.1 if number < 50 else 0.6
@@ -68,7 +68,7 @@ def test_a_machine_that_gets_busy_ends_it_sooner(wall: Wall) -> None:
     assert 8.0 < clock.seconds <= 10.6
 
 
-def test_a_stage_whose_iterations_are_longer_is_not_begun_too_late(wall: Wall) -> None:
+def test_a_stage_with_longer_iterations_is_not_started_too_late(wall: Wall) -> None:
     clock = IterationClock(1000, 10.0)
     for _ in clock.run(1000, "first look", 0.95):
         wall.now += 0.2
@@ -78,19 +78,19 @@ def test_a_stage_whose_iterations_are_longer_is_not_begun_too_late(wall: Wall) -
     assert clock.longest_s == pytest.approx(0.2)
 
 
-def test_the_first_iteration_is_made_even_too_late(wall: Wall) -> None:
+def test_the_first_iteration_runs_even_after_the_deadline(wall: Wall) -> None:
     clock = IterationClock(10, 1.0)
     wall.now += 2.0
     assert list(clock.run(10, "solve")) == [0]
 
 
-def test_time_is_kept_for_what_goes_on_after_the_last_iteration(wall: Wall) -> None:
+def test_time_is_reserved_for_iterations_after_the_last(wall: Wall) -> None:
     clock = IterationClock(1000, 10.0)
     clock.reserve(10)
     for _ in clock.run(1000, "solve"):
         wall.now += 0.1
     assert 8.3 < clock.seconds <= 9.0
-    for _ in clock.afterwards(1000):
+    for _ in clock.run_reserved(1000):
         wall.now += 0.1
     assert 9.3 < clock.seconds <= 10.0
     clock = IterationClock(1000, 10.0)
@@ -100,42 +100,44 @@ def test_time_is_kept_for_what_goes_on_after_the_last_iteration(wall: Wall) -> N
     assert clock.seconds == pytest.approx(8.3, abs=0.1)  # no more than 15 % are kept
 
 
-def test_one_long_iteration_in_five_does_not_end_what_goes_on_after_the_last(wall: Wall) -> None:
+def test_one_long_iteration_in_five_does_not_end_the_reserved_ones(wall: Wall) -> None:
     clock = IterationClock(1000, 10.0)
     wall.now += 8.0
     made = 0
-    for made in clock.afterwards(1000):
+    for made in clock.run_reserved(1000):
         wall.now += 0.5 if made % 5 == 4 else 0.02
     assert made > 8
     assert clock.seconds <= 10.0
 
 
-def test_the_fewest_after_the_last_are_made_where_they_fit(wall: Wall) -> None:
+def test_the_fewest_reserved_iterations_run_if_they_fit(wall: Wall) -> None:
     for least, expected in ((0, 1), (2, 2)):
         clock = IterationClock(1000, 10.0)
         wall.now += 8.5
-        for _ in clock.afterwards(1000, least):
+        for _ in clock.run_reserved(1000, least):
             wall.now += 0.6
         assert clock.seconds == pytest.approx(8.5 + 0.6 * expected)
 
 
 @pytest.mark.parametrize(("left_s", "first"), [(6.0, 15), (2.0, 8), (0.9, 0)])
-def test_what_is_to_be_made_twice_leaves_time_for_the_second(wall: Wall, left_s: float, first: int) -> None:
+def test_iterations_to_be_repeated_leave_time_for_the_second_pass(
+    wall: Wall, left_s: float, first: int
+) -> None:
     clock = IterationClock(1000, 10.0)
     for _ in clock.run(1, "solve"):
         wall.now += 0.1
     wall.now += 9.9 - left_s
     made = again = 0
-    for made, _ in enumerate(clock.afterwards(15, twice=4), 1):  # noqa: B007
+    for made, _ in enumerate(clock.run_reserved(15, repeat=4), 1):  # noqa: B007
         wall.now += 0.1
-    for again, _ in enumerate(clock.afterwards(max(made, 4), 2), 1):  # noqa: B007
+    for again, _ in enumerate(clock.run_reserved(max(made, 4), 2), 1):  # noqa: B007
         wall.now += 0.1
     assert made == first
     assert again == max(made, 4)
     assert clock.seconds <= 10.0
 
 
-def test_compiling_is_no_part_of_the_time() -> None:
+def test_compilation_is_not_counted() -> None:
     began = time.monotonic()
     clock = IterationClock(10, 1.0)
     numba.njit(lambda x: x * 2 + 1)(3)
@@ -143,7 +145,7 @@ def test_compiling_is_no_part_of_the_time() -> None:
     assert clock.seconds + clock.compiled_s <= time.monotonic() - began + 1e-3
 
 
-def test_a_budget_is_kept_by_the_wall() -> None:
+def test_a_budget_is_kept_in_wall_time() -> None:
     began = time.monotonic()
     result = reconstruct(
         segment(Geometry(20, 3, 120)), 3, 1, budget_s=0.8, solver="twist-band", iterations=100_000
@@ -155,7 +157,7 @@ def test_a_budget_is_kept_by_the_wall() -> None:
 
 
 @pytest.mark.parametrize("solver", ["admm", "twist"])
-def test_looking_on_shows_the_answer_to_be_and_takes_no_time(solver: str) -> None:
+def test_look_receives_the_answer_so_far_and_its_time_is_not_counted(solver: str) -> None:
     seen: list[Look] = []
     videos: list[np.ndarray] = []
 
@@ -175,22 +177,22 @@ def test_looking_on_shows_the_answer_to_be_and_takes_no_time(solver: str) -> Non
     np.testing.assert_allclose(plain.video, result.video, rtol=1e-5, atol=1e-4)
 
 
-def test_who_looks_on_takes_none_of_the_budget(wall: Wall) -> None:
+def test_the_look_callback_uses_none_of_the_budget(wall: Wall) -> None:
     clock = IterationClock(1000, 5.0)
-    clock.looks = lambda _: setattr(wall, "now", wall.now + 2.0)
+    clock.on_look = lambda _: setattr(wall, "now", wall.now + 2.0)
     for _ in clock.run(30, "solve", video=lambda: np.zeros((1, 1, 1))):
         wall.now += 0.1
     assert (clock.done, clock.ended) == (30, "done")
     assert clock.seconds == pytest.approx(3.0)
 
 
-def test_a_budget_that_cannot_be_kept_is_refused_with_what_can() -> None:
+def test_an_impossible_budget_is_refused_with_what_is_possible() -> None:
     large = segment(Geometry(64, 3, 263))
     with pytest.raises(UsageError, match=r"budget of 0.001 s cannot be kept: .* at least [\d.]+ s here"):
         reconstruct(large, 1, 4, budget_s=0.001)
 
 
-def test_a_hopeless_budget_gives_the_least_where_it_is_not_to_be_refused() -> None:
+def test_an_impossible_budget_that_is_not_refused_does_the_minimum() -> None:
     result = reconstruct(segment(Geometry(20, 3, 120)), 3, 1, budget_s=1e-6, refuse=False)
     assert result.iterations <= 3
     assert result.ended == "budget"

@@ -1,4 +1,4 @@
-"""The default chooses its prior without the truth: what moves, rests, blinks or flickers, with noise."""
+"""The default chooses its prior without the truth: for motion, rest, blinking and flicker, with noise."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_a_scene_that_flickers_as_a_whole_is_a_video_times_its_brightness() -> N
 
 
 @pytest.mark.parametrize("code_seed", [6, 7])
-def test_a_still_that_something_flashes_before_is_not_lit_with_the_code(code_seed: int) -> None:
+def test_a_still_with_a_flash_in_front_shows_no_trace_of_the_code(code_seed: int) -> None:
     lines, frames = segment("flash", code_seed=code_seed), GEOMETRY.trusted_frames(1)
     still = reconstruct(lines, 3, GEOMETRY.span, "fast", check=False).video
     result = reconstruct(lines, 3, 1, "fast", check=False)
@@ -102,7 +102,7 @@ def test_a_still_that_something_flashes_before_is_not_lit_with_the_code(code_see
     assert off.std() < 0.2 * truth.mean()
 
 
-def test_cosines_that_are_ahead_do_not_hide_that_a_scene_flickers_as_a_whole() -> None:
+def test_a_flickering_scene_is_recognised_even_if_cosines_are_ahead() -> None:
     recorded = record("flicker", 23, stages=32, lines=160)
     result = reconstruct(recorded.segment, 2, 8, "fast", check=False)
     tried = result.parameters["candidates"]
@@ -119,7 +119,7 @@ def test_the_last_iterations_have_all_samples_however_long_the_search_was() -> N
     assert stages[-LAST_ITERATIONS:] == ["solve"] * LAST_ITERATIONS
 
 
-def test_less_light_ends_in_a_smoother_picture_and_not_in_noise() -> None:
+def test_less_light_gives_a_smoother_picture_not_noise() -> None:
     weights = []
     for full_well_e in (1e5, 1e3):
         result = reconstruct(segment("still", full_well_e), 1, GEOMETRY.span)
@@ -129,7 +129,7 @@ def test_less_light_ends_in_a_smoother_picture_and_not_in_noise() -> None:
     assert weights[0] < weights[1]
 
 
-def test_brightness_is_found_with_the_picture_known() -> None:
+def test_brightness_is_fitted_to_a_known_picture() -> None:
     problem = build_problem(segment("flicker"), 3, 1, hold_out=0.08)
     picture = merge_video(light("still"), 3, 1).astype(np.float32) / problem.scale
     found = fit_brightness(segment("flicker"), problem, picture, (3, 1), 40)
@@ -138,7 +138,7 @@ def test_brightness_is_found_with_the_picture_known() -> None:
     assert np.abs(found - wanted)[frames].max() < 0.05
 
 
-def test_light_beyond_the_band_stands_out_of_what_the_rest_leaves() -> None:
+def test_light_beyond_the_band_stands_out_of_the_residual() -> None:
     problem = build_problem(segment("still"), 3, 1, hold_out=0.0)
     swing = np.cos(np.pi * 50 * (np.arange(GEOMETRY.span) + 0.5) / GEOMETRY.span)
     lamp = np.zeros((GEOMETRY.size, GEOMETRY.size), np.float32)
@@ -152,7 +152,7 @@ def test_light_beyond_the_band_stands_out_of_what_the_rest_leaves() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(case=cases())
-def test_the_near_inverse_is_that_of_either_arm_where_pixels_share_no_voxel(
+def test_the_approximate_inverse_is_exact_per_arm_if_pixels_share_no_voxel(
     case: tuple[Geometry, int, int, int, int],
 ) -> None:
     geometry, _, T_m, count, seed = case
@@ -169,7 +169,7 @@ def test_the_near_inverse_is_that_of_either_arm_where_pixels_share_no_voxel(
     np.testing.assert_allclose(again, lines[0], atol=2e-3 * max(1.0, float(np.abs(back).max())))
 
 
-def test_blocks_that_see_what_nobody_is_shown_do_not_count() -> None:
+def test_blocks_outside_the_trusted_frames_do_not_count() -> None:
     problem = build_problem(segment("still"), 3, 1, hold_out=0.3)
     held_out = HeldOut(problem, GEOMETRY)
     wrong = problem.samples.copy()
@@ -180,7 +180,7 @@ def test_blocks_that_see_what_nobody_is_shown_do_not_count() -> None:
     assert held_out.clearly_less(held_out.errors(problem.samples), held_out.errors(problem.samples + 1))
 
 
-def test_few_frames_of_lamps_that_blink_within_one_are_no_salt() -> None:
+def test_few_frames_of_fast_lamps_are_not_salt_and_pepper() -> None:
     whole = record("leds", 32, stages=32, lines=200)
     T_m = -(-whole.segment.geometry.span // 5)
     result = reconstruct(whole.segment, 1, T_m, "fast", check=False)

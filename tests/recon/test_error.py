@@ -1,4 +1,4 @@
-"""The estimated error of a video, beside the truth, and where nothing is claimed."""
+"""The estimated error of a video compared with the truth, and cases in which none is claimed."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from acquire.recon.error import (
     BY_LINES,
     BY_PRIOR,
     REGIONS,
-    Clues,
+    Indicators,
     VideoError,
-    from_clues,
-    in_frames,
+    combined_facts,
+    error_from,
     in_regions,
-    together,
+    regions_of,
 )
 from acquire.showing import error_in_words
 from acquire.sim.procedural import CLEAN, Camera, Recorded, record
@@ -42,7 +42,7 @@ def solved(scene: str) -> Reconstruction:
 
 
 @pytest.mark.parametrize("scene", ["splash", "leds", "runner"])
-def test_it_is_about_the_error_and_knows_where_it_is_large(scene: str) -> None:
+def test_it_is_close_to_the_error_and_shows_where_it_is_large(scene: str) -> None:
     result = solved(scene)
     assert isinstance(result.error, VideoError)
     off = result.video[result.trusted] - recorded(scene).truth(3, 1)
@@ -59,7 +59,7 @@ def test_estimating_it_does_not_change_the_video() -> None:
     for scene in ("splash", "leds"):
         without = reconstruct(recorded(scene).segment, 3, 1, "fast", error=False)
         assert np.array_equal(without.video, solved(scene).video)
-        assert without.error == "it was not asked for"
+        assert without.error == "it was not requested"
         assert without.iterations == solved(scene).iterations
 
 
@@ -72,10 +72,10 @@ def test_it_has_the_unit_of_the_video() -> None:
     assert brighter.error.rms == pytest.approx(7 * error.rms, rel=0.02)
 
 
-def test_nothing_is_claimed_where_nothing_can_be_known() -> None:
+def test_no_estimate_is_made_without_a_basis() -> None:
     segment = recorded("splash").segment
     paper = reconstruct(segment, 3, 1, solver="twist", iterations=3)
-    assert paper.error == "its solver gives nothing to tell it by"
+    assert paper.error == "its solver offers no way to estimate it"
     stop = threading.Event()
     stop.set()
     stopped = reconstruct(segment, 3, 1, "fast", stop=stop)
@@ -85,13 +85,13 @@ def test_nothing_is_claimed_where_nothing_can_be_known() -> None:
     swapped = replace(segment, lines=segment.lines[::-1].copy(), mask=segment.mask[::-1].copy())
     wrong = reconstruct(swapped, 3, 1, "fast")
     assert not wrong.believed
-    assert wrong.error == "the lines are not what is said of them"
-    assert np.isnan(in_frames(wrong.error, 5)).all()
+    assert wrong.error == "the lines contradict their description"
+    assert np.isnan(regions_of(wrong.error, 5)).all()
 
 
 @pytest.mark.parametrize("scene", ["splash", "leds", "still"])
-def test_a_budget_leaves_time_to_tell_it(scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the processor time of one thread: a busy machine leaves a budget of wall time with one iteration."""
+def test_a_budget_leaves_time_for_the_estimate(scene: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Time is processor time of one thread: wall time on a busy machine may allow one iteration only."""
     own = SimpleNamespace(monotonic=time.process_time, process_time=time.process_time)
     monkeypatch.setattr(clocks, "time", own)
     monkeypatch.setattr(api, "time", own)
@@ -106,63 +106,67 @@ def test_a_budget_leaves_time_to_tell_it(scene: str, monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize("side", [1, 5, 8, 20, 33])
-def test_regions_hold_all_voxels_alike(side: int) -> None:
+def test_regions_weigh_all_voxels_equally(side: int) -> None:
     frames = np.random.default_rng(side).random((3, side, side))
     means = in_regions(frames)
     assert means.shape == (3, REGIONS, REGIONS)
     assert np.allclose(means.mean((1, 2)), frames.mean((1, 2)))
 
 
-def test_an_error_has_degree_one_in_its_clues() -> None:
+def test_an_error_has_degree_one_in_its_indicators() -> None:
     rng = np.random.default_rng(3)
-    moved, change, edge = rng.uniform(0.1, 1, (20, 8, 8)), rng.uniform(0.1, 1, (8, 8)), rng.random((8, 8))
-    once = from_clues(Clues(BY_LINES, 0.1, 2.0, moved, change, edge), EVERY)
-    twice = from_clues(Clues(BY_LINES, 0.2, 4.0, 2 * moved, 2 * change, 2 * edge), EVERY)
+    sensitivity, change, edge = (
+        rng.uniform(0.1, 1, (20, 8, 8)),
+        rng.uniform(0.1, 1, (8, 8)),
+        rng.random((8, 8)),
+    )
+    once = error_from(Indicators(BY_LINES, 0.1, 2.0, sensitivity, change, edge), EVERY)
+    twice = error_from(Indicators(BY_LINES, 0.2, 4.0, 2 * sensitivity, 2 * change, 2 * edge), EVERY)
     assert twice.rms == pytest.approx(2 * once.rms)
     assert np.allclose(twice.regions, 2 * once.regions)
-    unsure = from_clues(Clues(BY_LINES, 0.2, 2.0, 2 * moved, change, edge), EVERY)
+    unsure = error_from(Indicators(BY_LINES, 0.2, 2.0, 2 * sensitivity, change, edge), EVERY)
     assert unsure.rms > once.rms
-    cut = Clues(BY_PRIOR, 0.1, 2.0, moved, change, edge, drifts=0.3)
-    assert from_clues(replace(cut, fine=True), EVERY).rms > from_clues(cut, EVERY).rms
-    assert from_clues(replace(cut, drifts=0.9), EVERY).rms > from_clues(cut, EVERY).rms
+    cut = Indicators(BY_PRIOR, 0.1, 2.0, sensitivity, change, edge, drift=0.3)
+    assert error_from(replace(cut, fine=True), EVERY).rms > error_from(cut, EVERY).rms
+    assert error_from(replace(cut, drift=0.9), EVERY).rms > error_from(cut, EVERY).rms
     assert np.sqrt(np.square(once.frames).mean()) == pytest.approx(once.rms)
 
 
-def test_sub_segments_are_told_together() -> None:
+def test_errors_of_sub_segments_are_combined() -> None:
     parts = [
         {"rms": 0.03, "low": 0.02, "high": 0.05, "full_scale": 1.0},
         {"rms": 0.04, "low": 0.03, "high": 0.08, "full_scale": 2.0},
     ]
-    whole = together(parts, [1, 1])
+    whole = combined_facts(parts, [1, 1])
     assert whole["rms"] == pytest.approx(np.sqrt((0.03**2 + 0.04**2) / 2))
     assert error_in_words(whole) == "about 1.8 % of full scale (1.3 to 3.3 % in nine of ten)"
-    unknown = together([*parts, {"unknown": "the video is dark"}], [1, 1, 1])
+    unknown = combined_facts([*parts, {"unknown": "the video is dark"}], [1, 1, 1])
     assert error_in_words(unknown) == "cannot be told: the video is dark"
 
 
 @pytest.mark.parametrize("camera", [CLEAN, Camera()], ids=["clean", "1e4"])
 def test_a_still_finer_than_pixels_is_judged_by_its_prior(camera: Camera) -> None:
-    """Its lines are explained to a part in a thousand where the picture is some percent off."""
+    """Its lines are explained to a part in a thousand while the picture is some percent off."""
     made = record("still", 72, stages=24, lines=120, camera=camera)
     result = reconstruct(made.segment, 2, 8, "fast")
     assert isinstance(result.error, VideoError)
-    assert result.error.clues.fine
+    assert result.error.indicators.fine
     off = np.sqrt(np.square(result.video[result.trusted] - made.truth(2, 8)).mean())
     assert result.error.low < off < result.error.high
 
 
 @pytest.mark.parametrize("scene", ["leds", "leds_dot"])
-def test_what_is_cut_drifts_and_is_not_told_to_be_near(scene: str) -> None:
-    """Its lines are explained long before the picture is right: they say less of it than of others."""
+def test_a_video_that_was_cut_short_drifts_and_is_not_underestimated(scene: str) -> None:
+    """Its lines are explained long before the picture is right: the residual shows less than for others."""
     made = record(scene, 73, stages=24, lines=120, camera=CLEAN)
     cut = reconstruct(made.segment, 3, 1, "best", iterations=40)
     assert cut.ended == "done"
     assert isinstance(cut.error, VideoError)
-    assert cut.error.clues.powers is BY_PRIOR
-    assert cut.error.clues.drifts > 0.1
+    assert cut.error.indicators.exponents is BY_PRIOR
+    assert cut.error.indicators.drift > 0.1
     off = np.sqrt(np.square(cut.video[cut.trusted] - made.truth(3, 1)).mean())
     assert cut.error.low < off < cut.error.high
     settled = solved("splash")
     assert settled.ended == "converged"
     assert isinstance(settled.error, VideoError)
-    assert settled.error.clues.powers is BY_LINES
+    assert settled.error.indicators.exponents is BY_LINES

@@ -1,4 +1,4 @@
-"""Held-out samples: whole blocks, usable ones only, as many as asked for."""
+"""Held-out samples: whole blocks of usable samples, in the requested number."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def test_blocks_of_lines_and_pixels_that_hold_the_share() -> None:
         assert arm.sum() / blocks > 24 * 4 / 2  # a border cuts a block, and neighbours count as one
 
 
-def test_seeds_and_arms_differ_and_what_cannot_be_used_is_left_out() -> None:
+def test_seeds_and_arms_differ_and_unusable_samples_are_left_out() -> None:
     usable = np.ones((2, 120, 32), bool)
     usable[0, 40:80] = False
     one, other = (held_out_blocks(usable, 0.1, seed) for seed in (1, 2))
@@ -36,7 +36,7 @@ def test_small_segments_have_smaller_blocks() -> None:
     assert np.mean(found) == pytest.approx(0.08 * 640, rel=0.3)
 
 
-def test_nothing_is_held_out_of_nothing() -> None:
+def test_nothing_is_held_out_for_a_share_of_0_or_without_usable_samples() -> None:
     assert not held_out_blocks(np.ones((2, 40, 8), bool), 0.0, 0).any()
     assert not held_out_blocks(np.zeros((2, 40, 8), bool), 0.1, 0).any()
 

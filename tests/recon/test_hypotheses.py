@@ -1,4 +1,4 @@
-"""What is said of lines, tried against them: the truth is found, or nothing is claimed."""
+"""Descriptions of lines compared with the lines: the right one is found, or nothing is claimed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from acquire.codes import mix_seed, prbs
 from acquire.forward import DualArm
 from acquire.geometry import Geometry
 from acquire.lines import Segment
-from acquire.recon.hypotheses import AS_BUILT, TURNS, Hypothesis, Turn, Witness, compare
+from acquire.recon.hypotheses import AS_BUILT, TURNS, Hypothesis, LineModel, Turn, compare
 from acquire.recon.search import Inquiry, Standing, inquire
 
 GEOMETRY = Geometry(24, 3, 120)
@@ -23,7 +23,7 @@ def lit_by(seed: int, start: int = 0, geometry: Geometry = GEOMETRY) -> np.ndarr
 
 
 def recorded(scene_seed: int = 1, *, texture: float = 3.0) -> Segment:
-    """A textured still before which a bright disc passes, with a camera's noise."""
+    """A bright disc that passes before a textured still, with a camera's noise."""
     rng, n = np.random.default_rng(scene_seed), GEOMETRY.size
     ground = gaussian_filter(rng.standard_normal((n, n)), texture, mode="wrap")
     ground = 0.5 + 0.2 * ground / ground.std()
@@ -47,13 +47,13 @@ def recorded(scene_seed: int = 1, *, texture: float = 3.0) -> Segment:
 
 
 def found(segment: Segment) -> Inquiry:
-    return inquire(Witness(segment))
+    return inquire(LineModel(segment))
 
 
-def test_what_is_right_is_left_alone() -> None:
+def test_a_right_description_is_confirmed() -> None:
     inquiry = found(recorded())
     assert inquiry.standing is Standing.RIGHT
-    assert inquiry.best is inquiry.said
+    assert inquiry.best is inquiry.described
 
 
 def test_a_late_code_is_named_to_the_substep() -> None:
@@ -104,8 +104,8 @@ def test_lost_samples_do_not_matter() -> None:
     assert found(segment).standing is Standing.RIGHT
 
 
-def test_of_a_uniform_scene_nothing_is_claimed() -> None:
-    """Mirrored it is itself."""
+def test_no_orientation_is_claimed_for_a_uniform_scene() -> None:
+    """It equals its mirror image."""
     segment = recorded()
     flat = DualArm(GEOMETRY, segment.code).forward(
         np.ones((GEOMETRY.span, GEOMETRY.size, GEOMETRY.size), np.float32)

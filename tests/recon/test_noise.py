@@ -1,4 +1,4 @@
-"""What is said of a residual beside the cameras' noise: against noise that was drawn, and on videos."""
+"""Residuals compared with the cameras' noise: the noise against random draws, the verdict on videos."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ def test_variance_is_that_of_drawn_samples() -> None:
 
 
 @pytest.mark.parametrize("bad", [-1.0, float("nan"), float("inf")])
-def test_noise_that_cannot_be_is_refused(bad: float) -> None:
+def test_impossible_noise_is_refused(bad: float) -> None:
     with pytest.raises(UsageError, match="noise"):
         Noise((bad, 1.0), (1.0, 1.0))
 
 
-def test_merging_and_swapping_arms_take_their_noise_along() -> None:
+def test_merged_and_swapped_arms_keep_their_noise() -> None:
     segment = record("still", 1, stages=12, substeps=1, lines=24, camera=Camera(1e4)).segment
     whole = replace(segment, noise=NOISE, lines=segment.lines.astype(np.float64), mask=segment.mask | True)
     summed = merged(whole, 3).variance()

@@ -20,7 +20,7 @@ from acquire.recon.basis import TemporalBasis
 DOUBLE = open_arrays(dtype="float64")
 
 
-def test_basis_is_orthonormal_and_both_ways_agree() -> None:
+def test_basis_is_orthonormal_and_transforms_agree_with_its_matrix() -> None:
     basis = TemporalBasis(50, 12, DOUBLE)
     D = basis.matrix()
     np.testing.assert_allclose(D @ D.T, np.eye(12), atol=1e-12)
@@ -32,7 +32,7 @@ def test_basis_is_orthonormal_and_both_ways_agree() -> None:
 
 
 def test_the_coarse_grid_samples_the_same_function() -> None:
-    """A video of twice the rate's worth of instants passes through the same band-limited signal."""
+    """A video at twice as many instants samples the same band-limited signal."""
     basis = TemporalBasis(60, 10, DOUBLE)
     theta = np.random.default_rng(1).standard_normal(10)
     coarse = basis.matrix(20).T @ theta * np.sqrt(20 / 60)

@@ -71,7 +71,7 @@ def test_curve_operator_is_the_sensing_matrix_of_the_patterns(
     )
 
 
-def test_curves_of_known_patterns_are_exact_even_where_samples_are_lost() -> None:
+def test_curves_of_known_patterns_are_exact_even_if_samples_are_lost() -> None:
     holed = segment()
     holed.mask[0, 20:24] = False
     cosines = TemporalBasis(GEOMETRY.span, 40)
@@ -122,7 +122,7 @@ def test_patterns_end_at_a_gap_that_leaves_little_out(singular: tuple[float, ...
 
 
 def test_more_iterations_do_not_spoil_the_picture() -> None:
-    """Not even where more patterns are found than there are, in a scene this small: by less than 3 dB."""
+    """Not even if more patterns are found than exist, in a scene this small: the loss is below 3 dB."""
     wanted = TRUTH.reshape(-1, 12, 3, 12, 3).mean((2, 4))[GEOMETRY.trusted]
     noise = np.random.default_rng(5).normal(0, 0.3, GEOMETRY.lines_shape)
     noisy = replace(segment(), lines=segment().lines + noise)
@@ -147,7 +147,7 @@ def test_the_bandwidth_is_found_from_the_lines() -> None:
 
 
 @pytest.mark.parametrize("coarse", [3, 36])
-def test_lamps_are_looked_for_where_coarse_voxels_are_larger_than_the_videos(
+def test_lamps_are_searched_for_if_coarse_voxels_are_larger_than_the_videos(
     monkeypatch: pytest.MonkeyPatch, coarse: int
 ) -> None:
     fast = segment(TRUTH * (0.5 + 0.5 * np.sin(2 * np.pi * INSTANTS / 9))[:, None, None])
@@ -177,7 +177,7 @@ def test_under_a_code_that_hardly_changes_no_fast_lamp_stands_out(density: float
     assert lamp(replace(segment(), code=code, lines=lines)) < FEWEST_COEFFICIENTS
 
 
-def test_what_rests_has_no_lamp_and_lost_lines_make_none() -> None:
+def test_a_scene_at_rest_has_no_lamp_and_lost_lines_add_none() -> None:
     still = segment(np.broadcast_to(IMAGES.sum(0), TRUTH.shape))
     noise = np.random.default_rng(7).normal(0, 0.02 * still.lines.mean(), GEOMETRY.lines_shape)
     holed = replace(still, lines=still.lines + noise)
@@ -186,7 +186,7 @@ def test_what_rests_has_no_lamp_and_lost_lines_make_none() -> None:
     assert lamp(holed) == 0
 
 
-def test_samples_that_are_lost_weigh_nothing_where_lines_are_whitened() -> None:
+def test_lost_samples_have_no_weight_in_whitened_lines() -> None:
     rng = np.random.default_rng(0)
     half = rng.standard_normal((9, 14))
     covariance = half @ half.T
@@ -200,7 +200,7 @@ def test_samples_that_are_lost_weigh_nothing_where_lines_are_whitened() -> None:
         assert not white[~kept].any()
 
 
-def test_a_warm_start_begins_where_the_last_ended() -> None:
+def test_a_warm_start_continues_the_last_result() -> None:
     first = reconstruct(segment(), 3, 1, iterations=50)
     cold = reconstruct(segment(), 3, 1, iterations=2)
     warm = reconstruct(segment(), 3, 1, iterations=2, initial=first.video)
@@ -212,7 +212,7 @@ def test_a_warm_start_begins_where_the_last_ended() -> None:
     assert error(warm.video) < 0.7 * error(cold.video)
 
 
-def test_with_a_known_image_the_light_is_followed() -> None:
+def test_the_light_of_a_known_image_is_recovered() -> None:
     light = np.random.default_rng(2).random(GEOMETRY.span).astype(np.float32)
     image = IMAGES.sum(0) + 0.2
     result = reconstruct(segment(light[:, None, None] * image), 3, 1, static_image=5 * image)
@@ -221,7 +221,7 @@ def test_with_a_known_image_the_light_is_followed() -> None:
     np.testing.assert_allclose(found, light[GEOMETRY.trusted][lit], atol=0.05)
 
 
-def test_another_denoiser_takes_the_place_of_total_variation() -> None:
+def test_another_denoiser_replaces_total_variation() -> None:
     result = reconstruct(segment(), 3, 1, iterations=30, denoiser=HaarShrink())
     assert "patterns" not in result.parameters
     assert result.quality.prediction < 0.3
@@ -232,7 +232,7 @@ def test_another_denoiser_takes_the_place_of_total_variation() -> None:
     assert flat.mean() == pytest.approx(frames.mean(), rel=1e-5)
 
 
-def test_a_stop_keeps_the_best_so_far() -> None:
+def test_a_stop_returns_the_best_so_far() -> None:
     stop = threading.Event()
 
     def seen(progress: Progress) -> None:

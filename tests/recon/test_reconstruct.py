@@ -1,4 +1,4 @@
-"""`reconstruct` as its users call it, on a small scene of blinking shapes."""
+"""`reconstruct` as users call it, on a small scene of blinking shapes."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def still() -> np.ndarray:
 
 @pytest.mark.parametrize("T_m", [GEOMETRY.span, 70])
 def test_a_scene_at_rest_is_found_at_full_resolution(T_m: int) -> None:
-    """In slow voxels: the mean light must not stand in the details' way."""
+    """In slow voxels: the mean light must not suppress the details."""
     seen = DualArm(GEOMETRY, CODE).forward(np.broadcast_to(still(), (GEOMETRY.span, 60, 60)))
     lines = np.rint(seen * 20 + 64).astype(np.float32)
     result = reconstruct(replace(segment(), lines=lines), 1, T_m)
@@ -90,7 +90,7 @@ def test_frames_carry_the_time_of_the_lines() -> None:
     assert first.time_ns[first.trusted][0] == segment().time_ns[0]
 
 
-def test_twist_is_there_and_the_default_beats_it_at_equal_iterations() -> None:
+def test_the_default_beats_twist_at_equal_iterations() -> None:
     twist = reconstruct(segment(), 3, 1, solver="twist", iterations=40)
     admm = reconstruct(segment(), 3, 1, iterations=40)
     assert twist.solver == "twist"
@@ -137,7 +137,7 @@ def test_units_of_the_light_do_not_matter(factor: float) -> None:
     np.testing.assert_allclose(scaled.video, plain.video * factor, rtol=1e-3, atol=1e-3 * factor)
 
 
-def test_a_budget_is_kept_and_progress_is_told() -> None:
+def test_a_budget_is_kept_and_progress_is_reported() -> None:
     steps: list[Progress] = []
     result = reconstruct(segment(), 3, 1, budget_s=1e-6, progress=steps.append, refuse=False)
     assert 1 <= result.iterations == len(steps) <= 2
@@ -165,7 +165,7 @@ def test_a_black_scene_is_black() -> None:
 
 
 @pytest.mark.parametrize("geometry", [Geometry(1, 1, 1), Geometry(1, 3, 4), Geometry(4, 3, 1)])
-def test_tiny_segments_end_in_a_finite_result(geometry: Geometry) -> None:
+def test_tiny_segments_give_a_finite_result(geometry: Geometry) -> None:
     tiny = Segment(
         lines=np.ones(geometry.lines_shape),
         mask=np.ones(geometry.lines_shape, bool),
@@ -198,7 +198,7 @@ def test_what_cannot_be_is_refused_with_what_can() -> None:
         reconstruct(replace(good, code=np.zeros_like(good.code)), 3, 1)
 
 
-def test_frame_error_is_a_residual_that_finds_lines_which_are_not_explained() -> None:
+def test_frame_error_is_a_residual_that_shows_unexplained_lines() -> None:
     good = segment()
     wrong = good.lines.copy()
     wrong[:, 70:74] *= 1.3

@@ -79,7 +79,7 @@ def test_weights_of_all_sub_segments_add_up_to_one(case, merge):
 
 @settings(max_examples=100, deadline=None)
 @given(arranged())
-def test_lines_sample_what_is_shown(case):
+def test_the_lines_of_a_sub_segment_sample_all_that_it_shows(case):
     stream, stretches, fade = case
     for segment in stream.arrange(stretches, fade):
         geometry, origin = stream.geometry(segment.lines), stream.substeps * segment.first_line
@@ -96,8 +96,8 @@ def test_lines_sample_what_is_shown(case):
 
 @settings(max_examples=40, deadline=None)
 @given(arranged(), st.integers(0, 2**31))
-def test_a_scene_that_every_voxel_can_hold_is_stitched_without_a_seam(case, seed):
-    """Voxels that tell the truth about a uniform scene of constant light give it back, on any grid."""
+def test_a_scene_that_every_voxel_represents_is_stitched_without_a_seam(case, seed):
+    """Exact voxels of a uniform scene of constant light are reproduced on any grid."""
     stream, stretches, fade = case
     size = stream.geometry(1).size
     grid = Grid.finest(stretches, size)
@@ -129,7 +129,7 @@ def test_resampling_takes_means_in_time_and_space():
     np.testing.assert_allclose(coarse[0], video[first : first + 2].mean(), rtol=1e-6)
 
 
-def test_a_piece_keeps_no_more_than_it_may():
+def test_a_piece_is_no_longer_than_allowed():
     parts = split(7, 4007, Voxels(3, 4), 600)
     assert parts[0].begin == 7
     assert parts[-1].end == 4007

@@ -50,7 +50,7 @@ def test_extreme_weights(dtype: type) -> None:
     np.testing.assert_allclose(prox(frames, 1e8), flat, rtol=2e-2)
 
 
-def test_frames_do_not_see_each_other_and_warm_starts_reach_the_same_point() -> None:
+def test_frames_are_independent_and_warm_starts_reach_the_same_point() -> None:
     frames = np.random.default_rng(2).random((4, 12, 9))
     together = prox(frames, 0.1)
     np.testing.assert_allclose(prox(frames[2:3], 0.1), together[2:3], atol=1e-12)

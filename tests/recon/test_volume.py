@@ -25,8 +25,8 @@ def test_equals_an_independent_implementation_in_three_dimensions() -> None:
     np.testing.assert_allclose(ours, theirs, atol=1e-4)
 
 
-def test_pace_is_the_price_of_change() -> None:
-    """Two instants of one pixel draw together by weight · pace each, until they meet."""
+def test_pace_is_the_weight_of_change() -> None:
+    """Two instants of one pixel each move by weight · pace towards each other, until they meet."""
     volume = np.array([[[0.0]], [[1.0]]])
     for pace, left in ((0.5, 0.9), (2.0, 0.6), (8.0, 0.0)):
         low, high = of_instants(VolumeTv(pace, 500), volume, 0.1).ravel()
@@ -34,13 +34,13 @@ def test_pace_is_the_price_of_change() -> None:
         assert low + high == pytest.approx(1)
 
 
-def test_without_a_price_of_change_instants_are_frames_of_their_own() -> None:
+def test_with_pace_0_instants_are_independent_frames() -> None:
     volume = np.random.default_rng(1).random((3, 7, 9))
     frame = denoise_tv_chambolle(volume[1], weight=0.2, eps=1e-14, max_num_iter=50_000)
     np.testing.assert_allclose(of_instants(VolumeTv(0.0, 4000), volume, 0.2)[1], frame, atol=1e-4)
 
 
-def test_other_libraries_take_the_same_steps_and_a_dual_is_handed_on() -> None:
+def test_other_libraries_make_the_same_steps_and_a_dual_field_is_resumed() -> None:
     frames = np.random.default_rng(2).standard_normal((5, 8, 8)).astype(np.float32)
     for prior, other in ((VolumeTv(2.0, 7), VolumeTv(2.0, 7)), (Smooth(0.5), Smooth(0.5))):
         strict = other.prox(array_api_strict.asarray(frames), 0.2)

@@ -37,7 +37,7 @@ def test_what_is_as_it_says(told: Told) -> None:
     found = told()
     assert found.standing is Standing.RIGHT
     assert not found.sentences
-    assert found.rows[0].name == "as said"
+    assert found.rows[0].name == "as described"
 
 
 def test_light_that_is_late(told: Told) -> None:

@@ -13,7 +13,7 @@ from acquire.config.scene import ConstantDrive, SineDrive
 from acquire.errors import UsageError
 from acquire.fibre import Tile
 from acquire.recon import reconstruct
-from acquire.recon.handed import Choice
+from acquire.recon.reuse import Choice
 from acquire.recon.segments import Voxels
 from acquire.reconstruct import Options, Outcome, Watcher, by_lines, combine, in_tiles, in_voxels, open_pool
 from acquire.reconstruct.liveliest import energies

@@ -1,8 +1,8 @@
-"""The least that a reconstruction takes here and now, so that a budget that cannot be kept is refused.
+"""Shortest possible duration of a reconstruction on this machine, so that an impossible budget is refused.
 
-What every solver does whatever its iterations (the operator's norm, one iteration, the video) grows as one
-pass of the operator over all lines. A pass over some lines of the same geometry, on this machine as busy as
-it is, is scaled up by what the rest was found to take in passes.
+The work that every solver does whatever its iterations (the operator's norm, one iteration, the video) scales
+with one pass of the operator over all lines. A pass over some lines of the same geometry is timed under the
+machine's present load and multiplied by the number of passes that this work was measured to take.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
     from acquire.recon.clock import IterationClock
 
 PROBED_SHARE = 6
-"""The pass is over one of so many lines."""
+"""The timed pass covers one sixth of the lines."""
 LOOK_S = 0.005
-"""Of processor time, for which passes are repeated."""
+"""Processor time for which the pass is repeated."""
 MARGIN, MARGIN_S = 0.1, 0.3
-"""A budget may be exceeded by so much of it, and so long."""
+"""A budget may be exceeded by this share of it plus this many seconds."""
 
 
 def least_seconds(geometry: Geometry, spatial_merge: int, temporal_merge: int, solver: str) -> float:
-    """Wall time of the shortest reconstruction of such a segment; within a factor of two."""
+    """Wall time of the shortest reconstruction of such a segment, within a factor of two."""
     few = Geometry(geometry.stages, geometry.substeps, max(1, geometry.lines // PROBED_SHARE))
     code = np.random.default_rng(0).integers(0, 2, few.span).astype(np.uint8)
     operator = DualArm(few, code, spatial_merge, min(temporal_merge, few.span))
@@ -46,7 +46,7 @@ def least_seconds(geometry: Geometry, spatial_merge: int, temporal_merge: int, s
 
 
 def check_budget(clock: IterationClock, budget_s: float, least_s: float) -> None:
-    """UsageError unless ``budget_s`` can be kept, where the rest takes ``least_s``."""
+    """Raise UsageError unless ``budget_s`` can be kept when the remaining work takes ``least_s``."""
     needed = clock.seconds + least_s
     if needed > (1 + MARGIN) * budget_s + MARGIN_S:
         raise UsageError(

@@ -1,4 +1,4 @@
-"""What rests is solved in fine pixels, and not pulled at by what passes; what changes is found beside it."""
+"""Stills are solved in fine pixels, robust against passing objects; these are solved as a change."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_a_still_with_detail_below_the_voxel_is_solved_in_fine_pixels(camera: Ca
     assert db(coarse.video, whole, 3) > db(direct.video, whole, 3) + gain_db
 
 
-def test_a_flash_does_not_pull_at_a_still() -> None:
+def test_a_flash_does_not_distort_a_still() -> None:
     whole = scene("spark", 42)
     result = reconstruct(whole.segment, 3, whole.segment.geometry.span, "fast", check=False)
     alike = [each for each in result.parameters["candidates"] if not each["robust"]]
@@ -44,7 +44,7 @@ def test_a_flash_does_not_pull_at_a_still() -> None:
     assert result.quality.prediction < 0.8 * min(each["error"] for each in alike)
 
 
-def test_what_passes_before_a_still_is_found_beside_it() -> None:
+def test_an_object_before_a_still_is_solved_as_a_change() -> None:
     whole = scene("bullet", 43)
     still = reconstruct(whole.segment, 3, whole.segment.geometry.span, "fast", check=False)
     result = reconstruct(whole.segment, 3, 1, "fast", check=False)
@@ -54,20 +54,20 @@ def test_what_passes_before_a_still_is_found_beside_it() -> None:
     assert result.video.min() >= 0
 
 
-def test_samples_that_are_missed_by_far_count_for_less() -> None:
+def test_samples_with_large_residuals_get_less_weight() -> None:
     problem = build_problem(scene("still", 44).segment, 3, 1, hold_out=0.1)
-    off = np.random.default_rng(1).standard_normal(problem.samples.shape).astype(np.float32)
-    off[0, 20:24, :5] = 50
-    doubted = problem.doubting(problem.samples + 1e-3 * off)
-    assert doubted.doubt is not None
-    assert (doubted.doubt[0, 20:24, :5] < 0.2).all()
-    assert np.median(doubted.doubt) == 1
-    whole = doubted.whole()
-    assert whole.doubt is doubted.doubt, "those that were held out, too"
-    assert problem.doubting(problem.samples) is problem, "nothing is missed"
+    error = np.random.default_rng(1).standard_normal(problem.samples.shape).astype(np.float32)
+    error[0, 20:24, :5] = 50
+    robust = problem.with_robust_weights(problem.samples + 1e-3 * error)
+    assert robust.robust_weight is not None
+    assert (robust.robust_weight[0, 20:24, :5] < 0.2).all()
+    assert np.median(robust.robust_weight) == 1
+    everything = robust.with_all_samples()
+    assert everything.robust_weight is robust.robust_weight, "held-out samples are weighted, too"
+    assert problem.with_robust_weights(problem.samples) is problem, "there is no residual"
 
 
-def test_a_change_may_be_darker_than_nothing_beside_light_that_is_there() -> None:
+def test_a_change_may_be_negative_if_its_sum_with_the_background_is_not() -> None:
     segment = scene("bullet", 45).segment
     problem = build_problem(segment, 3, 1, hold_out=0.0)
     frames, side, _ = segment.geometry.video_shape(3, 1)
@@ -78,8 +78,10 @@ def test_a_change_may_be_darker_than_nothing_beside_light_that_is_there() -> Non
     masked = problem.masked(operator)
     darker = masked.forward(-0.7 * even)
 
-    def solved(beside: np.ndarray | None) -> float:
-        solver = Admm(masked, darker, even.shape, basis, AdmmParameters(sign_penalty=0.03), beside=beside)
+    def solved(background: np.ndarray | None) -> float:
+        solver = Admm(
+            masked, darker, even.shape, basis, AdmmParameters(sign_penalty=0.03), background=background
+        )
         for _ in range(40):
             solver.step()
         return float(np.median(basis.synthesize(solver.theta)))

@@ -1,6 +1,7 @@
-"""What is wrong with lines whatever their code: arms that stand still, light without a code, little light.
+"""Sanity checks of lines: stuck arms, light that does not follow the code, too little light.
 
-Measured under the hypothesis that explains the lines best, in units of the scene, each with its error.
+Levels are measured under the hypothesis that explains the lines best, in units of the scene, with standard
+errors.
 """
 
 from __future__ import annotations
@@ -17,50 +18,46 @@ if TYPE_CHECKING:
 
     from acquire.lines import Segment
     from acquire.recon.gaussian import Model
-    from acquire.recon.hypotheses import Hypothesis, Witness
+    from acquire.recon.hypotheses import Hypothesis, LineModel
 
     Floats = NDArray[np.float64]
 
 SURE = 5.0
-"""Standard errors beyond which something is so."""
+"""Standard errors beyond which a constant light is significant."""
 CONSTANT_SHARE, CONSTANT_ERROR = 0.03, 0.012
-"""Of an arm's mean light: less that follows no code costs little, and what is not known as well as this is
-not told, since a scene that changes smoothly looks much like it."""
+"""Smallest constant light, relative to an arm's mean, that is reported, since less costs little; and the
+largest standard error for which it is, since a scene that changes smoothly looks much like constant light."""
 FEW_ELECTRONS = 100.0
-"""A sample's mean light over its noise, squared: what shot noise alone would leave of so many electrons."""
+"""Smallest (mean light / noise)² of a sample, which is its number of electrons if all noise is shot noise."""
 STUCK_SHARE = 0.5
 NOISE_STEPS = (0.1, 0.18, 0.32, 0.56, 1.0, 1.8, 3.2, 5.6, 10.0)
 
 
 @dataclass(frozen=True, slots=True)
 class Suspicion:
-    """``kind`` for programs, ``words`` for people."""
+    """An anomaly: ``kind`` for programs, ``words`` for people."""
 
     kind: str
     words: str
 
 
 def unusable(segment: Segment) -> list[Suspicion]:
-    """What leaves nothing to ask: no samples, arms that stand still, no code."""
+    """Find what makes lines unusable: no samples, stuck arms, a constant code."""
     found = []
     samples = segment.samples(np.float64)
     for arm, lines, mask in zip("ab", samples, segment.mask, strict=True):
         if not mask.any():
-            found.append(Suspicion("no_samples", f"arm {arm} has no sample that can be used"))
+            found.append(Suspicion("no_samples", f"arm {arm} has no usable sample"))
             continue
-        found += _standing(arm, np.where(mask, lines, np.nan), segment.geometry.lines)
+        found += _stuck(arm, np.where(mask, lines, np.nan), segment.geometry.lines)
     if segment.code.min() == segment.code.max():
-        found.append(
-            Suspicion(
-                "constant_code",
-                f"the code is {int(segment.code[0])} throughout: lines cannot be held against it",
-            )
-        )
+        words = f"the code is {int(segment.code[0])} throughout: lines cannot be compared with it"
+        found.append(Suspicion("constant_code", words))
     return found
 
 
-def _standing(arm: str, lines: Floats, count: int) -> list[Suspicion]:
-    """An arm whose lit columns do not change from line to line."""
+def _stuck(arm: str, lines: Floats, count: int) -> list[Suspicion]:
+    """Whether most of an arm's lit columns do not change from line to line."""
     seen = np.isfinite(lines).any(0)
     lowest, highest = np.nanmin(lines[:, seen], axis=0), np.nanmax(lines[:, seen], axis=0)
     if count == 1 or not highest.any():
@@ -75,7 +72,7 @@ def _standing(arm: str, lines: Floats, count: int) -> list[Suspicion]:
 
 
 def black_level_off(segment: Segment) -> list[Suspicion]:
-    """A black level that unlit columns contradict: they stand still together, at what should be 0."""
+    """Find arms whose unlit columns share one constant value that is not 0, as it should be."""
     found = []
     for arm, lines, mask in zip("ab", segment.samples(np.float64), segment.mask, strict=True):
         whole = mask.all(0)
@@ -86,19 +83,19 @@ def black_level_off(segment: Segment) -> list[Suspicion]:
         still = (columns == lowest).all(0)
         if still.sum() >= FEWEST_TOGETHER and still.mean() < 1 and abs(lowest) > 0.01 * abs(mean):
             words = (
-                f"{still.sum()} columns of arm {arm} that see no light stand at {lowest:.3g}, "
+                f"{still.sum()} columns of arm {arm} that see no light are at {lowest:.3g}, "
                 f"{abs(lowest / mean):.0%} of the mean light: the black level is too "
-                f"{'low' if lowest > 0 else 'high'}, or light follows no code"
+                f"{'low' if lowest > 0 else 'high'}, or some light does not follow the code"
             )
             found.append(Suspicion("black_level", words))
     return found
 
 
-def suspicions(witness: Witness, hypothesis: Hypothesis) -> list[Suspicion]:
-    """Black level, ambient light, too little light, if this is the case."""
-    views = [witness.view(hypothesis, arm) for arm in (0, 1)]
+def suspicions(model: LineModel, hypothesis: Hypothesis) -> list[Suspicion]:
+    """Find a wrong black level, ambient light and too little light."""
+    views = [model.view(hypothesis, arm) for arm in (0, 1)]
     found = []
-    for name, lines, view in zip("ab", witness.arms, views, strict=True):
+    for name, lines, view in zip("ab", model.arms, views, strict=True):
         mean = float(lines.mean())
         found += _constant(name, lines, view.model, mean)
         found += _little_light(name, lines, view.model, mean)
@@ -107,7 +104,7 @@ def suspicions(witness: Witness, hypothesis: Hypothesis) -> list[Suspicion]:
 
 def _constant(name: str, lines: Floats, model: Model, mean: float) -> list[Suspicion]:
     if mean < 0:
-        words = f"arm {name} is darker than its black level on the mean: the black level is too high"
+        words = f"arm {name} is darker than its black level on average: the black level is too high"
         return [Suspicion("black_level", words)]
     value, error = model.constant(lines)
     if error > CONSTANT_ERROR * mean or abs(value) < max(SURE * error, CONSTANT_SHARE * mean):
@@ -116,7 +113,10 @@ def _constant(name: str, lines: Floats, model: Model, mean: float) -> list[Suspi
     if value < 0:
         words = f"arm {name} lacks {share} of its mean light in every sample: the black level is too high"
     else:
-        words = f"{share} of arm {name}'s mean light follows no code: ambient light, or too low a black level"
+        words = (
+            f"{share} of arm {name}'s mean light does not follow the code: there is ambient light, or the "
+            "black level is too low"
+        )
     return [Suspicion("black_level", words)]
 
 
@@ -131,7 +131,7 @@ def _little_light(name: str, lines: Floats, model: Model, mean: float) -> list[S
     if electrons >= FEW_ELECTRONS:
         return []
     words = (
-        f"arm {name} has too little light: its noise is {sigma / max(mean, 1e-30):.0%} of its mean, as if a "
-        f"sample had {electrons:.0f} electrons"
+        f"arm {name} has too little light: its noise is {sigma / max(mean, 1e-30):.0%} of its mean, as with "
+        f"{electrons:.0f} electrons per sample"
     )
     return [Suspicion("little_light", words)]

@@ -1,4 +1,4 @@
-"""Light beyond the band is told by its frequency, and nothing is told of motion, slower lamps and noise."""
+"""Light beyond the band is reported with its frequency; motion, slower lamps and noise are not."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import pytest
 
 from acquire.forward import DualArm
 from acquire.recon import Reconstruction, reconstruct
+from acquire.recon.aliasing import detect_unresolved_light
 from acquire.recon.clock import IterationClock
-from acquire.recon.faster import tell_faster_light
 from acquire.recon.problem import build_problem
 from acquire.sim.procedural import Recorded, record
 
@@ -19,7 +19,7 @@ def told(warnings: tuple[str, ...]) -> list[str]:
     return [each for each in warnings if each.startswith("light changes at about")]
 
 
-def test_a_lamp_of_20_khz_is_told_by_its_frequency() -> None:
+def test_a_lamp_of_20_khz_is_reported_with_its_frequency() -> None:
     result = reconstruct(record("fastled", 22, **SIZES).segment, 3, 1)
     (words,) = told(result.warnings)
     found_hz = float(words.removeprefix("light changes at about ").split()[0])
@@ -29,17 +29,19 @@ def test_a_lamp_of_20_khz_is_told_by_its_frequency() -> None:
 
 
 def held_against(recorded: Recorded, result: Reconstruction, clock: IterationClock) -> tuple[str, ...]:
-    """What is told of a video, also where no noise makes `reconstruct` ask."""
+    """The report on a video, even if its residual is too small for `reconstruct` to check it."""
     segment = recorded.segment
     problem = build_problem(segment, 3, 1, hold_out=0.0)
     lines = DualArm(segment.geometry, segment.code, 3, 1).forward(result.video.astype(np.float32))
     predicted = lines / (problem.norm * problem.scale)
     resolved_hz = result.parameters["resolved_hz"]
-    return tell_faster_light(segment, problem, predicted, result.video, resolved_hz, clock)
+    return detect_unresolved_light(
+        segment, problem, predicted, result.video, resolved_hz=resolved_hz, clock=clock
+    )
 
 
 @pytest.mark.parametrize("scene", ["still", "leds", "splash", "flame", "spark", "disc", "bullet"])
-def test_none_is_told_of_scenes_without_any(scene: str) -> None:
+def test_nothing_is_reported_for_scenes_without_fast_light(scene: str) -> None:
     recorded = record(scene, 22, **SIZES)
     result = reconstruct(recorded.segment, 3, 1, "fast", iterations=20, check=False)
     assert not held_against(recorded, result, IterationClock(1))

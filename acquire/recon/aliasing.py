@@ -1,0 +1,121 @@
+"""Detection of light that is faster than what a video resolves, which then appears steady, or slow.
+
+A curve within the band can mimic most of what a fast lamp does to the lines: the residual of a reconstruction
+then looks like noise, even if a lamp of 20 kHz is shown as steady. But a lamp shines only within its own
+pattern. So each of the video's few strongest patterns is given a free curve, far beyond the band, to explain
+the residual. The energy of each of its cosines, relative to white noise of the same size, has an isolated
+peak for a lamp, and many similar values for motion, texture or noise.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy.ndimage import percentile_filter
+
+from acquire.recon.bandwidth import COARSE_SIDE
+from acquire.recon.basis import TemporalBasis
+from acquire.recon.curves import CurveOperator
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from acquire.lines import Segment
+    from acquire.recon.clock import IterationClock
+    from acquire.recon.problem import Problem
+
+PATTERNS, WEAKEST = 4, 1e-3
+"""Largest number of patterns, and the smallest norm of one relative to the strongest."""
+STRIPS = 4
+"""Number of strips of rows, and of columns: a small lamp is a small part of the whole."""
+SHARE = 0.5
+"""Share of the sub-steps' cosines that are searched: up to a quarter of the sub-step rate."""
+DAMPING = 0.1
+"""Damping relative to the mean eigenvalue: cosines that the lines hardly see would absorb all that is
+left."""
+WINDOW, OFTEN, STANDS_ALONE = 101, 90, 6.5
+"""Number of neighbouring cosines, the percentile of theirs that is usual, and the ratio to it above which
+light is detected: 35 for a lamp of 20 kHz with a pattern of its own, up to 4.4 where there is none; 3.6 for
+one of 3 % of a textured picture's area, which is missed."""
+MARGIN = 1.25
+"""Start of the search relative to the end of the band: what is just beyond it belongs to its end."""
+SECONDS, SPAN = 2.0, 980
+"""Processor time for this number of sub-steps; it grows with their cube."""
+LARGEST_SPAN = 2048
+"""Largest number of sub-steps: up to here it is about a tenth of a reconstruction's time, at 2900 a third."""
+
+
+def detect_unresolved_light(
+    segment: Segment,
+    problem: Problem,
+    predicted: NDArray[Any],
+    video: NDArray[Any],
+    *,
+    resolved_hz: float,
+    clock: IterationClock,
+) -> tuple[str, ...]:
+    """Return a sentence if light of one frequency beyond ``resolved_hz`` stands out of the residual.
+
+    ``predicted`` is as `Problem.samples`, ``video`` (frames, n′, n′) in any unit. Nothing is returned if
+    there is no time for the search, or if the segment is long.
+    """
+    span = segment.geometry.span
+    if span > LARGEST_SPAN or not clock.affords(SECONDS * (span / SPAN) ** 3):
+        return ()
+    rate_hz = 1e9 / segment.substep_ns
+    first = int(np.ceil(MARGIN * resolved_hz * 2 * span / rate_hz))
+    count = int(SHARE * span)
+    residual = np.where(problem.usable, problem.samples - predicted, 0)
+    patterns = _patterns(video, segment.geometry.size)
+    if first + WINDOW > count or not patterns or not residual.any():
+        return ()
+    basis = TemporalBasis(span, count)
+    energy = sum((_energy(segment, each, residual, basis) for each in patterns), np.zeros(count))
+    usual = np.maximum(
+        percentile_filter(energy, OFTEN, WINDOW, mode="nearest"), np.percentile(energy[first:], OFTEN)
+    )
+    highest = first + int(np.argmax((energy / usual)[first:]))
+    if not energy[highest] > STANDS_ALONE * usual[highest]:
+        return ()
+    return (
+        f"light changes at about {highest * rate_hz / (2 * span):.5g} Hz, faster than the "
+        f"{resolved_hz:.5g} Hz that this reconstruction resolves: the video shows it as steady or too slow",
+    )
+
+
+def _patterns(video: NDArray[Any], size: int) -> list[NDArray[np.float32]]:
+    """The strongest patterns of a video, and strips of its mean, each (1, n, n) of unit norm."""
+    frames, side, _ = video.shape
+    step = -(-side // COARSE_SIDE)
+    whole = side // step * step
+    coarse = video[:, :whole, :whole].reshape(frames, whole // step, step, whole // step, step).mean((2, 4))
+    curves = np.linalg.svd(coarse.reshape(frames, -1).astype(np.float64), full_matrices=False)[0][
+        :, :PATTERNS
+    ]
+    strongest = list(np.tensordot(curves.T.astype(video.dtype), video, axes=1))
+    mean, strips = video.mean(0), []
+    for rows in np.array_split(np.arange(side), STRIPS):
+        strip = np.zeros_like(mean)
+        strip[rows] = mean[rows]
+        across = np.zeros_like(mean)
+        across[:, rows] = mean[:, rows]
+        strips += [strip, across]
+    merge = -(-size // side)
+    held = [each.repeat(merge, axis=0).repeat(merge, axis=1)[:size, :size] for each in strongest + strips]
+    found = [each.astype(np.float32) for each in held]
+    norms = [float(np.linalg.norm(each)) for each in found]
+    return [each[None] / norm for each, norm in zip(found, norms, strict=True) if norm > WEAKEST * max(norms)]
+
+
+def _energy(
+    segment: Segment, pattern: NDArray[np.float32], residual: NDArray[Any], basis: TemporalBasis
+) -> NDArray[np.float64]:
+    """Energy of each cosine of a pattern's curve in the ``residual``, relative to that of white noise."""
+    operator = CurveOperator(segment, pattern, basis, 1)
+    gram = np.asarray(operator.gram(), np.float64)
+    right = np.asarray(operator.adjoint(residual.astype(np.float32)), np.float64)[:, 0]
+    inverse = np.linalg.inv(gram + DAMPING * np.trace(gram) / len(gram) * np.eye(len(gram)))
+    variance = np.einsum("ij,ji->i", inverse @ gram, inverse) * np.square(residual, dtype=np.float64).mean()
+    ratio: NDArray[np.float64] = np.square(inverse @ right) / np.maximum(variance, np.finfo(np.float64).tiny)
+    return ratio

@@ -1,0 +1,154 @@
+"""Reuse of a choice of prior, weight and band that was made on another part of the scene.
+
+Most of the time of a reconstruction is its search (`acquire.recon.choose`). What was chosen for one tile, or
+one range of time, is tried first on the next, and kept if it predicts the held-out blocks as closely as where
+it was chosen, in units of the noise. Larger weights are tried next to it, because noise that a small weight
+admits hardly shows in the lines. If it does not fit, a still is searched for from there, and a video as if
+nothing had been handed over. If the choice is a moving prior, a still is tried as well, which costs little,
+so that a part at rest next to a moving part is not made to move.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Self
+
+from acquire.recon.blinking import EXPLAINED, first_look, refine
+from acquire.recon.estimates import Preferred
+from acquire.recon.result import EXPLAINED as EXPLAINED_NOISE
+from acquire.recon.workbench import (
+    FIRST_ITERATIONS,
+    LARGEST_WEIGHT,
+    NEXT_ITERATIONS,
+    SEARCH_SHARE,
+    STILL,
+    WEIGHT_STEP,
+    Candidate,
+    rounded,
+)
+
+if TYPE_CHECKING:
+    from acquire.lines import Segment
+    from acquire.recon.estimates import Estimate
+    from acquire.recon.options import SolveOptions
+    from acquire.recon.result import Reconstruction
+    from acquire.recon.workbench import Trial, Workbench
+
+AS_CLOSELY = 1.05
+"""Largest held-out error in units of the noise, relative to that where the choice was made, for which it
+fits: a search takes 2 % for a gain, and errors of a few hundred blocks differ by as much as this by
+chance."""
+COSINES = "cosines"
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """What was chosen, and how well it predicted: ``error`` and ``noise`` are relative to the samples.
+
+    ``prior`` is that of a candidate, or `COSINES`, of which only the number is handed over. ``brightness`` is
+    the number of cosines of the whole scene's brightness, 0 if that is constant.
+    """
+
+    prior: str
+    coefficients: int
+    weight: float
+    pace: float
+    error: float
+    noise: float
+    brightness: int = 0
+    fine: bool = False
+
+    @classmethod
+    def of(cls, result: Reconstruction) -> Self | None:
+        """The choice of a reconstruction; None if nothing was chosen, or if it depends on an object there."""
+        found, quality = result.parameters, result.quality
+        if "candidates" not in found or found.get("robust") or found.get("change"):
+            return None
+        counts = [each["temporal_coefficients"] for each in found["candidates"] if each["prior"] == COSINES]
+        in_cosines = found["prior"] == COSINES
+        return cls(
+            prior=found["prior"],
+            coefficients=found["temporal_coefficients"],
+            weight=0.0 if in_cosines else found["weight"],
+            pace=0.0 if in_cosines else found["pace"],
+            error=quality.prediction,
+            noise=quality.noise,
+            brightness=counts[0] if found.get("brightness") and counts else 0,
+            fine=bool(found.get("fine")),
+        )
+
+    def fits(self, error: float, noise: float) -> bool:
+        """Whether samples are predicted as closely as where it was chosen, in units of the noise if known.
+
+        A choice that did not explain its own samples sets no looser standard than one that did.
+        """
+        if self.noise > 0 and noise > 0:
+            return error / noise <= AS_CLOSELY * min(self.error / self.noise, EXPLAINED_NOISE)
+        return error <= AS_CLOSELY * self.error
+
+    def kept(self, parameters: dict[str, Any]) -> bool:
+        """Whether a reconstruction with these parameters has kept this choice."""
+        same = parameters.get("prior") == self.prior
+        if not same or bool(parameters.get("brightness")) != bool(self.brightness):
+            return False
+        return self.prior == COSINES or (parameters["weight"], parameters["pace"]) == (self.weight, self.pace)
+
+    def candidate(self, frames: int) -> Candidate:
+        """The candidate to try on this many frames."""
+        cosines = min(self.coefficients, frames)
+        bright, fine = bool(self.brightness), self.fine
+        return Candidate(self.prior, cosines, self.weight, self.pace, bright, fine=fine)  # type: ignore[arg-type]  # not cosines
+
+
+def reuse_choice(bench: Workbench, segment: Segment, options: SolveOptions, trials: int) -> Estimate | None:
+    """Solve with the choice handed over; None if it does not fit, so that everything has to be searched."""
+    choice, frames, clock = options.choice, bench.frames, bench.clock
+    assert choice is not None
+    noise, at_rest = bench.problem.noise(segment), choice.prior == STILL.prior
+    if at_rest:
+        own = bench.with_problem(bench.problem, fine=choice.fine)
+        still = own.attempt(choice.candidate(frames), FIRST_ITERATIONS)
+    else:
+        still = bench.attempt(bench.fitting(STILL), FIRST_ITERATIONS)
+    fits = at_rest and choice.fits(still.error, noise)
+    if fits or still.error <= AS_CLOSELY * noise or clock.spent(SEARCH_SHARE):
+        return bench.finish(_strengthened(still))
+    if at_rest:
+        return bench.finish(still.bench.climb(still, trials)) if frames == 1 else None
+    if choice.prior == COSINES:
+        return _in_cosines(bench, still, segment, options)
+    bright = bench.brighten(still, choice.brightness) if choice.brightness else None
+    if bright is None and choice.brightness:
+        return None
+    moving = bench.attempt(choice.candidate(frames), FIRST_ITERATIONS, bright)
+    best = moving if bench.held_out.clearly_less(moving.errors, still.errors) else still
+    return bench.finish(_strengthened(best)) if choice.fits(best.error, noise) else None
+
+
+def _strengthened(best: Trial) -> Trial:
+    """The trial with the largest weight that does not worsen its prediction."""
+    clock = best.bench.clock
+    while not clock.spent(SEARCH_SHARE) and best.candidate.weight * WEIGHT_STEP <= LARGEST_WEIGHT:
+        stronger = replace(best.candidate, weight=rounded(best.candidate.weight * WEIGHT_STEP))
+        found = best.bench.attempt(stronger, NEXT_ITERATIONS, best)
+        if not found.error < best.error:
+            break
+        best = found
+    return best
+
+
+def _in_cosines(bench: Workbench, still: Trial, segment: Segment, options: SolveOptions) -> Estimate | None:
+    """Solve in the band handed over, as `choose` does where cosines are ahead of a still."""
+    problem, clock, choice = bench.problem, bench.clock, options.choice
+    assert choice is not None
+    options = replace(options, bandwidth=min(1.0, choice.coefficients / bench.frames))
+    start = still.admm.theta if still.error < EXPLAINED else None
+    cosines = first_look(segment, problem, options, clock, start)
+    bench.record_errors({"prior": COSINES} | cosines.facts(), cosines.predict())
+    found = refine(segment, problem, options, clock, cosines)
+    errors = bench.record_errors({"prior": "patterns"} | found.facts(), found.predict())
+    ahead = bench.held_out.clearly_less(errors, still.errors)
+    if ahead and choice.fits(bench.held_out.relative(errors), problem.noise(segment)):
+        return Preferred(found, bench.record)
+    clock.reset()  # the search that follows may use all of its iterations
+    return None
