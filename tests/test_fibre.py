@@ -79,11 +79,11 @@ def test_the_paper_s_sizes_lie_side_by_side_in_the_middle_of_the_sensor() -> Non
 @pytest.mark.parametrize(
     ("sizes", "words"),
     [
-        ((64, 1, 100, 192, 640), r"100 rows is no whole number of bands of n = 64; possible: a multiple"),
-        ((64, 1, 128, 200, 640), "200 columns is no whole number"),
-        ((64, 1, 64, 64, 640), "one band; possible: more rows or columns; or no fibre"),
+        ((64, 1, 100, 192, 640), r"100 rows is not a whole number of bands of n = 64; possible: a multiple"),
+        ((64, 1, 128, 200, 640), "200 columns is not a whole number"),
+        ((64, 1, 64, 64, 640), "a single band; possible: more rows or columns, or no fibre"),
         ((64, 1, 128, 192, 383), "sensor A with 383 columns is too narrow .* possible: 384 columns or more"),
-        ((64, 3, 384, 0, 640), "0 columns is no whole number"),
+        ((64, 3, 384, 0, 640), "0 columns is not a whole number"),
     ],
 )
 def test_scenes_that_do_not_fit_are_refused(sizes: tuple[int, ...], words: str) -> None:
@@ -94,9 +94,12 @@ def test_scenes_that_do_not_fit_are_refused(sizes: tuple[int, ...], words: str) 
 @pytest.mark.parametrize(
     ("bands", "words"),
     [
-        ({"a": (0,)}, "1 bands on sensor A cannot show .* possible: 2, of 64 rows each"),
-        ({"a": (0, 191)}, "192 columns from 0, 191 on do not lie beside each other .* at least 192 apart"),
-        ({"b": (0, 128, 513)}, "128 columns from 0, 128, 513 on .* possible: first columns from 0 to 512"),
+        ({"a": (0,)}, "1 bands on sensor A cannot show .* possible: 2 bands of 64 rows each"),
+        ({"a": (0, 191)}, "192 columns that begin at 0, 191 overlap or .* at least 192 apart"),
+        (
+            {"b": (0, 128, 513)},
+            "128 columns that begin at 0, 128, 513 .* possible: first columns from 0 to 512",
+        ),
     ],
 )
 def test_bands_that_overlap_or_leave_the_sensor_are_refused(bands: dict, words: str) -> None:
