@@ -166,7 +166,7 @@ class Fibre:
         row, column = (self.side - self.rows) // 2, (self.side - self.columns) // 2
         return slice(row, row + self.rows), slice(column, column + self.columns)
 
-    def laid(self, frames: NDArray[Any], arm: str) -> NDArray[Any]:
+    def lay_out(self, frames: NDArray[Any], arm: str) -> NDArray[Any]:
         """Lay frames (t, R, C) on an arm's sensor: (t, n, fine columns), dark between the bands."""
         import numpy as np
 

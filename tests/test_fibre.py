@@ -34,7 +34,7 @@ def test_every_pixel_of_the_scene_lies_once_on_either_sensor_and_tiles_find_it(f
     n, S = fibre.size, fibre.substeps
     scene = np.arange(1, fibre.rows * fibre.columns + 1).reshape(1, fibre.rows, fibre.columns)
     for arm in "ab":
-        laid = fibre.laid(scene, arm)
+        laid = fibre.lay_out(scene, arm)
         assert laid.shape == (1, n, S * fibre.sensor_pixels)
         assert np.array_equal(np.sort(laid[laid > 0]), scene.ravel())
         lit = (laid[0] > 0).all(axis=0).reshape(-1, S)
@@ -44,9 +44,9 @@ def test_every_pixel_of_the_scene_lies_once_on_either_sensor_and_tiles_find_it(f
     for tile in fibre.tiles:
         part = scene[:, tile.row * n : (tile.row + 1) * n, tile.column * n : (tile.column + 1) * n]
         a, b = fibre.pixels(tile)
-        np.testing.assert_array_equal(fibre.laid(scene, "a")[:, :, S * a.start : S * a.stop], part)
+        np.testing.assert_array_equal(fibre.lay_out(scene, "a")[:, :, S * a.start : S * a.stop], part)
         turned = np.rot90(part, axes=(1, 2))
-        np.testing.assert_array_equal(fibre.laid(scene, "b")[:, :, S * b.start : S * b.stop], turned)
+        np.testing.assert_array_equal(fibre.lay_out(scene, "b")[:, :, S * b.start : S * b.stop], turned)
 
 
 @given(fibres())
