@@ -152,7 +152,7 @@ def test_what_was_solved_before_a_stop_is_kept_and_marked(recording_path, reques
     segments = video.attrs["provenance"]["segments"]
     assert [part["trusted"] for part in segments] == [part["ended"] != "stopped" for part in segments]
     assert not segments[-1]["trusted"]
-    assert "was broken off after" in segments[-1]["warnings"][0]
+    assert "was stopped after" in segments[-1]["warnings"][0]
     begin = segments[-1]["begin_substep"] - request_of_three.grid.begin
     first, end = video.attrs["provenance"]["trusted"]
     assert first <= end <= begin // request_of_three.grid.voxels.temporal_merge

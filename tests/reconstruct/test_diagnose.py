@@ -13,7 +13,7 @@ from acquire.config.scene import ArmOptics
 from acquire.recon.diagnosis import Diagnosis
 from acquire.recon.hypotheses import Hypothesis, Turn
 from acquire.recon.search import Standing
-from acquire.reconstruct.diagnose import diagnose_recording, stretch
+from acquire.reconstruct.diagnose import diagnose_recording, diagnosed_range
 from acquire.sim.effects.image import StrayLight
 from acquire.sim.effects.light import CodeErrors
 from acquire.store import open_recording
@@ -68,5 +68,5 @@ def test_light_that_no_code_switches_is_no_news_of_the_code(told: Told) -> None:
 
 def test_the_middle_of_a_long_recording_is_looked_at(recording_path: Path) -> None:
     recording = open_recording(recording_path)
-    assert stretch(recording, None, None) == (recording.first_line + 40, 320)
-    assert stretch(recording, recording.first_line + 5, 30) == (recording.first_line + 5, 30)
+    assert diagnosed_range(recording, None, None) == (recording.first_line + 40, 320)
+    assert diagnosed_range(recording, recording.first_line + 5, 30) == (recording.first_line + 5, 30)
