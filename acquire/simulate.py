@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from acquire import __version__
-from acquire.calibrate.choose import handed_on
+from acquire.calibrate.choose import carried_calibration
 from acquire.clock import ClockFit
 from acquire.errors import AcquireError, UsageError
 from acquire.lines import ARMS, LineBlock, LineFlag
@@ -247,7 +247,7 @@ def _spec(config: RigConfig, scene: SceneConfig) -> RecordingSpec:
         trigger={**trigger, "settings": config.trigger.model_dump(mode="json")},
         cameras=cameras,
         config=config.model_dump(mode="json"),
-        extra=describe(scene) | handed_on(config, layout_of(config, scene)).attrs,
+        extra=describe(scene) | carried_calibration(config, layout_of(config, scene)).attrs,
         chunk_lines=config.chunk_lines,
         shard_chunks=recording.shard_chunks,
         tag_chunks=config.tag_chunks,

@@ -116,7 +116,7 @@ def test_values_that_are_none_name_their_key(key: str, value: object) -> None:
 
 
 def test_every_number_has_its_limits() -> None:
-    """A number without an upper limit fails somewhere behind, where nobody can say which key it was."""
+    """A number without an upper limit would fail later, where the key is not known any more."""
     open_ended: list[str] = []
     for name, model in RigConfig.model_json_schema()["$defs"].items():
         for key, found in model["properties"].items():

@@ -1,4 +1,4 @@
-"""The fibre's table: every pixel of the scene once on either sensor, wherever the bands lie."""
+"""The fibre's table: every pixel of the scene is once on each sensor, wherever the bands lie."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from acquire.fibre import Fibre, Tile
 
 @st.composite
 def fibres(draw: st.DrawFn) -> Fibre:
-    """Of up to 4 × 4 tiles, the bands in any order with gaps of any width."""
+    """Draw a fibre of up to 4 × 4 tiles, with bands in any order and gaps of any width."""
     stages, substeps = draw(st.integers(1, 4)), draw(st.integers(1, 3))
     tall, wide = draw(st.tuples(st.integers(1, 4), st.integers(1, 4)).filter(lambda tiles: tiles != (1, 1)))
     n, bands = stages * substeps, {}
@@ -107,7 +107,7 @@ def test_bands_that_overlap_or_leave_the_sensor_are_refused(bands: dict, words: 
         Fibre.side_by_side(64, 1, 128, 192, 640, **bands)
 
 
-def test_tiles_beside_the_scene_are_refused() -> None:
+def test_tiles_outside_the_scene_are_refused() -> None:
     fibre = Fibre.side_by_side(64, 1, 128, 192, 640)
     for tile in (Tile(2, 0), Tile(0, 3), Tile(-1, 0)):
         with pytest.raises(UsageError, match="possible: ROW,COLUMN from 0,0 to 1,2"):
