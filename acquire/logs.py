@@ -67,7 +67,7 @@ class JsonLine(OneLine):
 
 
 def is_journal(file: int) -> bool:
-    """Whether a descriptor leads to systemd's journal, as JOURNAL_STREAM says of it."""
+    """Whether a descriptor leads to systemd's journal, according to JOURNAL_STREAM."""
     try:
         found = os.fstat(file)
     except OSError:

@@ -49,7 +49,7 @@ class Noise:
         a, b = self.dark_noise_dn
         return Noise(self.dn_per_electron, (a * count, b * count))
 
-    def beside(self, light_dn: tuple[float, float]) -> Noise:
+    def with_ambient(self, light_dn: tuple[float, float]) -> Noise:
         """Return the noise with the shot noise of each arm's ambient light added to the dark noise."""
         rows = zip(self.dn_per_electron, self.dark_noise_dn, light_dn, strict=True)
         a, b = (float(np.sqrt(dark**2 + K * max(light, 0.0))) for K, dark, light in rows)

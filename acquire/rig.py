@@ -114,8 +114,7 @@ def check_rig(config: RigConfig) -> None:
 def _check_simulated_cameras(trigger: TriggerConfig, *, simulated: bool) -> None:
     """Refuse trigger settings that simulated cameras would ignore.
 
-    They are told only when lines begin and which code the light follows, and a simulated trigger has no
-    inputs.
+    They only receive the line starts and the code of the light, and a simulated trigger has no inputs.
     """
     pulsed = trigger.driver != "simulated" and trigger.lit_part != (0.0, 1.0)
     for ignored, key, possible in (

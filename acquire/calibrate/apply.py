@@ -185,7 +185,7 @@ def _noise(calibration: Calibration) -> Noise | None:
     if ambient is None:
         return known
     a, b = ambient.mean(axis=1).tolist()
-    return known.beside((a, b))
+    return known.with_ambient((a, b))
 
 
 def _columns(value: Any, segment: Segment) -> NDArray[np.float64]:

@@ -82,5 +82,5 @@ PSF = Step(
 STEPS = (DELAY, DARK, LINEARITY, FLAT, TARGET, PSF)
 AT_ONCE = (DARK, FLAT, TARGET)
 """The steps of `acquire calibrate all`, with one recording each."""
-WHERE_WANTED = (PSF,)
+OPTIONAL = (PSF,)
 """Optional steps after those, with one recording each."""

@@ -57,7 +57,7 @@ class View:
         shown = frames[..., ::-1] if self.mirrored else frames
         return np.rot90(shown, self.turn_deg // 90, axes=(-2, -1))
 
-    def unseen(self, frames: NDArray[Any]) -> NDArray[Any]:
+    def restored(self, frames: NDArray[Any]) -> NDArray[Any]:
         """Return the scene of frames in this view: the inverse of `seen`."""
         turned = np.rot90(frames, -(self.turn_deg // 90), axes=(-2, -1))
         return turned[..., ::-1] if self.mirrored else turned
@@ -103,7 +103,7 @@ def correlations(a: NDArray[Any], b: NDArray[Any]) -> dict[View, tuple[float, tu
     different views of one lamp are alike in these.
     """
     left = _whitened(a)
-    return {view: _peak(left, _whitened(view.unseen(b))) for view in VIEWS}
+    return {view: _peak(left, _whitened(view.restored(b))) for view in VIEWS}
 
 
 def _whitened(image: NDArray[Any]) -> NDArray[np.float64]:

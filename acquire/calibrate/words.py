@@ -107,7 +107,13 @@ def _quantities(quantities: Any) -> dict[str, str]:
     facts = {}
     for name, (label, unit) in PER_COLUMN.items():
         if name in quantities:
-            facts[label] = _range(quantities[name], unit)
+            measured = quantities[name]
+            arms = "; ".join(
+                f"{arm} {row.mean():.2f}{unit} ({row.min():.2f} to {row.max():.2f})"
+                for arm, row in zip("ab", measured.value, strict=True)
+            )
+            worst = f"{measured.uncertainty.max():.2g}{unit}"
+            facts[label] = f"{arms}; uncertain by {worst} in the worst column"
     if "gain" in quantities:
         gain = quantities["gain"]
         spread = " and ".join(f"{row.std():.2%}" for row in gain.value)
@@ -151,14 +157,6 @@ def _blur(measured: Measured) -> str:
             )
             widths.append(f"{arm} {axis} the transfer {width}")
     return "; ".join(widths) + " fine pixels (standard deviation)"
-
-
-def _range(measured: Measured, unit: str) -> str:
-    arms = "; ".join(
-        f"{arm} {row.mean():.2f}{unit} ({row.min():.2f} to {row.max():.2f})"
-        for arm, row in zip("ab", measured.value, strict=True)
-    )
-    return f"{arms}; uncertain by {measured.uncertainty.max():.2g}{unit} in the worst column"
 
 
 def _both(measured: Measured, unit: str) -> str:
