@@ -8,24 +8,24 @@ Data flows in one direction::
 
 The layers, top to bottom; imports point downwards only (checked by the tests)::
 
-    cli           testing            commands: one file per group · suites for everybody's variants
-    web           bluesky            the operator's page, a process of its own · the recorder in plans
+    cli           testing            commands: one file per group · public test suites for variants
+    web           bluesky            the operator's page, a separate process · the recorder in plans
     client                           the service from a script, blocking or awaited
     daemon        evaluate           the capture service · metrics, report
     rig           reconstruct        config -> devices · recording -> video
-    capacity      exchange           what this host captures without a loss · files of other programs
-    calibrate                        what an instrument is, measured
+    capacity      exchange           the loss-free rate of this host · files of other programs
+    calibrate                        measured properties of an instrument
     sim           recon              simulated devices · solvers, priors
     stream        forward            capture path · Eq. (1)-(4) of the paper and their adjoints
     store  camera  trigger           recording format · device protocols
-    pattern                          lines that follow from their numbers alone
-    config  lines  processes         what a rig is · what travels from camera to disk · children
-    fibre                            where the bands of a larger scene lie on the sensors
-    codes  geometry  clock  flags    the code, the shear, the time: plain arithmetic · words for lines
-    arrays  cores                    whose arrays are computed with, and on how many cores
+    pattern                          test lines determined by their numbers alone
+    config  lines  processes         configuration · lines from camera to disk · child processes
+    fibre                            position of a larger scene's bands on the sensors
+    codes  geometry  clock  flags    the code, the shear, the time: plain arithmetic · flags of lines
+    arrays  cores                    array back ends, and the cores they may use
     plugins                          classes that entry points name, ours and others'
-    logs  reading  showing           one line per entry · files that anybody may have put there · reprs
-    errors  text                     failures that a user can meet, with exit codes · foreign text
+    logs  reading  showing           one line per entry · safe reading of foreign files · reprs
+    errors  text                     errors shown to the user, with exit codes · foreign text
 
 `GLOSSARY.md`, next to this file, defines the terms; `DECISIONS.md` gives the reasons for the design and the
 alternatives that were considered.
@@ -55,6 +55,6 @@ _HOMES = {
     "open_recording": "store",
     "open_video": "store",
 }
-"""What is asked for first, and its package: imported when asked for, since each brings its libraries."""
+"""Public name → the package that defines it, imported on first use since each brings its libraries."""
 
 __getattr__, __dir__ = lazily(__name__, _HOMES, __all__)

@@ -1,4 +1,4 @@
-"""Where the image of arm B lies beside arm A's: a similarity of the plane, in fine pixels of the scene."""
+"""Position of arm B's image relative to arm A's: a similarity of the plane, in fine pixels of the scene."""
 
 from __future__ import annotations
 
@@ -20,10 +20,12 @@ LARGEST_MAGNIFICATION = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """What lies at p in arm A's view is at m·Q·p + (rows, columns) in arm B's, both from the field's middle.
+    """Maps the point p of arm A's view to m·Q·p + (rows, columns) in arm B's, both from the field's centre.
 
     ``rows`` and ``columns`` are fine pixels downwards and to the right in camera A's view, ``turn_deg`` is
-    counter-clockwise, ``magnification`` is m. The effect ``misregistration`` has the same convention.
+    counter-clockwise, ``magnification`` is m. The effect ``misregistration`` uses the same convention.
+
+    Raises UsageError for values beyond the limits above.
     """
 
     rows: float = 0.0
@@ -35,10 +37,9 @@ class Alignment:
         values = (self.rows, self.columns, self.turn_deg, self.magnification)
         if not all(map(math.isfinite, values)):
             raise UsageError(f"the alignment is impossible: {self}", possible="finite numbers")
-        near = max(abs(self.rows), abs(self.columns)) <= LARGEST_SHIFT_PIXELS
         low = 1 / LARGEST_MAGNIFICATION
         if not (
-            near
+            max(abs(self.rows), abs(self.columns)) <= LARGEST_SHIFT_PIXELS
             and abs(self.turn_deg) <= LARGEST_TURN_DEG
             and low <= self.magnification <= LARGEST_MAGNIFICATION
         ):
@@ -50,21 +51,21 @@ class Alignment:
 
     @property
     def matrix(self) -> NDArray[np.float64]:
-        """m·Q on (row, column): (2, 2)."""
+        """m·Q, which acts on (row, column): (2, 2)."""
         angle = math.radians(self.turn_deg)
-        turned = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-        return self.magnification * turned
+        rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+        return self.magnification * rotation
 
     def sources(self, size: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Row and column (size, size) of arm A's view that each fine pixel of arm B's view shows."""
-        middle = (size - 1) / 2
-        seen = np.indices((size, size), np.float64)
-        offset = np.array([middle + self.rows, middle + self.columns])
-        rows, columns = np.tensordot(np.linalg.inv(self.matrix), seen - offset[:, None, None], axes=1)
-        return rows + middle, columns + middle
+        """Return the row and column (size, size) of arm A's view that each fine pixel of arm B's shows."""
+        centre = (size - 1) / 2
+        in_b = np.indices((size, size), np.float64)
+        offset = np.array([centre + self.rows, centre + self.columns])
+        rows, columns = np.tensordot(np.linalg.inv(self.matrix), in_b - offset[:, None, None], axes=1)
+        return rows + centre, columns + centre
 
     def facts(self) -> dict[str, Any]:
-        """As JSON."""
+        """Return the alignment as JSON."""
         return {
             "rows": self.rows,
             "columns": self.columns,

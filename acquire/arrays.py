@@ -1,12 +1,12 @@
-"""Where the reconstruction's arrays live: a library of the array API standard, a device of it, a dtype.
+"""Array back ends of the reconstruction: a library of the array API standard, one of its devices, a dtype.
 
     numpy   the default; TV and the shear are compiled loops (numba)
-    others  the same solvers, TV and the shear in the standard's operations: vectorised over all frames
+    others  the same solvers, TV and the shear in the standard's operations, vectorised over all frames
 
 The solvers ask `namespace` for the functions of whatever array they hold. Lines, weights and bases are made
-on the host; `Arrays.asarray` is the one way to the device, `host` the one way back, and neither is called
-inside an iteration (between rounds of them, for small matrices and the lines predicted). What an iteration
-does read are scalars: whether its residual is finite, or 0.
+on the host. `Arrays.asarray` is the only way to the device and `host` the only way back. Neither is called
+inside an iteration, only between rounds of them, for small matrices and the predicted lines. All that an
+iteration reads back are scalars: whether its residual is finite, or 0.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 Array: TypeAlias = Any
-"""Of any library; the standard has no type for it yet."""
+"""An array of any library; the standard has no type for it yet."""
 Dtype = Literal["float32", "float64"]
 DTYPES: tuple[Dtype, ...] = ("float32", "float64")
 
@@ -40,37 +40,37 @@ class Arrays:
     dtype: Dtype = "float32"
 
     def asarray(self, given: Array) -> Array:
-        """The numbers of a numpy array, or of an array that is there already."""
+        """Copy a numpy array to the device; an array that is already there stays as it is."""
         return self.xp.asarray(given, dtype=getattr(self.xp, self.dtype), device=self.device)
 
     def zeros(self, shape: tuple[int, ...]) -> Array:
         return self.xp.zeros(shape, dtype=getattr(self.xp, self.dtype), device=self.device)
 
     def indices(self, given: NDArray[np.int64]) -> Array:
-        """Integers for ``take``."""
+        """Copy integer indices for ``take`` to the device."""
         return self.xp.asarray(given, device=self.device)
 
     def exact(self) -> Arrays:
-        """The same in float64."""
+        """Return the same back end in float64."""
         return replace(self, dtype="float64")
 
     @property
     def compiled(self) -> bool:
-        """Whether there are compiled loops for these arrays."""
+        """Whether the compiled loops work on these arrays."""
         return bool(array_api_compat.is_numpy_namespace(self.xp))
 
 
 HOST = Arrays()
-"""numpy's, float32."""
+"""numpy in float32."""
 
 
 def namespace(array: Array) -> Any:
-    """The functions of an array's library, named as in the standard."""
+    """Return the functions of an array's library under the standard's names."""
     return array_api_compat.array_namespace(array)
 
 
 def host(array: Array) -> NDArray[Any]:
-    """The same numbers for numpy: itself, or a copy from the device."""
+    """Return the array as a numpy array: itself, or a copy from the device."""
     if array_api_compat.is_cupy_array(array):
         copied: NDArray[Any] = array.get()
         return copied
@@ -78,7 +78,7 @@ def host(array: Array) -> NDArray[Any]:
 
 
 def dot(a: Array, b: Array) -> Array:
-    """Σ a·b over all elements, as an array of no dimension on their device."""
+    """Return Σ a·b over all elements, as a zero-dimensional array on their device."""
     return namespace(a).reshape(a, (-1,)) @ namespace(b).reshape(b, (-1,))
 
 
@@ -93,7 +93,7 @@ def _cupy() -> tuple[Any, Any]:
             hint="pip install 'tdi-acquire[gpu]'",
         ) from error
     try:
-        return xp, cupy.cuda.Device()  # the one in use; asks the driver
+        return xp, cupy.cuda.Device()  # the current device; queries the driver
     except cupy.cuda.runtime.CUDARuntimeError as error:
         raise UsageError(
             f"device 'gpu' does not work: {error}", possible="cpu", hint="nvidia-smi shows what CUDA sees"
@@ -104,14 +104,14 @@ DEVICES: dict[str, Callable[[], tuple[Any, Any]]] = {
     "cpu": lambda: (array_api_compat.numpy, None),
     "gpu": _cupy,
 }
-"""By name: the library and its device, opened when asked for."""
+"""Name → opener that returns the library and its device."""
 
 
 def open_arrays(device: str = "cpu", dtype: str = "float32") -> Arrays:
-    """Arrays on a device; UsageError where there is no such device or dtype."""
+    """Return the back end of a device and dtype. Raises UsageError for an unknown or unusable one."""
     if dtype not in DTYPES:
         raise UsageError(f"dtype {dtype!r} is not known", possible=", ".join(DTYPES))
     if device not in DEVICES:
         raise UsageError(f"device {device!r} is not known", possible=", ".join(DEVICES))
-    xp, where = DEVICES[device]()
-    return Arrays(xp, where, dtype)
+    xp, opened = DEVICES[device]()
+    return Arrays(xp, opened, dtype)

@@ -1,4 +1,4 @@
-"""How wide the optics blur either arm's image: a Gaussian, along the charge's transfer and across it."""
+"""Width of the optics' blur in each arm: a Gaussian along the charge transfer and one across it."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ LARGEST_SIGMA_PIXELS = 16.0
 class Blur:
     """Standard deviations (along, across) of the blur of arms A and B, in fine pixels.
 
-    Along and across the transfer of the arm's own charge. 0: that axis is not blurred.
-    Raises UsageError for what is no width.
+    Both directions refer to the transfer of the arm's own charge. 0 means that the axis is not blurred.
+    Raises UsageError for an impossible width.
     """
 
     a: tuple[float, float]
@@ -29,5 +29,5 @@ class Blur:
             )
 
     def swapped(self) -> Blur:
-        """With the arms in each other's places."""
+        """Return the blur with the arms exchanged."""
         return Blur(self.b, self.a)

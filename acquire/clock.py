@@ -1,4 +1,4 @@
-"""The trigger's clock is the instrument's clock; its relation to UTC is an affine map with an uncertainty."""
+"""The trigger's clock, which is the instrument's clock: an affine map to UTC with an uncertainty."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ NS_PER_S = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class ClockFit:
-    """UTC of a tick of the trigger's clock: ``utc_ns_at_tick_0 + tick / clock_hz``.
+    """Relation of the trigger's ticks to UTC: ``utc_ns_at_tick_0 + tick / clock_hz``.
 
     ``uncertainty_ns`` bounds the error of ``utc_ns_at_tick_0``, not of differences between ticks.
     """
@@ -26,12 +26,12 @@ class ClockFit:
     uncertainty_ns: int
 
     def time_ns(self, tick: NDArray[np.uint64]) -> NDArray[np.int64]:
-        """UTC in ns since 1970 (int64) of ticks (any shape), rounded down; exact integer arithmetic."""
+        """Return UTC in ns since 1970 (int64) of ticks (any shape), rounded down, in integer arithmetic."""
         time_ns: NDArray[np.int64] = self._utc_ns(tick.astype("int64"))
         return time_ns
 
     def instant_ns(self, tick: int) -> int:
-        """The same of one tick, however large."""
+        """Return UTC in ns of one tick, however large."""
         return int(self._utc_ns(tick))
 
     def _utc_ns(self, tick: Any) -> Any:

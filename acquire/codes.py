@@ -8,7 +8,8 @@ Its output obeys  o_k = ⊕_{tap} o_{k - tap}, hence also  o_k = ⊕ o_{k - 2^m�
 GF(2)). The first gives the jump to any index by one power of x modulo the characteristic polynomial,
 the second lets numpy generate blocks that double in length.
 
-numpy is imported by what computes bits: what a recording says of its code is read without.
+numpy is imported inside the functions that compute bits, so that a recording's code attribute can be read
+without it.
 """
 
 from __future__ import annotations
@@ -62,26 +63,26 @@ TAPS: dict[int, tuple[int, ...]] = {
 
 
 MOST_LISTED_BITS = 2**22
-"""Of a code that is no register's: they are a text in the recording's attributes."""
+"""Upper limit on the bits of a listed code, which are stored as text in the recording's attributes."""
 
 
 class Code(Protocol):
-    """The light's code of a run: bits by index, and what a recording must say to regenerate them."""
+    """The light's code of a run: its bits by index, and the attributes that regenerate them."""
 
     def bits(self, start: int, length: int) -> NDArray[np.uint8]:
-        """Bits ``start .. start + length - 1`` (uint8, 0 or 1). The light is off before index 0."""
+        """Return bits ``start .. start + length - 1`` (uint8, 0 or 1). The light is off before index 0."""
         ...
 
     def to_attrs(self) -> dict[str, Any]:
-        """The recording's ``code`` attribute."""
+        """Return the recording's ``code`` attribute."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class PrbsCode:
-    """Maximal-length pseudo-random code: ``state`` of its register at index 0, from which all bits follow.
+    """Maximal-length pseudo-random code, given by the ``state`` of its register at index 0.
 
-    ``seed`` is the number that its user gave, where one did; see `from_seed`.
+    ``seed`` is the number that the user gave, if any; see `from_seed`.
     """
 
     degree: int
@@ -94,7 +95,7 @@ class PrbsCode:
 
     @classmethod
     def from_seed(cls, degree: int, seed: int) -> PrbsCode:
-        """The code that configurations mean by a seed: its state is mixed from it."""
+        """Return the code that a seed in a configuration stands for: its state is mixed from the seed."""
         return cls(degree, mix_seed(seed, degree), seed)
 
     def bits(self, start: int, length: int) -> NDArray[np.uint8]:
@@ -105,7 +106,7 @@ class PrbsCode:
         return np.concatenate([np.zeros(dark, np.uint8), lit])
 
     def to_attrs(self) -> dict[str, Any]:
-        # States of degree 64 exceed what JSON readers in other languages keep exactly: hexadecimal text.
+        # Hexadecimal text: states of degree 64 exceed what JSON readers in other languages keep exactly.
         return {
             "kind": self.kind,
             "degree": self.degree,
@@ -139,9 +140,9 @@ class ConstantCode:
 
 @dataclass(frozen=True, slots=True)
 class ListedCode:
-    """Any bits, listed one by one: the first is the most significant of ``digits`` (hexadecimal).
+    """Arbitrary bits, listed one by one: the first is the most significant of ``digits`` (hexadecimal).
 
-    With ``repeats`` they come again and again; otherwise the light is off after the last.
+    With ``repeats`` the list is repeated without end; otherwise the light is off after the last bit.
     """
 
     digits: str
@@ -160,7 +161,7 @@ class ListedCode:
 
     @classmethod
     def of(cls, bits: NDArray[np.uint8], *, repeats: bool = False) -> ListedCode:
-        """The code whose bits, 0 or 1, are given one by one."""
+        """Return the code with these bits (0 or 1)."""
         import numpy as np
 
         return cls(np.packbits(bits).tobytes().hex(), len(bits), repeats)
@@ -184,7 +185,7 @@ class ListedCode:
 
 
 def code_from_attrs(attrs: Mapping[str, Any]) -> Code:
-    """The code that a recording's ``code`` attribute describes."""
+    """Return the code that a recording's ``code`` attribute describes. Raises UsageError if it is unknown."""
     kind = attrs.get("kind")
     if kind == "prbs":
         degree = int(attrs["degree"])
@@ -203,14 +204,14 @@ def code_from_attrs(attrs: Mapping[str, Any]) -> Code:
 
 
 def register_state(attrs: Mapping[str, Any]) -> int:
-    """The register's state at index 0 of a pseudo-random code; recordings of format 1 call it ``seed``."""
+    """Return a pseudo-random code's register state at index 0; recordings of format 1 call it ``seed``."""
     return int(str(attrs["state"] if "state" in attrs else attrs["seed"]), 0)
 
 
 def prbs(degree: int, state: int, start: int, length: int) -> NDArray[np.uint8]:
-    """Bits ``start .. start + length - 1`` of the pseudo-random code (uint8, 0 or 1).
+    """Return bits ``start .. start + length - 1`` of the pseudo-random code (uint8, 0 or 1).
 
-    The cost of ``start`` is logarithmic, of ``length`` linear with numpy speed.
+    The cost is logarithmic in ``start`` and linear in ``length``, at numpy speed.
     """
     _check_register(degree, state)
     if start < 0 or length < 0:
@@ -224,9 +225,9 @@ def prbs(degree: int, state: int, start: int, length: int) -> NDArray[np.uint8]:
 
 
 def state_at(degree: int, state: int, index: int) -> int:
-    """The register's state when it is about to emit bit ``index``, of a code that begins with ``state``.
+    """Return the register's state before it emits bit ``index``, for a code that begins with ``state``.
 
-    Whatever the state was, after ``degree`` steps it is made of the bits emitted meanwhile alone.
+    After ``degree`` steps the state depends only on the bits emitted since, whatever it was before.
     """
     _check_register(degree, state)
     mask = sum(1 << (tap - 1) for tap in TAPS[degree])
@@ -242,9 +243,9 @@ def state_at(degree: int, state: int, index: int) -> int:
 
 
 def mix_seed(number: int, degree: int) -> int:
-    """A register state with about as many ones as zeros from any small integer (splitmix64, never 0).
+    """Mix a register state with about as many ones as zeros from any small integer (splitmix64, never 0).
 
-    A register started at 1 emits tens of zeros first; people like to say ``--seed 1``.
+    A register that starts at 1 emits tens of zeros first, and ``--seed 1`` is what people like to type.
     """
     z = (number + 1) * 0x9E3779B97F4A7C15 & 0xFFFFFFFFFFFFFFFF
     z = (z ^ (z >> 30)) * 0xBF58476D1CE4E5B9 & 0xFFFFFFFFFFFFFFFF
@@ -263,7 +264,7 @@ def _check_register(degree: int, state: int) -> None:
 
 
 def _window(degree: int, state: int, start: int) -> NDArray[np.uint8]:
-    """The ``degree`` output bits from index ``start``: o_{N+i} = Σ_j a_j·o_{j+i} with x^N ≡ Σ_j a_j·x^j."""
+    """Return ``degree`` output bits from index ``start``: o_{N+i} = Σ_j a_j·o_{j+i}, x^N ≡ Σ_j a_j·x^j."""
     import numpy as np
 
     head = 0  # o_0 .. o_{2·degree - 1}, bit k = o_k
@@ -277,23 +278,20 @@ def _window(degree: int, state: int, start: int) -> NDArray[np.uint8]:
 
 
 def _x_power(exponent: int, degree: int) -> int:
-    """x^exponent modulo the characteristic polynomial x^d + Σ_tap x^(d - tap); bit j belongs to x^j."""
+    """Return x^exponent modulo the characteristic polynomial x^d + Σ_tap x^(d - tap), with x^j as bit j."""
     poly = 1 << degree | sum(1 << (degree - tap) for tap in TAPS[degree])
     result = 1
     for digit in f"{exponent:b}":
-        square = int(f"{result:b}", 4)  # squaring in GF(2) spreads the bits: digits read in base 4
-        result = _reduce(square << 1 if digit == "1" else square, poly, degree)
+        result = int(f"{result:b}", 4)  # squaring in GF(2) spreads the bits: binary digits read in base 4
+        if digit == "1":
+            result <<= 1
+        while (excess := result.bit_length() - 1 - degree) >= 0:
+            result ^= poly << excess
     return result
 
 
-def _reduce(value: int, poly: int, degree: int) -> int:
-    while (excess := value.bit_length() - 1 - degree) >= 0:
-        value ^= poly << excess
-    return value
-
-
 def _extend(window: NDArray[np.uint8], taps: tuple[int, ...], length: int) -> NDArray[np.uint8]:
-    """Continue ``window`` to ``length`` bits by blocks whose lag doubles whenever enough bits are known."""
+    """Continue ``window`` to ``length`` bits in blocks whose lag doubles whenever enough bits are known."""
     import numpy as np
 
     out = np.empty(length, np.uint8)

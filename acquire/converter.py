@@ -1,4 +1,4 @@
-"""A camera whose numbers are not quite in proportion to the light: by how much they are too high."""
+"""Non-linearity of a camera: by how much its readings exceed those of a linear one."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ConverterCurve:
-    """What a sample reads, and what it would read if the camera were linear: a rising curve for either arm.
+    """Readings of the camera and their excess over a linear camera's: one rising curve per arm.
 
     Attributes
     ----------
     dn : (arm, knot) readings, rising
-    excess_dn : (arm, knot) how much too high they are; linear between knots, beyond them as at the last
+    excess_dn : (arm, knot) by how much they are too high; linear between knots, constant beyond them
+
+    Raises UsageError for a curve that does not rise, since two amounts of light would then read alike.
     """
 
     dn: NDArray[np.float64]
@@ -39,12 +41,12 @@ class ConverterCurve:
             )
 
     def straight(self, dn: NDArray[Any]) -> NDArray[Any]:
-        """What a linear camera would have said; ``dn`` (arm, …) of floats keep their type."""
+        """Return the readings of a linear camera; ``dn`` (arm, …) of floats keep their type."""
         arms = zip(dn, self.dn, self.excess_dn, strict=True)
         return np.stack([each - np.interp(each, *knots).astype(dn.dtype) for each, *knots in arms])
 
     def slope(self, dn: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Of `straight` at ``dn`` (arm, …): what it makes of a small difference."""
+        """Return the derivative of `straight` at ``dn`` (arm, …)."""
         found = []
         for each, knots, excess in zip(dn, self.dn, self.excess_dn, strict=True):
             at = np.clip(np.searchsorted(knots, each) - 1, 0, len(knots) - 2)
@@ -53,5 +55,5 @@ class ConverterCurve:
         return np.stack(found)
 
     def swapped(self) -> ConverterCurve:
-        """Of an instrument whose arms have changed places."""
+        """Return the curve with the arms exchanged."""
         return ConverterCurve(self.dn[::-1], self.excess_dn[::-1])

@@ -1,7 +1,7 @@
-"""How many cores there are for this process, and linear algebra that keeps to a number of threads.
+"""Cores available to this process, and limits on the threads of its linear algebra.
 
-BLAS' threads wait for one another in a spin. Where others use the cores, each product then waits for a thread
-that does not run: two threads on two busy cores are several times slower than one.
+BLAS threads busy-wait for one another. If other programs use the cores, every product waits for a thread that
+is not running: two threads on two busy cores are several times slower than one.
 """
 
 from __future__ import annotations
@@ -20,35 +20,35 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 LOOKS, LOOK_S = 5, 0.004
-"""Threads that run in each of several looks are there to stay."""
+"""Number and spacing of looks at the running threads: those that run at every look count as lasting."""
 SLICES, SLICE_S = 9, 0.004
-"""Of processor time, over which a thread's share of a core is measured."""
+"""Slices of processor time over which a thread's share of a core is measured."""
 
 
 def usable_cores() -> int:
-    """Cores that this process may use: by its affinity, and by its control group's quota (containers)."""
+    """Return how many cores this process may use, by its affinity and its control group's quota."""
     return max(1, math.ceil(min(len(os.sched_getaffinity(0)), _quota())))
 
 
 def idle_cores() -> int:
-    """Of these, as many as nobody else uses now; at least one."""
+    """Return how many of the usable cores no other thread occupies now; at least one."""
     spare = (os.cpu_count() or 1) - (_running() - 1)
     return max(1, min(usable_cores(), spare))
 
 
 def limit_blas(threads: int) -> threadpool_limits:
-    """Every BLAS loaded in this process uses at most so many threads; as a context manager, until it ends.
+    """Limit every BLAS loaded in this process to ``threads``; as a context manager, until its end.
 
-    The environment variables that BLAS reads at its start come too late in a process that has numpy already.
+    BLAS reads its environment variables when it is loaded, too early for a process that already has numpy.
     """
     return threadpool_limits(threads, user_api="blas")
 
 
 def slowness() -> float:
-    """How many times longer than on a core of its own this thread takes now; at least 1.
+    """Measure how many times longer than on a core of its own this thread takes now; at least 1.
 
-    Cores are shared in slices of some milliseconds, over which the time is taken, but for the worst: a hiccup
-    is no share.
+    The scheduler shares cores in slices of some milliseconds, so the time is averaged over several of them.
+    The worst is left out, since a single hiccup says nothing about the share.
     """
     took_s = []
     for _ in range(SLICES):
@@ -60,14 +60,16 @@ def slowness() -> float:
 
 
 def process_age_s(process: Path = Path("/proc/self")) -> float:
-    """Since a process began; its start is the 22nd field of ``stat``, counted behind the name's bracket."""
+    """Return the age of a process in seconds, from the start time in ``stat``."""
+    # The start time is field 22. Fields are counted from the bracket that closes the name (field 2), since a
+    # name may hold spaces and brackets.
     began = int((process / "stat").read_text(errors="replace").rpartition(")")[2].split()[19])
     return time.clock_gettime(time.CLOCK_BOOTTIME) - began / os.sysconf("SC_CLK_TCK")
 
 
 @contextmanager
 def limit_threads(threads: int) -> Iterator[None]:
-    """The same for BLAS and for compiled loops (numba, where it is loaded), whose threads spin likewise."""
+    """Limit BLAS and compiled loops (numba, if loaded), whose threads busy-wait too, to ``threads``."""
     numba = sys.modules.get("numba")
     before = numba.get_num_threads() if numba else 0
     with limit_blas(threads):
@@ -81,7 +83,7 @@ def limit_threads(threads: int) -> Iterator[None]:
 
 
 def _running() -> int:
-    """Threads on this machine that run or want to, this one among them."""
+    """Return the threads of this machine that run or want to, this one among them."""
     fewest = math.inf
     for _ in range(LOOKS):
         fewest = min(fewest, int(Path("/proc/loadavg").read_text(encoding="ascii").split()[3].split("/")[0]))
@@ -90,7 +92,7 @@ def _running() -> int:
 
 
 def _quota(root: Path = Path("/sys/fs/cgroup")) -> float:
-    """Cores' worth of time that the control group may take (version 2, or 1); infinite without a limit."""
+    """Return the control group's quota in cores (version 2, or 1); infinite without a limit."""
     for files in ("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us"):
         if all((root / name).exists() for name in files):
             limit, period = " ".join((root / name).read_text(encoding="ascii") for name in files).split()

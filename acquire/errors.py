@@ -1,22 +1,22 @@
-"""Every failure a user can meet, and the exit code that the command line gives for it.
+"""The errors shown to a user, and the exit code that the command line returns for each.
 
 ::
 
     AcquireError                1  (a defect of ours, or a refused computation)
-    ├── UsageError              2  what was asked for is impossible as asked
+    ├── UsageError              2  the request cannot be fulfilled as it stands
     │   ├── ConfigError         2  a configuration file or value
     │   └── PlaceError          2  nothing of the kind is at a path or URL, or this user may not use it
-    ├── NoDaemonError           3  nobody answers on the control socket
+    ├── NoDaemonError           3  no daemon answers on the control socket
     ├── StateError              4  the daemon cannot do this now
     ├── DeviceError             5  trigger, camera or host hardware
     │   ├── TriggerError        5
     │   ├── CameraError         5
-    │   │   └── CameraLostError 5  it does not answer any more; it may come back
+    │   │   └── CameraLostError 5  it no longer answers; it may come back
     │   └── StoreError          5  a disk or a remote store fails, is full, or does not answer
     ├── DataError               6  a recording is damaged, or lines were lost; never anything else
-    └── NumericsError           1  a computation left the finite numbers
+    └── NumericsError           1  a computation produced numbers that are not finite
 
-A message states what was asked; ``possible`` and ``hint`` add what can be had and what to try.
+A message states what was asked; ``possible`` and ``hint`` add what is possible and what to try.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ EXIT_INTERRUPTED = 130
 
 
 class AcquireError(Exception):
-    """Base of the tree. ``str()`` gives the whole text, one sentence after the other."""
+    """Base of the tree. ``str()`` gives the whole text: the message, what is possible, what to try."""
 
     exit_code = 1
 
@@ -46,7 +46,7 @@ class AcquireError(Exception):
         return "; ".join(parts)
 
     def to_dict(self) -> dict[str, Any]:
-        """The error for programs: on the control socket, and as ``--json``."""
+        """Return the error for programs: on the control socket, and as ``--json``."""
         return {
             "error": type(self).__name__,
             "message": self.message,
@@ -60,12 +60,12 @@ class AcquireError(Exception):
 
 
 def _rebuild(cls: type[AcquireError], message: str, possible: str, hint: str) -> AcquireError:
-    """Errors cross process boundaries; keyword-only arguments need this help to be unpickled."""
+    """Unpickle an error that crossed a process boundary; pickle cannot pass keyword-only arguments itself."""
     return cls(message, possible=possible, hint=hint)
 
 
 class UsageError(AcquireError):
-    """What was asked for is impossible as asked."""
+    """The request cannot be fulfilled as it stands."""
 
     exit_code = 2
 
@@ -79,7 +79,7 @@ class PlaceError(UsageError):
 
 
 class NoDaemonError(AcquireError):
-    """Nobody answers on the control socket."""
+    """No daemon answers on the control socket."""
 
     exit_code = 3
 
@@ -105,7 +105,7 @@ class CameraError(DeviceError):
 
 
 class CameraLostError(CameraError):
-    """A camera that was open does not answer any more; it may come back."""
+    """A camera that was open no longer answers; it may come back."""
 
 
 class StoreError(DeviceError):
@@ -119,4 +119,4 @@ class DataError(AcquireError):
 
 
 class NumericsError(AcquireError):
-    """A computation left the finite numbers, or would have."""
+    """A computation produced numbers that are not finite, or would have."""

@@ -1,8 +1,8 @@
-"""An image-transmitting fibre: bands of a scene that is larger than the sensors, side by side on them.
+"""An image-transmitting fibre: it lays bands of a scene larger than the sensors side by side on them.
 
-The paper's conclusion: a sensor of 4640 columns and 256 stages looks at a scene of 768 x 1536 through a
-fibre that is cut into bands at one end. Camera A's bands are n rows of the scene high; camera B, which sees
-the scene turned by 90° counter-clockwise, has bands that are n columns wide, each turned::
+The paper's conclusion describes a sensor of 4640 columns and 256 stages that looks at a scene of 768 x 1536
+through a fibre that is cut into bands at one end. Camera A's bands are n rows of the scene high. Camera B
+sees the scene turned by 90° counter-clockwise, and its bands are n columns wide, each turned::
 
     scene, R × C                    arm A, n stages                     arm B, n stages
     ┌────┬────┬────┬────┐    ┌────────────┬────────────┐    ┌───────┬───────┬───────┬───────┐
@@ -11,8 +11,8 @@ the scene turned by 90° counter-clockwise, has bands that are n columns wide, e
     │1,0 │1,1 │1,2 │1,3 │     band 0: C/S     band 1          R/S: the scene's rows of column-band 0, …
     └────┴────┴────┴────┘
 
-So tile (i, j), n × n, is seen by M neighbouring columns of either arm as a scene of its own is by a whole
-sensor, and Eq. (1) holds for it as it stands.
+Tile (i, j), n × n, is thus seen by M neighbouring columns of each arm, just as a scene of its own would be
+seen by a whole sensor, and Eq. (1) holds for it unchanged.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 LARGEST = 2**16
-"""Of a scene, in fine pixels along either side."""
+"""Upper limit on the sides of a scene, in fine pixels."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
 class Tile:
-    """One n × n part of the scene: counted from 0, rows of tiles downwards, columns to the right."""
+    """One n × n part of the scene: rows of tiles count from 0 downwards, columns from 0 to the right."""
 
     row: int
     column: int
@@ -47,20 +47,20 @@ class Tile:
 
 @dataclass(frozen=True, slots=True)
 class Fibre:
-    """Which columns of which sensor see what.
+    """Which columns of which sensor see which part of the scene.
 
     Parameters
     ----------
     stages, substeps : M and S
     rows, columns : R and C of the scene in fine pixels, multiples of n = M·S
-    sensor_pixels : of a line of either camera
+    sensor_pixels : pixels per line of each camera
     bands_a : first column on sensor A of each band of rows, the topmost first
     bands_b : first column on sensor B of each band of columns, the leftmost first
 
     Raises
     ------
     UsageError
-        The scene is no whole number of tiles, or just one; bands overlap or lie beside the sensor.
+        The scene is not a whole number of tiles, or is a single one; bands overlap or leave the sensor.
     """
 
     stages: int
@@ -80,13 +80,15 @@ class Fibre:
     def side_by_side(
         cls, stages: int, substeps: int, rows: int, columns: int, sensor_pixels: int, **bands: Sequence[int]
     ) -> Self:
-        """With the bands of an arm that ``bands`` (``a``, ``b``) does not give next to each other in the
-        middle of the sensor, in order."""
+        """Return a fibre with the given ``bands`` (``a``, ``b``).
+
+        The bands of an arm that is not given lie next to one another in the middle of its sensor, in order.
+        """
         _check_sizes(stages, substeps, rows, columns)
         size = stages * substeps
         placed = {
             arm: tuple(bands.get(arm) or ())
-            or _in_the_middle(arm, across // size, along // substeps, sensor_pixels)
+            or _centred_bands(arm, across // size, along // substeps, sensor_pixels)
             for arm, across, along in (("a", rows, columns), ("b", columns, rows))
         }
         return cls(
@@ -101,12 +103,12 @@ class Fibre:
 
     @property
     def size(self) -> int:
-        """n = M·S, side of a tile in fine pixels, and breadth of a band."""
+        """n = M·S, side of a tile and breadth of a band in fine pixels."""
         return self.stages * self.substeps
 
     @property
     def side(self) -> int:
-        """Of the smallest square that the scene fits in, in fine pixels."""
+        """Side of the smallest square that the scene fits in, in fine pixels."""
         return max(self.rows, self.columns)
 
     @property
@@ -119,40 +121,40 @@ class Fibre:
 
     @property
     def tiles(self) -> tuple[Tile, ...]:
-        """Row by row."""
+        """All tiles, row by row."""
         return tuple(Tile(i, j) for i in range(self.tile_rows) for j in range(self.tile_columns))
 
     def bands(self, arm: str) -> tuple[int, ...]:
-        """First column of each band on an arm's sensor."""
+        """Return the first column of each band on an arm's sensor."""
         return self.bands_a if arm == "a" else self.bands_b
 
     def band_pixels(self, arm: str) -> int:
-        """Columns that a band takes."""
+        """Return the number of columns that a band of an arm occupies."""
         return (self.columns if arm == "a" else self.rows) // self.substeps
 
     def first_pixel(self, arm: str, tile: Tile) -> int:
-        """The first of the M columns of an arm's sensor that see a tile."""
+        """Return the first of the M columns of an arm's sensor that see a tile."""
         self.check_tile(tile)
-        band, place = (tile.row, tile.column) if arm == "a" else (tile.column, tile.row)
-        return self.bands(arm)[band] + place * self.stages
+        band, position = (tile.row, tile.column) if arm == "a" else (tile.column, tile.row)
+        return self.bands(arm)[band] + position * self.stages
 
     def pixels(self, tile: Tile) -> tuple[slice, slice]:
-        """The columns of sensors A and B that see a tile."""
+        """Return the columns of sensors A and B that see a tile."""
         a, b = (slice(first := self.first_pixel(arm, tile), first + self.stages) for arm in ARMS)
         return a, b
 
     def table(self, arm: str) -> NDArray[np.int64]:
-        """(column of the sensor, 2): number of the band, and where along it, in pixels; −1 where none is."""
+        """Return each sensor column's band and its pixel along that band (column, 2); −1 without a band."""
         import numpy as np
 
-        found = np.full((self.sensor_pixels, 2), -1, np.int64)
+        table = np.full((self.sensor_pixels, 2), -1, np.int64)
         along = np.arange(self.band_pixels(arm))
         for number, first in enumerate(self.bands(arm)):
-            found[first : first + len(along)] = np.stack([np.full_like(along, number), along], axis=1)
-        return found
+            table[first : first + len(along)] = np.stack([np.full_like(along, number), along], axis=1)
+        return table
 
     def folded(self, profile: NDArray[Any], arm: str) -> NDArray[Any]:
-        """What the columns of a sensor have (pixel,), added up over the tiles: (M,)."""
+        """Return the sum over the tiles (M,) of a profile over a sensor's columns (pixel,)."""
         import numpy as np
 
         firsts = [self.first_pixel(arm, tile) for tile in self.tiles]
@@ -160,12 +162,12 @@ class Fibre:
         return total
 
     def field(self) -> tuple[slice, slice]:
-        """Rows and columns of the scene in the middle of a square of `side`."""
+        """Return the rows and columns of the scene in the middle of a square of `side`."""
         row, column = (self.side - self.rows) // 2, (self.side - self.columns) // 2
         return slice(row, row + self.rows), slice(column, column + self.columns)
 
-    def laid(self, frames: NDArray[Any], arm: str) -> NDArray[Any]:
-        """Frames (t, R, C) as they lie on an arm's sensor: (t, n, fine columns), dark between the bands."""
+    def lay_out(self, frames: NDArray[Any], arm: str) -> NDArray[Any]:
+        """Lay frames (t, R, C) on an arm's sensor: (t, n, fine columns), dark between the bands."""
         import numpy as np
 
         n, S = self.size, self.substeps
@@ -177,7 +179,7 @@ class Fibre:
         return laid
 
     def check_tile(self, tile: Tile) -> None:
-        """UsageError unless there is such a tile."""
+        """Raise UsageError unless there is such a tile."""
         if not (0 <= tile.row < self.tile_rows and 0 <= tile.column < self.tile_columns):
             raise UsageError(
                 f"the fibre has no tile {tile}",
@@ -185,13 +187,13 @@ class Fibre:
             )
 
     def to_attrs(self) -> dict[str, Any]:
-        """What a recording's geometry says of it, beside stages, substeps and pixels (JSON)."""
+        """Return its entry in a recording's geometry, next to stages, substeps and pixels (JSON)."""
         bands = {"a": list(self.bands_a), "b": list(self.bands_b)}
         return {"rows": self.rows, "columns": self.columns, "bands": bands}
 
     @classmethod
     def of(cls, geometry: Mapping[str, Any]) -> Self | None:
-        """That of a recording's ``geometry``; None where it has none. UsageError for one that cannot be."""
+        """Return the fibre of a recording's ``geometry``, or None. Raises UsageError if it is impossible."""
         if (attrs := geometry.get("fibre")) is None:
             return None
         stages, substeps, pixels = (int(geometry[key]) for key in ("stages", "substeps", "pixels"))
@@ -205,14 +207,14 @@ class Fibre:
             raise UsageError(
                 f"fibre: {len(firsts)} bands on sensor {arm.upper()} cannot show a scene of "
                 f"{self.rows} x {self.columns}",
-                possible=f"{needed}, of {self.size} {'rows' if arm == 'a' else 'columns'} each",
+                possible=f"{needed} bands of {self.size} {'rows' if arm == 'a' else 'columns'} each",
             )
         edges = sorted(firsts)
         overlap = any(after < before + width for before, after in pairwise(edges))
         if overlap or edges[0] < 0 or edges[-1] + width > self.sensor_pixels:
             raise UsageError(
-                f"fibre: bands of {width} columns from {', '.join(map(str, firsts))} on do not lie beside "
-                f"each other on the {self.sensor_pixels} columns of sensor {arm.upper()}",
+                f"fibre: bands of {width} columns that begin at {', '.join(map(str, firsts))} overlap or do "
+                f"not fit on the {self.sensor_pixels} columns of sensor {arm.upper()}",
                 possible=f"first columns from 0 to {self.sensor_pixels - width}, at least {width} apart",
             )
 
@@ -222,16 +224,17 @@ def _check_sizes(stages: int, substeps: int, rows: int, columns: int) -> None:
     for name, length in (("rows", rows), ("columns", columns)):
         if length < size or length % size or length > LARGEST:
             raise UsageError(
-                f"fibre: a scene of {length} {name} is no whole number of bands of n = {size}",
+                f"fibre: a scene of {length} {name} is not a whole number of bands of n = {size}",
                 possible=f"a multiple of {stages} stages x {substeps} sub-steps, up to {LARGEST}",
             )
     if rows == columns == size:
         raise UsageError(
-            f"fibre: a scene of {rows} x {columns} is one band", possible="more rows or columns; or no fibre"
+            f"fibre: a scene of {rows} x {columns} is a single band",
+            possible="more rows or columns, or no fibre",
         )
 
 
-def _in_the_middle(arm: str, count: int, width: int, sensor_pixels: int) -> tuple[int, ...]:
+def _centred_bands(arm: str, count: int, width: int, sensor_pixels: int) -> tuple[int, ...]:
     if count * width > sensor_pixels:
         raise UsageError(
             f"fibre: sensor {arm.upper()} with {sensor_pixels} columns is too narrow for {count} bands of "

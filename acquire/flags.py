@@ -1,4 +1,4 @@
-"""Names of the arms, and what is known about a line: words that every part of the program says alike."""
+"""Names of the arms and flags of the lines, shared by every part of the program."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class LineFlag(IntFlag):
     INCOMPLETE = 2
     """The camera reported that part of the line is not valid."""
     SATURATED = 4
-    """At least one pixel stands at the top of the range."""
+    """At least one pixel is at the top of the range."""
     TIME_ESTIMATED = 8
     """No tag of the trigger confirmed tick and time; they are extrapolated."""
     CODE_UNVERIFIED = 16

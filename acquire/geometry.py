@@ -1,4 +1,4 @@
-"""The shear of a TDI recording as plain integers: sizes, spans, and what of them can be trusted.
+"""The shear of a TDI recording as plain integers: sizes, spans, and the trusted part of them.
 
 Eq. (1) of the paper counts lines, rows, columns and sub-steps from 1; this module is the only place
 that translates. In code, line ``i`` (from 0) sums row ``r`` of the scene at the sub-steps
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from acquire.errors import UsageError
 
 MAX_TEMPORAL_MERGE = 2**31 - 1
-"""What the kernels can count; far beyond any recording."""
+"""Largest merge that the kernels can count, far beyond any recording."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,16 +54,16 @@ class Geometry:
 
     @property
     def readout_substep(self) -> int:
-        """Sub-step, counted from a line's first, at which its read-out begins: it enters the last row."""
+        """Sub-step, counted from a line's first, at which it enters the last row and its read-out begins."""
         return self.size - 1
 
     @property
     def depth_lines(self) -> int:
-        """Lines read out after a start whose exposure began before it: M + 1."""
+        """Number of lines read out after a start whose exposure began before it: M + 1."""
         return self.stages + 1
 
     def line_substeps(self, line: int) -> range:
-        """Sub-steps that expose ``line`` (from 0): n + S − 1 of them."""
+        """Return the sub-steps that expose ``line`` (from 0): n + S − 1 of them."""
         first = line * self.substeps
         return range(first, first + self.size + self.substeps - 1)
 
@@ -71,21 +71,21 @@ class Geometry:
     def trusted(self) -> slice:
         """Sub-steps at which every row of the scene is sampled: 1-based t in [n, L_R·S] (Fig. 5, t1…t2).
 
-        Empty when the segment has fewer than M lines.
+        The slice is empty if the segment has fewer than M lines.
         """
         first = self.size - 1
         return slice(first, max(first, self.lines * self.substeps))
 
     def video_shape(self, spatial_merge: int = 1, temporal_merge: int = 1) -> tuple[int, int, int]:
-        """(time, row, column) of the voxels X′: ⌈T/T_m⌉, ⌈n/N_m⌉, ⌈n/N_m⌉ (Section 3.1)."""
+        """Return (time, row, column) of the voxels X′: ⌈T/T_m⌉, ⌈n/N_m⌉, ⌈n/N_m⌉ (Section 3.1)."""
         self.check_merge(spatial_merge, temporal_merge)
         side = -(-self.size // spatial_merge)
         return (-(-self.span // temporal_merge), side, side)
 
     def trusted_frames(self, temporal_merge: int = 1) -> slice:
-        """Frames of T_m sub-steps that lie wholly inside the trusted interval.
+        """Return the frames of T_m sub-steps that lie wholly inside the trusted interval.
 
-        The last frame of a segment may be shorter than T_m; it counts when its own sub-steps are trusted.
+        The last frame of a segment may be shorter than T_m; it counts if its own sub-steps are trusted.
         """
         self.check_merge(1, temporal_merge)
         trusted = self.trusted
@@ -96,12 +96,12 @@ class Geometry:
         return slice(first, max(first, last))
 
     def seam_substeps(self, temporal_merge: int = 1) -> int:
-        """Sub-steps dropped on either side of an inner seam: n − 1, up to whole frames (Fig. 5, 8)."""
+        """Return the sub-steps dropped on each side of an inner seam: n − 1 in whole frames (Fig. 5, 8)."""
         self.check_merge(1, temporal_merge)
         return -(-(self.size - 1) // temporal_merge) * temporal_merge
 
     def sampling_rate(self, spatial_merge: int = 1, temporal_merge: int = 1) -> float:
-        """S_r = 2·L_R·M·N_m²·T_m / (n²·T): samples per voxel (Fig. 4)."""
+        """Return S_r = 2·L_R·M·N_m²·T_m / (n²·T), the samples per voxel (Fig. 4)."""
         self.check_merge(spatial_merge, temporal_merge)
         samples = 2 * self.lines * self.stages * spatial_merge**2 * temporal_merge
         return samples / (self.size**2 * self.span)
@@ -121,5 +121,5 @@ class Geometry:
 
 
 def is_integer(value: object) -> bool:
-    """A whole number by type: neither 3.0 nor True."""
+    """Whether a value is an integer by type: neither 3.0 nor True."""
     return isinstance(value, int) and not isinstance(value, bool)

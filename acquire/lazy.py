@@ -1,4 +1,4 @@
-"""Packages whose names are imported when somebody asks for them, since each brings its libraries: PEP 562."""
+"""Packages that import their public names on first use (PEP 562), since each brings its libraries."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ if TYPE_CHECKING:
 def lazily(
     package: str, homes: Mapping[str, str], names: Sequence[str]
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """``__getattr__`` and ``__dir__`` of a package that shows ``names``.
+    """Return ``__getattr__`` and ``__dir__`` of a package whose public names are ``names``.
 
-    ``homes``: name → the module in the package that has it, imported at the first use.
+    ``homes`` maps each name to the module of the package that defines it, imported on first use.
     """
 
     def getattribute(name: str) -> Any:

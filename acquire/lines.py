@@ -1,4 +1,4 @@
-"""What travels from a camera to the disk and back: blocks of lines, their flags, and cut segments."""
+"""Lines on their way from a camera to the disk and back: blocks, their flags, and cut segments."""
 
 from __future__ import annotations
 
@@ -55,13 +55,13 @@ class LineBlock:
 
     @property
     def end_line(self) -> int:
-        """Number of the line after the last."""
+        """Number of the line after the block's last."""
         return self.first_line + len(self)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TaggedBlock:
-    """Consecutive lines with what the trigger says about each; all arrays have the length of ``pixels``."""
+    """Consecutive lines with the trigger's tag of each; all arrays have the length of ``pixels``."""
 
     arm: str
     first_line: int
@@ -95,13 +95,13 @@ class Segment:
     substep_ns : duration of a sub-step
     black_level_dn, responsivity_dn : DN = black level + responsivity · Y, with Y of Eq. (1);
         one number for both arms, one per arm, or one per arm and pixel (2, M)
-    curve : what makes the recorded DN those of a linear camera, of which black level, responsivity and noise
-        are then told; None: they are
-    alignment : where arm B's image lies beside arm A's; None: on it
-    blur : of either arm's optics; None: it is not known, or none
-    noise : of the samples in DN; None: it is not known
-    balanced : the arms' shares of the light are in ``responsivity_dn``, as far as anybody knows them
-    first_column : of arms A and B, where on the sensor's columns these pixels begin; behind a fibre not at 0
+    curve : converts recorded DN to those of a linear camera, to which black level, responsivity and noise
+        then refer; None if the camera is linear
+    alignment : position of arm B's image relative to arm A's; None if they coincide
+    blur : of each arm's optics; None if it is unknown or absent
+    noise : of the samples in DN; None if it is unknown
+    balanced : whether ``responsivity_dn`` includes the arms' shares of the light, as far as they are known
+    first_column : sensor columns of arms A and B at which these pixels begin; behind a fibre not 0
     """
 
     lines: NDArray[Any]
@@ -136,7 +136,7 @@ class Segment:
             raise UsageError(
                 f"a segment cannot have responsivity {self.responsivity_dn} and black level "
                 f"{self.black_level_dn} DN",
-                possible="a responsivity above 0 and a black level, as the camera has them",
+                possible="a finite black level and a responsivity above 0, those of the camera",
             )
         if self.time_ns.shape != (self.geometry.lines,):
             raise UsageError(
@@ -155,13 +155,13 @@ class Segment:
         )
 
     def samples(self, dtype: type[np.floating[Any]] = np.float32) -> NDArray[Any]:
-        """Y of Eq. (1) (2, L_R, M): black level removed, in units of the scene; 0 where masked."""
+        """Return Y of Eq. (1) (2, L_R, M): black level removed, in units of the scene; 0 where masked."""
         black, gain = (_beside_lines(value, dtype) for value in (self.black_level_dn, self.responsivity_dn))
         scaled = (self._linear(dtype) - black) / gain
         return np.where(self.mask, scaled, dtype(0))
 
     def variance(self) -> NDArray[np.float64] | None:
-        """Of the noise in `samples` (2, L_R, M), in squared units of the scene; None: not known."""
+        """Return the noise variance of `samples` (2, L_R, M), in squared scene units; None if unknown."""
         if self.noise is None:
             return None
         known = self.black_level_dn, self.responsivity_dn
@@ -170,25 +170,25 @@ class Segment:
         return np.asarray(in_dn2 / gain**2)
 
     def _linear(self, dtype: type[np.floating[Any]]) -> NDArray[Any]:
-        """The lines in DN of a linear camera."""
+        """Return the lines in DN of a linear camera."""
         dn = self.lines.astype(dtype)
         return dn if self.curve is None else self.curve.straight(dn)
 
     def mirrored(self, arm: int) -> Segment:
-        """With the pixels of one arm (0 or 1) in the other order, and all that is known of single columns."""
+        """Return the segment with one arm (0 or 1) mirrored: its pixels and everything given per column."""
         return self._of_arms(
             lambda values: np.stack([each[..., ::-1] if i == arm else each for i, each in enumerate(values)])
         )
 
     def swapped(self) -> Segment:
-        """With the arms in each other's places, and all that is known of either."""
+        """Return the segment with the arms exchanged, and everything that is given per arm."""
         segment = self._of_arms(lambda values: values[::-1].copy(), per_arm=True)
         noise, curve = self.noise and self.noise.swapped(), self.curve and self.curve.swapped()
         blur = self.blur and self.blur.swapped()
         return replace(segment, noise=noise, curve=curve, blur=blur)
 
     def _of_arms(self, change: Callable[[NDArray[Any]], NDArray[Any]], *, per_arm: bool = False) -> Segment:
-        """With all that there is of each arm and pixel changed alike; ``per_arm``: of each arm, too."""
+        """Apply ``change`` to every array per arm and pixel, and with ``per_arm`` to those per arm, too."""
         known: dict[str, Any] = {name: getattr(self, name) for name in ("black_level_dn", "responsivity_dn")}
         for name, value in known.items():
             if np.ndim(value) == 2:
@@ -198,7 +198,7 @@ class Segment:
         return replace(self, lines=change(self.lines), mask=change(self.mask), **known)
 
     def frame_time_ns(self, temporal_merge: int = 1) -> NDArray[np.int64]:
-        """UTC at which each frame of T_m sub-steps begins.
+        """Return the UTC at which each frame of T_m sub-steps begins.
 
         A line's time stamp is the beginning of its sub-step n − 1, so that the first trusted sub-step
         carries the time of the segment's first line (Fig. 9).
@@ -210,21 +210,21 @@ class Segment:
 
 
 def _beside_lines(value: object, dtype: type[np.floating[Any]]) -> NDArray[Any]:
-    """A number, or one per arm, or one per arm and pixel, as it stands beside lines (arm, line, pixel)."""
+    """Shape a number, one per arm, or one per arm and pixel to broadcast against (arm, line, pixel)."""
     given = np.asarray(value, dtype)
     return given[:, None, :] if given.ndim == 2 else given.reshape(-1, 1, 1)
 
 
 def merged(segment: Segment, count: int) -> Segment:
-    """Lines of whole steps merged ``count`` × ``count``: those of a sensor with ``count`` intra-line steps.
+    """Merge lines of whole steps ``count`` × ``count`` to those of a sensor with ``count`` intra-line steps.
 
     Line ℓ of Eq. (1) with M stages and S = ``count`` is the sum of the raw lines S·ℓ … S·ℓ + S − 1 of a
     sensor of M·S stages whose charge moves once a line, S columns each (Sect. 5.1: 192 stages at 100 kHz
-    become 64 at 33.33 kHz). A merged sample can be used where all of its raw samples can. What is known of
-    single columns is used before they are added up: the result is then in units of the scene. Raw lines lose
-    nothing and reconstruct as they are, with S = 1; merged ones are a ninth as many.
+    become 64 at 33.33 kHz). A merged sample is usable if all of its raw samples are. Corrections of single
+    columns are applied before the sum, and the result is then in units of the scene. Raw lines can also be
+    reconstructed directly, with S = 1 and without loss; for S = 3 the merged samples are a ninth as many.
 
-    Raises UsageError for lines that have intra-line steps already, and for a segment that does not begin and
+    Raises UsageError for lines that already have intra-line steps, and for a segment that does not begin and
     end between merged lines.
     """
     geometry = segment.geometry
@@ -235,6 +235,7 @@ def merged(segment: Segment, count: int) -> Segment:
             f"{segment.first_line} on cannot be merged {count} x {count}",
             possible=f"S = 1; stages, lines and first line multiples of {count}",
         )
+    # Corrections of single columns cannot be applied to a sum of columns any more.
     columns = segment.curve is not None
     columns |= np.ndim(segment.black_level_dn) == 2 or np.ndim(segment.responsivity_dn) == 2
     black = np.zeros(()) if columns else np.asarray(segment.black_level_dn, np.float64) * count**2

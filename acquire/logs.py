@@ -1,7 +1,8 @@
-"""The log of the daemon and its processes: one line per entry, whatever is in it, and not too many of them.
+"""The log of the daemon and its processes: one line per entry, whatever it contains, at a limited rate.
 
-An entry that repeats, as of a connection that cannot be accepted, is written some times a minute; how often
-it came besides is told once the minute is over. So the log can neither be forged nor fill the disk.
+A repeated entry, such as that of a connection that cannot be accepted, is written only a few times a minute;
+once the minute is over, another entry states how many were suppressed. The log can thus neither be forged nor
+fill the disk.
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ REPEATS = 10
 """Entries of one kind that are written within `WINDOW_S`."""
 WINDOW_S = 60.0
 MOST_KINDS = 256
-"""Kinds of entries that are told apart at a time."""
+"""Kinds of entries that are counted at a time."""
 MOST_CHARACTERS = 4000
-"""Of one entry."""
+"""Upper limit on the length of an entry."""
 MOST_TRACEBACK_LINES = 60
 
 Kind = tuple[str, int, str]
-"""Logger, level and the message before its arguments are put in."""
+"""Logger, level and message before its arguments are formatted."""
 
 
 class OneLine(logging.Formatter):
@@ -43,13 +44,13 @@ class OneLine(logging.Formatter):
         text = f"{self.formatTime(record)} {record.levelname} {visible(record.getMessage())}"
         lines = [text if len(text) <= MOST_CHARACTERS else f"{text[:MOST_CHARACTERS]}…"]
         if record.exc_info:
-            told = self.formatException(record.exc_info).splitlines()
-            lines += [f"  {visible(line)[:MOST_CHARACTERS]}" for line in told[-MOST_TRACEBACK_LINES:]]
+            traceback = self.formatException(record.exc_info).splitlines()
+            lines += [f"  {visible(line)[:MOST_CHARACTERS]}" for line in traceback[-MOST_TRACEBACK_LINES:]]
         return "\n".join(lines)
 
 
 class JsonLine(OneLine):
-    """One JSON object in one line, for programs."""
+    """One JSON object per line, for programs."""
 
     def format(self, record: logging.LogRecord) -> str:
         facts: dict[str, object] = {
@@ -60,13 +61,13 @@ class JsonLine(OneLine):
             "message": visible(record.getMessage())[:MOST_CHARACTERS],
         }
         if record.exc_info:
-            told = self.formatException(record.exc_info).splitlines()[-MOST_TRACEBACK_LINES:]
-            facts["traceback"] = [visible(line)[:MOST_CHARACTERS] for line in told]
+            traceback = self.formatException(record.exc_info).splitlines()[-MOST_TRACEBACK_LINES:]
+            facts["traceback"] = [visible(line)[:MOST_CHARACTERS] for line in traceback]
         return json.dumps(facts)
 
 
 def is_journal(file: int) -> bool:
-    """Whether a descriptor leads to systemd's journal, as JOURNAL_STREAM says of it."""
+    """Whether a descriptor leads to systemd's journal, according to JOURNAL_STREAM."""
     try:
         found = os.fstat(file)
     except OSError:
@@ -81,41 +82,39 @@ class _Count:
 
 
 class Bounded(logging.Filter):
-    """Lets `REPEATS` entries of a kind pass in `WINDOW_S`, and then tells how many it kept back."""
+    """Passes `REPEATS` entries of a kind per `WINDOW_S`, and then reports how many it suppressed."""
 
-    def __init__(self, tell: Callable[[str], None], now_s: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, report: Callable[[str], None], now_s: Callable[[], float] = time.monotonic) -> None:
         super().__init__()
-        self._tell = tell
+        self._report = report
         self._now_s = now_s
         self._counts: dict[Kind, _Count] = {}
 
     def filter(self, record: logging.LogRecord) -> bool:
         now_s = self._now_s()
-        self._end_windows(now_s)
-        kind = (record.name, record.levelno, str(record.msg)[:MOST_CHARACTERS])
-        count = self._counts.setdefault(kind, _Count(now_s))
-        count.seen += 1
-        return count.seen <= REPEATS
-
-    def _end_windows(self, now_s: float) -> None:
         for kind, count in list(self._counts.items()):
             if now_s - count.began_s < WINDOW_S and len(self._counts) < MOST_KINDS:
                 break  # kinds are in the order in which their windows began
             del self._counts[kind]
             if count.seen > REPEATS:
-                self._tell(f"{count.seen - REPEATS} more entries like this one were not written: {kind[2]}")
+                self._report(f"{count.seen - REPEATS} more entries like this one were not written: {kind[2]}")
+        kind = (record.name, record.levelno, str(record.msg)[:MOST_CHARACTERS])
+        count = self._counts.setdefault(kind, _Count(now_s))
+        count.seen += 1
+        return count.seen <= REPEATS
 
 
 def write_log(level: int) -> None:
-    """Log to stderr from now on, in this process, what is at least of this level.
+    """Log entries of at least ``level`` to stderr, from now on in this process.
 
-    For people; and as JSON where stderr is systemd's journal, which gives its own time to every entry.
+    The entries are text for people, but JSON if stderr is systemd's journal, which stamps every entry itself.
     """
     handler = logging.StreamHandler()
     handler.setFormatter(JsonLine() if is_journal(sys.stderr.fileno()) else OneLine())
-    handler.addFilter(Bounded(lambda text: handler.emit(_entry(text))))
+
+    def report(text: str) -> None:
+        # `emit` bypasses the filter, which would otherwise count its own entries.
+        handler.emit(logging.LogRecord("acquire.daemon", logging.WARNING, __file__, 0, text, None, None))
+
+    handler.addFilter(Bounded(report))
     logging.basicConfig(level=level, handlers=[handler])
-
-
-def _entry(text: str) -> logging.LogRecord:
-    return logging.LogRecord("acquire.daemon", logging.WARNING, __file__, 0, text, None, None)

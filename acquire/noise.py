@@ -1,4 +1,4 @@
-"""Temporal noise of a camera's samples: what is left to explain when everything else is explained."""
+"""Temporal noise of a camera's samples: the residual of a perfect reconstruction."""
 
 from __future__ import annotations
 
@@ -35,22 +35,22 @@ class Noise:
             raise UsageError(f"the noise is impossible: {self}", possible="numbers from 0 on")
 
     def variance_dn2(self, light_dn: NDArray[Any]) -> NDArray[np.float64]:
-        """Of samples (arm, line, pixel) that are so far above their black level."""
+        """Return the variance of samples (arm, line, pixel) that are ``light_dn`` above their black level."""
         K, dark = (np.reshape(each, (2, 1, 1)) for each in (self.dn_per_electron, self.dark_noise_dn))
         variance: NDArray[np.float64] = QUANTISATION_DN2 + dark**2 + K * np.maximum(light_dn, 0.0)
         return variance
 
     def swapped(self) -> Noise:
-        """Of an instrument whose arms have changed places."""
+        """Return the noise with the arms exchanged."""
         return Noise(self.dn_per_electron[::-1], self.dark_noise_dn[::-1])
 
     def merged(self, count: int) -> Noise:
-        """Of sums of ``count`` × ``count`` samples."""
+        """Return the noise of sums of ``count`` × ``count`` samples."""
         a, b = self.dark_noise_dn
         return Noise(self.dn_per_electron, (a * count, b * count))
 
-    def beside(self, light_dn: tuple[float, float]) -> Noise:
-        """With the shot noise of light that is always there, as much in each arm."""
+    def with_ambient(self, light_dn: tuple[float, float]) -> Noise:
+        """Return the noise with the shot noise of each arm's ambient light added to the dark noise."""
         rows = zip(self.dn_per_electron, self.dark_noise_dn, light_dn, strict=True)
         a, b = (float(np.sqrt(dark**2 + K * max(light, 0.0))) for K, dark, light in rows)
         return Noise(self.dn_per_electron, (a, b))

@@ -1,8 +1,9 @@
-"""Lines without a scene, at next to no cost, which follow from their numbers alone.
+"""Lines without a scene, at next to no cost, determined by their numbers alone.
 
-Line ``l`` of an arm is row ``l mod rows`` of a table: noise around a profile, as a sensor has it, which a
-codec packs as it packs real lines. Any line can be checked by itself. For loads, endurance and the proof
-at arm time, where computing a scene would be what is measured.
+Line ``l`` of an arm is row ``l mod rows`` of a table: noise around a profile, like a sensor's, so that a
+codec compresses it as it compresses real lines. Every line can be checked independently. The pattern serves
+load and endurance tests and the capacity test at arm time, which would otherwise measure the simulation of a
+scene.
 """
 
 from __future__ import annotations
@@ -19,16 +20,16 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _TABLE_BYTES = 1 << 25
-"""More than a processor's cache holds: copying lines costs what it costs with a real camera."""
+"""More than a processor's cache holds, so that copying lines costs as much as with a real camera."""
 _MOST_ROWS = 1 << 16
 _NOISE_REPEATS = 16
 _FULL_WELL = 10_000.0
-"""Electrons at the top of the range: what noise there is (its root) sets what can be packed."""
+"""Electrons at the top of the range; the noise, their square root, limits the compression."""
 
 
 @dataclass(frozen=True, slots=True)
 class Pattern:
-    """The lines of one arm: ``pixels`` samples of ``dtype``, none above ``white_dn`` - 1."""
+    """The lines of one arm: ``pixels`` samples of ``dtype`` each, none above ``white_dn`` - 1."""
 
     arm: str
     pixels: int
@@ -37,11 +38,11 @@ class Pattern:
 
     @property
     def rows(self) -> int:
-        """Lines after which the pattern repeats: odd, so that no block's length divides it."""
+        """Period of the pattern in lines: odd, so that no block's length divides it."""
         return min(_MOST_ROWS, _TABLE_BYTES // (self.pixels * np.dtype(self.dtype).itemsize)) | 1
 
     def lines(self, first_line: int, count: int) -> NDArray[Any]:
-        """Lines ``first_line .. first_line + count - 1`` (count, pixels); a view wherever it can be one."""
+        """Return lines ``first_line .. first_line + count - 1`` (count, pixels), as a view if possible."""
         table, first = _table(self), first_line % self.rows
         if first + count <= len(table):
             return table[first : first + count]
@@ -50,7 +51,7 @@ class Pattern:
 
 @cache
 def _table(pattern: Pattern) -> NDArray[Any]:
-    """(row, pixel): one round, and half of it again so that few stretches meet its end."""
+    """Return (row, pixel): one period and half of it again, so that few ranges cross its end."""
     rng = np.random.default_rng(ARMS.index(pattern.arm))
     few = pattern.rows // _NOISE_REPEATS + 1
     profile = 0.4 + 0.2 * np.sin(np.linspace(0, 20, pattern.pixels, dtype=np.float32))

@@ -1,12 +1,12 @@
 """Variants that any installed distribution may add: effects, scenes, drivers, solvers, denoisers.
 
-Each is a class that an entry point names. Ours are listed in our own pyproject.toml as anybody's are in
-theirs; PLUGINS.md says how to write one. A name is looked up without importing anything; a class is imported
-when it is asked for by name. What cannot be imported is left out of every list and named with its error by
-``acquire plugins``; only who asks for it by name is refused.
+Each is a class that an entry point names. Ours are listed in our own pyproject.toml, just as others list
+theirs; PLUGINS.md describes how to write one. A name is looked up without importing anything, and a class is
+imported when it is requested by name. A class that cannot be imported is left out of every list, and
+``acquire plugins`` shows its error. Only a request for it by name is refused.
 
 Our names cannot be taken: another distribution's class of the same name is left out, too. A name that two
-other distributions have belongs to neither.
+other distributions claim belongs to neither.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import difflib
 import importlib
 import inspect
 import tomllib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib import metadata
 from pathlib import Path
@@ -33,7 +33,7 @@ _ENTRY_POINTS = "entry-points"
 
 @dataclass(frozen=True, slots=True)
 class Plugin:
-    """An entry point of a group: who lists it under which name. Nothing of it is imported yet."""
+    """An entry point of a group, its name and its distribution. Nothing of it is imported yet."""
 
     group: str
     name: str
@@ -41,7 +41,7 @@ class Plugin:
     version: str
     entry: metadata.EntryPoint
     refused: str = ""
-    """Why the name is not its own; empty: it is."""
+    """Why the plug-in cannot have the name; empty if it can."""
 
     @property
     def origin(self) -> str:
@@ -54,8 +54,8 @@ class Group:
 
     Attributes
     ----------
-    name : of the entry points' group
-    what : in errors and lists, a noun
+    name : name of the entry points' group
+    what : noun for errors and lists
     base : ``module:class`` that every class of the group extends
     """
 
@@ -64,15 +64,15 @@ class Group:
     base: str
 
     def found(self) -> tuple[Plugin, ...]:
-        """Every entry point of the group, ours first, refused ones too. Imports nothing."""
+        """Return every entry point of the group, ours first, including refused ones. Imports nothing."""
         return _found(self.name)
 
     def names(self) -> tuple[str, ...]:
-        """What can be asked for, working or not, ours first. Imports nothing."""
+        """Return the names that can be requested, working or not, ours first. Imports nothing."""
         return tuple(plugin.name for plugin in self.found() if not plugin.refused)
 
     def load(self, name: str) -> Any:
-        """The class of that name. Raises ConfigError where there is none, or where it cannot be used."""
+        """Return the class of that name. Raises ConfigError if there is none, or if it cannot be used."""
         plugin = self._named(name)
         try:
             return _load(self, plugin.entry)
@@ -84,11 +84,11 @@ class Group:
             ) from error
 
     def working(self) -> dict[str, Any]:
-        """Name → class of all that can be imported, ours first; what cannot is left out."""
+        """Return name → class of all that can be imported, ours first."""
         return {plugin.name: _load(self, plugin.entry) for plugin in self.found() if not self.trouble(plugin)}
 
     def trouble(self, plugin: Plugin) -> str:
-        """Why an entry point of this group gives nothing; empty where it does. Imports it."""
+        """Return why an entry point of this group is unusable, or an empty text. Imports it."""
         if plugin.refused:
             return plugin.refused
         try:
@@ -98,7 +98,8 @@ class Group:
         return ""
 
     def _named(self, name: str) -> Plugin:
-        for plugin in _found_ours(self.name):  # most often it is ours: nobody else's files are read
+        # Most names are ours, which are found without reading the metadata of other distributions.
+        for plugin in _found_ours(self.name):
             if plugin.name == name:
                 return plugin
         same = [plugin for plugin in self.found() if plugin.name == name]
@@ -114,14 +115,14 @@ class Group:
         raise ConfigError(
             f"{self.what} {shown(name)} is not known{guess}",
             possible=self._listed(),
-            hint=_reinstall(self.name, name),
+            hint=_hint_for_unknown(self.name, name),
         )
 
     def _listed(self, without: str = "") -> str:
-        """What can be asked for, and from where unless it is ours."""
-        have = [plugin for plugin in self.found() if not plugin.refused and plugin.name != without]
+        """List the names that can be requested, with their origin unless they are ours."""
+        usable = [plugin for plugin in self.found() if not plugin.refused and plugin.name != without]
         return ", ".join(
-            each.name if each.distribution == OURS else f"{each.name} ({each.origin})" for each in have
+            each.name if each.distribution == OURS else f"{each.name} ({each.origin})" for each in usable
         )
 
 
@@ -136,24 +137,26 @@ GROUPS = (EFFECTS, SCENES, CAMERAS, TRIGGERS, SOLVERS, DENOISERS)
 
 
 def forget() -> None:
-    """Look again at what is installed: for a process in which something was installed or mended."""
-    for looked_up in (_found, _found_ours, _outcome):
-        looked_up.cache_clear()
+    """Forget what is installed, so that it is looked up again: after an installation by this process."""
+    for cached in (_found, _found_ours, _outcome):
+        cached.cache_clear()
 
 
 class _BrokenError(Exception):
-    """What an entry point names cannot be imported, or is not what its group needs."""
+    """The object that an entry point names cannot be imported, or is not what its group needs."""
 
 
 @cache
 def _found(group: str) -> tuple[Plugin, ...]:
     ours = _found_ours(group)
-    theirs = [
-        plugin
-        for entry in metadata.entry_points(group=group)
-        if (plugin := _plugin(group, entry)).distribution != OURS
-    ]
-    return (*ours, *_told_apart(sorted(theirs, key=lambda each: (each.name, each.distribution)), ours))
+    theirs = []
+    for entry in metadata.entry_points(group=group):
+        dist = entry.dist
+        name, version = ("an unknown distribution", "") if dist is None else (dist.name, dist.version)
+        if name != OURS:
+            theirs.append(Plugin(group, entry.name, name, version, entry))
+    theirs.sort(key=lambda each: (each.name, each.distribution))
+    return (*ours, *_with_refusals(theirs, ours))
 
 
 @cache
@@ -167,40 +170,27 @@ def _found_ours(group: str) -> tuple[Plugin, ...]:
     )
 
 
-def _plugin(group: str, entry: metadata.EntryPoint) -> Plugin:
-    by = entry.dist
-    name, version = ("an unknown distribution", "") if by is None else (by.name, by.version)
-    return Plugin(group, entry.name, name, version, entry)
-
-
-def _told_apart(theirs: Sequence[Plugin], ours: Sequence[Plugin]) -> Iterator[Plugin]:
-    """``theirs``, refused where a name is ours or that of two."""
+def _with_refusals(theirs: Sequence[Plugin], ours: Sequence[Plugin]) -> Iterator[Plugin]:
+    """Yield ``theirs``, refused if the name is ours or if two distributions claim it."""
     taken = {plugin.name for plugin in ours}
     for plugin in theirs:
         origins = [other.origin for other in theirs if other.name == plugin.name]
-        why = ""
+        refused = ""
         if plugin.name in taken:
-            why = f"the name is {OURS}'s own"
+            refused = f"the name is {OURS}'s own"
         elif len(origins) > 1:
-            why = f"{' and '.join(origins)} both have it"
-        yield Plugin(
-            group=plugin.group,
-            name=plugin.name,
-            distribution=plugin.distribution,
-            version=plugin.version,
-            entry=plugin.entry,
-            refused=why,
-        )
+            refused = f"{' and '.join(origins)} both have it"
+        yield replace(plugin, refused=refused)
 
 
 @cache
 def _outcome(group: Group, entry: metadata.EntryPoint) -> tuple[Any, str]:
-    """What an entry point names, or why it is of no use: tried once in a process."""
+    """Return the object that an entry point names, and why it is unusable; tried once per process."""
     try:
         loaded = entry.load()
-    except (Exception, SystemExit) as error:  # noqa: BLE001  # another's module may fail in any way
+    except (Exception, SystemExit) as error:  # noqa: BLE001  # somebody else's module may fail in any way
         return None, shortened(f"{type(error).__name__}: {error}", 400)
-    return loaded, _misfit(group, entry, loaded)
+    return loaded, _unsuitable(group, entry, loaded)
 
 
 def _load(group: Group, entry: metadata.EntryPoint) -> Any:
@@ -210,42 +200,33 @@ def _load(group: Group, entry: metadata.EntryPoint) -> Any:
     return loaded
 
 
-def _misfit(group: Group, entry: metadata.EntryPoint, loaded: Any) -> str:
-    """Why ``loaded`` is not what the group needs; empty where it is."""
+def _unsuitable(group: Group, entry: metadata.EntryPoint, loaded: Any) -> str:
+    """Return why ``loaded`` is not what the group needs, or an empty text."""
     module, _, name = group.base.partition(":")
     base = getattr(importlib.import_module(module), name)
     if not (isinstance(loaded, type) and issubclass(loaded, base)):
-        return f"{entry.value} is no class that extends {module}.{name}"
+        return f"{entry.value} is not a class that extends {module}.{name}"
     if missing := sorted(getattr(loaded, "__abstractmethods__", ())):
         return f"{entry.value} does not define {', '.join(missing)}"
     kind = getattr(loaded, "model_fields", {}).get("kind")
     if kind is not None and get_args(kind.annotation) != (entry.name,):
-        return f"{entry.value} needs kind: Literal[{entry.name!r}], as its entry point is named"
+        return f"{entry.value} needs kind: Literal[{entry.name!r}], the name of its entry point"
     return ""
 
 
-def _reinstall(group: str, name: str) -> str:
-    """What to do where a checkout lists what its installation does not yet know."""
-    listed = _checkout().get(group, {})
+def _hint_for_unknown(group: str, name: str) -> str:
+    """Return what to try: an installation if this is a checkout that lists the name, else the list."""
+    root = Path(__file__).parents[1]
+    try:
+        project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    except (OSError, ValueError, KeyError):
+        project = {}  # not a checkout
+    listed = project.get(_ENTRY_POINTS, {}).get(group, {}) if project.get("name") == OURS else {}
     if name in listed or (listed and not _found_ours(group)):
-        return f"pip install -e . --no-deps in {_root()}: its pyproject.toml is newer than what is installed"
+        return f"pip install -e . --no-deps in {root}: its pyproject.toml is newer than the installation"
     return "acquire plugins"
 
 
-def _root() -> Path:
-    return Path(__file__).parents[1]
-
-
-def _checkout() -> dict[str, Any]:
-    """The entry points in the pyproject.toml of the checkout that this is, group by group; else none."""
-    try:
-        project = tomllib.loads((_root() / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    except (OSError, ValueError, KeyError):
-        return {}
-    points: dict[str, Any] = project.get(_ENTRY_POINTS, {}) if project.get("name") == OURS else {}
-    return points
-
-
 def described(loaded: Any) -> str:
-    """The first line of what a class says of itself."""
+    """Return the first line of a class's docstring."""
     return (inspect.getdoc(loaded) or "").partition("\n")[0]

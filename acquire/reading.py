@@ -1,8 +1,8 @@
-"""Reading files that anybody may have put there: regular ones only, up to a size, and JSON that is an object.
+"""Safe reading of files that anybody may have created: regular ones of limited size, and JSON objects.
 
 A directory that many programs and people write to holds more than recordings: pipes that keep a reader
-waiting for ever, links to devices, documents nested so deeply that the parser gives up. What is refused here
-is an OSError (the file) or a ValueError (its content), with a reason in words.
+waiting for ever, links to devices, documents nested so deeply that the parser gives up. A refusal is an
+OSError (the file) or a ValueError (its content) whose message states the reason.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 MOST_BYTES = 2**26
-"""Of a document or a table that is read whole; the largest that acquire writes is a few MB."""
+"""Size limit of a document or table that is read whole; the largest that acquire writes is a few MB."""
 MOST_DEPTH = 64
-"""Of nested lists and objects in a document; those that acquire writes have a dozen levels."""
+"""Limit on the nesting of a document; those that acquire writes have a dozen levels."""
 
 
 class OddFileError(OSError):
-    """It is there, and nothing that could be read as a file of ours."""
+    """The file exists but cannot be one of ours: not a regular file, or too large."""
 
 
 _KINDS = (
@@ -37,19 +37,19 @@ _KINDS = (
 
 
 def kind_of(mode: int) -> str | None:
-    """What a directory entry is, in words; None for a regular file."""
+    """Return what kind of directory entry a mode stands for, in words; None for a regular file."""
     return next((words for is_kind, words in _KINDS if is_kind(mode)), None)
 
 
 def open_regular(path: Path | str, flags: int = os.O_RDONLY, *, follow: bool = True) -> int:
-    """A descriptor of a regular file. Raises OSError for anything else, without waiting for it.
+    """Open a regular file and return its descriptor. Raises OSError for anything else, without blocking.
 
-    ``follow``: a link may lead to the file. A device is not even opened: some act on that alone.
+    With ``follow``, the path may be a link. A device is not even opened, since some react to that alone.
     """
     mode = os.stat(path, follow_symlinks=follow).st_mode  # noqa: PTH116 - for every chunk that is read
     if (kind := kind_of(mode)) is None:
         fd = os.open(path, flags | os.O_CLOEXEC | os.O_NONBLOCK | (0 if follow else os.O_NOFOLLOW))
-        if (kind := kind_of(os.fstat(fd).st_mode)) is None:  # it may have been exchanged since
+        if (kind := kind_of(os.fstat(fd).st_mode)) is None:  # it may have been replaced since `stat`
             return fd
         os.close(fd)
     number = errno.ELOOP if stat.S_ISLNK(mode) else errno.EINVAL
@@ -57,18 +57,18 @@ def open_regular(path: Path | str, flags: int = os.O_RDONLY, *, follow: bool = T
 
 
 def read_regular(path: Path | str, most_bytes: int = MOST_BYTES, *, follow: bool = True) -> bytes:
-    """All bytes of a regular file. Raises OSError for anything else, and for a file that is too large."""
+    """Return all bytes of a regular file. Raises OSError for anything else, and for one that is too large."""
     fd = open_regular(path, follow=follow)
     with os.fdopen(fd, "rb") as file:
         size = os.fstat(fd).st_size
         data = file.read(most_bytes + 1) if size <= most_bytes else b""
     if max(size, len(data)) > most_bytes:
-        raise OddFileError(errno.EFBIG, f"it is larger than the {most_bytes} bytes that are read", str(path))
+        raise OddFileError(errno.EFBIG, f"it is larger than the limit of {most_bytes} bytes", str(path))
     return data
 
 
 def parse_object(data: bytes) -> dict[str, Any]:
-    """The JSON object that ``data`` is. Raises ValueError for anything else."""
+    """Return the JSON object that ``data`` holds. Raises ValueError for anything else."""
     try:
         document = json.loads(data)
     except RecursionError:
@@ -89,5 +89,5 @@ def parse_object(data: bytes) -> dict[str, Any]:
 
 
 def read_object(path: Path | str, *, follow: bool = True) -> dict[str, Any]:
-    """The JSON object in a regular file. Raises OSError, and ValueError for what is no such object."""
+    """Return the JSON object in a regular file. Raises OSError, and ValueError if it holds anything else."""
     return parse_object(read_regular(path, follow=follow))

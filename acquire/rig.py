@@ -1,7 +1,7 @@
 """The composition root: a rig's configuration becomes devices, here and nowhere else.
 
-Above this file nobody knows whether a device is simulated; below it no device knows of another, except
-through the wire that the rig lays between simulated ones.
+Layers above this file do not depend on whether a device is simulated. Below it, devices are independent of
+one another, except for the wire that the rig lays between simulated ones.
 """
 
 from __future__ import annotations
@@ -27,19 +27,24 @@ if TYPE_CHECKING:
 class Rig:
     """The devices of one instrument; a context manager that closes them.
 
-    Building one touches no device; it reads the scene where cameras see one. Raises ConfigError for files and
-    values, UsageError for a scene that cannot be shown to these cameras.
+    The constructor touches no device, but reads the scene of simulated cameras. Raises ConfigError for files
+    and values, UsageError for a scene that does not suit these cameras.
     """
 
     def __init__(self, config: RigConfig) -> None:
         check_rig(config)
         self.config = config
-        self._simulated = _simulated_devices(config)
+        self._simulated: SimulatedDevices | None = None
+        # A replay needs the simulated trigger, too; see `check_rig`.
+        if _trigger(config).simulated or config.simulates_cameras:
+            from acquire.sim.instrument import SimulatedDevices  # only here: a real rig never loads it
+
+            self._simulated = SimulatedDevices(config)
         self._closed = False
         self.trigger: Trigger = _trigger(config).open(config, self._simulated)
 
     def openers(self) -> dict[str, CameraOpener]:
-        """Arm → what opens its camera, here or in a process being spawned."""
+        """Return arm → opener of its camera, for use here or in a child process."""
         if self.config.columns:
             return dict.fromkeys(ARMS, self._opener(ARMS[0]))
         return {arm: self._opener(arm) for arm in ARMS}
@@ -52,26 +57,26 @@ class Rig:
 
     @property
     def simulated(self) -> SimulatedDevices:
-        """The simulated ones of the rig's devices. Raises UsageError where all are real."""
+        """The simulated devices of the rig. Raises UsageError if all devices are real."""
         if self._simulated is None:
             raise UsageError(f"rig {self.config.name} has no simulated device")
         return self._simulated
 
     def describe(self) -> dict[str, Any]:
-        """What a recording must say about where its lines come from (JSON)."""
+        """Return what a recording must state about the origin of its lines (JSON)."""
         return {"simulated": False} if self._simulated is None else self._simulated.describe()
 
     @property
     def layout(self) -> str:
-        """How the instrument is laid out: ``dual``, ``compact``, ``emulated``, ``interline``, ``fibre``."""
+        """Layout of the instrument: ``dual``, ``compact``, ``emulated``, ``interline`` or ``fibre``."""
         return self.config.cameras.layout if self._simulated is None else self._simulated.layout
 
     def scene(self) -> Scene:
-        """What simulated cameras see, in camera A's rows and columns; sub-step 0 is the run's first."""
+        """Return the simulated cameras' scene in camera A's view; sub-step 0 is the run's first."""
         return self.simulated.scene()
 
     def close(self) -> None:
-        """Stop the trigger and take simulated devices away. Idempotent."""
+        """Stop the trigger and close the simulated devices. Idempotent."""
         if self._closed:
             return
         self._closed = True
@@ -90,17 +95,8 @@ class Rig:
         self.close()
 
 
-def _simulated_devices(config: RigConfig) -> SimulatedDevices | None:
-    """None where there are none: the simulator is then not even imported."""
-    if not _trigger(config).simulated and not config.simulates_cameras:
-        return None  # nor is a recording replayed, see `check_rig`
-    from acquire.sim.instrument import SimulatedDevices
-
-    return SimulatedDevices(config)
-
-
 def check_rig(config: RigConfig) -> None:
-    """Raise ConfigError for what no trigger, or not the rig's simulated cameras, can honour."""
+    """Raise ConfigError for settings that no trigger, or not the rig's simulated cameras, can honour."""
     trigger = config.trigger
     if config.simulation.replay is not None and trigger.driver != "simulated":
         raise ConfigError(f"a replay cannot have trigger.driver = {trigger.driver!r}", possible="'simulated'")
@@ -108,7 +104,7 @@ def check_rig(config: RigConfig) -> None:
         raise ConfigError(
             f"simulation.speed = {config.simulation.speed:g} does not go with "
             f"trigger.driver = {trigger.driver!r}",
-            possible="1: its time is real",
+            possible="1, since that trigger runs in real time",
         )
     _trigger(config).check(config)
     if config.simulates_cameras:
@@ -116,7 +112,10 @@ def check_rig(config: RigConfig) -> None:
 
 
 def _check_simulated_cameras(trigger: TriggerConfig, *, simulated: bool) -> None:
-    """They see when lines begin and which code the light follows; a simulated trigger has no inputs."""
+    """Refuse trigger settings that simulated cameras would ignore.
+
+    They only receive the line starts and the code of the light, and a simulated trigger has no inputs.
+    """
     pulsed = trigger.driver != "simulated" and trigger.lit_part != (0.0, 1.0)
     for ignored, key, possible in (
         (not simulated, f"driver = {trigger.driver!r}", "'simulated'"),
@@ -126,20 +125,16 @@ def _check_simulated_cameras(trigger: TriggerConfig, *, simulated: bool) -> None
         (not trigger.b.enable, "b.enable = false", "true"),
         (trigger.a.direction != "forward", f"a.direction = {trigger.a.direction!r}", "'forward'"),
         (trigger.b.direction != "forward", f"b.direction = {trigger.b.direction!r}", "'forward'"),
-        (
-            pulsed,
-            "light.open_ticks, light.close_ticks",
-            "absent; or driver = 'simulated'",
-        ),
+        (pulsed, "light.open_ticks, light.close_ticks", "absent, or driver = 'simulated'"),
     ):
         if ignored:
-            raise ConfigError(f"trigger.{key}: cannot be simulated", possible=possible)
+            raise ConfigError(f"trigger.{key} cannot be simulated", possible=possible)
 
 
 def open_trigger(config: RigConfig) -> Trigger:
-    """The rig's trigger without its cameras; connected when first used."""
+    """Return the rig's trigger without its cameras; it connects at its first use."""
     return _trigger(config).open(config, None)
 
 
 def _trigger(config: RigConfig) -> TriggerVariant:
-    return cast("TriggerVariant", config.trigger.options)  # which the configuration has made sure of
+    return cast("TriggerVariant", config.trigger.options)  # the configuration has validated it

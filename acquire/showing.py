@@ -1,7 +1,8 @@
-"""How objects show themselves where somebody looks at them: in an interpreter, and in a notebook.
+"""Representations of objects in an interpreter and in a notebook.
 
-A line of words for ``repr``; a table, with a picture where there is one, for a notebook. Neither reads more
-than a moment's worth of data, and neither fails: what is foreign is escaped, what cannot be drawn left out.
+``repr`` is one line of words; a notebook gets a table and, if there is one, a picture. Neither reads more
+than a moment's worth of data, and neither fails: foreign text is escaped, and a picture that cannot be drawn
+is left out.
 """
 
 from __future__ import annotations
@@ -23,17 +24,17 @@ if TYPE_CHECKING:
 PICTURE_PX = 192
 """Height of a picture in a notebook."""
 MOST_SHOWN = 2**22
-"""Samples of one picture that are looked at."""
+"""Upper limit on the samples of a picture."""
 
 
 def in_words(kind: str, *first: str, **facts: Any) -> str:
-    """``<Kind: first, name value, name value>``, without facts that are None."""
+    """Return ``<Kind: first, name value, name value>``, without facts that are None."""
     named = (f"{name.replace('_', ' ')} {value}" for name, value in facts.items() if value is not None)
     return f"<{kind}: {', '.join(shortened(words, 200) for words in (*first, *named))}>"
 
 
 def as_table(title: str, facts: Mapping[str, Any], picture: str = "") -> str:
-    """HTML: a title, a row for each fact that is not None, and a picture beside them."""
+    """Return HTML: a title, a row for each fact that is not None, and a picture next to them."""
     left = "style='text-align:left'"
     rows = "".join(
         f"<tr><th {left}>{_safe(name)}</th><td {left}>{_safe(value)}</td></tr>"
@@ -47,7 +48,7 @@ def as_table(title: str, facts: Mapping[str, Any], picture: str = "") -> str:
 
 
 def as_picture(image: NDArray[Any], words: str) -> str:
-    """An ``<img>`` of (row, column), grey from 0 to nearly the brightest; empty without Pillow."""
+    """Return an ``<img>`` of (row, column), grey from 0 to nearly the brightest; empty without Pillow."""
     try:
         from PIL import Image
     except ModuleNotFoundError:
@@ -68,8 +69,8 @@ def _safe(value: object) -> str:
 
 
 def error_in_words(facts: Mapping[str, Any]) -> str:
-    """The estimated error of a video, of the facts that its provenance has."""
+    """Describe the estimated error of a video, given the facts in its provenance."""
     if "unknown" in facts:
-        return f"cannot be told: {facts['unknown']}"
+        return f"unknown: {facts['unknown']}"
     rms, low, high = (f"{100 * facts[key] / facts['full_scale']:.2g}" for key in ("rms", "low", "high"))
     return f"about {rms} % of full scale ({low} to {high} % in nine of ten)"

@@ -1,7 +1,7 @@
-"""From a scene to a recording without a daemon: as fast as it goes, and what its effects are worth.
+"""Simulation of a recording without a daemon, as fast as possible, and a study of its effects.
 
-`simulate` writes what the daemon would have recorded from line 0 on. `study` leaves out one effect after the
-other and compares the lines: an effect that changes them by far less than their noise need not be listed.
+`simulate` writes what the daemon would have recorded from line 0 on. `study` leaves out one effect at a time
+and compares the lines: an effect that changes them by far less than their noise need not be listed.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from acquire import __version__
-from acquire.calibrate.choose import handed_on
+from acquire.calibrate.choose import carried_calibration
 from acquire.clock import ClockFit
 from acquire.errors import AcquireError, UsageError
 from acquire.lines import ARMS, LineBlock, LineFlag
@@ -27,7 +27,7 @@ from acquire.stream.tagger import Tagger
 from acquire.trigger.base import TriggerRun
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator
     from concurrent.futures import Future
     from pathlib import Path
 
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 _BLOCK_LINES = 1024
 _COMMIT_BLOCKS = 32
 _QUANTISATION = 1 / 12
-"""Variance of rounding to whole DN."""
+"""Variance of rounding to whole DN, in DN²."""
 STUDIED_LINES = 512
 BARE = "Eq. (1)"
 LOSS = "dropped_lines"
@@ -53,7 +53,7 @@ TEMPORAL_NOISE = ("shot_noise", "dark_current", "read_noise")
 
 @dataclass(frozen=True, slots=True)
 class Simulated:
-    """What `simulate` wrote."""
+    """Result of `simulate`."""
 
     path: Path
     lines: int
@@ -63,17 +63,17 @@ class Simulated:
 
     @property
     def speed(self) -> float:
-        """Simulated seconds per second."""
+        """Simulated seconds per second of wall time."""
         return self.simulated_s / self.seconds
 
 
 @dataclass(frozen=True, slots=True)
 class Worth:
-    """What one effect does to the lines of both arms.
+    """What one effect changes in the lines of both arms, and its cost.
 
     ``change_dn`` is the RMS change when it alone is left out, ``noises`` the same in units of the lines'
-    temporal noise (None for lines that are lost: they do not change, and are known), ``us_per_line`` the time
-    that it takes.
+    temporal noise (None for lost lines, which do not change and are known), ``us_per_line`` its computing
+    time.
     """
 
     effect: str
@@ -85,7 +85,7 @@ class Worth:
 
 @dataclass(frozen=True, slots=True)
 class Study:
-    """What `study` found. ``bare_us_per_line`` is one arm without any effect."""
+    """Result of `study`. ``bare_us_per_line`` is one arm without any effect."""
 
     noise_dn: float
     signal_dn: float
@@ -95,7 +95,7 @@ class Study:
 
 
 def bench_of(config: RigConfig, scene: SceneConfig) -> Bench:
-    """The simulated optics and cameras of a rig before a scene."""
+    """Return the simulated optics and cameras of a rig in front of a scene."""
     cameras = {arm: config.cameras.arm(arm) for arm in ARMS}
     trigger = config.trigger
     substep_s = trigger.substep_ticks / trigger.clock_hz
@@ -111,7 +111,7 @@ def bench_of(config: RigConfig, scene: SceneConfig) -> Bench:
 
 
 def layout_of(config: RigConfig, scene: SceneConfig) -> str:
-    """How the simulated instrument is laid out: a fibre is the rig's, others may be the scene's optics'."""
+    """Return the simulated instrument's layout: the rig's with a fibre, else that of the scene's optics."""
     return scene.optics.layout if config.fibre is None else config.cameras.layout
 
 
@@ -124,22 +124,22 @@ def simulate(
 ) -> Simulated:
     """Write a recording of ``lines`` lines of both arms, from line 0 on.
 
-    Everything that can be refused is refused before ``path`` exists: UsageError. What fails later, or is
-    interrupted, leaves a sealed recording that says so.
+    Everything that can be refused is refused with a UsageError before ``path`` exists. A later failure or
+    interruption leaves a sealed recording that states it.
     """
     if lines < 1:
         raise UsageError(f"a simulation of {lines} lines is not possible", possible="1 or more")
     code, bench = config.code.build(), bench_of(config, scene)
     cameras = {arm: bench.camera(arm, code) for arm in ARMS}
     for camera in cameras.values():
-        camera.read(0, 1)
+        camera.read(0, 1)  # refuses what only a read can refuse, and compiles
     began = time.perf_counter()
     run = TriggerRun("simulation", code, config.geometry.substeps, config.trigger.substep_ticks, 1)
     spec = _spec(config, scene)
     writer = RecordingWriter.create(path, spec)
     tagger = Tagger(run, config.geometry.stages, spec.clock)
     tagger.confirmed_end = lines
-    # A thread per arm: a camera's lines are read one block after the other.
+    # One thread per arm, because a camera's blocks are read in order.
     with writer, ThreadPoolExecutor(1) as a, ThreadPoolExecutor(1) as b:
         threads = dict(zip(ARMS, (a, b), strict=True))
         lost = _write(writer, tagger, _read_ahead(cameras, threads, lines), lines, progress)
@@ -147,21 +147,27 @@ def simulate(
 
 
 def study(bench: Bench, code: Code, lines: int = STUDIED_LINES) -> Study:
-    """Leave out one effect after the other, over ``lines`` lines of both arms that are exposed throughout."""
-    us_per_line, places = _times(bench, code, lines), _places(bench, code)
+    """Leave out one effect at a time, over ``lines`` lines of both arms that are exposed throughout."""
+    from acquire.sim.effects import in_order
+
+    us_per_line = _times(bench, code, lines)
+    stages = [stage for arm in ARMS for stage in bench.camera(arm, code).stages]
+    place_of = {stage.effect: stage.place for stage in reversed(stages)}
+    kinds = [effect.kind for effect in in_order(bench.scene.effects) if effect.kind in place_of]
     bench = bench.without(LOSS)
     full = _sample(bench, code, lines)
     again = _sample(replace(bench, realisation=bench.realisation + 1), code, lines)
     quiet = _sample(bench.without(*TEMPORAL_NOISE), code, lines)
     noise_dn = float(np.sqrt(np.mean((full - again) ** 2) / 2 + _QUANTISATION))
     worths = []
-    for effect, place in places:
+    for effect in kinds:
         if effect in TEMPORAL_NOISE:
-            change = _rms(full - _sample(bench.without(effect), code, lines))
-        else:  # noise that is drawn anew for other lines is not the effect's doing
-            change = _rms(quiet - _sample(bench.without(effect, *TEMPORAL_NOISE), code, lines))
-        noises = None if effect == LOSS else change / noise_dn
-        worths.append(Worth(effect, place, change, noises, us_per_line.get(effect, 0.0)))
+            change = full - _sample(bench.without(effect), code, lines)
+        else:  # other lines draw other noise, which must not be attributed to the effect
+            change = quiet - _sample(bench.without(effect, *TEMPORAL_NOISE), code, lines)
+        change_dn = float(np.sqrt(np.mean(change**2)))
+        noises = None if effect == LOSS else change_dn / noise_dn
+        worths.append(Worth(effect, place_of[effect], change_dn, noises, us_per_line.get(effect, 0.0)))
     return Study(noise_dn, float(full.std()), us_per_line[BARE], sum(us_per_line.values()), tuple(worths))
 
 
@@ -194,7 +200,7 @@ def _write(
 def _read_ahead(
     cameras: dict[str, Camera], threads: dict[str, ThreadPoolExecutor], lines: int
 ) -> Iterator[_Block]:
-    """First line and lines of each block; the next one is computed while the caller has this one."""
+    """Yield first line and readouts of each block; the next is computed while the caller handles this one."""
     waiting: deque[_Block] = deque()
     for first in range(0, lines, _BLOCK_LINES):
         count = min(_BLOCK_LINES, lines - first)
@@ -206,7 +212,7 @@ def _read_ahead(
 
 
 def _append(writer: RecordingWriter, tagger: Tagger, arm: str, first: int, readout: Readout) -> int:
-    """Write one block; the number of its lines that are missing."""
+    """Write one block and return the number of its missing lines."""
     white = writer.spec.cameras[arm]["white_dn"]
     flags = readout.flags | np.where(
         (readout.pixels >= white).any(axis=1), np.uint16(LineFlag.SATURATED), np.uint16(0)
@@ -241,45 +247,30 @@ def _spec(config: RigConfig, scene: SceneConfig) -> RecordingSpec:
         trigger={**trigger, "settings": config.trigger.model_dump(mode="json")},
         cameras=cameras,
         config=config.model_dump(mode="json"),
-        extra=describe(scene) | handed_on(config, layout_of(config, scene)).attrs,
+        extra=describe(scene) | carried_calibration(config, layout_of(config, scene)).attrs,
         chunk_lines=config.chunk_lines,
         shard_chunks=recording.shard_chunks,
         tag_chunks=config.tag_chunks,
-        codec="lz4" if recording.codec == "auto" else recording.codec,  # nothing has to be kept up with
+        codec="lz4" if recording.codec == "auto" else recording.codec,  # no camera has to be kept up with
         fsync=recording.fsync,
         layout=layout_of(config, scene),
         fibre=config.laid_out,
     )
 
 
-def _places(bench: Bench, code: Code) -> Sequence[tuple[str, str]]:
-    """Effects of either arm, in the order in which they act, and where."""
-    from acquire.sim.effects import in_order
-
-    stages = [stage for arm in ARMS for stage in bench.camera(arm, code).stages]
-    found = {stage.effect: stage.place for stage in reversed(stages)}
-    kinds = [effect.kind for effect in in_order(bench.scene.effects)]
-    return [(kind, found[kind]) for kind in kinds if kind in found]
-
-
 def _sample(bench: Bench, code: Code, lines: int) -> NDArray[np.float64]:
-    """Lines of both arms, one after the other: (2·lines, M)."""
+    """Return lines of both arms, one after the other: (2·lines, M)."""
     first = bench.geometry.stages + 1
-    return np.concatenate([bench.camera(arm, code).read(first, lines).pixels for arm in ARMS]).astype(
-        np.float64
-    )
-
-
-def _rms(change: NDArray[np.float64]) -> float:
-    return float(np.sqrt(np.mean(change**2)))
+    pixels = [bench.camera(arm, code).read(first, lines).pixels for arm in ARMS]
+    return np.concatenate(pixels).astype(np.float64)
 
 
 def _times(bench: Bench, code: Code, lines: int) -> dict[str, float]:
-    """Microseconds per line and arm, by effect and of the bare model: what each does by itself."""
+    """Return microseconds per line and arm of each effect alone, and of the bare model."""
     stopwatch = Stopwatch()
     cameras = [replace(bench, stopwatch=stopwatch).camera(arm, code) for arm in ARMS]
     for camera in cameras:
-        camera.read(0, 1)
+        camera.read(0, 1)  # the first read compiles
     stopwatch.seconds.clear()
     for camera in cameras:
         stopwatch.timed(BARE, camera.read)(bench.geometry.stages + 1, lines)

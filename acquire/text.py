@@ -1,7 +1,7 @@
-"""Foreign text on a terminal, in a log or on the wire: one function that makes it harmless.
+"""Escaping of foreign text for a terminal, a log or the wire.
 
 Foreign is whatever this program did not write: an operator's mark, the attributes of a recording, file
-names, what a device or a remote store answers. A newline in it forges a line of the log, an escape sequence
+names, answers of a device or a remote store. A newline in it forges a line of the log, an escape sequence
 recolours or rewrites the terminal, a bidirectional override shows a name backwards, and a file name that is
 not UTF-8 cannot be encoded at all.
 """
@@ -22,9 +22,9 @@ _SUSPECT = re.compile(r"[^ -~]")
 
 
 def visible(text: object, *, lines: bool = False) -> str:
-    """``text`` with every character that is not printable as its escape: ``\\n``, ``\\x1b``, ``\\u202e``.
+    """Return ``text`` with unprintable characters as their escapes: ``\\n``, ``\\x1b``, ``\\u202e``.
 
-    With ``lines``, newlines and tabs stay: for text whose lines are our own.
+    With ``lines``, newlines and tabs stay, for text whose line breaks are our own.
     """
     kept = _ALLOWED + "\n\t" if lines else _ALLOWED
 
@@ -38,13 +38,13 @@ def visible(text: object, *, lines: bool = False) -> str:
 
 
 def shortened(text: object, characters: int = 120) -> str:
-    """``text``, visible, and at most so many characters of it, with a mark where it was cut."""
+    """Return ``text``, visible and cut to ``characters``, with an ellipsis at the cut."""
     shown = visible(text)
     return shown if len(shown) <= characters else f"{shown[: characters - 1]}…"
 
 
 def did_you_mean(word: str, possible: Iterable[str]) -> str:
-    """``; did you mean 'start'?`` for a word that is close to a possible one; empty for any other."""
+    """Return ``; did you mean 'start'?`` for a word close to a possible one, else an empty text."""
     near = difflib.get_close_matches(word, list(possible), n=1)
     return f"; did you mean {near[0]!r}?" if near else ""
 
@@ -55,7 +55,7 @@ _REPR.maxlevel = 3
 
 
 def shown(value: object) -> str:
-    """A value as Python writes it, visible and short, however long or deeply nested it is."""
+    """Return the repr of a value, visible and short, however long or deeply nested it is."""
     try:
         return shortened(_REPR.repr(value))
     except (ValueError, RecursionError):  # an integer of thousands of digits, or a list in a list in a list

@@ -116,6 +116,6 @@ def test_listed_bits_come_back_one_by_one(listed: list[int], repeats: bool, star
 
 
 @pytest.mark.parametrize(("digits", "length"), [("", 0), ("a", 4), ("ag", 8), ("abcd", 8), ("AB", 8)])
-def test_listed_bits_that_are_none_are_refused(digits: str, length: int) -> None:
+def test_impossible_listed_bits_are_refused(digits: str, length: int) -> None:
     with pytest.raises(UsageError, match="code"):
         ListedCode(digits, length)

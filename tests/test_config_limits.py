@@ -116,7 +116,7 @@ def test_values_that_are_none_name_their_key(key: str, value: object) -> None:
 
 
 def test_every_number_has_its_limits() -> None:
-    """A number without an upper limit fails somewhere behind, where nobody can say which key it was."""
+    """A number without an upper limit would fail later, where the key is not known any more."""
     open_ended: list[str] = []
     for name, model in RigConfig.model_json_schema()["$defs"].items():
         for key, found in model["properties"].items():
@@ -176,9 +176,12 @@ FIBRE |= {"fibre.rows": 128, "fibre.columns": 192, "fibre.sensor_pixels": 400}
             {"cameras.layout": "compact", "cameras.b.serial": "SIM-A"},
             "[fibre] goes with another cameras.layout than 'compact'",
         ),
-        ({"fibre.rows": 100}, "100 rows is no whole number of bands of n = 64; possible: a multiple of 64"),
+        (
+            {"fibre.rows": 100},
+            "100 rows is not a whole number of bands of n = 64; possible: a multiple of 64",
+        ),
         ({"fibre.sensor_pixels": 383}, "sensor A with 383 columns is too narrow for 2 bands of 192"),
-        ({"fibre.bands_b": [0, 100, 256]}, "bands of 128 columns from 0, 100, 256 on do not lie beside each"),
+        ({"fibre.bands_b": [0, 100, 256]}, "bands of 128 columns that begin at 0, 100, 256 overlap or"),
         ({"stream.ring_seconds": 1000.0}, "lines of 400 pixels are"),
     ],
 )

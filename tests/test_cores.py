@@ -1,4 +1,4 @@
-"""How many cores are ours, and that BLAS keeps to them."""
+"""The cores available to this process, and the limit of BLAS threads."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_a_containers_quota_counts(tmp_path: Path, files: dict[str, str], limit:
     assert cores._quota(tmp_path) == limit
 
 
-def test_cores_that_others_use_are_not_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cores_that_others_use_are_not_idle(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1, 2, 3})
     monkeypatch.setattr(os, "cpu_count", lambda: 6)
     monkeypatch.setattr(cores, "_quota", lambda: float("inf"))
@@ -55,9 +55,9 @@ def test_cores_that_others_use_are_not_ours(monkeypatch: pytest.MonkeyPatch) -> 
     assert usable_cores() == 1
 
 
-def test_slowness_is_the_share_of_a_core_and_no_hiccup(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slowness_is_the_share_of_a_core_without_hiccups(monkeypatch: pytest.MonkeyPatch) -> None:
     class Clock:
-        """Of a thread that gets every third millisecond, and once nothing for a second."""
+        """The clock of a thread that runs every third millisecond, and once not at all for a second."""
 
         used = 0
 

@@ -1,4 +1,4 @@
-"""The fibre's table: every pixel of the scene once on either sensor, wherever the bands lie."""
+"""The fibre's table: every pixel of the scene is once on each sensor, wherever the bands lie."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from acquire.fibre import Fibre, Tile
 
 @st.composite
 def fibres(draw: st.DrawFn) -> Fibre:
-    """Of up to 4 × 4 tiles, the bands in any order with gaps of any width."""
+    """Draw a fibre of up to 4 × 4 tiles, with bands in any order and gaps of any width."""
     stages, substeps = draw(st.integers(1, 4)), draw(st.integers(1, 3))
     tall, wide = draw(st.tuples(st.integers(1, 4), st.integers(1, 4)).filter(lambda tiles: tiles != (1, 1)))
     n, bands = stages * substeps, {}
@@ -34,7 +34,7 @@ def test_every_pixel_of_the_scene_lies_once_on_either_sensor_and_tiles_find_it(f
     n, S = fibre.size, fibre.substeps
     scene = np.arange(1, fibre.rows * fibre.columns + 1).reshape(1, fibre.rows, fibre.columns)
     for arm in "ab":
-        laid = fibre.laid(scene, arm)
+        laid = fibre.lay_out(scene, arm)
         assert laid.shape == (1, n, S * fibre.sensor_pixels)
         assert np.array_equal(np.sort(laid[laid > 0]), scene.ravel())
         lit = (laid[0] > 0).all(axis=0).reshape(-1, S)
@@ -44,9 +44,9 @@ def test_every_pixel_of_the_scene_lies_once_on_either_sensor_and_tiles_find_it(f
     for tile in fibre.tiles:
         part = scene[:, tile.row * n : (tile.row + 1) * n, tile.column * n : (tile.column + 1) * n]
         a, b = fibre.pixels(tile)
-        np.testing.assert_array_equal(fibre.laid(scene, "a")[:, :, S * a.start : S * a.stop], part)
+        np.testing.assert_array_equal(fibre.lay_out(scene, "a")[:, :, S * a.start : S * a.stop], part)
         turned = np.rot90(part, axes=(1, 2))
-        np.testing.assert_array_equal(fibre.laid(scene, "b")[:, :, S * b.start : S * b.stop], turned)
+        np.testing.assert_array_equal(fibre.lay_out(scene, "b")[:, :, S * b.start : S * b.stop], turned)
 
 
 @given(fibres())
@@ -79,11 +79,11 @@ def test_the_paper_s_sizes_lie_side_by_side_in_the_middle_of_the_sensor() -> Non
 @pytest.mark.parametrize(
     ("sizes", "words"),
     [
-        ((64, 1, 100, 192, 640), r"100 rows is no whole number of bands of n = 64; possible: a multiple"),
-        ((64, 1, 128, 200, 640), "200 columns is no whole number"),
-        ((64, 1, 64, 64, 640), "one band; possible: more rows or columns; or no fibre"),
+        ((64, 1, 100, 192, 640), r"100 rows is not a whole number of bands of n = 64; possible: a multiple"),
+        ((64, 1, 128, 200, 640), "200 columns is not a whole number"),
+        ((64, 1, 64, 64, 640), "a single band; possible: more rows or columns, or no fibre"),
         ((64, 1, 128, 192, 383), "sensor A with 383 columns is too narrow .* possible: 384 columns or more"),
-        ((64, 3, 384, 0, 640), "0 columns is no whole number"),
+        ((64, 3, 384, 0, 640), "0 columns is not a whole number"),
     ],
 )
 def test_scenes_that_do_not_fit_are_refused(sizes: tuple[int, ...], words: str) -> None:
@@ -94,9 +94,12 @@ def test_scenes_that_do_not_fit_are_refused(sizes: tuple[int, ...], words: str) 
 @pytest.mark.parametrize(
     ("bands", "words"),
     [
-        ({"a": (0,)}, "1 bands on sensor A cannot show .* possible: 2, of 64 rows each"),
-        ({"a": (0, 191)}, "192 columns from 0, 191 on do not lie beside each other .* at least 192 apart"),
-        ({"b": (0, 128, 513)}, "128 columns from 0, 128, 513 on .* possible: first columns from 0 to 512"),
+        ({"a": (0,)}, "1 bands on sensor A cannot show .* possible: 2 bands of 64 rows each"),
+        ({"a": (0, 191)}, "192 columns that begin at 0, 191 overlap or .* at least 192 apart"),
+        (
+            {"b": (0, 128, 513)},
+            "128 columns that begin at 0, 128, 513 .* possible: first columns from 0 to 512",
+        ),
     ],
 )
 def test_bands_that_overlap_or_leave_the_sensor_are_refused(bands: dict, words: str) -> None:
@@ -104,7 +107,7 @@ def test_bands_that_overlap_or_leave_the_sensor_are_refused(bands: dict, words: 
         Fibre.side_by_side(64, 1, 128, 192, 640, **bands)
 
 
-def test_tiles_beside_the_scene_are_refused() -> None:
+def test_tiles_outside_the_scene_are_refused() -> None:
     fibre = Fibre.side_by_side(64, 1, 128, 192, 640)
     for tile in (Tile(2, 0), Tile(0, 3), Tile(-1, 0)):
         with pytest.raises(UsageError, match="possible: ROW,COLUMN from 0,0 to 1,2"):

@@ -1,4 +1,4 @@
-"""Segments: lines in DN, and what they say of the scene."""
+"""Segments: lines in DN, and their conversion to the scene's units."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ COLUMNS = np.arange(6.0).reshape(2, 3)
     ("black", "gain"),
     [(5.0, 2.0), ((5.0, 7.0), (2.0, 3.0)), (10 + COLUMNS, 2 + COLUMNS), (5.0, 2 + COLUMNS)],
 )
-def test_samples_are_the_light_whoever_has_an_offset_and_a_gain(black: object, gain: object) -> None:
+def test_samples_are_the_light_for_any_shape_of_offset_and_gain(black: object, gain: object) -> None:
     beside = [np.asarray(each) if np.ndim(each) < 2 else np.asarray(each)[:, None] for each in (black, gain)]
     offset, factor = (each.reshape(-1, 1, 1) if each.ndim == 1 else each for each in beside)
     mask = np.ones(GEOMETRY.lines_shape, bool)
@@ -59,7 +59,7 @@ def raw(**changes: object) -> Segment:
 
 
 def test_merged_lines_are_those_of_a_sensor_with_intra_line_steps() -> None:
-    """Eq. (1) with S = 3 out of Eq. (1) with S = 1, whole numbers of DN."""
+    """Eq. (1) with S = 3 follows from Eq. (1) with S = 1, in whole DN."""
     assert RAW.span == MERGED.span
     found = merged(raw(), S)
     expected = DualArm(MERGED, CODE, dtype=np.float64).forward(SCENE)
@@ -96,7 +96,7 @@ INTRA_LINE = {
 
 
 @pytest.mark.parametrize("changes", [{"first_line": 7}, INTRA_LINE])
-def test_what_cannot_be_merged_is_refused(changes: dict[str, object]) -> None:
+def test_segments_that_cannot_be_merged_are_refused(changes: dict[str, object]) -> None:
     with pytest.raises(UsageError, match="cannot be merged"):
         merged(raw(**changes), S)
 
@@ -104,7 +104,7 @@ def test_what_cannot_be_merged_is_refused(changes: dict[str, object]) -> None:
 OF_COLUMNS = np.arange(2 * RAW.stages, dtype=float).reshape(2, -1) + 1
 
 
-def test_arms_that_are_turned_take_what_is_known_of_their_columns_along() -> None:
+def test_columns_keep_their_corrections_when_arms_are_turned() -> None:
     segment = raw(responsivity_dn=OF_COLUMNS, black_level_dn=(3.0, 5.0), noise=Noise((0.1, 0.2), (1.0, 2.0)))
     for arm in (0, 1):
         turned = segment.mirrored(arm)

@@ -1,4 +1,4 @@
-"""The daemon's log cannot be forged, and what repeats does not fill the disk."""
+"""The daemon's log cannot be forged, and repeated entries do not fill the disk."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def record(text: str, *words: object, level: int = logging.INFO) -> logging.LogR
     return logging.LogRecord("acquire.daemon", level, __file__, 1, text, words, None)
 
 
-def test_a_mark_is_one_line_whatever_is_in_it() -> None:
+def test_a_mark_is_one_line_whatever_it_contains() -> None:
     line = OneLine().format(record("event: %s", "a\n2026-01-01 00:00:00 ERROR forged\x1b[31m\x00\u202e"))
     assert line.count("\n") == 0
     assert line.endswith(r"event: a\n2026-01-01 00:00:00 ERROR forged\x1b[31m\x00\u202e")
@@ -34,7 +34,7 @@ def test_an_entry_is_of_bounded_length() -> None:
     assert len(OneLine().format(record("x" * 10**6))) < MOST_CHARACTERS + 10
 
 
-def test_what_repeats_is_counted_instead() -> None:
+def test_repeated_entries_are_counted_instead() -> None:
     told: list[str] = []
     clock = [0.0]
     bounded = Bounded(told.append, lambda: clock[0])
@@ -47,7 +47,7 @@ def test_what_repeats_is_counted_instead() -> None:
     assert told == [f"{1000 - REPEATS} more entries like this one were not written: too many files: %d"]
 
 
-def test_kinds_without_number_are_bounded_too() -> None:
+def test_the_number_of_kinds_is_bounded() -> None:
     told: list[str] = []
     bounded = Bounded(told.append, lambda: 0.0)
     assert all(bounded.filter(record(f"kind {i}")) for i in range(5000))
@@ -55,7 +55,7 @@ def test_kinds_without_number_are_bounded_too() -> None:
 
 
 def test_under_systemd_the_log_is_json() -> None:
-    """Where JOURNAL_STREAM names stderr; it says the same, with the same bounds."""
+    """If JOURNAL_STREAM names stderr, the log has the same content within the same bounds."""
     code = (
         "import logging, os, sys\n"
         "found = os.fstat(2); os.environ['JOURNAL_STREAM'] = f'{found.st_dev}:{found.st_ino}'\n"

@@ -58,7 +58,7 @@ def test_trigger_and_cameras_of_a_rig_share_one_wire(config):
 
 
 def test_both_arms_collect_the_light_of_the_same_scene(config):
-    """The truth, summed over rows and columns, is what a line gathers: arm by arm the same total."""
+    """The scene, summed over rows and columns, is the light of a line, and the same in both arms."""
     bright = config.model_copy(
         update={"code": config.code.model_validate({"kind": "prbs", "degree": 7, "seed": 3})}
     )
@@ -81,7 +81,7 @@ def test_both_arms_collect_the_light_of_the_same_scene(config):
         assert measured == pytest.approx(total, abs=8 * 0.5 / 6)
 
 
-def test_what_a_recording_is_told_rebuilds_the_scene(config):
+def test_the_description_in_a_recording_rebuilds_the_scene(config):
     with Rig(config) as rig:
         described = json.loads(json.dumps(rig.describe()))
         scene = rig.scene()
@@ -90,7 +90,7 @@ def test_what_a_recording_is_told_rebuilds_the_scene(config):
     np.testing.assert_array_equal(truth(scene, 100, 40, 3, 4), truth(again, 100, 40, 3, 4))
 
 
-def test_a_rig_of_real_cameras_is_not_said_to_be_simulated():
+def test_a_rig_of_real_cameras_is_not_called_simulated():
     with Rig(load_rig("rig-vt-4k5c-h100")) as rig:
         assert rig.describe() == {"simulated": False}
         assert rig.layout == "dual"
@@ -100,7 +100,7 @@ HARDWARE = {"trigger.driver": "serial", "trigger.url": "/dev/ttyUSB0"}
 
 
 def test_real_devices_need_no_scene_and_nothing_that_makes_one(tmp_path):
-    """Looked at in a process of its own: this one has the simulator."""
+    """Checked in another process, since this one has imported the simulator."""
     code = (
         "import sys, acquire.cli, acquire.daemon.server\n"
         "from acquire.config import load_rig\n"
@@ -136,7 +136,7 @@ def without_scene(driver):
 
 
 @pytest.mark.parametrize("driver", ["simulated", "gentl-simulated", "gige-simulated"])
-def test_simulated_cameras_without_a_scene_are_refused_with_the_scenes_there_are(tmp_path, driver):
+def test_simulated_cameras_without_a_scene_are_refused_with_a_list_of_scenes(tmp_path, driver):
     (tmp_path / "rig.toml").write_text(without_scene(driver))
     with pytest.raises(
         ConfigError, match=r"simulation\.scene is missing.*scene-leds.*try: simulation\.scene"

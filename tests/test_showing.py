@@ -1,4 +1,4 @@
-"""What objects say of themselves in an interpreter and in a notebook."""
+"""Representations of objects in an interpreter and in a notebook."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return open_recording(path)
 
 
-def test_a_recording_and_its_parts_say_what_they_hold(recording: Recording, tmp_path: Path) -> None:
+def test_a_recording_and_its_parts_show_their_content(recording: Recording, tmp_path: Path) -> None:
     assert repr(recording) == (
         f"<Recording: {recording}, GOOD, lines 0 to 59 of each arm, duration 0.0012 s at 50000 lines/s, "
         "geometry M = 8, S = 2, samples 8 pixels uint16, code prbs>"
@@ -47,7 +47,7 @@ def test_a_recording_and_its_parts_say_what_they_hold(recording: Recording, tmp_
     assert "data:image" not in open_recording(damaged)._repr_html_()
 
 
-def test_results_say_what_can_be_trusted(recording: Recording, tmp_path: Path) -> None:
+def test_results_show_what_can_be_trusted(recording: Recording, tmp_path: Path) -> None:
     result = reconstruct(recording.cut(0, 60), 2, 2, preset="fast")
     trusted = range(len(result.video))[result.trusted]
     words = f"trusted frames {trusted.start} to {trusted.stop - 1}"
@@ -65,7 +65,7 @@ def test_results_say_what_can_be_trusted(recording: Recording, tmp_path: Path) -
     assert "data:image" not in file._repr_html_()
 
 
-def test_a_calibration_says_what_is_known() -> None:
+def test_a_calibration_shows_what_is_known() -> None:
     instrument = Instrument(stages=8, substeps=2, substep_s=1e-5, layout="dual", cameras={})
     black = Measured(np.full((2, 8), 12.0), np.full((2, 8), 0.5))
     assert repr(black) == "<Measured: mean 12 ± 0.5 each, shape (2, 8)>"
@@ -74,7 +74,7 @@ def test_a_calibration_says_what_is_known() -> None:
     )
 
 
-def test_what_is_foreign_is_escaped(recording: Recording) -> None:
+def test_foreign_text_is_escaped(recording: Recording) -> None:
     document = json.loads(json.dumps(recording.document))
     document["attributes"]["run_id"] = "<script>\x1b[31m"
     shown = Recording(recording.source, document)._repr_html_()
@@ -82,7 +82,7 @@ def test_what_is_foreign_is_escaped(recording: Recording) -> None:
     assert "<b>&lt;i&gt;</b>" in as_table("<i>", {})
 
 
-def test_what_cannot_be_drawn_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_that_cannot_be_drawn_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     assert as_picture(np.ones((3, 3)), "x").startswith("<img alt='x'")
     assert as_picture(np.full((3, 3), np.nan), "x") == ""
     assert as_picture(np.zeros((0, 3)), "x") == ""

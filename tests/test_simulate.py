@@ -1,4 +1,4 @@
-"""From a scene to a recording without a daemon, and what its effects are worth."""
+"""Simulation of a recording without a daemon, and the study of its effects."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_a_simulated_recording_is_equation_1_with_its_code_and_time(tmp_path):
 
 
 def test_blocks_read_ahead_by_two_threads_are_those_of_one(tmp_path):
-    """What is kept between blocks (frames, tiles, charge) is never touched by two threads at once."""
+    """State kept between blocks (frames, tiles, charge) is never used by two threads at once."""
     window = {"kind": "window", "phases": [{"duration_s": 7e-3, "axis": "row"}]}
     table = listed("shot_noise", "cti").model_dump(mode="json") | {"shutters": [window]}
     scene = LedSceneConfig.model_validate(table)
@@ -84,7 +84,7 @@ def test_effects_and_their_order_and_the_layout_are_recorded(tmp_path):
     assert (attrs["layout"], attrs["effects"][2]["sigma_e"]) == ("compact", 25.0)
 
 
-def test_nothing_exists_after_a_refusal_and_what_fails_later_says_so(tmp_path, monkeypatch):
+def test_a_refusal_leaves_nothing_and_a_later_failure_a_sealed_recording(tmp_path, monkeypatch):
     out = tmp_path / "r.zarr"
     with pytest.raises(UsageError, match="0 lines"):
         simulate(RIG, LEDS, out, 0)

@@ -1,4 +1,4 @@
-"""Foreign text is shown as it is where it is harmless, and as its escapes where it is not."""
+"""Harmless foreign text is shown unchanged, other text as its escapes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_visible(text: str, shown: str) -> None:
     assert visible(text) == shown
 
 
-def test_lines_of_our_own_stay_lines() -> None:
+def test_line_breaks_of_our_own_stay() -> None:
     assert visible("a\n\tb\x1b\r", lines=True) == "a\n\tb\\x1b\\r"
 
 
@@ -35,6 +35,6 @@ def test_whatever_it_is_can_be_encoded_and_is_one_line(text: str) -> None:
     assert visible(shown) == shown
 
 
-def test_shortened_tells_that_it_was() -> None:
+def test_a_cut_is_marked() -> None:
     assert shortened("x" * 500, 10) == "x" * 9 + "…"
     assert shortened("x" * 10, 10) == "x" * 10

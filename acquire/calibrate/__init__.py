@@ -1,4 +1,4 @@
-"""What an instrument is, measured: from recordings of known light to what the reconstruction corrects.
+"""Calibration of an instrument: from recordings of known light to the corrections of a reconstruction.
 
 ::
 
@@ -8,8 +8,8 @@
                              │
                              └──▶ apply: a segment's offsets, responsivities, mask, alignment, blur
 
-A calibration holds what was measured and nothing else; what it does not hold is not corrected. Lines on disk
-are never altered.
+A calibration holds measurements and nothing else, and a property that was not measured is not corrected.
+Lines on disk are never altered.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
-"""Where arm B's image lies on arm A's: shift, turn, magnification, from a still textured target.
+"""Alignment of arm B's image with arm A's: shift, turn and magnification, from a textured target at rest.
 
-Arm A's image is fine along rows, arm B's along columns (`still`), and box-filtered alike. They are compared
-where a coarse column of A meets a coarse row of B in the scene: there each is interpolated along its own fine
-axis only, where it is well sampled. Each point tells the distance along one direction of texture; over the
-field that is shift, turn and magnification, by least squares (Levenberg–Marquardt).
+Arm A's image is finely sampled along rows, arm B's along columns (`still`), and both are box-filtered alike.
+They are compared where a coarse column of A meets a coarse row of B in the scene, so that each is
+interpolated only along its own fine axis, where it is well sampled. Each point gives the displacement along
+one direction of texture. Over the field these give shift, turn and magnification by least squares.
 """
 
 from __future__ import annotations
@@ -26,17 +26,19 @@ if TYPE_CHECKING:
     from acquire.geometry import Geometry
 
 SMOOTHINGS = (4.0, 0.0)
-"""Of the images in fine pixels: first coarse, so that a start some pixels off finds the way."""
+"""Smoothing of the images in fine pixels: coarse first, so that a start some pixels off converges."""
 EDGE = 4
-"""Fine pixels at the rim that are not compared: splines and dark columns reach so far."""
+"""Fine pixels at the rim that are not compared, since splines and dark columns affect them."""
 NUMBERS = ("rows", "columns", "turn_deg", "magnification")
 WORST = {"rows": 0.15, "columns": 0.15, "turn_deg": 0.1, "magnification": 0.002}
-"""Uncertainties beyond which an alignment is not worth having: a target without texture."""
+"""Uncertainties beyond which an alignment is useless, as from a target without texture."""
 
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """An alignment; what is left of the difference of the images, relative to their own variation; and the
+    """An alignment and its quality.
+
+    ``misfit`` is the residual difference of the images relative to their own variation, ``brightness`` the
     light of arm B over that of arm A, summed over the points that both see.
     """
 
@@ -46,9 +48,9 @@ class Match:
 
 
 def align(a: Still, b: Still, geometry: Geometry, start: tuple[float, float] = (0.0, 0.0)) -> Match:
-    """Arm B beside arm A; ``b`` as the model turns it. ``start``: shift in fine pixels, to within some.
+    """Align arm B with arm A, with ``b`` as the model turns it; ``start`` is a rough shift in fine pixels.
 
-    UsageError where the target does not tell: too little texture.
+    Raises UsageError if the target has too little texture to determine the alignment.
     """
     images = _Images(a, b, geometry)
     numbers = np.array([*start, 0.0, 0.0, 1.0, 0.0])
@@ -62,24 +64,24 @@ def align(a: Still, b: Still, geometry: Geometry, start: tuple[float, float] = (
         jacobian = np.asarray(solved.jac, np.float64)
         covariance = np.linalg.inv(jacobian.T @ jacobian) * 2 * solved.cost / freedom
     except np.linalg.LinAlgError as error:
-        raise _untold() from error
+        raise _undetermined() from error
     errors = np.sqrt(np.diag(covariance)) * _units(geometry)
     uncertainty = dict(zip(NUMBERS, errors.tolist(), strict=False))
     if any(not uncertainty[name] <= worst for name, worst in WORST.items()):
-        raise _untold()
+        raise _undetermined()
     found = AlignmentFound(alignment, uncertainty)
     return Match(found, comparison.misfit(numbers), comparison.brightness(numbers))
 
 
-def _untold() -> UsageError:
+def _undetermined() -> UsageError:
     return UsageError(
-        "the target does not tell how arm B lies on arm A: it has too little texture, or moves",
+        "the target does not determine the alignment of the arms: it has too little texture, or moves",
         possible="sharp dots or a binary pattern of 2 to 6 fine pixels all over, or the USAF target",
     )
 
 
 def _units(geometry: Geometry) -> NDArray[np.float64]:
-    """Of the six numbers that are fitted: turn and magnification are pixels at the field's edge."""
+    """Return the units of the six fitted numbers; turn and magnification are pixels at the field's edge."""
     half = geometry.size / 2
     return np.array([1, 1, np.rad2deg(1 / half), 1 / half, 1, 1])
 
@@ -90,7 +92,7 @@ def _alignment(numbers: NDArray[np.float64], geometry: Geometry) -> Alignment:
 
 
 class _Images:
-    """Both arms' images in arm A's view: A (n + S − 1, M), B (M, n + S − 1)."""
+    """Both arms' images in arm A's view, A (n + S − 1, M) and B (M, n + S − 1), and their usable parts."""
 
     def __init__(self, a: Still, b: Still, geometry: Geometry) -> None:
         self.geometry = geometry
@@ -100,8 +102,10 @@ class _Images:
 
 
 class _Comparison:
-    """Differences of the images at the points where their lattices cross, for six numbers: shift (2), turn
-    and magnification as pixels at the field's edge, B's brightness beside A's, and what is added to it.
+    """Differences of the images at the points where their lattices cross, as a function of six numbers.
+
+    These are the shift (2), turn and magnification as pixels at the field's edge, and the factor and offset
+    of B's brightness relative to A's.
     """
 
     def __init__(self, images: _Images, sigma: float) -> None:
@@ -122,26 +126,28 @@ class _Comparison:
 
     def __call__(self, numbers: NDArray[np.float64]) -> NDArray[np.float64]:
         a, b, inside = self._pairs(numbers)
-        left = np.where(inside, b - numbers[4] * a - numbers[5], 0.0)[self._good]
-        weighted: NDArray[np.float64] = left * self._images.weight
+        residual = np.where(inside, b - numbers[4] * a - numbers[5], 0.0)[self._good]
+        weighted: NDArray[np.float64] = residual * self._images.weight
         return weighted
 
     def misfit(self, numbers: NDArray[np.float64]) -> float:
-        """RMS of the differences, relative to the images' variation."""
+        """Return the RMS of the differences, relative to the images' variation."""
         a, b, inside = self._pairs(numbers)
-        left = (b - numbers[4] * a - numbers[5])[self._good & inside]
-        return float(np.sqrt(np.mean(left**2)) / max(self._level, 1e-12)) if left.size else float("inf")
+        residual = (b - numbers[4] * a - numbers[5])[self._good & inside]
+        if not residual.size:
+            return float("inf")
+        return float(np.sqrt(np.mean(residual**2)) / max(self._level, 1e-12))
 
     def brightness(self, numbers: NDArray[np.float64]) -> float:
-        """B's light over A's. Not the fitted factor: blur and noise of either image lower that."""
+        """Return B's light over A's; not the fitted factor, which blur and noise of each image lower."""
         a, b, inside = self._pairs(numbers)
-        seen = self._good & inside
-        total = float(a[seen].sum())
-        return float(b[seen].sum()) / total if total > 0 else 1.0
+        common = self._good & inside
+        total = float(a[common].sum())
+        return float(b[common].sum()) / total if total > 0 else 1.0
 
     def _pairs(self, numbers: NDArray[np.float64]) -> tuple[NDArray[Any], NDArray[Any], NDArray[np.bool_]]:
-        """A and B where they show the same point, and whether both do."""
-        # Row y of B and column x of A show one point where (y, q) − middle = m·Q·((p, x) − middle) + shift:
+        """Return A and B where they show the same point, and whether both cover it."""
+        # Row y of B and column x of A show one point if (y, q) − middle = m·Q·((p, x) − middle) + shift:
         # two equations, linear in p, the row of A, and q, the column of B.
         alignment = _alignment(numbers, self._images.geometry)
         (d, e), (f, g) = alignment.matrix

@@ -1,4 +1,7 @@
-"""A calibration on lines: a segment's offsets, responsivities, mask, alignment, blur. No line is altered."""
+"""Application of a calibration to a segment: offsets, responsivities, mask, alignment, blur.
+
+The lines themselves are not altered.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from acquire.blur import Blur
-from acquire.calibrate.calibration import COLUMN, QUANTITIES, Calibration, Measured, differing
+from acquire.calibrate.calibration import COLUMN, QUANTITIES, Calibration, Measured, differences_between
 from acquire.calibrate.curve import curve_of
 from acquire.calibrate.exposure import instrument_of
 from acquire.calibrate.orientation import oriented, view_named
@@ -26,22 +29,22 @@ OLD_DAYS = 30
 WARMER_K = 5.0
 SLOWER = 0.01
 CLEAR_BLUR = 2.0
-"""Standard uncertainties above 0 from which on a width is part of the model."""
+"""Standard uncertainties by which a width must exceed 0 to be part of the model."""
 
 
 def calibration_of(recording: Recording) -> Calibration | None:
-    """The copy that a recording carries; None where it carries none. DataError for a damaged one."""
+    """Return the copy that a recording carries, or None. Raises DataError for a damaged one."""
     attrs = recording.attrs.get("calibration")
     return None if attrs is None else Calibration.from_attrs(attrs)
 
 
 def check_fits(calibration: Calibration, recording: Recording) -> tuple[str, ...]:
-    """What is doubtful about a calibration for a recording, in sentences.
+    """Return doubts about using a calibration for a recording, in sentences: its age, its temperature.
 
-    Raises UsageError where it is of another instrument: geometry, layout, camera, pixel format, gain.
+    Raises UsageError if it is of another instrument: geometry, layout, camera, pixel format, gain.
     """
     mine, theirs = calibration.instrument, instrument_of(recording)
-    if differences := differing(mine, theirs):
+    if differences := differences_between(mine, theirs):
         raise UsageError(
             f"the calibration does not fit {recording}: " + "; ".join(differences),
             hint="a calibration of that instrument, or none: --calibration none",
@@ -52,13 +55,24 @@ def check_fits(calibration: Calibration, recording: Recording) -> tuple[str, ...
             f"the calibration was made at sub-steps of {mine.substep_s:.3g} s, the recording has "
             f"{theirs.substep_s:.3g} s: dark current and ambient light differ"
         )
-    return (*doubts, *_aged(calibration, recording), *_warmer(calibration, recording))
+    made = [datetime.fromisoformat(step["made"]) for step in calibration.steps.values() if "made" in step]
+    row = recording.first_available_line - recording.first_line if recording.lines else 0
+    if made and row < recording.lines:
+        begun = datetime.fromtimestamp(int(recording.arms["a"].read("time", row, row + 1)[0]) * 1e-9, UTC)
+        days = max(abs((begun - each).total_seconds()) for each in made) / 86400
+        if days > OLD_DAYS:
+            doubts.append(f"calibration and recording are {days:.0f} days apart")
+    for arm, before in calibration.steps.get("dark", {}).get("temperature_c", {}).items():
+        now = recording.attrs["cameras"].get(arm, {}).get("DeviceTemperature")
+        if now is not None and abs(now - before) > WARMER_K:
+            doubts.append(f"camera {arm} is at {now:.0f} °C; its offsets were measured at {before:.0f} °C")
+    return tuple(doubts)
 
 
 def calibrated(segment: Segment, calibration: Calibration) -> Segment:
-    """The segment with all that the calibration holds; what it does not hold stays as it was.
+    """Return the segment with all corrections that the calibration holds.
 
-    Raises UsageError for another number of columns, and for an orientation that cannot be put right.
+    Raises UsageError for another number of columns, and for an orientation that cannot be corrected.
     """
     if segment.geometry.stages != calibration.instrument.stages:
         raise UsageError(
@@ -70,15 +84,21 @@ def calibrated(segment: Segment, calibration: Calibration) -> Segment:
     black, curve = black_level(segment, calibration), curve_of(calibration)
     if curve is not None:
         black = curve.straight(_columns(segment.black_level_dn, segment) if black is None else black)
+    gain, balance = calibration.value("gain"), calibration.value("balance")
+    responsivity = None
+    if gain is not None or balance is not None:
+        responsivity = _columns(segment.responsivity_dn, segment)
+        responsivity = responsivity if gain is None else responsivity * gain
+        responsivity = responsivity if balance is None else responsivity * balance[:, None]
     known = {
         "curve": curve,
         "black_level_dn": black,
-        "responsivity_dn": _responsivity(segment, calibration),
+        "responsivity_dn": responsivity,
         "blur": blur_of(calibration),
         "noise": _noise(calibration),
     }
     changes: dict[str, Any] = {name: value for name, value in known.items() if value is not None}
-    if calibration.value("balance") is not None:
+    if balance is not None:
         changes["balanced"] = True
     if calibration.usable is not None and not calibration.usable.all():
         changes["mask"] = segment.mask & calibration.usable[:, None, :]
@@ -91,19 +111,21 @@ def calibrated(segment: Segment, calibration: Calibration) -> Segment:
 
 
 def _of_columns(calibration: Calibration, segment: Segment) -> Calibration:
-    """Behind a fibre: what is known of the segment's tile and of the columns that see it. UsageError beside
-    them."""
+    """Restrict a calibration to the segment's columns, and behind a fibre to the alignment of its tile.
+
+    Raises UsageError if the calibration does not cover these columns.
+    """
     if max(segment.first_column) + segment.geometry.stages > calibration.instrument.columns:
         raise UsageError(
-            f"a calibration of {calibration.instrument.columns} columns does not reach those of the lines, "
-            f"from column {max(segment.first_column)} on",
+            f"a calibration of {calibration.instrument.columns} columns does not cover those of the lines, "
+            f"which begin at column {max(segment.first_column)}",
             possible="a calibration of this instrument",
         )
     if calibration.instrument.columns == segment.geometry.stages:
         return calibration
     stages = segment.geometry.stages
 
-    def seen(values: NDArray[Any]) -> NDArray[Any]:
+    def cut(values: NDArray[Any]) -> NDArray[Any]:
         return np.stack(
             [row[first : first + stages] for row, first in zip(values, segment.first_column, strict=True)]
         )
@@ -112,18 +134,18 @@ def _of_columns(calibration: Calibration, segment: Segment) -> Calibration:
         calibration,
         instrument=calibration.instrument.model_copy(update={"pixels": None}),
         quantities={
-            name: Measured(seen(each.value), seen(each.uncertainty))
+            name: Measured(cut(each.value), cut(each.uncertainty))
             if QUANTITIES[name].dimensions == COLUMN
             else each
             for name, each in calibration.quantities.items()
         },
-        usable=None if calibration.usable is None else seen(calibration.usable),
+        usable=None if calibration.usable is None else cut(calibration.usable),
         alignment=next((e.found for e in calibration.tiles if e.columns == segment.first_column), None),
     )
 
 
 def black_level(segment: Segment, calibration: Calibration) -> NDArray[np.float64] | None:
-    """DN of each column without the coded light (arm, column); None where it was not measured."""
+    """Return the DN of each column without the coded light (arm, column); None if it was not measured."""
     offset, ambient = calibration.value("offset_dn"), calibration.value("ambient_dn")
     if offset is None and ambient is None:
         return None
@@ -132,7 +154,7 @@ def black_level(segment: Segment, calibration: Calibration) -> NDArray[np.float6
 
 
 def blur_of(calibration: Calibration) -> Blur | None:
-    """Of the optics, as far as it is clear that there is one; None where it is not, or was not measured."""
+    """Return the optics' blur, with unclear widths as 0; None if none is clear or it was not measured."""
     if "blur_px" not in calibration.quantities:
         return None
     found = calibration.quantities["blur_px"]
@@ -142,10 +164,10 @@ def blur_of(calibration: Calibration) -> Blur | None:
 
 
 def _without_interpolation(segment: Segment) -> Segment:
-    """Arm B's blur less what laying it on arm A adds in the model: the width that was measured is of both."""
+    """Subtract from arm B's blur what registration adds in the model: the measured width includes both."""
     if segment.blur is None or segment.alignment is None:
         return segment
-    from acquire.forward import interpolation_variance  # compiled loops, which a capture host is without
+    from acquire.forward import interpolation_variance  # compiled loops, which a capture host lacks
 
     rows, columns = interpolation_variance(segment.alignment, segment.geometry.size)
     along, across = segment.blur.b  # of arm B's charge, which moves along the scene's columns
@@ -154,7 +176,7 @@ def _without_interpolation(segment: Segment) -> Segment:
 
 
 def _noise(calibration: Calibration) -> Noise | None:
-    """Of the samples, with the shot noise of the light that is always there; None without DN per electron."""
+    """Return the samples' noise, including shot noise of ambient light; None without DN per electron."""
     K, read = calibration.value("dn_per_electron"), calibration.value("read_noise_e")
     if K is None or read is None:
         return None
@@ -163,43 +185,11 @@ def _noise(calibration: Calibration) -> Noise | None:
     if ambient is None:
         return known
     a, b = ambient.mean(axis=1).tolist()
-    return known.beside((a, b))
-
-
-def _responsivity(segment: Segment, calibration: Calibration) -> NDArray[np.float64] | None:
-    gain, balance = calibration.value("gain"), calibration.value("balance")
-    if gain is None and balance is None:
-        return None
-    found = _columns(segment.responsivity_dn, segment)
-    if gain is not None:
-        found = found * gain
-    return found if balance is None else found * balance[:, None]
+    return known.with_ambient((a, b))
 
 
 def _columns(value: Any, segment: Segment) -> NDArray[np.float64]:
-    """A number, or one per arm, or one per arm and column, as the last."""
+    """Expand a number, one per arm, or one per arm and column to (arm, column)."""
     given = np.asarray(value, np.float64)
-    beside = given if given.ndim == 2 else given.reshape(-1, 1)
-    return np.broadcast_to(beside, (len(segment.lines), segment.geometry.stages)).copy()
-
-
-def _aged(calibration: Calibration, recording: Recording) -> list[str]:
-    made = [datetime.fromisoformat(step["made"]) for step in calibration.steps.values() if "made" in step]
-    if not made or not recording.lines:
-        return []
-    row = recording.first_available_line - recording.first_line
-    if row >= recording.lines:
-        return []
-    begun = datetime.fromtimestamp(int(recording.arms["a"].read("time", row, row + 1)[0]) * 1e-9, UTC)
-    days = max(abs((begun - each).total_seconds()) for each in made) / 86400
-    return [f"the calibration is {days:.0f} days away from the recording"] if days > OLD_DAYS else []
-
-
-def _warmer(calibration: Calibration, recording: Recording) -> list[str]:
-    known = calibration.steps.get("dark", {}).get("temperature_c", {})
-    found = []
-    for arm, before in known.items():
-        now = recording.attrs["cameras"].get(arm, {}).get("DeviceTemperature")
-        if now is not None and abs(now - before) > WARMER_K:
-            found.append(f"camera {arm} is at {now:.0f} °C; its offsets were measured at {before:.0f} °C")
-    return found
+    given = given if given.ndim == 2 else given.reshape(-1, 1)
+    return np.broadcast_to(given, (len(segment.lines), segment.geometry.stages)).copy()

@@ -1,21 +1,21 @@
-"""The model of a calibration: quantities with uncertainties, of which instrument, and how they were found.
+"""The model of a calibration: quantities with uncertainties, their instrument, and how they were measured.
 
 ::
 
     offset_dn        (arm, column)   DN of a pixel under a dark code
-    noise_dn         (arm, column)   its temporal standard deviation
-    ambient_dn       (arm, column)   what light that no code switches adds to it
-    gain             (arm, column)   response beside the arm's mean; 1 where the optics hide it
-    balance          (arm)           response beside the mean of both arms, which the splitter divides
+    noise_dn         (arm, column)   temporal standard deviation of a dark pixel
+    ambient_dn       (arm, column)   DN added by light that no code switches
+    gain             (arm, column)   response relative to the arm's mean; 1 where the optics hide the column
+    balance          (arm)           response relative to the mean of both arms, which the splitter divides
     dn_per_electron  (arm)           K of EMVA 1288
     read_noise_e     (arm)           σ_d of EMVA 1288
     full_well_e      (arm)           μ_e.sat of EMVA 1288
-    light_late_ticks (arm)           by which light comes after the charge's moves, without lead and delays
+    light_late_ticks (arm)           delay of the light relative to the charge, without lead and delays
     linearity_error  (arm)           LE of EMVA 1288
     blur_px          (arm, axis)     standard deviation of the optics' blur, along the transfer and across it
-    excess_dn        (arm, knot)     by which samples are too high that read so much, evenly from 0 to white
+    excess_dn        (arm, knot)     excess of samples that read 0 … white, at evenly spaced knots
 
-and ``usable`` (arm, column), the orientation of arm B, and its alignment on arm A.
+and ``usable`` (arm, column), the orientation of arm B, and its alignment with arm A.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ if TYPE_CHECKING:
 
 FORMAT = "acquire-calibration/1"
 DIGITS = 7
-"""Significant digits of the copy in a recording: more than was measured."""
+"""Significant digits of the copy in a recording, more than any measurement has."""
 
 
 @dataclass(frozen=True, slots=True)
 class Quantity:
-    """What an array of a calibration is."""
+    """Description of an array of a calibration."""
 
     dimensions: tuple[str, ...]
     unit: str
@@ -53,7 +53,7 @@ class Quantity:
 
 ARM, COLUMN, CURVE, WIDTHS = ("arm",), ("arm", "column"), ("arm", "knot"), ("arm", "axis")
 KNOTS = 65
-"""Of a camera's curve: between them a bend of a percent is straight to a part in 10⁶."""
+"""Knots of a camera's curve; between them a bend of a percent is straight to a part in 10⁶."""
 QUANTITIES = {
     "offset_dn": Quantity(COLUMN, "DN", "of a pixel under a dark code"),
     "noise_dn": Quantity(COLUMN, "DN", "temporal standard deviation of a dark pixel"),
@@ -107,7 +107,7 @@ class Measured:
 
 
 class Instrument(BaseModel):
-    """What a calibration belongs to."""
+    """The instrument that a calibration belongs to."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
@@ -122,13 +122,13 @@ class Instrument(BaseModel):
 
     @property
     def columns(self) -> int:
-        """Of either sensor."""
+        """Number of columns of each sensor."""
         return self.stages if self.pixels is None else self.pixels
 
 
 @dataclass(frozen=True, slots=True)
 class AlignmentFound:
-    """An alignment of arm B on arm A, and the standard uncertainty of each number."""
+    """An alignment of arm B with arm A, and the standard uncertainty of each number."""
 
     alignment: Alignment
     uncertainty: dict[str, float]
@@ -136,7 +136,7 @@ class AlignmentFound:
 
 @dataclass(frozen=True, slots=True)
 class TileAlignment:
-    """That of a ``tile`` behind a fibre, which is seen from ``columns`` of arms A and B on."""
+    """The alignment of a ``tile`` behind a fibre, which begins at ``columns`` of arms A and B."""
 
     tile: str
     columns: tuple[int, int]
@@ -145,19 +145,19 @@ class TileAlignment:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Finding:
-    """What one step found.
+    """Result of one step. Properties that the step does not measure are None or empty.
 
     Attributes
     ----------
     step : its name
-    instrument : of the recordings
+    instrument : that of the recordings
     quantities : name → value and uncertainty
-    usable : (arm, column), False for columns that say nothing; None where the step does not tell
-    orientation : name of arm B's view of the scene, where the step tells; see `acquire.calibrate.orientation`
-    alignment : where the step tells
-    tiles : alignments behind a fibre, where the step tells
-    facts : JSON: recordings, lines, and what else is worth knowing
-    warnings : what is wrong with it, in sentences
+    usable : (arm, column), False for columns without useful samples
+    orientation : name of arm B's view of the scene; see `acquire.calibrate.orientation`
+    alignment : that of arm B with arm A
+    tiles : alignments behind a fibre
+    facts : JSON: recordings, lines, and whatever else is worth knowing
+    warnings : problems with the result, in sentences
     """
 
     step: str
@@ -173,7 +173,7 @@ class Finding:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """What is known of an instrument; see the module. ``steps``: name → how and when it was found (JSON)."""
+    """Measured properties of an instrument; see the module. ``steps``: name → how and when it was done."""
 
     instrument: Instrument
     quantities: Mapping[str, Measured] = field(default_factory=dict)
@@ -212,25 +212,25 @@ class Calibration:
                 )
 
     def value(self, name: str) -> NDArray[np.float64] | None:
-        """Values of a quantity; None where it was not measured."""
+        """Return the values of a quantity, or None if it was not measured."""
         return self.quantities[name].value if name in self.quantities else None
 
     def with_step(self, found: Finding) -> Calibration:
-        """The calibration with what a step found in place of what was known of it.
+        """Return the calibration with a step's result in place of earlier ones.
 
-        Raises UsageError where the step's recordings are of another instrument.
+        Raises UsageError if the step's recordings are of another instrument.
         """
-        differences = differing(self.instrument, found.instrument)
+        differences = differences_between(self.instrument, found.instrument)
         if differences:
             raise UsageError(
-                f"the recordings of {found.step!r} are of another instrument than the calibration: "
+                f"the recordings of {found.step!r} come from another instrument than the calibration: "
                 + "; ".join(differences),
                 hint="another calibration for it: --out NAME.zarr",
             )
         now = datetime.now(UTC).isoformat(timespec="seconds")
         step = {**found.facts, "made": now, "warnings": list(found.warnings)}
         if found.usable is not None:
-            step["unusable_columns"] = listed(found.usable)
+            step["unusable_columns"] = unusable_columns(found.usable)
         steps = {**self.steps, found.step: step}
         return replace(
             self,
@@ -243,9 +243,9 @@ class Calibration:
         )
 
     def finding(self, step: str) -> Finding:
-        """What a step found, as far as no later one has found it anew.
+        """Return the result of a step, as far as no later step has replaced it.
 
-        Raises UsageError where it was not done.
+        Raises UsageError if the step was not done.
         """
         if step not in self.steps:
             raise UsageError(
@@ -265,7 +265,7 @@ class Calibration:
         )
 
     def to_attrs(self) -> dict[str, Any]:
-        """All of it as JSON: the copy that a recording carries."""
+        """Return the whole calibration as JSON: the copy that a recording carries."""
         arrays = {
             name: {"value": _rounded(each.value), "uncertainty": _rounded(each.uncertainty)}
             for name, each in self.quantities.items()
@@ -273,25 +273,28 @@ class Calibration:
         return {**self.facts(), "quantities": arrays}
 
     def facts(self) -> dict[str, Any]:
-        """All but the arrays, as JSON."""
-        found = self.alignment
+        """Return everything but the arrays, as JSON."""
+
+        def facts(found: AlignmentFound) -> dict[str, Any]:
+            return {**found.alignment.facts(), "uncertainty": found.uncertainty}
+
         return {
             "format": FORMAT,
             "instrument": self.instrument.model_dump(mode="json"),
             "usable": None if self.usable is None else self.usable.tolist(),
             "orientation": self.orientation,
-            "alignment": found and _facts(found),
+            "alignment": self.alignment and facts(self.alignment),
             "steps": dict(self.steps),
-            "tiles": [{"tile": e.tile, "seen_from": list(e.columns), **_facts(e.found)} for e in self.tiles],
+            "tiles": [{"tile": e.tile, "seen_from": list(e.columns), **facts(e.found)} for e in self.tiles],
         }
 
     @classmethod
     def from_attrs(
         cls, attrs: Mapping[str, Any], quantities: Mapping[str, Measured] | None = None
     ) -> Calibration:
-        """What `to_attrs` wrote; ``quantities`` in place of those in ``attrs``.
+        """Rebuild a calibration from `to_attrs`; ``quantities`` replace those in ``attrs``.
 
-        DataError for a damaged one.
+        Raises DataError if it is damaged.
         """
         try:
             if quantities is None:
@@ -318,25 +321,21 @@ class Calibration:
             raise DataError(f"the calibration is damaged: {error}", hint="measure it again") from error
 
 
-def listed(usable: NDArray[np.bool_]) -> dict[str, list[int]]:
-    """Columns of either arm that are not usable."""
+def unusable_columns(usable: NDArray[np.bool_]) -> dict[str, list[int]]:
+    """Return the columns of each arm that are not usable."""
     return {arm: np.flatnonzero(~row).tolist() for arm, row in zip(ARMS, usable, strict=True)}
 
 
 def _usable(steps: Mapping[str, dict[str, Any]], columns: int) -> NDArray[np.bool_] | None:
-    """Columns that no step found to be no good; None where no step looked."""
-    told = [step["unusable_columns"] for step in steps.values() if "unusable_columns" in step]
-    if not told:
+    """Return the columns (arm, column) that no step excluded; None if no step examined them."""
+    excluded = [step["unusable_columns"] for step in steps.values() if "unusable_columns" in step]
+    if not excluded:
         return None
     usable = np.ones((len(ARMS), columns), np.bool_)
-    for each in told:
+    for each in excluded:
         for row, arm in zip(usable, ARMS, strict=True):
             row[each.get(arm, [])] = False
     return usable
-
-
-def _facts(found: AlignmentFound) -> dict[str, Any]:
-    return {**found.alignment.facts(), "uncertainty": found.uncertainty}
 
 
 def _alignment(attrs: Mapping[str, Any]) -> AlignmentFound:
@@ -345,14 +344,14 @@ def _alignment(attrs: Mapping[str, Any]) -> AlignmentFound:
 
 
 def _rounded(values: NDArray[np.float64]) -> Any:
-    """As lists, with as many digits as mean something."""
+    """Return the values as lists, rounded to significant digits of the largest."""
     size = np.abs(values[values != 0])
     decimals = DIGITS - 1 - int(np.floor(np.log10(size.max()))) if size.size else 0
     return np.round(values, decimals).tolist()
 
 
-def differing(known: Instrument, other: Instrument) -> list[str]:
-    """What makes two instruments differ, so that the calibration of one is none of the other; in words."""
+def differences_between(known: Instrument, other: Instrument) -> list[str]:
+    """Return, in words, the differences of two instruments that keep them from sharing a calibration."""
     found = []
     for name, meaning in (
         ("stages", "stages M"),
@@ -362,11 +361,11 @@ def differing(known: Instrument, other: Instrument) -> list[str]:
     ):
         mine, theirs = getattr(known, name), getattr(other, name)
         if mine != theirs:
-            found.append(f"{meaning} {mine} is {theirs} there")
+            found.append(f"{meaning} is {theirs} instead of {mine}")
     for arm in ARMS:
         mine, theirs = known.cameras.get(arm, {}), other.cameras.get(arm, {})
         found += [
-            f"camera {arm}: {key} {mine[key]} is {theirs[key]} there"
+            f"camera {arm}: {key} is {theirs[key]} instead of {mine[key]}"
             for key in mine
             if key in theirs and mine[key] != theirs[key]
         ]

@@ -1,4 +1,4 @@
-"""Is a calibration still true? What a new recording says, beside what is known."""
+"""Check of a calibration against a new recording: is it still true?"""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from acquire.calibrate.apply import check_fits
 from acquire.calibrate.columns import dark, flat
-from acquire.calibrate.field import mended
+from acquire.calibrate.field import without_field_edge
 from acquire.calibrate.psf import psf
 from acquire.calibrate.target import alignment, orientation
 from acquire.errors import UsageError
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from acquire.calibrate.exposure import Exposure
 
 SURE = 5.0
-"""Standard uncertainties of a difference from which on it is one."""
+"""Standard uncertainties from which a difference is significant."""
 MATTERS = {
     "offset_dn": 0.5,
     "gain": 0.003,
@@ -32,12 +32,12 @@ MATTERS = {
     "turn_deg": 0.1,
     "blur_px": 0.15,
 }
-"""What a reconstruction notices: smaller changes leave a calibration true, however sure they are."""
+"""Changes that a reconstruction notices; smaller ones leave a calibration true, however certain they are."""
 
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """One quantity, then and now; ``change`` is the largest of its elements, ``sure`` its uncertainty."""
+    """Change of one quantity: ``change`` is the largest of its elements, ``sure`` its uncertainty."""
 
     quantity: str
     unit: str
@@ -47,16 +47,16 @@ class Compared:
 
     @property
     def holds(self) -> bool:
-        """It did not change, as far as a reconstruction notices."""
+        """Whether the change is too small for a reconstruction to notice, or not significant."""
         return abs(self.change) <= max(self.matters, SURE * self.sure)
 
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """What a recording says of a calibration.
+    """Result of comparing a recording with a calibration.
 
-    ``doubts`` are what may matter beside what was compared; ``same_view``: nothing speaks against the
-    orientation.
+    ``doubts`` are further concerns, apart from the compared quantities. ``same_view`` is whether nothing
+    contradicts the orientation.
     """
 
     compared: tuple[Compared, ...]
@@ -69,9 +69,9 @@ class Check:
 
 
 def check(exposure: Exposure, known: Calibration, *, covered: bool = False) -> Check:
-    """Compare what a recording shows with what is known: dark lines, a flat, or a target, by its code.
+    """Compare a recording of dark lines, a flat or a target, depending on its code, with a calibration.
 
-    Raises UsageError where it is of another instrument, or shows none of these.
+    Raises UsageError if it is of another instrument, or shows none of these.
     """
     doubts = check_fits(known, exposure.recording)
     if exposure.code_value == 0 or covered:
@@ -79,35 +79,29 @@ def check(exposure: Exposure, known: Calibration, *, covered: bool = False) -> C
         return Check(tuple(_columns(found, known, "offset_dn", "DN")), doubts)
     if exposure.code_value == 1:
         found = flat(exposure, known)
-        seen = found
+        corrected = found
         if known.alignment is not None:
-            corrected = mended(known.with_step(found), known.alignment.alignment)
-            seen = replace(found, quantities={**found.quantities, **corrected})
-        return Check((*_columns(seen, known, "gain", "1"), *_balance(found, known)), doubts)
+            quantities = without_field_edge(known.with_step(found), known.alignment.alignment)
+            corrected = replace(found, quantities={**found.quantities, **quantities})
+        return Check((*_columns(corrected, known, "gain", "1"), *_balance(found, known)), doubts)
     if exposure.recording.fibre is not None:
         raise UsageError(
             f"{exposure.recording} shows a target behind a fibre, which is not compared tile by tile",
-            possible="a dark or a flat; or `acquire calibrate align`, which tells where each tile lies now",
+            possible="a dark or a flat; or `acquire calibrate align`, which measures each tile's alignment",
         )
-    focus, unfocused = _focus(exposure, known)
-    doubts += unfocused
-    seen = orientation(exposure, known)
-    believed = known.orientation or "turn 90"
-    if seen.orientation is None or seen.orientation != believed:
-        turned = "cannot be told" if seen.orientation is None else f"is {seen.orientation!r}"
-        doubt = f"the orientation {turned}; {believed!r} was believed"
-        return Check(focus, (*doubts, doubt), same_view=seen.orientation is None)
-    return Check((*_alignment(alignment(exposure, known), known), *focus), doubts)
-
-
-def _focus(exposure: Exposure, known: Calibration) -> tuple[tuple[Compared, ...], tuple[str, ...]]:
-    """The optics' blur beside what is known of it, where a target has edges that tell; else why not."""
-    if "blur_px" not in known.quantities:
-        return (), ()
-    try:
-        return tuple(_blur(psf(exposure, known), known)), ()
-    except UsageError as error:
-        return (), (f"the optics' blur was not compared: {error.message}",)
+    blur: tuple[Compared, ...] = ()
+    if "blur_px" in known.quantities:
+        try:
+            blur = tuple(_blur(psf(exposure, known), known))
+        except UsageError as error:  # many targets have no edges that show the blur
+            doubts += (f"the optics' blur was not compared: {error.message}",)
+    found = orientation(exposure, known)
+    expected = known.orientation or "turn 90"
+    if found.orientation is None or found.orientation != expected:
+        result = "is not clear" if found.orientation is None else f"is {found.orientation!r}"
+        doubt = f"the orientation {result}; the calibration has {expected!r}"
+        return Check(blur, (*doubts, doubt), same_view=found.orientation is None)
+    return Check((*_alignment(alignment(exposure, known), known), *blur), doubts)
 
 
 def _columns(found: Finding, known: Calibration, name: str, unit: str) -> Iterator[Compared]:
@@ -124,7 +118,7 @@ def _columns(found: Finding, known: Calibration, name: str, unit: str) -> Iterat
 
 
 def _balance(found: Finding, known: Calibration) -> Iterator[Compared]:
-    """Flat beside flat: an alignment may have put the balance right where a flat's light ends."""
+    """Compare the flats themselves, since an alignment may have corrected the balance of the calibration."""
     before = known.steps.get("flat", {}).get("part_a")
     if before is not None:
         change, balance = found.facts["part_a"] - before, found.quantities["balance"]
@@ -133,7 +127,7 @@ def _balance(found: Finding, known: Calibration) -> Iterator[Compared]:
 
 
 def _alignment(found: Finding, known: Calibration) -> Iterator[Compared]:
-    assert found.alignment is not None  # `alignment` gives one or raises
+    assert found.alignment is not None  # `alignment` returns one or raises
     before, now = known.alignment, found.alignment
     then = before.alignment.facts() if before else {"magnification": 1.0}
     errors = before.uncertainty if before else {}
@@ -152,5 +146,5 @@ def _blur(found: Finding, known: Calibration) -> Iterator[Compared]:
         for axis, along in enumerate(("along", "across")):
             change = float(now.value[arm, axis] - before.value[arm, axis])
             sure = float(np.hypot(now.uncertainty[arm, axis], before.uncertainty[arm, axis]))
-            what = f"blur of arm {name} {along} the transfer"
-            yield Compared(what, "fine pixels", change, sure, MATTERS["blur_px"])
+            quantity = f"blur of arm {name} {along} the transfer"
+            yield Compared(quantity, "fine pixels", change, sure, MATTERS["blur_px"])

@@ -1,4 +1,4 @@
-"""What recordings must be for a step, and what is wrong with those that are not; in words."""
+"""Requirements of the steps on their recordings: errors and warnings for those that do not meet them."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
 QUANTISATION = 1 / 12
 """Variance of rounding, DN²."""
 MOST_AT_ZERO = 1e-3
-"""Share of a dark column's samples at 0 from which on its mean is not to be believed."""
+"""Share of a dark column's samples at 0 above which its mean is wrong."""
 MOST_SATURATED = 1e-3
 DIMMEST, BRIGHTEST = 0.1, 0.9
-"""Of the range: where a flat tells little, and where noise may reach white."""
+"""Shares of the range below which a flat determines little, and above which noise may reach white."""
 DRIFT = 6.0
 LOWEST_LIGHT_DN = 8.0
 
 
 def offset_of(known: Calibration, step: str, *, with_ambient: bool = True) -> NDArray[np.float64]:
-    """DN of a column without our light (arm, column); UsageError where it was not measured."""
+    """Return the DN of columns without our light (arm, column). Raises UsageError if it was not measured."""
     offset = known.value("offset_dn")
     if offset is None or "dark" not in known.steps:
         raise UsageError(
@@ -38,28 +38,29 @@ def offset_of(known: Calibration, step: str, *, with_ambient: bool = True) -> ND
 
 
 def refuse_coded(exposure: Exposure, step: str) -> None:
-    """UsageError for a light that is not steady."""
+    """Raise UsageError for a light that is not steady."""
     if exposure.code_value != 1:
         raise UsageError(
-            f"{exposure.recording} is no steady light for {step}: code {exposure.recording.attrs['code']}",
+            f"{exposure.recording} does not have the steady light that {step} needs: its code is "
+            f"{exposure.recording.attrs['code']}",
             possible="code.kind = 'constant', code.value = 1",
         )
 
 
 def refuse_clipped(exposure: Exposure, found: Moments) -> None:
-    """UsageError for dark lines that reach 0."""
+    """Raise UsageError for dark lines that reach 0."""
     clipped = found.at_zero > MOST_AT_ZERO
     if clipped.any():
         raise UsageError(
             f"{exposure.recording}: {clipped.sum()} columns of dark lines reach 0 DN, in up to "
-            f"{found.at_zero.max():.1%} of their samples: what noise would be below is cut off",
-            possible="a black level some noises above 0",
+            f"{found.at_zero.max():.1%} of their samples: noise below 0 is cut off",
+            possible="a black level several standard deviations of the noise above 0",
             hint="raise the camera's BlackLevel (simulated: cameras.a.black_level_dn), and record again",
         )
 
 
 def refuse_level(exposure: Exposure, found: Moments, light: NDArray[np.float64]) -> None:
-    """UsageError for a flat that is saturated, or none; ``light`` (arm, column) in DN."""
+    """Raise UsageError for a flat that is saturated, or too dark; ``light`` (arm, column) in DN."""
     saturated = np.median(found.saturated, axis=1).max()
     if saturated > MOST_SATURATED:
         raise UsageError(
@@ -71,32 +72,32 @@ def refuse_level(exposure: Exposure, found: Moments, light: NDArray[np.float64])
         raise UsageError(
             f"{exposure.recording}: the light adds {np.median(light, axis=1).min():.2g} DN to an arm",
             possible=f"{LOWEST_LIGHT_DN:g} DN or more; 50 to 70 % of white are best",
-            hint="is the light on, and the scene white?",
+            hint="check that the light is on and the scene white",
         )
 
 
-def dim(exposure: Exposure, light: NDArray[np.float64]) -> list[str]:
-    """A warning, where a flat is too dark or too bright to be good."""
+def warn_of_level(exposure: Exposure, light: NDArray[np.float64]) -> list[str]:
+    """Warn of a flat that is darker or brighter than it should be."""
     share = light.mean(axis=1) / exposure.camera("white_dn")
     if share.min() >= DIMMEST and share.max() <= BRIGHTEST:
         return []
     return [
-        f"the flat is at {share.min():.0%} to {share.max():.0%} of white; 50 to 70 % tell most of the gains"
+        f"the flat is at {share.min():.0%} to {share.max():.0%} of white; 50 to 70 % determine gains best"
     ]
 
 
-def drift(found: Moments) -> list[str]:
-    """A warning, where the columns' means move."""
-    moved = float(np.median(found.drift))
-    return [f"the mean of the columns drifts, by {moved:.0f} standard errors"] if moved > DRIFT else []
+def warn_of_drift(found: Moments) -> list[str]:
+    """Warn of column means that drift."""
+    drift = float(np.median(found.drift))
+    return [f"the mean of the columns drifts, by {drift:.0f} standard errors"] if drift > DRIFT else []
 
 
-def left_out(usable: NDArray[np.bool_], why: str) -> list[str]:
-    """A warning, where columns are no good."""
+def warn_of_exclusions(usable: NDArray[np.bool_], reason: str) -> list[str]:
+    """Warn of columns that are left out."""
     count = int((~usable).sum())
-    return [f"{count} columns are left out for their {why}"] if count else []
+    return [f"{count} columns are left out for their {reason}"] if count else []
 
 
 def per_arm(values: NDArray[np.float64]) -> list[float]:
-    """As JSON."""
+    """Round values for JSON."""
     return [round(float(value), 6) for value in values]

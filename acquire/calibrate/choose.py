@@ -1,4 +1,4 @@
-"""Which calibration a recording is read with: its own copy, another one, or none; and what a rig hands on."""
+"""Choice of a recording's calibration: its own copy, another one, or none; and the copy a rig gives it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from acquire.calibrate.apply import blur_of, calibration_of, check_fits
-from acquire.calibrate.calibration import Calibration, Instrument, differing
+from acquire.calibrate.calibration import Calibration, Instrument, differences_between
 from acquire.calibrate.curve import curve_of
 from acquire.calibrate.file import open_calibration
 from acquire.calibrate.orientation import MODEL, view_named
@@ -26,7 +26,7 @@ OWN = "the recording's own"
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """A calibration, where it is from, and what is doubtful about it for the recording, in sentences."""
+    """A calibration, its origin, and doubts about it for the recording, in sentences."""
 
     calibration: Calibration
     origin: str
@@ -34,9 +34,9 @@ class Chosen:
 
 
 def choose(recording: Recording, asked: Path | str | None = None) -> Chosen | None:
-    """The calibration for a recording: ``asked``, or the copy that it carries; None for ``"none"``.
+    """Return the calibration for a recording: ``asked``, or the copy that it carries; None for ``"none"``.
 
-    Raises UsageError for one that does not fit, PlaceError where there is none, DataError for a damaged one.
+    Raises UsageError if it does not fit, PlaceError if it is not there, DataError if it is damaged.
     """
     if asked == NONE:
         return None
@@ -47,7 +47,7 @@ def choose(recording: Recording, asked: Path | str | None = None) -> Chosen | No
 
 
 def corrected(known: Calibration) -> list[str]:
-    """What a reconstruction corrects with a calibration, in words."""
+    """List the corrections of a reconstruction with this calibration, in words that videos store."""
     found = [] if curve_of(known) is None else ["the cameras' curves"]
     for name, words in (
         ("offset_dn", "offsets per column"),
@@ -60,8 +60,8 @@ def corrected(known: Calibration) -> list[str]:
     if known.usable is not None and not known.usable.all():
         found.append(f"{int((~known.usable).sum())} columns left out")
     if known.orientation is not None and (view := view_named(known.orientation)) != MODEL:
-        seen = " (the video is what camera B sees)" if view.swapped else ""
-        found.append(f"the orientation: {view.name}{seen}")
+        shown = " (the video is what camera B sees)" if view.swapped else ""
+        found.append(f"the orientation: {view.name}{shown}")
     if known.alignment is not None or known.tiles:
         found.append("arm B laid on arm A")
     if blur_of(known) is not None:
@@ -70,7 +70,7 @@ def corrected(known: Calibration) -> list[str]:
 
 
 def provenance(known: Calibration | None) -> dict[str, Any] | None:
-    """What of a calibration went into a result, as JSON."""
+    """Return the calibration's share in a result, as JSON."""
     if known is None:
         return None
     steps = {name: step.get("made") for name, step in known.steps.items()}
@@ -78,43 +78,44 @@ def provenance(known: Calibration | None) -> dict[str, Any] | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Handed:
-    """What a rig's recordings get: attributes, and in words what they carry; None: the rig names none."""
+class Carried:
+    """Attributes of a rig's recordings, and their calibration in words; None if the rig names none."""
 
     attrs: dict[str, Any]
     place: Path | None = None
     text: str | None = None
 
 
-def handed_on(config: RigConfig, layout: str) -> Handed:
-    """The attribute ``calibration`` that a rig's recordings get; ``calibration_missing``, its place, where it
-    is not there (yet): it is made with this rig, and can be put to the recordings afterwards.
+def carried_calibration(config: RigConfig, layout: str) -> Carried:
+    """Return the attribute ``calibration`` of a rig's recordings.
 
-    Raises ConfigError where the calibration is damaged, cannot be read, or is of another instrument.
+    If the file does not exist (yet), the attribute is ``calibration_missing``, its path: it is made with this
+    rig, and can be added to the recordings afterwards. Raises ConfigError if the calibration is damaged,
+    cannot be read, or is of another instrument.
     """
     place = config.calibration
     if place is None:
-        return Handed({})
+        return Carried({})
     try:
         known = open_calibration(place)
     except AcquireError as error:
         if isinstance(error, PlaceError) and not os.path.lexists(place):
             text = f"none: {place} is not there; acquire calibrate all --out {place} makes it"
-            return Handed({"calibration_missing": str(place)}, place, text)
+            return Carried({"calibration_missing": str(place)}, place, text)
         raise ConfigError(
             f"calibration: {error.message}", possible=error.possible, hint=error.hint
         ) from error
-    if differences := differing(known.instrument, configured(config, layout)):
+    if differences := differences_between(known.instrument, configured(config, layout)):
         raise ConfigError(
             f"calibration: {place} is not of rig {config.name}: " + "; ".join(differences),
             hint="acquire arm --without-calibration, and acquire calibrate all with another --out",
         )
     text = f"{place}: {', '.join(known.steps)}"
-    return Handed({"calibration": known.to_attrs()}, place, text)
+    return Carried({"calibration": known.to_attrs()}, place, text)
 
 
 def configured(config: RigConfig, layout: str) -> Instrument:
-    """The instrument that a rig file describes."""
+    """Return the instrument that a rig file describes."""
     cameras = {arm: config.cameras.arm(arm) for arm in ARMS}
     return Instrument(
         stages=config.geometry.stages,

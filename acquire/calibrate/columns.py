@@ -1,7 +1,7 @@
-"""Steps that look at columns under a dark code or a steady light: dark, ambient, flat.
+"""Steps that measure columns under a dark code or a steady light: dark, ambient, flat.
 
-A line-scan sensor's samples of one column are one pixel's: means over lines are fixed patterns, variances
-over lines are temporal noise (EMVA Standard 1288, release 4.0, Linear).
+All samples of one column of a line-scan sensor come from one pixel, so means over lines are fixed patterns
+and variances over lines are temporal noise (EMVA Standard 1288, release 4.0, Linear).
 """
 
 from __future__ import annotations
@@ -10,20 +10,20 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from acquire.calibrate.calibration import Finding, Measured, listed
+from acquire.calibrate.calibration import Finding, Measured, unusable_columns
 from acquire.calibrate.checks import (
     QUANTISATION,
-    dim,
-    drift,
-    left_out,
     offset_of,
     per_arm,
     refuse_clipped,
     refuse_coded,
     refuse_level,
+    warn_of_drift,
+    warn_of_exclusions,
+    warn_of_level,
 )
 from acquire.calibrate.curve import straightened
-from acquire.calibrate.exposure import moments, unseen
+from acquire.calibrate.exposure import moments, no_progress
 from acquire.errors import UsageError
 from acquire.lines import ARMS
 
@@ -34,23 +34,24 @@ if TYPE_CHECKING:
     from acquire.calibrate.exposure import Exposure, Progress
 
 NOISY = 6.0
-"""Median absolute deviations of log noise beyond which a column is no good."""
+"""Median absolute deviations of log noise beyond which a column is unusable."""
 DEAD, DARK = 0.5, 0.05
-"""Response beside the arm's median below which a column is no good; at an edge it may see half a field."""
+"""Response, relative to the arm's median, below which a column is unusable, inside and at an edge, where it
+may see half a field."""
 DARK_EDGE = 4.0
-"""Spreads of the gain below the median at which a column at the edge is dark by the optics."""
+"""Spreads of the gain below the median at which the optics must have darkened a column at the edge."""
 TOGETHER, LEAST_LACK = 3.0, 2e-3
-"""Standard errors, and part of 1, by which the outermost columns together are below the others there."""
+"""Least deficit of the outermost columns together, in standard errors and relative to 1, that counts."""
 EDGE_SHARE = 0.125
 SMOOTH_DEGREE = 4
 
 
-def dark(exposure: Exposure, *, covered: bool = False, progress: Progress = unseen) -> Finding:
-    """Offset and noise per column, from lines without the light.
+def dark(exposure: Exposure, *, covered: bool = False, progress: Progress = no_progress) -> Finding:
+    """Measure offset and noise per column, from lines without the light.
 
-    ``covered``: the lens is covered, so the code does not matter, and light that is not ours is kept out;
-    else the offset holds that as well. Raises UsageError for a code that lights the scene, and for lines that
-    reach 0, of which the mean is wrong.
+    With ``covered``, the lens is covered: the code does not matter and ambient light is kept out, which the
+    offset otherwise includes. Raises UsageError for a code that lights the scene, and for lines that reach 0,
+    whose mean is wrong.
     """
     if exposure.code_value != 0 and not covered:
         raise UsageError(
@@ -61,7 +62,7 @@ def dark(exposure: Exposure, *, covered: bool = False, progress: Progress = unse
     refuse_clipped(exposure, found)
     noise = np.sqrt(found.variance)
     lines = found.lines[:, None]
-    # usable: columns whose noise is like that of most
+    # Usable columns have a noise like most others.
     size = np.log(np.maximum(noise, 1e-6))
     middle = np.median(size, axis=1, keepdims=True)
     spread = np.median(np.abs(size - middle), axis=1, keepdims=True)
@@ -71,38 +72,38 @@ def dark(exposure: Exposure, *, covered: bool = False, progress: Progress = unse
         "noise_dn": Measured(noise, noise / np.sqrt(2 * lines)),
     }
     facts = {**exposure.facts(), "covered": covered}
-    warnings = (*drift(found), *left_out(usable, "noise"))
+    warnings = (*warn_of_drift(found), *warn_of_exclusions(usable, "noise"))
     return Finding("dark", exposure.instrument, quantities, usable, facts=facts, warnings=warnings)
 
 
-def ambient(exposure: Exposure, known: Calibration, *, progress: Progress = unseen) -> Finding:
-    """What light that no code switches adds to each column: an open lens under a dark code, less `dark`.
+def ambient(exposure: Exposure, known: Calibration, *, progress: Progress = no_progress) -> Finding:
+    """Measure the ambient light on each column: an open lens under a dark code, less `dark`.
 
-    Raises UsageError without a dark that was covered.
+    Raises UsageError without a covered dark.
     """
     offset = offset_of(known, "ambient", with_ambient=False)
     if not known.steps["dark"].get("covered"):
         raise UsageError(
-            "the offsets of this calibration hold the ambient light already: its dark was not covered",
+            "the offsets of this calibration include the ambient light already: its dark was not covered",
             possible="nothing more to do; or acquire calibrate dark --covered first",
         )
-    seen = dark(exposure, progress=progress)
-    here = seen.quantities["offset_dn"]
+    found = dark(exposure, progress=progress)
+    here = found.quantities["offset_dn"]
     spread = np.hypot(here.uncertainty, known.quantities["offset_dn"].uncertainty)
     quantities = {"ambient_dn": Measured(here.value - offset, spread)}
     facts = {**exposure.facts(), "mean_dn": per_arm((here.value - offset).mean(axis=1))}
-    return Finding("ambient", exposure.instrument, quantities, facts=facts, warnings=seen.warnings)
+    return Finding("ambient", exposure.instrument, quantities, facts=facts, warnings=found.warnings)
 
 
 def flat(
-    exposure: Exposure, known: Calibration, *, smooth: bool = False, progress: Progress = unseen
+    exposure: Exposure, known: Calibration, *, smooth: bool = False, progress: Progress = no_progress
 ) -> Finding:
-    """Gain per column and the arms' balance, from a uniform scene under steady light.
+    """Measure gain per column and the arms' balance, from a uniform scene under steady light.
 
-    ``smooth``: the scene is not quite uniform, and a smooth profile (polynomial of degree 4) is its own, not
-    the columns'. Columns at the edge that the optics leave dark get the gain 1; the gain of the others at the
-    edge may hold some of the field's, and their uncertainty says how much. Raises UsageError for lines that
-    are too dark or saturated, a code that is not steady, and without a dark.
+    With ``smooth``, the scene is not quite uniform: a smooth profile (polynomial of degree 4) is attributed
+    to it, not to the columns. Columns at the edge that the optics leave dark get the gain 1. The gain of the
+    others at the edge may include some fall-off of the field, which their uncertainty covers. Raises
+    UsageError for lines that are too dark or saturated, for a code that is not steady, and without a dark.
     """
     refuse_coded(exposure, "flat")
     offset = offset_of(known, "flat")
@@ -124,8 +125,8 @@ def flat(
     )
     own_error = np.sqrt(np.maximum(found.own_variance, QUANTISATION) / found.lines[:, None])
     relative = np.hypot(own_error, known.quantities["offset_dn"].uncertainty)
-    relative = relative / np.where(alive, light, np.inf)  # a column that sees nothing has no gain
-    # what the field's edge takes from the outermost is not seen below the spread of the columns' own gains
+    relative = relative / np.where(alive, light, np.inf)  # a column without light has no gain
+    # A fall-off at the outermost columns cannot be detected below the spread of the columns' own gains.
     relative[:, [0, -1]] = np.hypot(relative[:, [0, -1]], _spread(shape, trusted) / np.sqrt(2))
     gain = np.where(trusted, shape / level, 1.0)
     arm_error = np.sqrt((error**2).sum(axis=1)) / light.sum(axis=1)
@@ -139,15 +140,22 @@ def flat(
         "level_dn": per_arm(light.mean(axis=1)),
         "smooth": smooth,
         "part_a": round(float(balance[0] / balance.sum()), 6),
-        "optics_hide_columns": listed(trusted | ~usable),
-        "edge_response": _responses(shape / level, edges),
+        "optics_hide_columns": unusable_columns(trusted | ~usable),
+        "edge_response": {
+            arm: {str(column): round(float(row[column]), 6) for column in np.flatnonzero(dark)}
+            for arm, row, dark in zip(ARMS, shape / level, edges, strict=True)
+        },
     }
-    warnings = (*dim(exposure, light), *drift(found), *left_out(usable | ~exposure.lit, "response"))
+    warnings = (
+        *warn_of_level(exposure, light),
+        *warn_of_drift(found),
+        *warn_of_exclusions(usable | ~exposure.lit, "response"),
+    )
     return Finding("flat", exposure.instrument, quantities, usable, facts=facts, warnings=warnings)
 
 
 def dark_edges(shape: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Columns from either edge inwards that are below all others: what lies beyond the field is dark."""
+    """Return the columns from each edge inwards that lie beyond the field and are therefore dark."""
     dark = np.zeros_like(usable)
     most = max(1, round(EDGE_SHARE * shape.shape[1]))
     for row, good, out in zip(shape, usable, dark, strict=True):
@@ -156,16 +164,17 @@ def dark_edges(shape: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray
         low = row < middle - np.maximum(DARK_EDGE * spread, 2e-3 * middle)
         for order in (slice(None, most), slice(None, -most - 1, -1)):
             out[order] = np.logical_and.accumulate(low[order])
-    return dark | _blurred(shape, usable, dark)
+    return dark | _blurred_edges(shape, usable, dark)
 
 
-def _blurred(
+def _blurred_edges(
     shape: NDArray[np.float64], usable: NDArray[np.bool_], dark: NDArray[np.bool_]
 ) -> NDArray[np.bool_]:
-    """The outermost columns, where together they lack light: a lens blurs the field's edge.
+    """Return the outermost columns, if together they lack light because a lens blurs the field's edge.
 
-    Each alone lacks no more than columns differ; the four of both arms do not do so by chance. Of an arm, a
-    dark one is evidence against the other, which its own gain may make as bright as the rest.
+    The deficit of one column is no larger than the differences between columns, but all four of both arms do
+    not have one by chance. Within an arm, one dark column is evidence against the other, too, which its own
+    gain may make as bright as the rest.
     """
     outermost = np.zeros_like(usable)
     outermost[:, [0, -1]] = True
@@ -183,21 +192,13 @@ def _blurred(
 
 
 def _spread(shape: NDArray[np.float64], usable: NDArray[np.bool_]) -> float:
-    """Standard deviation of the columns' own response, of both arms."""
+    """Return the standard deviation of the columns' own response, averaged over the arms."""
     inner = [row[good] for row, good in zip(shape, usable, strict=True)]
     return float(np.mean([1.4826 * np.median(np.abs(row / np.median(row) - 1)) for row in inner]))
 
 
-def _responses(shape: NDArray[np.float64], edges: NDArray[np.bool_]) -> dict[str, dict[str, float]]:
-    """Arm → column at the edge → its response beside the arm's mean."""
-    return {
-        arm: {str(column): round(float(row[column]), 6) for column in np.flatnonzero(dark)}
-        for arm, row, dark in zip(ARMS, shape, edges, strict=True)
-    }
-
-
 def _profile(response: NDArray[np.float64], usable: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """The smooth part of each arm's response: a polynomial of the columns."""
+    """Return the smooth part of each arm's response: a polynomial over the columns."""
     x = np.linspace(-1, 1, response.shape[1])
     inner = usable & ~dark_edges(response, usable)
     fits = [

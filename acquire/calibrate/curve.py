@@ -1,4 +1,4 @@
-"""The curve of a camera that bends, as a calibration holds it, and what it makes of measured levels."""
+"""A calibration's curve of a non-linear camera, and its effect on measured levels."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 
 
 def knots_dn(instrument: Instrument) -> NDArray[np.float64]:
-    """(arm, knot) readings from 0 to white, at which a calibration has the excess."""
+    """Return the readings (arm, knot), from 0 to white, at which a calibration gives the excess."""
     white = [float(instrument.cameras[arm]["white_dn"]) for arm in ARMS]
     return np.linspace(0.0, white, KNOTS, axis=1)
 
 
 def curve_of(known: Calibration) -> ConverterCurve | None:
-    """None where it was not measured, or no camera bends."""
+    """Return the curve, or None if it was not measured or both cameras are linear."""
     excess = known.value("excess_dn")
     if excess is None or not excess.any():
         return None
@@ -33,9 +33,7 @@ def curve_of(known: Calibration) -> ConverterCurve | None:
 def straightened(
     known: Calibration, mean: NDArray[np.float64], offset: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Light of columns (arm, column) as a linear camera would have it, and by how much the camera's curve
-    stretches small differences there.
-    """
+    """Return the light on columns (arm, column) in a linear camera's DN, and the slope of that correction."""
     curve = curve_of(known)
     if curve is None:
         return mean - offset, np.ones_like(mean)

@@ -1,23 +1,23 @@
-"""The step ``delay``: how late the light is beside the charge's moves, for either camera.
+"""The step ``delay``: delay of the light relative to the charge transfer, for each camera.
 
-Nothing of the scene lights a packet of charge before it enters the sensor or after it has left. So, of a
-scene at rest under a pseudo-random code, only sub-steps 0 to n + S − 2 of a line have a part in it (Eq. 1),
-whatever the scene is, and what lies beyond says how far light and charge are apart. Light that is late by δ
-sub-steps gives every packet what belongs to the sub-step before::
+The scene does not light a packet of charge before it enters the sensor or after it has left. For a scene at
+rest under a pseudo-random code, a line therefore contains only contributions of its own sub-steps 0 to
+n + S − 2 (Eq. 1), whatever the scene is. Contributions from other sub-steps measure the offset between light
+and charge. Light that is late by δ sub-steps gives every packet a share that belongs to the sub-step before::
 
-    part of sub-step m in a line, summed over the columns      z(m) = Σ_u X(m − u),   0 elsewhere
+    contribution of sub-step m to a line, all columns          z(m) = Σ_u X(m − u),   0 elsewhere
     light late by 0 ≤ δ < 1                                    z′(m) = (1 − δ)·z(m) + δ·z(m + 1)
     light early by 0 ≤ −δ < 1                                  z′(m) = (1 + δ)·z(m) − δ·z(m − 1)
 
-All parts z′ follow from the lines by linear regression on the code's bits. At the ends they are, with the
-light X_0, X_1 on the sensor's first rows and Y_0, Y_1 on its last::
+All contributions z′ follow from the lines by linear regression on the code's bits. At the ends they are, with
+the light X_0, X_1 on the sensor's first rows and Y_0, Y_1 on its last::
 
                   z′(−1)      z′(0)           z′(n + S − 2)     z′(n + S − 1)
     late by δ     δ·X_0       X_0 + δ·X_1     (1 − δ)·Y_0       0
     early by δ    0           (1 − δ)·X_0     Y_0 + δ·Y_1       δ·Y_0
 
-A sweep of the trigger's delays finds these rows' light along with the delay, so that nothing need be known of
-the scene but that it is not dark there.
+A sweep of the trigger's delays determines the light on these rows together with the delay, so that the scene
+can be anything that is not dark there.
 """
 
 from __future__ import annotations
@@ -41,31 +41,31 @@ if TYPE_CHECKING:
     from acquire.geometry import Geometry
 
 GUARD = 6
-"""Sub-steps beyond a line's own, to either side, whose part is found."""
+"""Sub-steps on each side of a line's own whose contributions are determined, too."""
 SPARE = 2.0
-"""Lines per part below which noise makes nothing of them."""
+"""Least number of lines per unknown contribution; with fewer, noise dominates."""
 PASSES = 2
-"""Passes over the sensor by which light may be late, or early, at first sight."""
+"""Largest offset of the light that the first estimate can find, in passes over the sensor."""
 LIT = 0.2
-"""Light on the first and last rows, beside the mean row's, without which nothing is seen there."""
+"""Least light on the first and last rows, relative to the mean row, that shows a delay."""
 CERTAIN = 8.0
-"""Standard deviations by chance that the correlation with a line's sub-steps must have."""
+"""Least correlation with a line's sub-steps, in standard deviations of chance correlations."""
 AT_SIGHT = 4096
-"""Lines that the first sight is of."""
+"""Lines used for the first estimate."""
 BLOCK = 4096
-"""Lines of a regression that are taken at once."""
+"""Lines that a regression takes at once."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Beyond:
-    """What of one arm's lines comes from sub-steps that are none of theirs, in units of a row's light.
+    """Contributions to one arm's lines at and beyond the ends of their sub-steps, in units of a row's light.
 
     Attributes
     ----------
-    whole : sub-steps by which the light is late, to the nearest; the others are beside this
-    before, first, last, after : parts of the sub-step before the line's first, of its first and last, and of
-        the one after it
-    error : standard deviation of any of them
+    whole : delay of the light in whole sub-steps; the others are relative to it
+    before, first, last, after : contributions of the sub-step before the line's first, of its first and last,
+        and of the one after it
+    error : standard deviation of each of them
     """
 
     whole: int
@@ -77,12 +77,15 @@ class Beyond:
 
     @property
     def late_substeps(self) -> float:
-        """By which the light is late, at first sight: if the edge rows are as bright as the mean row."""
+        """Rough delay of the light, for edge rows that are as bright as the mean row."""
         return self.whole + self.before - self.after
 
 
 def beyond(exposure: Exposure) -> tuple[Beyond, Beyond]:
-    """Of both arms. UsageError for another code than a pseudo-random one, and too few or too dark lines."""
+    """Measure both arms' contributions at and beyond the ends of a line's sub-steps.
+
+    Raises UsageError for a code that is not pseudo-random, and for too few or too dark lines.
+    """
     code = code_from_attrs(exposure.recording.attrs["code"])
     if isinstance(code, ConstantCode):
         raise UsageError(
@@ -98,7 +101,7 @@ def beyond(exposure: Exposure) -> tuple[Beyond, Beyond]:
     found = []
     for arm, sums in zip(ARMS, np.concatenate(parts, axis=1), strict=True):
         try:
-            with limit_blas(1):  # products of some hundred columns: threads spin longer than they work
+            with limit_blas(1):  # for a few hundred columns, threads would wait longer than they compute
                 found.append(beyond_of(sums, code, exposure.first_line, geometry))
         except UsageError as error:
             raise UsageError(
@@ -110,25 +113,26 @@ def beyond(exposure: Exposure) -> tuple[Beyond, Beyond]:
 
 
 def beyond_of(sums: NDArray[np.float64], code: Code, first_line: int, geometry: Geometry) -> Beyond:
-    """Of one arm: ``sums`` (line,) over a line's columns from ``first_line`` on, NaN for those that are not
-    whole.
-    """
+    """Measure one arm's; ``sums`` (line,) of columns begin at ``first_line``, NaN for incomplete lines."""
     S, width = geometry.substeps, geometry.size + geometry.substeps - 1
     lines = np.flatnonzero(np.isfinite(sums))
     needed = int(SPARE * (width + 2 * GUARD + 1))
     if len(lines) < needed:
-        raise UsageError(f"{len(lines)} whole lines do not tell", possible=f"{needed} or more")
+        raise UsageError(f"{len(lines)} complete lines do not show a delay", possible=f"{needed} or more")
     change = sums[lines] - sums[lines].mean()
-    whole = _whole(code, S * first_line, S * lines, change, width)
+    whole = _whole_substeps(code, S * first_line, S * lines, change, width)
     begin = S * first_line - whole - GUARD
     span = width + 2 * GUARD
     bits = code.bits(begin, S * len(sums) + span).astype(np.float64)
     view = np.lib.stride_tricks.sliding_window_view(bits, span)
-    return _parts(view, S * lines, change, whole, geometry)
+    parts, errors = _contributions(view, S * lines, change)
+    return _ends(parts, errors, whole, geometry)
 
 
-def _whole(code: Code, first: int, starts: NDArray[np.int64], y: NDArray[np.float64], width: int) -> int:
-    """By how many sub-steps the light is late, to some: where the lines follow the code best together."""
+def _whole_substeps(
+    code: Code, first: int, starts: NDArray[np.int64], y: NDArray[np.float64], width: int
+) -> int:
+    """Return the delay of the light in whole sub-steps, roughly: where lines and code correlate best."""
     reach, y, starts = PASSES * width, y[:AT_SIGHT], starts[:AT_SIGHT]
     bits = code.bits(first - reach, int(starts[-1]) + width + 2 * reach).astype(np.float64)
     view = np.lib.stride_tricks.sliding_window_view(bits, width + 2 * reach)
@@ -141,19 +145,18 @@ def _whole(code: Code, first: int, starts: NDArray[np.int64], y: NDArray[np.floa
     if sums[best] < CERTAIN * chance:
         raise UsageError(
             "the lines do not follow the light's code",
-            hint="light on, a scene at rest; acquire status and acquire trigger square look at the wires",
+            hint="switch the light on, keep the scene at rest; acquire trigger square checks the wires",
         )
     return reach - best
 
 
-def _parts(
-    view: NDArray[np.float64],
-    starts: NDArray[np.int64],
-    y: NDArray[np.float64],
-    whole: int,
-    geometry: Geometry,
-) -> Beyond:
-    """By regression on the bits, and a constant for what the light does not switch."""
+def _contributions(
+    view: NDArray[np.float64], starts: NDArray[np.int64], y: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the sub-steps' contributions and their errors, by regression on the bits and a constant.
+
+    The constant takes up light that the code does not switch.
+    """
     unknown = view.shape[1] + 1
     normal, right = np.zeros((unknown, unknown)), np.zeros(unknown)
     for at in range(0, len(y), BLOCK):
@@ -164,16 +167,16 @@ def _parts(
         factor = cho_factor(normal)
     except LinAlgError as error:
         raise UsageError(
-            "the light's code does not tell its sub-steps apart", possible="a pseudo-random code"
+            "the light's code does not distinguish its sub-steps", possible="a pseudo-random code"
         ) from error
     found = cho_solve(factor, right)
     variance = max(float(y @ y - right @ found), 0.0) / (len(y) - unknown)
     errors = np.sqrt(variance * np.diag(cho_solve(factor, np.eye(unknown))))
-    return _edges(found[:-1], errors, whole, geometry)
+    return found[:-1], errors
 
 
-def _edges(parts: NDArray[np.float64], errors: NDArray[np.float64], whole: int, geometry: Geometry) -> Beyond:
-    """What lies beyond, with the line's own sub-steps where they leave least of it."""
+def _ends(parts: NDArray[np.float64], errors: NDArray[np.float64], whole: int, geometry: Geometry) -> Beyond:
+    """Place the line's own sub-steps where they leave least outside, and return the contributions there."""
     width = geometry.size + geometry.substeps - 1
     row = float(parts.sum() / (geometry.size * geometry.substeps))
     outside = np.abs(parts).sum() - np.convolve(np.abs(parts), np.ones(width), "valid")

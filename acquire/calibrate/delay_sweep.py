@@ -1,4 +1,4 @@
-"""A sweep of the trigger's delays: where to look, and where light and charge are together."""
+"""A sweep of the trigger's delays: its settings, and the delay that aligns light and charge."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from acquire.calibrate.calibration import Finding, Measured
 from acquire.calibrate.delay import beyond
-from acquire.calibrate.exposure import unseen
+from acquire.calibrate.exposure import no_progress
 from acquire.errors import UsageError
 from acquire.lines import ARMS
 from acquire.trigger.base import Delays
@@ -26,24 +26,24 @@ if TYPE_CHECKING:
     from acquire.calibrate.exposure import Exposure, Progress
 
 SHARES = (0.3, -0.3, 0.2, -0.2, 0.15, -0.15)
-"""Of a sub-step, by which the light is made late in the recordings of a sweep: a half of it is one, too."""
+"""Delays of the light in the recordings of a sweep, relative to a sub-step."""
 FIRST_LINES = 4096
-"""Of the recording that shows roughly where light and charge are."""
+"""Lines of the first recording, which gives a rough delay."""
 MOST_LINES = 2**17
 LEAST_SHARE = 0.08
-"""Of a sub-step, below which a recording says little: that is the roundness of the light's edges."""
+"""Least useful delay, relative to a sub-step; the light's rounded edges hide smaller ones."""
 WANTED_TICKS = 0.5
-"""Uncertainty that a sweep is made for, with as many lines as are sensible."""
+"""Uncertainty that a sweep aims at, within a sensible number of lines."""
 SWEEP_ERROR = 0.75
-"""Uncertainty of a sweep's delay beside that of one part of one recording."""
+"""Uncertainty of a sweep's delay relative to that of one contribution in one recording."""
 MOST_LEAD = 255
 APART = 4.0
-"""Standard errors by which the two sides of a sweep are apart for certain."""
+"""Standard errors from which the two sides of a sweep count as different."""
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """What the delays of one trigger may be, in ticks."""
+    """The possible delays of one trigger, in ticks."""
 
     clock_hz: int
     substep_ticks: int
@@ -58,38 +58,40 @@ class Setting:
         return self.pulse_distance_ticks - pulse_width_ticks(None, self.pulse_distance_ticks) - 1
 
     def delays(self, later: Sequence[float]) -> Delays:
-        """Those with which each arm's line starts ``later`` (ticks) than the light of its first sub-step, as
-        far as the trigger can.
+        """Return the delays, within the trigger's range, that start each arm's lines later than their light.
+
+        ``later`` is in ticks, from the light of a line's first sub-step.
         """
         a, b = (max(0, round(each)) for each in later)
         lead = min(a, b, self.most_lead)
         return Delays(lead, min(a - lead, self.most_delay), min(b - lead, self.most_delay))
 
     def sweep(self, late: Sequence[float]) -> list[Delays]:
-        """Settings to look at, around where the light would be ``late`` (arm) without any.
+        """Return settings to record, around the delay of each arm's light (``late``) without any.
 
-        Where that is out of reach, whole sub-steps away from it: light that is early, or late, by some shows
-        as well where its sub-steps begin.
+        If that is out of reach, the settings are whole sub-steps away from it, where an early or late light
+        shows the beginnings of its sub-steps just as well.
         """
-        around = [each - self._beyond_reach(each) * self.substep_ticks for each in late]
+        reach, side = (self.most_lead + self.most_delay) / self.substep_ticks, max(SHARES)
+        around = []
+        for each in late:
+            substeps = each / self.substep_ticks
+            excess = math.ceil(substeps + side - reach)
+            if excess <= 0:  # not too late, but perhaps too early to be seen from both sides
+                excess = min(0, math.floor(substeps - side))
+            around.append(each - excess * self.substep_ticks)
         found = [self.delays([each - share * self.substep_ticks for each in around]) for share in SHARES]
         return list(dict.fromkeys(found))
 
-    def _beyond_reach(self, late: float) -> int:
-        """Sub-steps by which ``late`` is too much, or too little (below 0), to be seen from both sides."""
-        substeps, side = late / self.substep_ticks, max(SHARES)
-        too_much = math.ceil(substeps + side - (self.most_lead + self.most_delay) / self.substep_ticks)
-        return too_much if too_much > 0 else min(0, math.floor(substeps - side))
-
     def whole_substeps(self, late: NDArray[np.float64]) -> int:
-        """Sub-steps of lateness that are more than the trigger can take back."""
+        """Return the whole sub-steps of delay that the trigger cannot compensate."""
         too_much = float(late.max()) - self.most_lead - self.most_delay
         return max(0, math.ceil(too_much / self.substep_ticks))
 
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """One recording of a sweep: by how much each arm's line was made later (ticks), and what lay beyond."""
+    """One recording of a sweep: the ticks by which each arm's lines were delayed, and their contributions."""
 
     later: tuple[int, int]
     seen: tuple[Beyond, Beyond]
@@ -97,10 +99,10 @@ class Point:
 
 @dataclass(frozen=True, slots=True)
 class Crossing:
-    """Where light and charge of one arm are together: ``late_ticks`` is what the light lacks without delays.
+    """The delay that aligns light and charge of one arm: ``late_ticks`` is the light's delay without any.
 
-    ``edge_ticks`` is by how much the sides of the sweep are apart, as rounded edges of the light make them;
-    0 where only one side could be seen.
+    ``edge_ticks`` is the difference between the sides of the sweep, caused by rounded edges of the light; 0
+    if only one side was recorded.
     """
 
     late_ticks: float
@@ -117,7 +119,7 @@ def setting_of(exposure: Exposure) -> Setting:
 
 
 def point_of(exposure: Exposure) -> Point:
-    """What a recording of a sweep says, and the delays that it was made with."""
+    """Evaluate a recording of a sweep, together with the delays that it was made with."""
     trigger = exposure.recording.attrs["config"]["trigger"]
     lead, a, b = (
         trigger["light"]["lead_ticks"],
@@ -128,7 +130,7 @@ def point_of(exposure: Exposure) -> Point:
 
 
 def first_sight(point: Point, substep_ticks: int) -> list[float]:
-    """By how many ticks the light of each arm is late without delays, from one recording."""
+    """Estimate from one recording the delay of each arm's light, in ticks, without delays of the trigger."""
     return [
         later + each.late_substeps * substep_ticks
         for later, each in zip(point.later, point.seen, strict=True)
@@ -136,32 +138,33 @@ def first_sight(point: Point, substep_ticks: int) -> list[float]:
 
 
 def lines_for(point: Point, lines: int, substep_ticks: int) -> int:
-    """Lines of each recording with which a sweep finds delays to half a tick, as far as that is sensible."""
+    """Return the lines per recording for a sweep that is certain to half a tick, within sensible limits."""
     error_ticks = max(each.error for each in point.seen) * substep_ticks
     wanted = lines * (SWEEP_ERROR * error_ticks / WANTED_TICKS) ** 2
     return int(min(MOST_LINES, max(FIRST_LINES, -(-wanted // 1024) * 1024)))
 
 
-def delay(exposures: Sequence[Exposure], *, progress: Progress = unseen) -> Finding:
-    """How late the light is for either camera, from recordings with different delays of the trigger.
+def delay(exposures: Sequence[Exposure], *, progress: Progress = no_progress) -> Finding:
+    """Measure each camera's delay of the light, from recordings with different delays of the trigger.
 
-    Needs a scene at rest that is bright at the edges of the field, and the rig's pseudo-random code. Raises
-    UsageError for fewer than two recordings that say something about an arm.
+    This needs a scene at rest that is bright at the edges of the field, and the rig's pseudo-random code.
+    Raises UsageError for fewer than two useful recordings of an arm.
     """
     setting = setting_of(exposures[0])
     if any(setting_of(each) != setting for each in exposures):
         raise UsageError(
-            "recordings with sub-steps of different length are no sweep", possible="one trigger.substep_ticks"
+            "recordings with sub-steps of different length do not form a sweep",
+            possible="one trigger.substep_ticks",
         )
     points = []
     for each in exposures:
         points.append(point_of(each))
         progress(len(points), len(exposures))
-    return found_by(points, exposures, setting)
+    return evaluate_sweep(points, exposures, setting)
 
 
-def found_by(points: Sequence[Point], exposures: Sequence[Exposure], setting: Setting) -> Finding:
-    """What the points of a sweep say."""
+def evaluate_sweep(points: Sequence[Point], exposures: Sequence[Exposure], setting: Setting) -> Finding:
+    """Return the result of a sweep from its points."""
     crossings = [_crossing(points, arm, setting.substep_ticks) for arm in range(len(ARMS))]
     late = np.array([each.late_ticks for each in crossings])
     error = np.array([each.uncertainty for each in crossings])
@@ -179,7 +182,7 @@ def found_by(points: Sequence[Point], exposures: Sequence[Exposure], setting: Se
 
 
 def settings_for(late: NDArray[np.float64], setting: Setting) -> dict[str, int]:
-    """Keys of ``[trigger]`` with which light and charge of both arms are together, as far as they can be."""
+    """Return the keys of ``[trigger]`` that align light and charge of both arms as far as possible."""
     late = late - setting.whole_substeps(late) * setting.substep_ticks
     earlier = max(0.0, -float(late.min()))
     delays = setting.delays((late + earlier).tolist())
@@ -192,7 +195,7 @@ def settings_for(late: NDArray[np.float64], setting: Setting) -> dict[str, int]:
 
 
 def _crossing(points: Sequence[Point], arm: int, substep_ticks: int) -> Crossing:
-    """Of one arm: the delay with which the table in `acquire.calibrate.delay` explains all recordings."""
+    """Fit one arm's delay, with which the table in `acquire.calibrate.delay` explains all recordings."""
     sight = float(np.median([first_sight(point, substep_ticks)[arm] for point in points]))
     later = np.array([point.later[arm] + point.seen[arm].whole * substep_ticks for point in points])
     kept = np.abs(sight - later) > LEAST_SHARE * substep_ticks
@@ -200,22 +203,22 @@ def _crossing(points: Sequence[Point], arm: int, substep_ticks: int) -> Crossing
     if len(set(later)) < 2:
         raise UsageError(
             f"arm {ARMS[arm]}: no two recordings have their light late, or early, by a part of a sub-step",
-            hint="acquire calibrate delay, with the daemon, sweeps by itself",
+            hint="let acquire calibrate delay, with the daemon, make the sweep",
         )
     model = _Model(later, seen, sight, substep_ticks)
-    together = model.fit(rounded=False)
+    sharp = model.fit(rounded=False)
     if (later < sight).all() or (later > sight).all():
-        return Crossing(*together[:2], 0.0)
-    apart = model.fit(rounded=True)
-    if abs(apart[2]) > APART * apart[3]:
-        return Crossing(*apart[:3])
-    return Crossing(*together[:2], 0.0)
+        return Crossing(*sharp[:2], 0.0)
+    rounded = model.fit(rounded=True)
+    if abs(rounded[2]) > APART * rounded[3]:
+        return Crossing(*rounded[:3])
+    return Crossing(*sharp[:2], 0.0)
 
 
 class _Model:
-    """The parts at both ends of a line, as the delay and four rows' light make them; see the table.
+    """Model of the contributions at both ends of a line, given the delay and four rows' light; see the table.
 
-    ``later`` is by how much each recording's lines were made later, whole sub-steps of lateness included.
+    ``later`` is the delay of each recording's lines, including whole sub-steps of the light's delay.
     """
 
     def __init__(
@@ -227,12 +230,12 @@ class _Model:
         self._is_late = later < sight
 
     def fit(self, *, rounded: bool) -> tuple[float, float, float, float]:
-        """The delay and its standard error, and, where ``rounded``, by how much both sides are apart (ticks).
+        """Return the delay and its standard error and, if ``rounded``, the difference of both sides (ticks).
 
-        Rounded edges of the light make it seem later where it is late, and earlier where it is early.
+        Rounded edges of the light make late light seem later, and early light earlier.
         """
         start = [self._sight / self._ticks, 1.0, 1.0, 1.0, 1.0, *([0.0] if rounded else [])]
-        found = least_squares(self._left, start, x_scale=0.1)
+        found = least_squares(self._residual, start, x_scale=0.1)
         spare = found.fun.size - len(start)
         scale = max(1.0, 2 * found.cost / spare) if spare > 0 else 1.0
         slopes = np.asarray(found.jac, np.float64)
@@ -241,7 +244,7 @@ class _Model:
         late = float(found.x[0]) * self._ticks, float(errors[0])
         return (*late, float(found.x[5]) * self._ticks, float(errors[5])) if rounded else (*late, 0.0, 0.0)
 
-    def _left(self, unknown: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _residual(self, unknown: NDArray[np.float64]) -> NDArray[np.float64]:
         delay, X0, X1, Y0, Y1, *edge = unknown
         shift = delay - self._later / self._ticks
         if edge:
@@ -256,26 +259,28 @@ class _Model:
             ],
             axis=1,
         )
-        left: NDArray[np.float64] = ((self._parts - expected) / self._errors[:, None]).ravel()
-        return left
+        residual: NDArray[np.float64] = ((self._parts - expected) / self._errors[:, None]).ravel()
+        return residual
 
 
 def _doubts(error: NDArray[np.float64], facts: dict[str, Any]) -> tuple[str, ...]:
     doubts = []
     if error.max() > 1:
-        doubts.append(f"sure to {error.max():.1f} ticks only: more lines or brighter light, for one tick")
+        doubts.append(
+            f"the uncertainty is {error.max():.1f} ticks: more lines or brighter light would reduce it to one"
+        )
     edge = {arm: ticks for arm, ticks in facts["edge_ticks"].items() if abs(ticks) > APART * error.max()}
     if edge:
         text = " and ".join(f"{abs(ticks):.0f} ticks in arm {arm}" for arm, ticks in edge.items())
-        doubts.append(f"light and charge do not change at once, but over {text}: see the light's edges")
+        doubts.append(f"the light does not change at once, but over {text}: check the light's edges")
     if facts["whole_substeps"]:
         doubts.append(
-            f"the light is late by {facts['whole_substeps']} sub-steps more than the trigger can take back; "
-            "the code stays shifted by them, as acquire status says: a faster light driver or isolator helps"
+            f"the light is late by {facts['whole_substeps']} sub-steps more than the trigger can compensate; "
+            "the code stays shifted by them, as acquire status shows: a faster light driver or isolator helps"
         )
     if "light.open_ticks" in facts["rig"]:
         doubts.append(
-            "the light is early for the later camera, which no lead mends: light.open_ticks cuts off what "
-            "comes too soon, and with it as much of every sub-step's light; a later light would cost none"
+            "the light is early for the later camera, which no lead can correct: light.open_ticks cuts off "
+            "the early part of every sub-step's light; a later light would lose none"
         )
     return tuple(doubts)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from acquire.store import Recording
 
     Progress = Callable[[int, int], object]
-    """Is told how many lines are done, of how many."""
+    """Called with the number of lines done, and of all lines."""
 
 BLOCK_LINES = 1024
 FEWEST_LINES = 16
@@ -46,12 +46,12 @@ SETTINGS = (
     "black_level_dn",
     "responsivity_dn",
 )
-"""What the numbers of a calibration depend on, of the settings that a camera was read back with."""
+"""Settings, as read back from a camera, that the numbers of a calibration depend on."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Exposure:
-    """``lines`` lines from ``first_line`` on of a recording."""
+    """``lines`` lines of a recording from ``first_line`` on."""
 
     recording: Recording
     first_line: int
@@ -63,22 +63,22 @@ class Exposure:
 
     @property
     def code_value(self) -> int | None:
-        """0 or 1 where the light's code is constant, else None."""
+        """0 or 1 if the light's code is constant, else None."""
         code = code_from_attrs(self.recording.attrs["code"])
         return code.value if isinstance(code, ConstantCode) else None
 
     def camera(self, key: str) -> NDArray[np.float64]:
-        """A number of each camera: (arm,)."""
+        """Return a number of each camera: (arm,)."""
         return np.array([float(self.recording.attrs["cameras"][arm][key]) for arm in ARMS])
 
     def blocks(self) -> Iterator[Segment]:
-        """All of it, in blocks that fit into memory."""
+        """Yield all lines in blocks that fit into memory."""
         for first in range(0, self.lines, BLOCK_LINES):
             count = min(BLOCK_LINES, self.lines - first)
             yield self.recording.cut(self.first_line + first, count)
 
     def samples(self) -> Iterator[tuple[NDArray[Any], NDArray[np.bool_]]]:
-        """The same of all columns, whatever they see: samples (arm, line, column) and which can be used."""
+        """Yield the samples (arm, line, column) of all columns, lit or not, and which are usable."""
         if self.recording.fibre is None:
             yield from ((block.lines, block.mask) for block in self.blocks())
             return
@@ -88,18 +88,18 @@ class Exposure:
 
     @property
     def lit(self) -> NDArray[np.bool_]:
-        """Columns (arm, column) that see the scene: behind a fibre those that a band ends on."""
+        """Columns (arm, column) that see the scene: behind a fibre those within a band."""
         fibre = self.recording.fibre
         if fibre is None:
             return np.ones((len(ARMS), self.recording.arms[ARMS[0]].pixels), np.bool_)
         return np.stack([fibre.table(arm)[:, 0] >= 0 for arm in ARMS])
 
     def whole(self) -> Segment:
-        """All of it at once."""
+        """Return all lines at once."""
         return self.recording.cut(self.first_line, self.lines)
 
     def facts(self) -> dict[str, Any]:
-        """Where it is from, as JSON."""
+        """Return the origin of the lines, as JSON."""
         cameras = self.recording.attrs["cameras"]
         warm = {arm: cameras[arm]["DeviceTemperature"] for arm in ARMS if "DeviceTemperature" in cameras[arm]}
         return {
@@ -112,7 +112,10 @@ class Exposure:
 
 
 def open_exposure(place: Path | str, first_line: int | None = None, lines: int | None = None) -> Exposure:
-    """Lines of a recording: all, or as asked. UsageError for too few, and what `open_recording` raises."""
+    """Open all lines of a recording, or those requested.
+
+    Raises UsageError for too few lines, and what `open_recording` raises.
+    """
     recording = open_recording(place)
     first = recording.first_available_line if first_line is None else first_line
     count = recording.first_line + recording.lines - first if lines is None else lines
@@ -125,7 +128,7 @@ def open_exposure(place: Path | str, first_line: int | None = None, lines: int |
 
 
 def instrument_of(recording: Recording) -> Instrument:
-    """The instrument that a recording was made with, as far as it says so."""
+    """Return the instrument that made a recording, as far as the recording describes it."""
     attrs = recording.attrs
     cameras = {}
     for arm in ARMS:
@@ -151,10 +154,10 @@ class Moments:
 
     Attributes
     ----------
-    lines : of each arm that were used
+    lines : number of lines used of each arm
     mean : in DN
     variance : temporal, within blocks of `BLOCK_LINES` lines
-    own_variance : the same without what all columns of a line share, as of light that flickers
+    own_variance : the same without the common part of all columns of a line, as from flickering light
     drift : largest difference of a block's mean from the mean, in standard errors of a block's mean
     at_zero, saturated : share of the samples
     """
@@ -168,12 +171,12 @@ class Moments:
     saturated: NDArray[np.float64]
 
 
-def unseen(done: int, total: int) -> None:
-    """Nobody watches the progress."""
+def no_progress(done: int, total: int) -> None:
+    """Ignore the progress."""
 
 
-def moments(exposure: Exposure, progress: Progress = unseen) -> Moments:
-    """Statistics of an exposure. UsageError where an arm has no usable line."""
+def moments(exposure: Exposure, progress: Progress = no_progress) -> Moments:
+    """Compute the statistics of an exposure. Raises UsageError if an arm has no usable line."""
     white = np.ceil(exposure.camera("white_dn"))[:, None, None]
     parts: list[tuple[NDArray[Any], ...]] = []
     done = 0
@@ -187,9 +190,9 @@ def moments(exposure: Exposure, progress: Progress = unseen) -> Moments:
         raise UsageError(f"{exposure.recording}: an arm has no line that arrived", hint="other lines")
 
     def pooled(values: NDArray[Any], weights: NDArray[Any]) -> NDArray[np.float64]:
-        beside = weights[:, :, None].astype(np.float64)
-        found: NDArray[np.float64] = (values * beside).sum(axis=0) / beside.sum(axis=0).clip(1)
-        return found
+        weights = weights[:, :, None].astype(np.float64)
+        average: NDArray[np.float64] = (values * weights).sum(axis=0) / weights.sum(axis=0).clip(1)
+        return average
 
     mean, variance = pooled(means, counts), pooled(variances, (counts - 1).clip(0))
     errors = np.sqrt(variance / counts.clip(1)[:, :, None]).clip(1e-9)
@@ -225,16 +228,16 @@ def _block_moments(
 
 
 def _own_variance(samples: NDArray[np.float64], mean: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Temporal variance of columns without the factor that all columns of a line share.
+    """Return the temporal variance of columns without the factor that all columns of a line share.
 
-    The factor of a line is the mean of its samples beside those of all; taking it away takes the part
-    g_j/Σg of a column's own noise along, for which the result is corrected.
+    The factor of a line is the mean of its samples relative to those of all lines. Removing it also removes
+    the share g_j/Σg of a column's own noise, for which the result is corrected.
     """
     share = mean / mean.sum() if mean.sum() > 0 else np.full(len(mean), 1 / len(mean))
     change = samples - mean
-    left = change - change.sum(axis=1, keepdims=True) * share
-    raw = (left**2).sum(axis=0) / (len(samples) - 1)
-    # Var(left_j) = v_j·(1 − 2·s_j) + s_j²·Σv, with Σv = Σ raw / (1 − Σs²) to first order
+    own_change = change - change.sum(axis=1, keepdims=True) * share
+    raw = (own_change**2).sum(axis=0) / (len(samples) - 1)
+    # Var(own_change_j) = v_j·(1 − 2·s_j) + s_j²·Σv, with Σv = Σ raw / (1 − Σs²) to first order
     total = raw.sum() / max(1 - float((share**2).sum()), 0.5)
     own: NDArray[np.float64] = (raw - share**2 * total) / np.maximum(1 - 2 * share, 0.1)
     return own

@@ -1,8 +1,8 @@
-"""A flat whose light ends at the field's edge: what arm B does not see of it is no gain of its columns.
+"""Correction of a flat whose light ends at the field's edge: arm B's missing light is not a gain of columns.
 
-Arm B looks some pixels beside arm A. Where a flat is larger than the field it sees light there as well; where
-it is not, the columns at its edge are dark in part, and a turn gives the columns between a slope. Once the
-alignment is known, so is either profile, and the columns at the edge tell which of them it was.
+Arm B's view is displaced from arm A's by some pixels. If the flat is larger than the field, arm B sees light
+there, too. Otherwise the columns at its edge are partly dark, and a turn gives the columns in between a
+slope. Once the alignment is known, so are both profiles, and the columns at the edge show which one applies.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ if TYPE_CHECKING:
     from acquire.calibrate.calibration import Calibration
 
 TELLS = 0.02
-"""Light that a column must lack for it to be a witness."""
+"""Least light that a column must lack to distinguish the two profiles."""
 BETTER = 0.25
-"""Of the squared error of the whole field, below which the field that ends is believed."""
+"""Largest squared error of the ending field, relative to the unlimited one, with which it is accepted."""
 LEAST_LIGHT = 0.3
-"""Of a column's, below which its gain is not calculated from what is left."""
+"""Least share of its light with which a column's gain is still computed."""
 BALANCE_ERROR = 5e-4
-"""What some hundredths of a pixel leave in doubt."""
+"""Uncertainty of the balance from some hundredths of a pixel in the alignment."""
 
 
 def profile(alignment: Alignment, stages: int, substeps: int) -> NDArray[np.float64]:
-    """Part of the light that each pixel of arm B gets where nothing is lit beyond arm A's field: (M,).
+    """Return the share of light that each pixel of arm B gets if only arm A's field is lit: (M,).
 
-    Of a fine pixel that reaches over the field's edge, the part within it.
+    A fine pixel across the field's edge gets the share of its area within the field.
     """
     size = stages * substeps
     down, right = (np.clip(np.minimum(each + 1, size - each), 0, 1) for each in alignment.sources(size))
@@ -41,11 +41,11 @@ def profile(alignment: Alignment, stages: int, substeps: int) -> NDArray[np.floa
     return lit
 
 
-def mended(known: Calibration, alignment: Alignment) -> dict[str, Measured]:
-    """Gain and balance without the profile of a flat that ends at the field's edge; nothing where it goes on.
+def without_field_edge(known: Calibration, alignment: Alignment) -> dict[str, Measured]:
+    """Return gain and balance without the profile of a flat that ends at the field's edge; else nothing.
 
-    ``known`` holds the flat, and the orientation if it was found. Nor is it a gain that the edge is blurred:
-    columns that `flat` left at 1 stay there.
+    ``known`` holds the flat, and the orientation if it was measured. Columns that `flat` left at 1, because
+    the edge is blurred, stay there.
     """
     step = known.steps.get("flat", {})
     if not {"gain", "balance"} <= known.quantities.keys() or "edge_response" not in step:
@@ -57,17 +57,17 @@ def mended(known: Calibration, alignment: Alignment) -> dict[str, Measured]:
         lit = lit[::-1]
     gain, balance = known.quantities["gain"], known.quantities["balance"]
     hidden = {int(column): value for column, value in step["edge_response"].get(name, {}).items()}
-    seen = gain.value[arm].copy()
-    seen[list(hidden)] = list(hidden.values())
+    response = gain.value[arm].copy()
+    response[list(hidden)] = list(hidden.values())
     witnesses = lit < 1 - TELLS
-    dark, whole = (float(((seen - each)[witnesses] ** 2).sum()) for each in (lit, 1.0))
-    if not witnesses.any() or dark > BETTER * whole:
+    ending, unlimited = (float(((response - each)[witnesses] ** 2).sum()) for each in (lit, 1.0))
+    if not witnesses.any() or ending > BETTER * unlimited:
         return {}
-    told = lit > LEAST_LIGHT
-    told[list(hidden)] = False
-    own = gain.value[arm, told] / lit[told]
+    corrected = lit > LEAST_LIGHT
+    corrected[list(hidden)] = False
+    own = gain.value[arm, corrected] / lit[corrected]
     gains, arms = gain.value.copy(), balance.value.copy()
-    gains[arm, told] = own / own.mean()
+    gains[arm, corrected] = own / own.mean()
     arms[arm] *= own.mean()
     return {
         "gain": Measured(gains, gain.uncertainty),

@@ -1,9 +1,9 @@
-"""A calibration on disk: a Zarr v3 group whose arrays open in zarr-python and xarray without us.
+"""A calibration on disk: a Zarr v3 group whose arrays open in zarr-python and xarray without this program.
 
 ::
 
-    NAME.zarr/   attributes: format, instrument, orientation, alignment, steps (how each was found, and when)
-      gain       (arm, column) float64, with ``units`` and ``long_name``; and so on, as far as measured
+    NAME.zarr/   attributes: format, instrument, orientation, alignment, steps (how and when each was done)
+      gain       (arm, column) float64, with ``units`` and ``long_name``; likewise every measured quantity
       gain_uncertainty
 """
 
@@ -34,13 +34,13 @@ if TYPE_CHECKING:
 
 UNCERTAINTY = "_uncertainty"
 ROOT = "zarr.json"
-HINT = "the path of a calibration (a directory NAME.zarr), as `acquire calibrate dark … --out` writes one"
+HINT = "the path of a calibration (a directory NAME.zarr), as `acquire calibrate dark … --out` writes it"
 
 
 def save_calibration(place: Path | str, calibration: Calibration) -> None:
-    """Write a calibration; one that is at the path already is replaced as a whole, anything else is not.
+    """Write a calibration. An existing one is replaced as a whole; anything else is refused.
 
-    Raises UsageError for what cannot be written, StoreError when the disk refuses.
+    Raises UsageError if it cannot be written, StoreError if the disk refuses.
     """
     if is_url(place) or not os.path.lexists(place):
         _deliver(delivery_to(place), place, calibration)
@@ -60,7 +60,7 @@ def save_calibration(place: Path | str, calibration: Calibration) -> None:
 def open_calibration(place: Path | str) -> Calibration:
     """Open a calibration, here or at a URL.
 
-    Raises PlaceError where there is none, DataError for a damaged one, StoreError where that cannot be told.
+    Raises PlaceError if there is none, DataError if it is damaged, StoreError if the store cannot be read.
     """
     source = source_of(place)
     with refused(source, "read"):

@@ -1,6 +1,7 @@
-"""The steps of a calibration as somebody does them: what to put in front of the lens, and how many lines.
+"""The steps of a calibration for the person who does them: what to put in front of the lens, how many lines.
 
-In the order in which a new instrument needs them. The command line and the operator's page both ask here.
+They are in the order in which a new instrument needs them. Both the command line and the operator's page use
+this list.
 """
 
 from __future__ import annotations
@@ -11,14 +12,14 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Step:
-    """One sitting: what to do before it, its light, and the steps of a calibration that it finds.
+    """One session: its preparation, its light, and the calibration steps that it completes.
 
     Attributes
     ----------
-    lines : of each recording, unless somebody says otherwise; None: as many as it takes
+    lines : default for each recording; None means as many as needed
     least_lines : fewer are refused
-    code : what the light follows, as in `acquire.client.Client.arm`
-    after : name of the step that it needs; empty: none
+    code : the light's code, as in `acquire.client.Client.arm`
+    after : name of the step that must precede it, or empty
     """
 
     name: str
@@ -32,9 +33,9 @@ class Step:
 
 MOST_LINES = 2**20
 LINES = 1024
-"""That each recording has; see `acquire calibrate dark --help` and its neighbours for what they give."""
+"""Lines per recording; see `acquire calibrate dark --help` and the other steps for the precision."""
 RAMP_LINES = 512
-"""A mean over a camera's columns to a part in 10⁴, as steady as lamps are from one recording to the next."""
+"""Lines for a mean over the columns to a part in 10⁴, the stability of lamps between recordings."""
 LEAST_SWEEP_LINES = 1024
 
 DELAY = Step(
@@ -77,9 +78,9 @@ PSF = Step(
     "rig",
     ("psf",),
 )
-"""Not after dark or flat: it asks how wide edges are, which columns that differ by 3 % leave as it is."""
+"""It needs neither dark nor flat, since columns that differ by 3 % do not change the width of edges."""
 STEPS = (DELAY, DARK, LINEARITY, FLAT, TARGET, PSF)
 AT_ONCE = (DARK, FLAT, TARGET)
-"""Those of `acquire calibrate all`, of one recording each."""
-WHERE_WANTED = (PSF,)
-"""Of one recording each, too, after those, and only where somebody asks for them."""
+"""The steps of `acquire calibrate all`, with one recording each."""
+OPTIONAL = (PSF,)
+"""Optional steps after those, with one recording each."""

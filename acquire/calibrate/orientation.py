@@ -1,13 +1,13 @@
-"""Which of eight views of the scene arm B has beside arm A's, and what puts its lines right.
+"""Arm B's orientation: which of eight views of the scene it has, and the correction of its lines.
 
-A view is the scene mirrored left to right if so, then turned counter-clockwise, as the scene files say it.
-The dual arm needs B's charge to move across A's: a turn of 90 or 270 degrees.
+A view is the scene, optionally mirrored left to right, then turned counter-clockwise, as in scene files. The
+dual arm needs B's charge to move across A's: a turn of 90 or 270 degrees.
 
     turn 90             the model's own
     turn 270            the arms are swapped: B is what the model calls A
     turn 270, mirrored  B's pixels are in the wrong order
     turn 90, mirrored   both
-    turn 0 or 180       both cameras transfer along the same axis: nothing can put that right
+    turn 0 or 180       both cameras transfer along the same axis, which cannot be corrected
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ if TYPE_CHECKING:
     from acquire.lines import Segment
 
 CLEAR = 1.5
-"""Ratio of the best view's correlation to the next one's from which on it is the answer."""
+"""Least ratio of the best view's correlation to the next one's for a clear result."""
 LEAST_CORRELATION = 0.25
 FARTHEST = 0.25
-"""Of the field: the largest shift that is looked at."""
+"""Largest shift that is tried, relative to the field."""
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """How one arm sees the scene, in words and as a map of frames."""
+    """One arm's view of the scene, by name and as a map of frames."""
 
     turn_deg: int
     mirrored: bool
@@ -53,33 +53,33 @@ class View:
         return self.crosses and (self.turn_deg == 270) != self.mirrored
 
     def seen(self, frames: NDArray[Any]) -> NDArray[Any]:
-        """The scene (…, row, column) in this view."""
+        """Return the scene (…, row, column) in this view."""
         shown = frames[..., ::-1] if self.mirrored else frames
         return np.rot90(shown, self.turn_deg // 90, axes=(-2, -1))
 
-    def unseen(self, frames: NDArray[Any]) -> NDArray[Any]:
-        """The scene of what is seen in this view."""
+    def restored(self, frames: NDArray[Any]) -> NDArray[Any]:
+        """Return the scene of frames in this view: the inverse of `seen`."""
         turned = np.rot90(frames, -(self.turn_deg // 90), axes=(-2, -1))
         return turned[..., ::-1] if self.mirrored else turned
 
 
 VIEWS = tuple(View(turn, mirrored) for mirrored in (False, True) for turn in (90, 270, 0, 180))
 MODEL = VIEWS[0]
-"""What arm B sees in Eq. (4)."""
+"""Arm B's view in Eq. (4)."""
 
 
 def view_named(name: str) -> View:
-    """UsageError for a name that none has."""
-    found = {view.name: view for view in VIEWS}
-    if name not in found:
-        raise UsageError(f"there is no orientation {name!r}", possible="; ".join(found))
-    return found[name]
+    """Return the view of that name. Raises UsageError if there is none."""
+    views = {view.name: view for view in VIEWS}
+    if name not in views:
+        raise UsageError(f"there is no orientation {name!r}", possible="; ".join(views))
+    return views[name]
 
 
 def oriented(segment: Segment, view: View) -> Segment:
-    """The lines as the model expects them, of an instrument whose arm B has ``view``.
+    """Convert the lines of an instrument whose arm B has ``view`` to those that the model expects.
 
-    Where the arms are swapped, the video is what camera B sees. UsageError where both cameras transfer along
+    If the arms are swapped, the video shows camera B's view. Raises UsageError if both cameras transfer along
     the same axis.
     """
     if view == MODEL:
@@ -97,13 +97,13 @@ def oriented(segment: Segment, view: View) -> Segment:
 
 
 def correlations(a: NDArray[Any], b: NDArray[Any]) -> dict[View, tuple[float, tuple[float, float]]]:
-    """How well camera B's image fits camera A's in each view, and at which shift, in pixels of the images.
+    """Return for each view the correlation of camera B's image with camera A's, and its shift in pixels.
 
-    Both are (M, M) in their camera's own rows and columns; of each the mean is taken away, and what is
-    smooth: two views of one lamp are alike too.
+    Both images are (M, M) in their camera's own rows and columns. Mean and smooth parts are removed, because
+    different views of one lamp are alike in these.
     """
     left = _whitened(a)
-    return {view: _peak(left, _whitened(view.unseen(b))) for view in VIEWS}
+    return {view: _peak(left, _whitened(view.restored(b))) for view in VIEWS}
 
 
 def _whitened(image: NDArray[Any]) -> NDArray[np.float64]:
@@ -116,7 +116,7 @@ def _whitened(image: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def _peak(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[float, tuple[float, float]]:
-    """Largest normalised cross-correlation, and the shift of ``b`` beside ``a``."""
+    """Return the largest normalised cross-correlation, and the shift of ``b`` relative to ``a``."""
     size = 2 * len(a)
     product = np.conj(np.fft.rfft2(a, (size, size))) * np.fft.rfft2(b, (size, size))
     found = np.fft.irfft2(product, (size, size))

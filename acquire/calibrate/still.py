@@ -1,9 +1,9 @@
-"""What one arm alone sees of a scene at rest: more equations than unknowns, so no prior is needed.
+"""Image of a scene at rest from one arm alone: there are more equations than unknowns, so no prior is needed.
 
-Of a scene at rest, line i of an arm is Σ_m E(m + i·S)·z(m), where z is the image summed over S rows at a time
-and m its last row (Eq. 1 with the sums over u and r in the other order). z has n + S − 1 rows, all of them
-fine, and M columns: box-filtered over S × S fine pixels, and sampled at every row. Arm B's is sampled at
-every column of arm A's view instead.
+For a scene at rest, line i of an arm is Σ_m E(m + i·S)·z(m), where z is the image summed over S rows at a
+time and m its last row (Eq. 1 with the sums over u and r in the other order). z has n + S − 1 rows, all of
+them fine, and M columns: it is box-filtered over S × S fine pixels and sampled at every row. Arm B's is
+sampled at every column of arm A's view instead.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from acquire.lines import Segment
 
 SPARE = 1.25
-"""Lines per unknown below which noise makes nothing of an image."""
+"""Least number of lines per unknown; with fewer, noise dominates the image."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -34,7 +34,7 @@ class Still:
     ----------
     image : (n + S − 1, M) in the arm's own rows and columns, scene units summed over S × S fine pixels
     uncertainty : standard deviation of its elements
-    misfit : RMS of what it does not explain of the lines, relative to their RMS
+    misfit : RMS residual of the lines, relative to their RMS
     usable : (M,) columns with samples
     """
 
@@ -44,24 +44,22 @@ class Still:
     usable: NDArray[np.bool_]
 
     def blocks(self, substeps: int) -> NDArray[np.float64]:
-        """Of S × S fine pixels without overlap: (M, M)."""
+        """Return the image in blocks of S × S fine pixels without overlap: (M, M)."""
         found: NDArray[np.float64] = self.image[substeps - 1 :: substeps]
         return found
 
 
 def stills(segment: Segment) -> tuple[Still, Still]:
-    """Both arms' images of a scene at rest. UsageError for too few lines, or a code that says too little."""
-    samples = segment.samples(np.float64)
-    windows = _windows(segment.code, segment.geometry)
-    a, b = (_still(samples[arm], segment.mask[arm], windows, segment.geometry) for arm in range(len(samples)))
+    """Solve for both arms' images of a scene at rest.
+
+    Raises UsageError for too few lines, and for a code that does not determine an image.
+    """
+    samples, geometry = segment.samples(np.float64), segment.geometry
+    width = geometry.size + geometry.substeps - 1
+    view = np.lib.stride_tricks.sliding_window_view(segment.code, width)[:: geometry.substeps]
+    windows = view[: geometry.lines].astype(np.float64)  # E(m + i·S): (L_R, n + S − 1)
+    a, b = (_still(samples[arm], segment.mask[arm], windows, geometry) for arm in range(len(samples)))
     return a, b
-
-
-def _windows(code: NDArray[np.uint8], geometry: Geometry) -> NDArray[np.float64]:
-    """E(m + i·S): (L_R, n + S − 1)."""
-    width, S = geometry.size + geometry.substeps - 1, geometry.substeps
-    view = np.lib.stride_tricks.sliding_window_view(code, width)[::S]
-    return view[: geometry.lines].astype(np.float64)
 
 
 def _still(
@@ -73,7 +71,7 @@ def _still(
     needed = int(np.ceil(SPARE * windows.shape[1]))
     if lines.sum() < needed:
         raise UsageError(
-            f"{lines.sum()} whole lines do not show an image of {windows.shape[1]} rows",
+            f"{lines.sum()} complete lines do not determine an image of {windows.shape[1]} rows",
             possible=f"{needed} or more; {4 * geometry.size} for a good one",
             hint="more lines of a target at rest, not saturated",
         )
@@ -83,14 +81,14 @@ def _still(
         factor = cho_factor(A.T @ A)
     except LinAlgError as error:
         raise UsageError(
-            "the light's code does not tell the rows of the scene apart",
+            "the light's code does not distinguish the rows of the scene",
             possible="a pseudo-random code",
             hint="a run with code.kind = 'prbs'",
         ) from error
     image = cho_solve(factor, A.T @ y)
-    left = y - A @ image
+    residual = y - A @ image
     spare = lines.sum() - windows.shape[1]
-    noise = float(np.sqrt((left**2).sum() / (spare * max(usable.sum(), 1))))
+    noise = float(np.sqrt((residual**2).sum() / (spare * max(usable.sum(), 1))))
     inverse = cho_solve(factor, np.eye(windows.shape[1]))
     level = float(np.sqrt((y[:, usable] ** 2).mean()))
     return Still(

@@ -1,4 +1,4 @@
-"""Steps that look at a target at rest under a pseudo-random code: orientation and alignment of the arms."""
+"""Steps with a target at rest under a pseudo-random code: orientation and alignment of the arms."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from acquire.calibrate.align import Match, align
 from acquire.calibrate.apply import calibrated
 from acquire.calibrate.calibration import Finding, Measured, TileAlignment
-from acquire.calibrate.field import mended
+from acquire.calibrate.field import without_field_edge
 from acquire.calibrate.orientation import (
     CLEAR,
     LEAST_CORRELATION,
@@ -29,34 +29,46 @@ if TYPE_CHECKING:
     from acquire.lines import Segment
 
 MOVES = 3.0
-"""Misfit beside the lines' own noise from which on a target is not at rest."""
+"""Misfit, relative to the lines' own noise, from which a target is not at rest."""
 MOST_LINES = 4096
-"""That are looked at; more do not make an alignment better than its model."""
+"""Upper limit on the lines used; more do not make an alignment better than its model."""
 UNLIKE = 0.5
-"""Misfit of the arms' images, of their variation, beyond which they are not taken to show the same."""
+"""Misfit of the arms' images, relative to their variation, beyond which they do not show the same."""
 SAME_BALANCE = 0.002
 BALANCE_ERROR = 0.001
-"""Of the ratio of the arms' light over the field that both see."""
+"""Uncertainty of the ratio of the arms' light over the field that both see."""
 
 
 def orientation(exposure: Exposure, known: Calibration) -> Finding:
-    """Which of eight views of the scene arm B has. One that is not clear is not told: the finding has None.
+    """Find which of eight views of the scene arm B has; None in the finding if it is not clear.
 
-    Raises UsageError for too few lines, and for a code that tells nothing.
+    Raises UsageError for too few lines, and for a code that does not determine an image.
     """
     still_a, still_b = stills(_segment(exposure, replace(known, orientation=None, alignment=None)))
-    view, facts = told(still_a, still_b, exposure.instrument.substeps)
+    view, facts = clearest_view(still_a, still_b, exposure.instrument.substeps)
+    warnings: tuple[str, ...] = ()
+    if view is None:
+        warnings = (
+            f"the orientation is not clear: the best view correlates with {facts['correlation']:.2f}, "
+            f"{facts['next']['view']} with {facts['next']['correlation']:.2f}; a target with sharp, "
+            "irregular texture would show it",
+        )
+    elif not view.crosses:
+        warnings = (
+            f"arm B sees the scene with {view.name}: both cameras transfer along the same axis; turn one of "
+            "them by 90 degrees",
+        )
     return Finding(
         "orientation",
         exposure.instrument,
         orientation=None if view is None else view.name,
         facts={**exposure.facts(), **facts},
-        warnings=_warnings(view, facts),
+        warnings=warnings,
     )
 
 
-def told(a: Still, b: Still, substeps: int) -> tuple[View | None, dict[str, Any]]:
-    """The view that fits the arms' images, if it is clear which, and how clear."""
+def clearest_view(a: Still, b: Still, substeps: int) -> tuple[View | None, dict[str, Any]]:
+    """Return the view that fits the arms' images, or None if it is not clear, and the correlations."""
     found = correlations(a.blocks(substeps), b.blocks(substeps))
     ranked = sorted(found, key=lambda view: -found[view][0])
     best, following = found[ranked[0]][0], max(found[ranked[1]][0], 1e-3)
@@ -69,39 +81,24 @@ def told(a: Still, b: Still, substeps: int) -> tuple[View | None, dict[str, Any]
     return (ranked[0] if clear else None), facts
 
 
-def _warnings(view: View | None, facts: dict[str, Any]) -> tuple[str, ...]:
-    if view is None:
-        return (
-            f"cannot tell: the best view correlates with {facts['correlation']:.2f}, "
-            f"{facts['next']['view']} with {facts['next']['correlation']:.2f}; a target with sharp, "
-            "irregular texture tells",
-        )
-    if not view.crosses:
-        return (
-            f"arm B sees the scene with {view.name}: both cameras transfer along the same axis; turn one of "
-            "them by 90 degrees",
-        )
-    return ()
-
-
 def alignment(exposure: Exposure, known: Calibration) -> Finding:
-    """Where arm B's image lies on arm A's, and the arms' balance over the field that both see.
+    """Measure arm B's alignment with arm A, and the arms' balance over the field that both see.
 
-    Raises UsageError for a target that does not tell, or that shows another orientation than is known.
+    Raises UsageError for a target that does not determine it, or that shows another orientation than known.
     """
     segment = _segment(exposure, replace(known, alignment=None))
     geometry, S = segment.geometry, segment.geometry.substeps
     still_a, still_b = stills(segment)
-    view, facts = told(still_a, still_b, S)
+    view, facts = clearest_view(still_a, still_b, S)
     if view is not None and view != MODEL:
-        believed = MODEL.name if known.orientation is None else known.orientation
+        expected = MODEL.name if known.orientation is None else known.orientation
         raise UsageError(
-            f"{exposure.recording}: arm B does not see the scene with {believed}, as was believed",
-            hint="acquire calibrate orientation, with the same recording",
+            f"{exposure.recording}: arm B does not see the scene with {expected}, the known orientation",
+            hint="run acquire calibrate orientation with the same recording",
         )
     shift = correlations(still_a.blocks(S), still_b.blocks(S))[MODEL][1]
     match = align(still_a, still_b, geometry, (S * shift[0], S * shift[1]))
-    quantities = mended(known, match.found.alignment)
+    quantities = without_field_edge(known, match.found.alignment)
     ends = bool(quantities)
     if not ends:
         quantities = _balance(known, match)
@@ -116,13 +113,13 @@ def alignment(exposure: Exposure, known: Calibration) -> Finding:
     warnings = []
     if ends:
         warnings.append(
-            "the flat's light ends at the field's edge, beyond which arm B looks: gain and balance are "
-            "corrected; a larger white scene is better"
+            "the flat's light ends at the field's edge, and arm B sees beyond it: gain and balance are "
+            "corrected, but a larger white scene is better"
         )
     elif quantities:
         warnings.append(
-            f"over the field that both arms see, arm B is {match.brightness - 1:+.1%} brighter than the flat "
-            "says: the balance is corrected"
+            f"over the field that both arms see, arm B is {match.brightness - 1:+.1%} brighter than in the "
+            "flat: the balance is corrected"
         )
     return Finding(
         "align",
@@ -135,10 +132,10 @@ def alignment(exposure: Exposure, known: Calibration) -> Finding:
 
 
 def tile_alignments(exposure: Exposure, known: Calibration) -> Finding:
-    """Where arm B's image lies on arm A's in each tile behind a fibre, whose bands lie a little beside their
-    places. A tile in which the target does not tell is left out, and named.
+    """Measure arm B's alignment with arm A in each tile behind a fibre, whose bands are slightly displaced.
 
-    Raises UsageError where it tells in none.
+    A tile in which the target does not determine it is left out and named in a warning. Raises UsageError if
+    no tile remains.
     """
     recording, bare = exposure.recording, replace(known, orientation=None, alignment=None, tiles=())
     assert recording.fibre is not None
@@ -159,7 +156,7 @@ def tile_alignments(exposure: Exposure, known: Calibration) -> Finding:
         found.append(TileAlignment(str(tile), segment.first_column, match.found))
     if not found:
         raise UsageError(
-            f"{recording}: the target tells in no tile how arm B lies on arm A",
+            f"{recording}: the target does not determine the alignment of the arms in any tile",
             possible="sharp dots or a binary pattern of 2 to 6 fine pixels all over",
         )
     facts = {**exposure.facts(), "lines": lines, "tiles": len(found)}
@@ -167,7 +164,7 @@ def tile_alignments(exposure: Exposure, known: Calibration) -> Finding:
 
 
 def _balance(known: Calibration, match: Match) -> dict[str, Measured]:
-    """The arms' balance, where what both see is brighter in one of them."""
+    """Return the corrected balance if the common field is brighter in one arm; else nothing."""
     if abs(match.brightness - 1) <= SAME_BALANCE:
         return {}
     before = known.value("balance")
@@ -181,7 +178,7 @@ def _balance(known: Calibration, match: Match) -> dict[str, Measured]:
 def _segment(exposure: Exposure, known: Calibration) -> Segment:
     if exposure.code_value is not None:
         raise UsageError(
-            f"{exposure.recording} has a constant code, which does not tell the rows of a scene apart",
+            f"{exposure.recording} has a constant code, which does not distinguish the rows of a scene",
             possible="a pseudo-random code: code.kind = 'prbs'",
         )
     lines = min(exposure.lines, MOST_LINES)

@@ -1,4 +1,4 @@
-"""The step ``transfer``: electrons behind the numbers, by EMVA 1288's photon transfer method."""
+"""The step ``transfer``: conversion of DN to electrons, by EMVA 1288's photon transfer method."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from acquire.calibrate.checks import (
     refuse_coded,
 )
 from acquire.calibrate.curve import straightened
-from acquire.calibrate.exposure import moments, unseen
+from acquire.calibrate.exposure import moments, no_progress
 from acquire.errors import UsageError
 from acquire.lines import ARMS
 
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 
 
 FALLEN = 3.0
-"""Standard errors by which a level's variance is below the one before it where pixels are full."""
+"""Standard errors by which a level's variance falls below the preceding one when pixels are full."""
 ROUGHLY = 0.05
-"""Relative uncertainty of a full well that lies somewhere between two levels."""
+"""Relative uncertainty of a full well between two levels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,12 +44,15 @@ class Point:
     saturated: float
 
 
-def transfer(exposures: Sequence[Exposure], known: Calibration, *, progress: Progress = unseen) -> Finding:
-    """DN per electron, read noise and, where the lines reach it, full well: EMVA 1288's photon transfer.
+def transfer(
+    exposures: Sequence[Exposure], known: Calibration, *, progress: Progress = no_progress
+) -> Finding:
+    """Measure DN per electron, read noise and, if the lines reach it, full well.
 
-    K = (σ² − σ_d²) / (μ − μ_d) (EMVA 1288 Eq. 13), without what all columns of a line share, which is the
-    light's doing and not the sensor's; over the levels of ``exposures`` up to where pixels are full. Raises
-    UsageError without a dark, for a light that is not steady, and for lines without shot noise.
+    K = (σ² − σ_d²) / (μ − μ_d) (EMVA 1288 Eq. 13), over the levels of ``exposures`` until pixels are full.
+    Variations common to all columns of a line are excluded, since they come from the light and not from the
+    sensor. Raises UsageError without a dark, for a light that is not steady, and for lines without shot
+    noise.
     """
     dark_lines = int(known.steps.get("dark", {}).get("lines", 0))
     offset = offset_of(known, "transfer")
@@ -89,8 +92,9 @@ def transfer(exposures: Sequence[Exposure], known: Calibration, *, progress: Pro
 
 
 def _slope(points: list[Point], arm: str) -> tuple[float, float, float]:
-    """K and its standard error from levels that grow, and the light in DN of the last one before pixels are
-    full (inf: they are not).
+    """Return K, its standard error, and the light in DN of the last level before pixels are full, or inf.
+
+    ``points`` are in the order of rising light.
     """
     kept: list[Point] = []
     full_dn = float("inf")
@@ -104,7 +108,7 @@ def _slope(points: list[Point], arm: str) -> tuple[float, float, float]:
     if not kept:
         raise UsageError(
             f"arm {arm} has no level between {LOWEST_LIGHT_DN:g} DN and where pixels are full",
-            hint="flats at 10 to 90 % of white",
+            hint="record flats at 10 to 90 % of white",
         )
     weights = np.array([(point.light / point.error) ** 2 for point in kept])
     slopes = np.array([point.variance / point.light for point in kept])
@@ -113,6 +117,6 @@ def _slope(points: list[Point], arm: str) -> tuple[float, float, float]:
         raise UsageError(
             f"the lines of arm {arm} have no more noise in the light than in the dark",
             possible="shot noise that the lines resolve",
-            hint="brighter flats, more lines",
+            hint="record brighter flats, or more lines",
         )
     return K, error, full_dn

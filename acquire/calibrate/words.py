@@ -1,4 +1,4 @@
-"""What ``acquire calibrate`` found, in words: values, and how sure they are."""
+"""Results of ``acquire calibrate`` in words: values and their uncertainties."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from acquire.calibrate.check import Check
 
 PER_ARM = {
-    "balance": ("arm's light beside the mean", ""),
+    "balance": ("arm's light relative to the mean", ""),
     "dn_per_electron": ("DN per electron", ""),
     "read_noise_e": ("read noise", " e"),
     "full_well_e": ("full well", " e"),
@@ -30,7 +30,7 @@ PER_COLUMN = {
 
 
 def found_facts(found: Finding) -> dict[str, Any]:
-    """Name → value and uncertainty, in words."""
+    """Describe a finding: name → value and uncertainty, in words."""
     facts: dict[str, Any] = {"step": f"{found.step}, {found.facts.get('lines', 0)} lines"}
     facts |= _quantities(found.quantities)
     if found.step == "flat":
@@ -39,7 +39,15 @@ def found_facts(found: Finding) -> dict[str, Any]:
     if found.step == "psf":
         facts["edges"] = ", ".join(f"{arm} {found.facts[arm]['edges']}" for arm in "ab")
     if found.step == "linearity":
-        facts |= _linearity(found)
+        columns = (found.facts[name] for name in ("levels", "reached", "left_over", "powers"))
+        rows = list(zip("ab", *columns, strict=True))
+        facts["levels"] = "; ".join(
+            f"{arm} {count}, up to {part:.0%} of saturation" for arm, count, part, *_ in rows
+        )
+        facts["left over"] = "; ".join(
+            f"{arm} {100 * error:.2g} % with the curve" if powers else f"{arm} is straight: no curve"
+            for arm, _, _, error, powers in rows
+        )
     if found.step == "delay":
         tick_ns = 1e9 / found.facts["clock_hz"]
         late = found.quantities["light_late_ticks"].value * tick_ns
@@ -60,7 +68,7 @@ def found_facts(found: Finding) -> dict[str, Any]:
 
 
 def known_facts(known: Calibration) -> dict[str, Any]:
-    """All that a calibration holds, in words."""
+    """Describe all that a calibration holds, in words."""
     instrument = known.instrument
     facts: dict[str, Any] = {
         "instrument": f"M = {instrument.stages}, S = {instrument.substeps}, {instrument.layout}",
@@ -82,7 +90,7 @@ def known_facts(known: Calibration) -> dict[str, Any]:
 
 
 def compared_rows(found: Check) -> list[dict[str, str]]:
-    """What was compared, one row each."""
+    """Return one row for each compared quantity."""
     return [
         {
             "quantity": each.quantity,
@@ -99,12 +107,19 @@ def _quantities(quantities: Any) -> dict[str, str]:
     facts = {}
     for name, (label, unit) in PER_COLUMN.items():
         if name in quantities:
-            facts[label] = _range(quantities[name], unit)
+            measured = quantities[name]
+            arms = "; ".join(
+                f"{arm} {row.mean():.2f}{unit} ({row.min():.2f} to {row.max():.2f})"
+                for arm, row in zip("ab", measured.value, strict=True)
+            )
+            worst = f"{measured.uncertainty.max():.2g}{unit}"
+            facts[label] = f"{arms}; uncertain by {worst} in the worst column"
     if "gain" in quantities:
         gain = quantities["gain"]
         spread = " and ".join(f"{row.std():.2%}" for row in gain.value)
         facts["gain"] = (
-            f"spread {spread} over the columns of a and b; sure to {np.median(gain.uncertainty):.2%} a column"
+            f"spread {spread} over the columns of a and b, each uncertain by "
+            f"{np.median(gain.uncertainty):.2%}"
         )
     for name, (label, unit) in PER_ARM.items():
         if name in quantities:
@@ -119,22 +134,8 @@ def _quantities(quantities: Any) -> dict[str, str]:
     return facts
 
 
-def _linearity(found: Finding) -> dict[str, str]:
-    columns = (found.facts[name] for name in ("levels", "reached", "left_over", "powers"))
-    rows = list(zip("ab", *columns, strict=True))
-    return {
-        "levels": "; ".join(
-            f"{arm} {count}, up to {part:.0%} of saturation" for arm, count, part, *_ in rows
-        ),
-        "left over": "; ".join(
-            f"{arm} {left:.2g} % with the curve" if powers else f"{arm} is straight: no curve"
-            for arm, _, _, left, powers in ((*row[:3], 100 * row[3], row[4]) for row in rows)
-        ),
-    }
-
-
 def _curve(measured: Measured) -> str:
-    """Where samples are off the most, and how sure that is."""
+    """Describe the largest excess of each arm, with its uncertainty and position."""
     worst = np.abs(measured.value).argmax(axis=1)
     ends = measured.value.shape[1] - 1
     return "; ".join(
@@ -144,24 +145,18 @@ def _curve(measured: Measured) -> str:
 
 
 def _blur(measured: Measured) -> str:
-    """Standard deviations, or that there is none that can be told."""
-    told = []
+    """Describe each standard deviation, or its limit if it is not clearly above 0."""
+    widths = []
     for arm, row, errors in zip("ab", measured.value, measured.uncertainty, strict=True):
         for axis, value, error in zip(("along", "across"), row, errors, strict=True):
             clear = value > CLEAR_BLUR * error
             width = (
-                f"{value:.2f} ± {error:.2g}" if clear else f"not told from 0 (below {value + 2 * error:.2f})"
+                f"{value:.2f} ± {error:.2g}"
+                if clear
+                else f"not clearly above 0 (below {value + 2 * error:.2f})"
             )
-            told.append(f"{arm} {axis} the transfer {width}")
-    return "; ".join(told) + " fine pixels (standard deviation)"
-
-
-def _range(measured: Measured, unit: str) -> str:
-    arms = "; ".join(
-        f"{arm} {row.mean():.2f}{unit} ({row.min():.2f} to {row.max():.2f})"
-        for arm, row in zip("ab", measured.value, strict=True)
-    )
-    return f"{arms}; sure to {measured.uncertainty.max():.2g}{unit} in the worst column"
+            widths.append(f"{arm} {axis} the transfer {width}")
+    return "; ".join(widths) + " fine pixels (standard deviation)"
 
 
 def _both(measured: Measured, unit: str) -> str:
@@ -182,10 +177,10 @@ def _alignment(found: AlignmentFound) -> dict[str, str]:
 
 
 def _tiles(found: Sequence[TileAlignment]) -> dict[str, str]:
-    """Where arm B lies in each tile behind a fibre."""
+    """Describe arm B's alignment in each tile behind a fibre."""
     return {f"in tile {each.tile} arm B lies": _alignment(each.found)["arm B lies"] for each in found}
 
 
-def _columns(listed: dict[str, list[int]]) -> str | None:
-    told = [f"{arm}: columns {', '.join(map(str, columns))}" for arm, columns in listed.items() if columns]
-    return "; ".join(told) or None
+def _columns(by_arm: dict[str, list[int]]) -> str | None:
+    texts = [f"{arm}: columns {', '.join(map(str, columns))}" for arm, columns in by_arm.items() if columns]
+    return "; ".join(texts) or None

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from acquire.calibrate.guide import AT_ONCE, LINES, MOST_LINES, PSF, WHERE_WANTED, Step
+from acquire.calibrate.guide import AT_ONCE, LINES, MOST_LINES, OPTIONAL, PSF, Step
 from acquire.cli.calibrate_live import instrument, kept, record, tell_finding, wait_for_enter
 from acquire.cli.control import SocketOption
 from acquire.cli.output import JsonFlag, note, print_json, print_warning, say
@@ -56,7 +56,7 @@ def calibrate_all(
 
     Example: [bold]acquire calibrate all --out cal.zarr[/]
     """
-    names = [step.name for step in (*AT_ONCE, *WHERE_WANTED)]
+    names = [step.name for step in (*AT_ONCE, *OPTIONAL)]
     if wrong := [each for each in only or () if each not in names]:
         raise UsageError(f"step {wrong[0]!r} is not known", possible=", ".join(names))
     steps = [step for step in AT_ONCE if not only or step.name in only]

@@ -49,15 +49,15 @@ def diagnose(
     Example: [bold]acquire diagnose run.zarr[/]
     """
     from acquire.calibrate.choose import choose
-    from acquire.reconstruct.diagnose import diagnose_recording, stretch
-    from acquire.reconstruct.liveliest import speaker
+    from acquire.reconstruct.diagnose import diagnose_recording, diagnosed_range
+    from acquire.reconstruct.liveliest import representative_tile
     from acquire.store import open_recording
 
     opened = open_recording(recording)
     chosen = choose(opened, calibration)
-    first, count = stretch(opened, *lines_between(opened, first_line, lines, begin, end))
+    first, count = diagnosed_range(opened, *lines_between(opened, first_line, lines, begin, end))
     known, named = None if chosen is None else chosen.calibration, tile_of(opened, tile)
-    seen = speaker(opened, () if named is None else (named,), (first, count), known, moving=False)
+    seen = representative_tile(opened, () if named is None else (named,), (first, count), known, moving=False)
     found = diagnose_recording(opened, first, count, known, seen)
     whose = {} if seen is None else {"tile": str(seen)}
     if json:

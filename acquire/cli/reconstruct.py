@@ -261,9 +261,9 @@ def _turned(recording: Recording, asked: Asked, *, wanted: bool) -> Asked:
     from acquire.recon.diagnosis import TURNED
     from acquire.recon.hypotheses import AS_BUILT
     from acquire.recon.search import Standing
-    from acquire.reconstruct.diagnose import diagnose_recording, stretch
+    from acquire.reconstruct.diagnose import diagnose_recording, diagnosed_range
 
-    first, count = stretch(recording, asked.first_line, asked.lines)
+    first, count = diagnosed_range(recording, asked.first_line, asked.lines)
     found = diagnose_recording(recording, first, count, asked.options.calibration)
     turn = AS_BUILT if found.hypothesis is None else found.hypothesis.turn
     if found.standing is Standing.NAMED and turn != AS_BUILT and found.alternative is None:

@@ -33,7 +33,7 @@ def explain_calibration(
 def _explain(recording: Recording, chosen: Chosen | None, asked: Asked, *, json: bool) -> None:
     from acquire.cores import idle_cores, limit_blas
     from acquire.reconstruct.explain import MOST_LINES, explain
-    from acquire.reconstruct.liveliest import speaker
+    from acquire.reconstruct.liveliest import representative_tile
 
     if chosen is None:
         raise UsageError(
@@ -46,7 +46,7 @@ def _explain(recording: Recording, chosen: Chosen | None, asked: Asked, *, json:
     lines = recording.first_line + recording.lines - first if asked.lines is None else asked.lines
     count = min(lines, MOST_LINES)
     middle = (first + (lines - count) // 2, count)
-    tile = speaker(recording, asked.tiles, middle, chosen.calibration)
+    tile = representative_tile(recording, asked.tiles, middle, chosen.calibration)
     segment = recording.cut(*middle, tile)
     with (
         stage_progress("leaving out one part of the calibration after the other") as advance,

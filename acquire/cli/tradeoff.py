@@ -183,7 +183,7 @@ def _cases(
 ) -> tuple[list[Case], Study | None]:
     """What is measured on; what the effects of the first scene that has any are worth."""
     from acquire.evaluate.cases import full_wells, of_recording, procedural
-    from acquire.reconstruct.liveliest import speaker
+    from acquire.reconstruct.liveliest import representative_tile
     from acquire.sim.procedural import SCENES
 
     (first_line, lines, repeats), cases, effects = asked, [], None
@@ -199,7 +199,7 @@ def _cases(
         if first is None:  # not the very beginning, if there is room
             first = recording.first_line + max(0, min(FIRST_LINE, recording.lines - lines))
         named = tile_of(recording, tile)
-        seen = speaker(recording, () if named is None else (named,), (first, lines))
+        seen = representative_tile(recording, () if named is None else (named,), (first, lines))
         # lines that are not there are refused before anything is measured
         recording.cut(first, lines, seen)
         cases.append(of_recording(Path(source).stem, recording, first, lines, APART, seen))

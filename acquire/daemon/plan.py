@@ -8,7 +8,7 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
-from acquire.calibrate.choose import handed_on
+from acquire.calibrate.choose import carried_calibration
 from acquire.config import ConstantCodeConfig
 from acquire.daemon.events import budget_lines, window_of
 from acquire.daemon.messages import CalibrationStatus
@@ -45,7 +45,7 @@ class Run:
         self._rig = rig
         self._choose = choose
         self._choice: CodecChoice | None = None
-        self._calibration = handed_on(config, rig.layout)
+        self._calibration = carried_calibration(config, rig.layout)
         self.capture = Capture(capture_plan(config, rig, self.run_id), rig.trigger)
 
     @property

@@ -1,4 +1,4 @@
-"""The forward model, Eq. (1)–(4): what the lines see of a scene, and the transpose of that."""
+"""The forward model, Eq. (1)–(4): the lines that a scene produces, and the transpose of that map."""
 
 from acquire.forward.arms import DualArm
 from acquire.forward.blurring import Blurring, blur_matrices, blurring

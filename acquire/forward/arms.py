@@ -1,7 +1,7 @@
 """Both arms: the sensing matrix Λ′ of Eq. (4) as an operator.
 
 Camera B looks at the scene turned by 90° counter-clockwise: its rows are the scene's columns from right to
-left, its pixels the scene's rows. So its lines come from the frames transposed, with the rows flipped.
+left, its pixels the scene's rows. Its lines therefore come from the transposed frames, with the rows flipped.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ class DualArm:
     Parameters
     ----------
     geometry : M, S, L_R
-    code : (T,) exposure bits E of the sub-steps touched
+    code : (T,) exposure bits E of the sub-steps that the lines touch
     spatial_merge, temporal_merge : N_m, T_m ≥ 1; a voxel's value is held over its block
     dtype : float32 or float64, of voxels and lines
-    alignment : where arm B's image lies beside arm A's; absent: on it
-    blur : of either arm's optics; absent: none
+    alignment : position of arm B's image relative to arm A's; None if they coincide
+    blur : of each arm's optics; None if there is none
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class DualArm:
         self.lines_shape = geometry.lines_shape
         self._a = TdiArm(geometry, code, spatial_merge, temporal_merge, dtype=dtype)
         self._b = TdiArm(geometry, code, spatial_merge, temporal_merge, flipped=True, dtype=dtype)
-        self._turned = np.empty(self.video_shape, dtype)
+        self._transposed = np.empty(self.video_shape, dtype)  # reused: a video can be large
         arrays = Arrays(dtype="float32" if self.dtype == np.float32 else "float64")
         self._registration = registration(alignment, geometry, spatial_merge, arrays)
         self._blurring = blurring(blur, geometry, spatial_merge, arrays)
@@ -66,50 +66,52 @@ class DualArm:
     def forward(self, video: NDArray[Any]) -> NDArray[Any]:
         """Λ′·X′: (⌈T/T_m⌉, ⌈n/N_m⌉, ⌈n/N_m⌉) → (2, L_R, M)."""
         video = self._checked(video, self.video_shape, "video")
-        seen = video if self._registration is None else self._registration.forward(video)
+        view_b = video if self._registration is None else self._registration.forward(video)
         if self._blurring is not None:
-            video, seen = self._blurring.forward(0, video), self._blurring.forward(1, seen)
-        transpose_frames(seen, self._turned)
-        return np.stack([self._a.forward(video), self._b.forward(self._turned)])
+            video, view_b = self._blurring.forward(0, video), self._blurring.forward(1, view_b)
+        transpose_frames(view_b, self._transposed)
+        return np.stack([self._a.forward(video), self._b.forward(self._transposed)])
 
     def adjoint(self, lines: NDArray[Any]) -> NDArray[Any]:
         """Λ′ᵀ·Y: (2, L_R, M) → (⌈T/T_m⌉, ⌈n/N_m⌉, ⌈n/N_m⌉)."""
         lines = self._checked(lines, self.lines_shape, "lines")
         video = self._a.adjoint(lines[0])
-        seen = self._b.adjoint(lines[1])
+        from_b = self._b.adjoint(lines[1])
         if self._registration is None and self._blurring is None:
-            add_transposed_frames(seen, video)
+            add_transposed_frames(from_b, video)
             return video
-        transpose_frames(seen, self._turned)
-        back = self._turned
+        transpose_frames(from_b, self._transposed)
+        view_b = self._transposed
         if self._blurring is not None:
-            video, back = self._blurring.adjoint(0, video), self._blurring.adjoint(1, back)
-        video += back if self._registration is None else self._registration.adjoint(back)
+            video, view_b = self._blurring.adjoint(0, video), self._blurring.adjoint(1, view_b)
+        video += view_b if self._registration is None else self._registration.adjoint(view_b)
         return video
 
     def norm_bound(self, steps: int = 10) -> float:
-        """A rigorous upper bound of ‖Λ′‖₂ (Collatz–Wielandt: max_i (ΛᵀΛv)_i / v_i for a non-negative Λ).
+        """Return a rigorous upper bound of ‖Λ′‖₂, within a percent of it after ten steps.
 
-        Voxels that no line sees (E = 0 in all their sub-steps) have no say. Within a percent after ten steps.
+        By Collatz–Wielandt, max_i (ΛᵀΛv)_i / v_i is a bound for a non-negative Λ and any positive v. Voxels
+        that no line samples (E = 0 in all their sub-steps) are left out.
 
         Raises
         ------
-        NumericsError : the code leaves every voxel dark (E ≡ 0); nothing can be measured
+        NumericsError : the code leaves every voxel dark (E ≡ 0), so that nothing can be measured
         """
         v = np.ones(self.video_shape, self.dtype)
-        seen = self.adjoint(np.ones(self.lines_shape, self.dtype)) > 0
-        if not seen.any():
+        sampled = self.adjoint(np.ones(self.lines_shape, self.dtype)) > 0
+        if not sampled.any():
             raise NumericsError(
                 "the exposure code is dark for the whole segment", hint="another code or segment"
             )
-        v[~seen] = 0
+        v[~sampled] = 0
         bound = np.inf
         for _ in range(steps):
             w = self.adjoint(self.forward(v))
-            bound = min(bound, float((w[seen] / v[seen]).max()))
+            bound = min(bound, float((w[sampled] / v[sampled]).max()))
             v = w / w.max()
-            v[seen] = np.maximum(v[seen], np.finfo(self.dtype).tiny ** 0.5)
-        return float(np.sqrt(bound * (1 + 8 * np.finfo(self.dtype).eps)))
+            # v must stay positive for the bound to hold; it could underflow.
+            v[sampled] = np.maximum(v[sampled], np.finfo(self.dtype).tiny ** 0.5)
+        return float(np.sqrt(bound * (1 + 8 * np.finfo(self.dtype).eps)))  # rounding must not undercut it
 
     def _checked(self, array: NDArray[Any], shape: tuple[int, ...], what: str) -> NDArray[Any]:
         if array.shape != shape:

@@ -1,13 +1,14 @@
-"""The optics' blur in the model: what either arm's sensor gets of a frame, as matrices and their transposes.
+"""The optics' blur in the model: the image of a frame on each arm's sensor, as matrices and their transposes.
 
-The kernel of an axis is that of the effect ``psf``, a Gaussian at whole fine pixels, normalised and cut off
-at 4σ, and as wide as was measured: narrow ones have less variance than the σ that they are made of. Beyond
-the edge the scene is what it is at the edge. So elements are not negative and rows sum to 1, a uniform scene
-stays what it is, and the bound of ‖Λ′‖ holds. For voxels of N_m > 1 it is the kernel between holding a voxel
-over its block and taking the mean of one: as the Gaussian, one matrix for rows and one for columns.
+The kernel of an axis is that of the effect ``psf``: a Gaussian sampled at whole fine pixels, normalised and
+cut off at 4σ. Its parameter is chosen so that the kernel has the measured width, since a narrow sampled
+Gaussian has less variance than its parameter says. Beyond the edge the scene continues with its edge values.
+Elements are thus not negative and rows sum to 1, a uniform scene is unchanged, and the bound of ‖Λ′‖ holds.
+For voxels of N_m > 1 a voxel is held over its block, the kernel is applied, and the mean over each block is
+taken; like the Gaussian, this is one matrix for rows and one for columns.
 
-Where Λ′ is a product of dense factors (`acquire.recon.band`), these take the matrices up once and nothing is
-done per frame; elsewhere frames are multiplied by them. Without a blur there is nothing.
+If Λ′ is a product of dense factors (`acquire.recon.band`), these absorb the matrices once and nothing is done
+per frame. Otherwise frames are multiplied by them. Without a blur there are no matrices.
 """
 
 from __future__ import annotations
@@ -29,15 +30,15 @@ if TYPE_CHECKING:
     from acquire.geometry import Geometry
 
 CUT_AT = 4.0
-"""σ, as `scipy.ndimage.gaussian_filter1d` does it by itself."""
+"""Half-width of the kernel in σ, the default of `scipy.ndimage.gaussian_filter1d`."""
 NARROWEST = 0.2
-"""σ of a kernel whose neighbours get 4·10⁻⁶: nothing narrower is told from a point."""
+"""σ of a kernel whose neighbours get 4·10⁻⁶; anything narrower is treated as a point."""
 
 
 def blurring(
     blur: Blur | None, geometry: Geometry, spatial_merge: int = 1, arrays: Arrays = HOST
 ) -> Blurring | None:
-    """What a blur does to frames; None where there is none, and nothing is done."""
+    """Return the operator of a blur, or None if there is no blur."""
     return None if blur is None else Blurring(blur, geometry.size, spatial_merge, arrays)
 
 
@@ -50,12 +51,12 @@ class Blurring:
         ]
 
     def forward(self, arm: int, frames: Array) -> Array:
-        """What arm 0 or 1 gets of frames."""
+        """Blur frames as arm 0 or 1 does."""
         rows, columns = self._pairs[arm]
         return rows @ frames @ columns.T
 
     def adjoint(self, arm: int, frames: Array) -> Array:
-        """The transpose."""
+        """Apply the transpose of `forward`."""
         rows, columns = self._pairs[arm]
         return rows.T @ frames @ columns
 
@@ -63,9 +64,9 @@ class Blurring:
 def blur_matrices(
     blur: Blur, size: int, spatial_merge: int = 1
 ) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """Of arms A and B: what acts on the scene's rows and on its columns, each (n′, n′).
+    """Return for arms A and B the matrices that act on the scene's rows and on its columns, each (n′, n′).
 
-    Arm A's charge moves along the scene's rows, arm B's along its columns.
+    Arm A's charge moves from row to row of the scene, arm B's from column to column.
     """
     along_a, across_a, along_b, across_b = (
         blur_matrix(sigma, size, spatial_merge) for sigma in (*blur.a, *blur.b)
@@ -75,7 +76,7 @@ def blur_matrices(
 
 @lru_cache(maxsize=32)
 def blur_matrix(sigma: float, size: int, spatial_merge: int = 1) -> NDArray[np.float64]:
-    """The blur of one axis (n′, n′) by a kernel whose standard deviation is ``sigma`` fine pixels."""
+    """Return the blur of one axis (n′, n′) by a kernel with a standard deviation of ``sigma`` fine pixels."""
     weights = kernel(sigma)
     reach = len(weights) // 2
     at = np.arange(size)[:, None]
@@ -86,16 +87,16 @@ def blur_matrix(sigma: float, size: int, spatial_merge: int = 1) -> NDArray[np.f
         starts, lengths = block_bounds(size, spatial_merge)
         sums = np.add.reduceat(np.add.reduceat(fine, starts, axis=0), starts, axis=1)
         fine = sums / lengths[:, None]
-    fine.setflags(write=False)
+    fine.setflags(write=False)  # the cache hands the same array to everybody
     return fine
 
 
 def kernel(sigma: float) -> NDArray[np.float64]:
-    """A Gaussian at whole pixels of which the standard deviation is ``sigma``, of odd length."""
+    """Return a Gaussian at whole pixels, of odd length, whose standard deviation is ``sigma``."""
     if sigma**2 <= _variance(_gaussian(NARROWEST)):
         return np.ones(1)
-    made_of = brentq(lambda each: _variance(_gaussian(each)) - sigma**2, NARROWEST, sigma + 1, xtol=1e-9)
-    return _gaussian(float(made_of))
+    parameter = brentq(lambda each: _variance(_gaussian(each)) - sigma**2, NARROWEST, sigma + 1, xtol=1e-9)
+    return _gaussian(float(parameter))
 
 
 def _gaussian(sigma: float) -> NDArray[np.float64]:

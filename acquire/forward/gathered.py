@@ -1,11 +1,11 @@
-"""The shear in the operations that every array library has: for arrays without the compiled loops.
+"""The shear in operations that every array library has, for arrays without the compiled loops.
 
-A line is a sum over the row blocks q and over the few frames j that its staircase crosses in each (kernels),
+A line is a sum over the row blocks q and the few frames j that its staircase crosses in each (see `kernels`),
 
     out[i, :] = Σ_q Σ_j weight[j, i, q]·voxels[frame(j, i, q), q, :]
 
-and the transpose a sum over the few lines that meet a frame in a row block. Both are gathers with a fixed
-number of terms, padded by weights of 0 (ELLPACK), one term for all lines or frames at a time.
+and the transpose is a sum over the few lines that meet a frame in a row block. Both are gathers with a fixed
+number of terms, padded with weights of 0 (ELLPACK), computed one term at a time for all lines or frames.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 class GatheredArms:
-    """Λ′ as `DualArm`, in any ``arrays``."""
+    """Λ′ like `DualArm`, in any ``arrays``."""
 
     def __init__(
         self,
@@ -54,10 +54,10 @@ class GatheredArms:
 
     def forward(self, video: Array) -> Array:
         """Λ′·X′: (⌈T/T_m⌉, ⌈n/N_m⌉, ⌈n/N_m⌉) → (2, L_R, M)."""
-        seen = video if self._registration is None else self._registration.forward(video)
+        view_b = video if self._registration is None else self._registration.forward(video)
         if self._blurring is not None:
-            video, seen = self._blurring.forward(0, video), self._blurring.forward(1, seen)
-        views = (video, self._xp.permute_dims(seen, (0, 2, 1)))
+            video, view_b = self._blurring.forward(0, video), self._blurring.forward(1, view_b)
+        views = (video, self._xp.permute_dims(view_b, (0, 2, 1)))
         arms = [terms.shear(view) for terms, view in zip(self._terms, views, strict=True)]
         return self._xp.stack(arms) @ self._merging
 
@@ -65,10 +65,10 @@ class GatheredArms:
         """Λ′ᵀ·Y: (2, L_R, M) → (⌈T/T_m⌉, ⌈n/N_m⌉, ⌈n/N_m⌉)."""
         spread = lines @ self._merging.T
         a, b = (terms.unshear(spread[arm, ...]) for arm, terms in enumerate(self._terms))
-        seen = self._xp.permute_dims(b, (0, 2, 1))
+        view_b = self._xp.permute_dims(b, (0, 2, 1))
         if self._blurring is not None:
-            a, seen = self._blurring.adjoint(0, a), self._blurring.adjoint(1, seen)
-        return a + (seen if self._registration is None else self._registration.adjoint(seen))
+            a, view_b = self._blurring.adjoint(0, a), self._blurring.adjoint(1, view_b)
+        return a + (view_b if self._registration is None else self._registration.adjoint(view_b))
 
 
 class _Terms:
@@ -117,7 +117,7 @@ def _crossings(
     lengths: NDArray[np.int64],
     temporal_merge: int,
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Σ m(d)·E(t) by frame (j, line, block), and the frame of j = 0 (line, block)."""
+    """Return Σ m(d)·E(t) by frame (j, line, block), and the frame of j = 0 (line, block)."""
     S = geometry.substeps
     begins = S * np.arange(geometry.lines)[:, None] + starts
     first, steps = begins // temporal_merge, int(lengths.max()) + S - 1
@@ -133,7 +133,7 @@ def _crossings(
 def _transposed(
     weights: NDArray[np.int64], frame: NDArray[np.int64], frames: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Lines (k, frame, block) that meet a frame in a block, and their weights."""
+    """Return the lines (k, frame, block) that meet a frame in a block, and their weights."""
     _, lines, blocks = weights.shape
     _, line, block = np.nonzero(weights)
     where, weight = frame[weights > 0], weights[weights > 0]

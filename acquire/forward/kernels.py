@@ -6,9 +6,9 @@ One line sums the voxels along a staircase in (time, row): at fixed row block q,
     m(d) = #{(r, u): r + u = d, r < length, u < S} = min(d + 1, length, S, length + S - 1 - d)
 
 and weight ``m(d)·E(t)``. Weights that fall into the same frame (T_m > 1) are summed before the row of
-voxels is touched. An own kernel because sparse libraries need the matrix in memory, tens to hundreds of MB
-per arm, to be as fast (tools/bench_operator.py). Elements are addressed one by one: a slice of an array
-costs a reference count, which is more than the work on a short row.
+voxels is touched. The kernels are our own because sparse libraries need the matrix in memory, tens to
+hundreds of MB per arm, to be as fast (tools/bench_operator.py). Elements are addressed one by one, because a
+slice of an array costs a reference count, which is more than the work on a short row.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def shear(
     out: NDArray[Any],
 ) -> None:
     """out[i, c] = Σ_q Σ_d m(d)·E(t)·voxels[t // T_m, q, c]."""
-    # Threads share no element of out: sums come in the same order however many there are.
+    # No two threads write the same element, so the order of the sums does not depend on their number.
     for i in numba.prange(out.shape[0]):
         out[i, :] = 0
         for q in range(len(starts)):
@@ -72,14 +72,15 @@ def unshear(
     out: NDArray[Any],
 ) -> None:
     """The transpose of `shear`: out[f, q, c] = Σ_i Σ_{d: t in frame f} m(d)·E(t)·lines[i, c]."""
-    # By frames, though the sum is over lines: a line adds to all frames that it met, and threads with a line
-    # each would have to take turns.
+    # Parallel over frames although the sum is over lines: a line contributes to all frames that it met, so
+    # threads with one line each would have to take turns.
     for f in numba.prange(out.shape[0]):
         t_first, t_end = f * T_m, min((f + 1) * T_m, len(code))
         for q in range(len(starts)):
             out[f, q, :] = 0
             steps = lengths[q] + S - 1
-            # The lines of which a sub-step first .. first + steps - 1, first = i·S + start, is in the frame.
+            # Lines with at least one of their sub-steps first .. first + steps - 1, first = i·S + start, in
+            # the frame.
             i_first = max(0, -((steps - 1 + starts[q] - t_first) // S))
             i_end = min(lines.shape[0], (t_end - 1 - starts[q]) // S + 1)
             for i in range(i_first, i_end):
@@ -96,8 +97,8 @@ def unshear(
 
 @numba.njit(cache=True)
 def blocks_to_pixels(blocks: NDArray[Any], n: int, S: int, N_m: int) -> NDArray[Any]:
-    """blocks·C_N: (L_R, n/N_m) → (L_R, M); every fine column carries its block's value into its pixel."""
-    # Column by column: where N_m is no divisor of S, a block lies across the edge of a pixel.
+    """Return blocks·C_N, (L_R, n/N_m) → (L_R, M): every fine column adds its block's value to its pixel."""
+    # Column by column, because a block can straddle two pixels if N_m does not divide S.
     pixels = np.zeros((blocks.shape[0], n // S), blocks.dtype)
     for i in range(blocks.shape[0]):
         for column in range(n):
@@ -107,7 +108,7 @@ def blocks_to_pixels(blocks: NDArray[Any], n: int, S: int, N_m: int) -> NDArray[
 
 @numba.njit(cache=True)
 def pixels_to_blocks(pixels: NDArray[Any], n: int, S: int, N_m: int) -> NDArray[Any]:
-    """pixels·C_Nᵀ: (L_R, M) → (L_R, n/N_m)."""
+    """Return pixels·C_Nᵀ: (L_R, M) → (L_R, n/N_m)."""
     blocks = np.zeros((pixels.shape[0], (n + N_m - 1) // N_m), pixels.dtype)
     for i in range(pixels.shape[0]):
         for column in range(n):
@@ -117,7 +118,7 @@ def pixels_to_blocks(pixels: NDArray[Any], n: int, S: int, N_m: int) -> NDArray[
 
 @numba.njit(parallel=True, cache=True)
 def transpose_frames(video: NDArray[Any], out: NDArray[Any]) -> None:
-    """out[t] = video[t].T, frame by frame, so that both arms read rows that are contiguous."""
+    """out[t] = video[t].T, frame by frame, so that both arms read contiguous rows."""
     for t in numba.prange(video.shape[0]):
         for r in range(video.shape[1]):
             for c in range(video.shape[2]):
@@ -141,9 +142,9 @@ def gather_frame(
     weight: NDArray[Any],
     out: NDArray[Any],
 ) -> None:
-    """out[p] = Σ_j weight[j]·frame[source[j]], j from first[p] to first[p + 1]: a CSR matrix.
+    """out[p] = Σ_j weight[j]·frame[source[j]], j from first[p] to first[p + 1] - 1: a CSR matrix.
 
-    Rows are short: to reorder their sums for wide instructions costs more than it saves.
+    No fastmath: rows are so short that reordering their sums for wide instructions costs more than it saves.
     """
     for p in range(len(out)):
         total = out.dtype.type(0)
@@ -160,6 +161,6 @@ def gather_frames(
     weight: NDArray[Any],
     out: NDArray[Any],
 ) -> None:
-    """`gather_frame` of many frames at once."""
+    """Apply `gather_frame` to many frames in parallel."""
     for k in numba.prange(out.shape[0]):
         gather_frame(frames[k], first, source, weight, out[k])

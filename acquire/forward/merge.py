@@ -1,4 +1,4 @@
-"""Merging of voxels: which fine rows, columns and sub-steps one voxel of X′ stands for.
+"""Merging of voxels: the fine rows, columns and sub-steps that one voxel of X′ stands for.
 
 X is X′ held constant over its block, so merging a projection matrix sums the columns of a block
 (M_T, M_N of Eq. 3), and C_N counts the fine columns that a block shares with a pixel. N_m need not divide
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 
 
 def block_bounds(length: int, merge: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First element and length of each block of ``merge`` elements that tile ``length``."""
+    """Return the first element and length of each block of ``merge`` elements that tile ``length``."""
     starts = np.arange(0, length, merge, dtype=np.int64)
     return starts, np.minimum(merge, length - starts)
 
 
 def column_merging(geometry: Geometry, spatial_merge: int) -> NDArray[np.int64]:
-    """C_N (⌈n/N_m⌉, M): how many fine columns a block shares with a pixel."""
+    """Return C_N (⌈n/N_m⌉, M): how many fine columns a block shares with a pixel."""
     columns = np.arange(geometry.size)
     shared = np.zeros((-(-geometry.size // spatial_merge), geometry.stages), np.int64)
     np.add.at(shared, (columns // spatial_merge, columns // geometry.substeps), 1)
@@ -34,7 +34,7 @@ def column_merging(geometry: Geometry, spatial_merge: int) -> NDArray[np.int64]:
 
 
 def merge_video(video: NDArray[Any], spatial_merge: int, temporal_merge: int) -> NDArray[Any]:
-    """Mean of a fine video (T, n, n) over the blocks of each voxel: (⌈T/T_m⌉, ⌈n/N_m⌉, ⌈n/N_m⌉)."""
+    """Average a fine video (T, n, n) over the block of each voxel: (⌈T/T_m⌉, ⌈n/N_m⌉, ⌈n/N_m⌉)."""
     if video.ndim != 3:
         raise UsageError(f"a video of shape {video.shape} cannot be merged", possible="(time, row, column)")
     merged = video.astype(np.result_type(video.dtype, np.float32))
@@ -51,7 +51,7 @@ def merge_video(video: NDArray[Any], spatial_merge: int, temporal_merge: int) ->
 def hold_video(
     voxels: NDArray[Any], geometry: Geometry, spatial_merge: int, temporal_merge: int
 ) -> NDArray[Any]:
-    """X (T, n, n): each voxel of X′ held over its block. The size of the fine video; for small cases."""
+    """Hold each voxel of X′ over its block and return X (T, n, n): large, so for small cases only."""
     fine = voxels
     for axis, (merge, length) in enumerate(
         ((temporal_merge, geometry.span), (spatial_merge, geometry.size), (spatial_merge, geometry.size))

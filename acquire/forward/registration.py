@@ -1,12 +1,12 @@
-"""Registration: arm B's view of the scene made of arm A's, as one sparse matrix R and its transpose.
+"""Registration: the map from arm A's view of the scene to arm B's, as one sparse matrix R and its transpose.
 
-R interpolates between the four neighbours of where a pixel of arm B looks; beyond the edge the scene is what
-it is at the edge. Its elements are not negative and its rows sum to 1, so a uniform scene stays what it is
-and the bound of ‖Λ′‖ holds with R as without. For voxels of N_m > 1 it is R between holding a voxel over its
-block and taking the mean of one.
+R interpolates between the four neighbours of the point at which a pixel of arm B looks. Beyond the edge the
+scene continues with its edge values. Its elements are not negative and its rows sum to 1, so a uniform scene
+is unchanged and the bound of ‖Λ′‖ holds with R as without. For voxels of N_m > 1 a voxel is held over its
+block, R is applied, and the mean over each block is taken.
 
-It acts on frames that do not change from sub-step to sub-step (coefficients of a basis, patterns), so
-sub-steps cost nothing more. Without an alignment there is no R.
+R acts on frames that do not change from sub-step to sub-step (coefficients of a basis, patterns), so that
+more sub-steps cost nothing. Without an alignment there is no R.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ if TYPE_CHECKING:
 
 
 FEW = 2**21
-"""Products that one thread has done before others are woken on a busy host."""
+"""Products that one thread computes before others could be woken on a busy host."""
 
 
 def registration(
     alignment: Alignment | None, geometry: Geometry, spatial_merge: int = 1, arrays: Arrays = HOST
 ) -> Registration | None:
-    """R of an alignment; None where there is none, and nothing is done."""
+    """Return R of an alignment, or None if there is no alignment."""
     return None if alignment is None else Registration(alignment, geometry.size, spatial_merge, arrays)
 
 
@@ -48,11 +48,11 @@ class Registration:
         self._forward, self._adjoint = (_Gather(each, arrays) for each in pair)
 
     def forward(self, frames: Array) -> Array:
-        """Arm A's view (k, n′, n′) as arm B sees it."""
+        """Map arm A's view (k, n′, n′) to arm B's."""
         return self._forward(frames)
 
     def adjoint(self, frames: Array) -> Array:
-        """Rᵀ, from arm B's view to arm A's."""
+        """Apply Rᵀ, from arm B's view to arm A's."""
         return self._adjoint(frames)
 
 
@@ -60,13 +60,13 @@ class Registration:
 def _with_transpose(
     alignment: Alignment, size: int, spatial_merge: int
 ) -> tuple[sparse.csr_array, sparse.csr_array]:
-    """R and Rᵀ; kept, since a refinement asks for them round after round."""
+    """Return R and Rᵀ; cached, since a refinement needs them round after round."""
     matrix = sampling_matrix(alignment, size, spatial_merge)
     return matrix, matrix.T.tocsr()
 
 
 def sampling_matrix(alignment: Alignment, size: int, spatial_merge: int = 1) -> sparse.csr_array:
-    """R (n′², n′²), rows and columns in the order of a frame's elements."""
+    """Return R (n′², n′²), with rows and columns in the order of a frame's elements."""
     rows, columns = (np.clip(each, 0, size - 1).ravel() for each in alignment.sources(size))
     row, column = (each.astype(np.int64) for each in (rows, columns))
     below, right = rows - row, columns - column
@@ -83,7 +83,7 @@ def sampling_matrix(alignment: Alignment, size: int, spatial_merge: int = 1) -> 
     if spatial_merge == 1:
         fine.eliminate_zeros()
         return fine
-    # H = B ⊗ B, (n², n′²): voxels held over their blocks, and means over them the other way.
+    # H = B ⊗ B, (n², n′²), holds voxels over their blocks; its normalised transpose takes the means.
     _, lengths = block_bounds(size, spatial_merge)
     block = np.repeat(np.arange(len(lengths)), lengths)
     one = sparse.coo_array((np.ones(size), (np.arange(size), block))).tocsr()
@@ -95,15 +95,17 @@ def sampling_matrix(alignment: Alignment, size: int, spatial_merge: int = 1) -> 
 
 
 def interpolation_variance(alignment: Alignment, size: int) -> tuple[float, float]:
-    """By how much R itself blurs an image along rows and columns, in fine pixels²: f·(1 − f) of what lies at
-    the fraction f between two pixels, in the mean of the field."""
+    """Return the variance by which R itself blurs an image along rows and columns, in fine pixels².
+
+    It is f·(1 − f) for a point at the fraction f between two pixels, averaged over the field.
+    """
     fractions = (each % 1 for each in alignment.sources(size))
     rows, columns = (float((each * (1 - each)).mean()) for each in fractions)
     return rows, columns
 
 
 class _Gather:
-    """A sparse matrix along the pixels of frames."""
+    """A sparse matrix that acts on the pixels of frames."""
 
     def __init__(self, matrix: sparse.csr_array, arrays: Arrays) -> None:
         self._arrays = arrays
@@ -117,12 +119,12 @@ class _Gather:
     def __call__(self, frames: Array) -> Array:
         if not self._terms:
             out = np.empty(frames.shape, frames.dtype)
-            flat, into = frames.reshape(len(frames), -1), out.reshape(len(frames), -1)
+            flat, flat_out = frames.reshape(len(frames), -1), out.reshape(len(frames), -1)
             if flat.shape[0] * len(self._source) > FEW:
-                gather_frames(flat, self._first, self._source, self._weight, into)
+                gather_frames(flat, self._first, self._source, self._weight, flat_out)
                 return out
-            for frame, made in zip(flat, into, strict=True):
-                gather_frame(frame, self._first, self._source, self._weight, made)
+            for frame, row in zip(flat, flat_out, strict=True):
+                gather_frame(frame, self._first, self._source, self._weight, row)
             return out
         xp = self._arrays.xp
         flat = xp.reshape(frames, (frames.shape[0], -1))
@@ -134,11 +136,10 @@ class _Gather:
 
 
 def _padded(matrix: sparse.csr_array) -> list[tuple[NDArray[np.int64], NDArray[Any]]]:
-    """Source and weight of the j-th element of every row, for each j; weights of 0 where a row has fewer."""
+    """Return for each j the source and weight of every row's j-th element; weight 0 if the row has fewer."""
     counts = np.diff(matrix.indptr)
     terms = []
     for j in range(int(counts.max())):
-        there = counts > j
         at = np.minimum(matrix.indptr[:-1] + j, matrix.nnz - 1)
-        terms.append((matrix.indices[at].astype(np.int64), np.where(there, matrix.data[at], 0.0)))
+        terms.append((matrix.indices[at].astype(np.int64), np.where(counts > j, matrix.data[at], 0.0)))
     return terms

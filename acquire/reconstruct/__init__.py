@@ -2,13 +2,13 @@
 
 ::
 
-    select    lines, times or a plan ──▶ VideoRequest: stretches on one grid
+    select    lines, times or a plan ──▶ VideoRequest: ranges on one grid
     combine   VideoRequest ──▶ sub-segments ──▶ pool ──▶ stitched in order ──▶ video
-    pools     where sub-segments are solved: here, in processes, on a cluster
-    work      one sub-segment: cut, solve, bring to the grid
-    single    a reconstruction that is already in memory, as `reconstruct` (of `acquire.recon`) makes one
+    pools     where sub-segments are solved: in this process, in others, on a cluster
+    work      one sub-segment: cut, solve, resample to the grid
+    single    a reconstruction that is already in memory, made by `reconstruct` (of `acquire.recon`)
 
-Memory is bounded by what the pool works on; the recording is read and the video written piece by piece.
+The sub-segments in work bound the memory: the recording is read and the video written piece by piece.
 """
 
 from acquire.recon import reconstruct

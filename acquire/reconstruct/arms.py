@@ -1,4 +1,4 @@
-"""The arms' balance of a recording: what its lines say of it, beside what its calibration says."""
+"""The arms' balance of a recording, estimated from its lines and compared with its calibration."""
 
 from __future__ import annotations
 
@@ -17,47 +17,51 @@ if TYPE_CHECKING:
     from acquire.reconstruct.work import Options
     from acquire.store import Recording
 
-MOST_STRETCHES = 8
-"""Of a long recording, spread over it: the ends of a stretch are what is not known, and these average out."""
+MOST_SAMPLES = 8
+"""Ranges of a long recording that are evaluated: their ends are unknown, which averages out over several."""
 PASSES = 4
-"""Of light across the sensor, in each stretch."""
+"""Passes of the scene across the sensor in each of these ranges."""
 
 
 def balance_of_recording(
     recording: Recording, options: Options
 ) -> tuple[Balance | None, dict[str, Any] | None, tuple[str, ...]]:
-    """What to divide arm B's light by, what was found as JSON, and what to say of it.
+    """Return the balance to divide arm B's light by, the estimate as JSON, and warnings.
 
-    A balance that the calibration holds is believed; lines that contradict it are told.
+    A balance in the calibration takes precedence; a warning is given if the lines contradict it.
     """
-    stretches = [as_read(each, options) for each in _stretches(recording)]
-    found = balance_of(stretches)
+    segments = [as_read(each, options) for each in _sample_segments(recording)]
+    found = balance_of(segments)
     if found is None:
         return None, None, ()
-    measured = any(each.balanced for each in stretches)
+    measured = any(each.balanced for each in segments)
     if not found.clear:
         return None, found.facts(corrected=False), ()
     if not measured:
         return found, found.facts(corrected=True), (found.corrected_words,)
     drifted = (
-        f"{found.words}, and with the calibration it should be as much: the calibration no longer holds; the "
-        "video is made with it nevertheless (`acquire calibrate check` compares, `flat` measures anew)"
+        f"{found.words}, although the calibration should have made them equal: it no longer holds, and the "
+        "video uses it nevertheless (`acquire calibrate check` compares, `flat` measures again)"
     )
     return None, found.facts(corrected=False), (drifted,)
 
 
-def _stretches(recording: Recording) -> Iterator[Segment]:
-    """Spread over the lines that are there; what cannot be cut is told to whoever asks for those lines."""
+def _sample_segments(recording: Recording) -> Iterator[Segment]:
+    """Cut ranges spread over the available lines, and behind a fibre over its tiles.
+
+    Ranges that cannot be cut are skipped: whoever asks for their lines gets the error.
+    """
     first, end = recording.first_available_line, recording.first_line + recording.lines
     tiles: tuple[Tile | None, ...] = (None,) if recording.fibre is None else recording.fibre.tiles
-    stages = recording.geometry_for(1).stages
-    length = PASSES * stages
-    count = min(MOST_STRETCHES, (end - first) // length)
-    whole = [(first, end - first)] if count < MOST_STRETCHES else []
-    step = (end - first) // max(count, 1)
-    places = whole or [(first + index * step, length) for index in range(count)]
-    for number in range(max(len(places), len(tiles))):  # behind a fibre every tile, wherever in time
-        begin, lines = places[number % len(places)]
+    length = PASSES * recording.geometry_for(1).stages
+    count = (end - first) // length
+    if count < MOST_SAMPLES:
+        ranges = [(first, end - first)]
+    else:
+        step = (end - first) // MOST_SAMPLES
+        ranges = [(first + index * step, length) for index in range(MOST_SAMPLES)]
+    for number in range(max(len(ranges), len(tiles))):  # every tile has its turn, at whatever time
+        begin, lines = ranges[number % len(ranges)]
         try:
             yield recording.cut(begin, lines, tiles[number % len(tiles)])
         except AcquireError:

@@ -1,8 +1,8 @@
-"""One budget of wall time for all that is asked for: kept, shared, or refused before anything is written.
+"""One budget of wall time for a whole request: kept, shared, or refused before anything is written.
 
-Each task is given the moment at which it is to be done: what is left, evenly over what is left to solve. A
-worker that starts late has that much less time. What cannot be done in time at all is refused; what turns out
-not to be, because the machine became busy, ends with the sub-segments that are there.
+Each task gets a deadline: the remaining time is shared evenly among the remaining tasks. A worker that starts
+late has that much less time. A request that cannot be met at all is refused. If the machine becomes busy and
+the budget runs out, the video ends with the sub-segments solved so far.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from acquire.reconstruct.work import Task
 
 WRITING_S, WRITING_S_PER_VOXEL = 0.25, 1e-7
-"""To finish a video and end, and to compress and write a voxel, on a core of its own; then as measured."""
+"""Time to finish a video, and to compress and write a voxel, on an idle core; the latter is then measured."""
 KINDS = 4
-"""So many kinds of sub-segments are measured to find out the least; others are taken to be like the last."""
+"""Kinds of sub-segments whose shortest time is measured; any others count like the slowest of these."""
 
 
 class Budget:
-    """What is left of ``seconds`` after ``began`` (`time.monotonic`); None: all the time in the world."""
+    """The time left of ``seconds`` from ``began`` (`time.monotonic`) on; unlimited if ``seconds`` is None."""
 
     def __init__(self, seconds: float | None, began: float, workers: int) -> None:
         self.seconds, self._began, self._workers = seconds, began, workers
@@ -39,25 +39,34 @@ class Budget:
 
     @property
     def elapsed_s(self) -> float:
-        """Wall time, without what compiling took."""
+        """Wall time so far, without the time for compiling."""
         return time.monotonic() - self._began - self._compiled_s
 
     @property
     def left_s(self) -> float:
-        """To solve and write in, before the video is finished."""
+        """Time left for solving and writing, before the video is finished."""
         assert self.seconds is not None
         return self.seconds - self.elapsed_s - WRITING_S * self._slowness
 
     @property
-    def gone(self) -> bool:
-        """Nothing is to be begun any more."""
+    def exhausted(self) -> bool:
+        """Whether no further task should be started."""
         return self.seconds is not None and self.left_s <= 0
 
     def check(self, tasks: Sequence[Task], geometry: Geometry) -> None:
-        """UsageError unless the least that ``tasks`` take fits; ``geometry`` is that of any lines."""
+        """Raise UsageError unless the shortest time for ``tasks`` fits; ``geometry`` may have any lines."""
         if self.seconds is None:
             return
-        needed_s = self.seconds - self.left_s + self._least_s(tasks, geometry)
+        known: dict[tuple[int, int, int], float] = {}
+        least_s = 0.0
+        for task in tasks:
+            voxels = task.segment.voxels
+            kind = (voxels.spatial_merge, voxels.temporal_merge, task.segment.lines)
+            if kind not in known and len(known) < KINDS:
+                few = replace(geometry, lines=task.segment.lines)
+                known[kind] = least_seconds(few, *kind[:2], task.options.solver)
+            least_s += known.get(kind, max(known.values())) + self._writing_s_per_voxel * _voxels(task)
+        needed_s = self.seconds - self.left_s + least_s / self._workers
         if needed_s > (1 + MARGIN) * self.seconds + MARGIN_S:
             what = "this segment needs" if len(tasks) == 1 else f"these {len(tasks)} sub-segments need"
             raise UsageError(
@@ -66,7 +75,7 @@ class Budget:
             )
 
     def limit(self, task: Task, undone: int, after: int) -> Task:
-        """The task with the moment when it is to be done; ``undone`` are, ``after`` of them after it."""
+        """Return the task with its deadline; ``undone`` tasks are left in all, ``after`` of them after it."""
         if self.seconds is None:
             return task
         share_s = self.left_s / -(-undone // self._workers)
@@ -75,22 +84,10 @@ class Budget:
         return replace(task, options=options, due=time.monotonic() + max(until_s, LEAST_BUDGET_S))
 
     def written(self, voxels: int, seconds: float, compiled_s: float) -> None:
-        """So many voxels were stitched and written in that time, of a part that compiled for so long."""
+        """Account for ``voxels`` written in ``seconds``, of a part that compiled for ``compiled_s``."""
         if voxels:
             self._writing_s_per_voxel = max(seconds / voxels, self._writing_s_per_voxel / 2)
-        self._compiled_s += compiled_s / self._workers  # all of them compile at the same time
-
-    def _least_s(self, tasks: Sequence[Task], geometry: Geometry) -> float:
-        known: dict[tuple[int, int, int], float] = {}
-        total_s = 0.0
-        for task in tasks:
-            voxels = task.segment.voxels
-            kind = (voxels.spatial_merge, voxels.temporal_merge, task.segment.lines)
-            if kind not in known and len(known) < KINDS:
-                few = replace(geometry, lines=task.segment.lines)
-                known[kind] = least_seconds(few, *kind[:2], task.options.solver)
-            total_s += known.get(kind, max(known.values())) + self._writing_s_per_voxel * _voxels(task)
-        return total_s / self._workers
+        self._compiled_s += compiled_s / self._workers  # all workers compile at the same time
 
 
 def _voxels(task: Task) -> int:

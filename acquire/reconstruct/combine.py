@@ -21,7 +21,7 @@ from acquire.recon.error import combined_facts
 from acquire.recon.segments import Stitcher
 from acquire.reconstruct.arms import balance_of_recording
 from acquire.reconstruct.budget import Budget
-from acquire.reconstruct.handing import Handing, handed_on, liveliest_first
+from acquire.reconstruct.sharing import SharedChoices, liveliest_first, sharing_facts
 from acquire.reconstruct.sheet import open_sheet
 from acquire.reconstruct.times import Times
 from acquire.reconstruct.work import Task
@@ -40,13 +40,13 @@ if TYPE_CHECKING:
     from acquire.store import Recording
 
 LOOK_S = 0.1
-"""How often the one who waits looks at the progress and at Ctrl-C."""
+"""Interval at which the waiting thread checks the progress and Ctrl-C."""
 QUALITY_KEYS = ("misfit", "prediction", "coverage", "noise")
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """What was written. ``interrupted``: less than what was asked for; ``cut``: likewise, by the budget."""
+    """The written video. ``interrupted``: it was stopped early; ``cut``: the budget ended it early."""
 
     path: Path | str
     shape: tuple[int, int, int]
@@ -56,9 +56,9 @@ class Outcome:
 
 
 class Watcher:
-    """Passes the progress on, and says when to stop: ``stopped`` once it was.
+    """Forwards the progress and requests the stop; ``stopped`` is set once it was requested.
 
-    ``progress`` takes (tasks done, of how many); ``stop`` is asked often and answers at once.
+    ``progress`` takes (tasks done, number of tasks). ``stop`` is called often and must return at once.
     """
 
     def __init__(
@@ -87,30 +87,30 @@ def combine(
     watcher: Watcher,
     began: float | None = None,
 ) -> Outcome:
-    """Reconstruct the stretches of a request and write their video.
+    """Reconstruct the ranges of a request and write their video.
 
-    ``out`` is a new path or URL. Behind a fibre one tile of the scene is solved after the other. When the
-    watcher says stop, what was solved so far is written, marked as interrupted; DataError and whatever a
-    sub-segment raises leave nothing. The options' budget is wall time from ``began`` (`time.monotonic`; else
-    now) to the video's end; UsageError where it cannot be kept.
+    ``out`` is a new path or URL. Behind a fibre the tiles of the scene are solved one after the other. If the
+    watcher requests a stop, the part solved so far is written and marked as interrupted. A DataError, or
+    whatever a sub-segment raises, leaves nothing behind. The options' budget is wall time from ``began``
+    (`time.monotonic`; the call if None) to the end of the video. Raises UsageError if it cannot be kept.
     """
     called, grid = time.monotonic(), request.grid
     segments = request.sub_segments()
-    place = str(recording) if is_url(str(recording)) else str(recording.path.resolve())
+    location = str(recording) if is_url(str(recording)) else str(recording.path.resolve())
     balance, balance_facts, warnings = balance_of_recording(recording, options)
     options = replace(options, balance=balance)
-    handing = options.chooses and (bool(request.tiles) if options.shared is None else options.shared)
+    sharing = options.chooses and (bool(request.tiles) if options.shared is None else options.shared)
     tiles: Sequence[Tile | None] = request.tiles or (None,)
-    if handing and len(tiles) > 1:
+    if sharing and len(tiles) > 1:
         tiles = liveliest_first(recording, request, options)
-    tasks = [Task(place, each, grid, options, tile=tile) for tile in tiles for each in segments]
+    tasks = [Task(location, each, grid, options, tile=tile) for tile in tiles for each in segments]
     budget = Budget(options.budget_s, called if began is None else began, pool.workers)
     budget.check(tasks, request.stream.geometry(1))
     times, anchor = Times.of(recording), _anchor(recording, request)
     done: list[dict[str, Any]] = []
     with open_sheet(out, request, times, anchor) as sheet:
-        for part, task, following in _solved(tasks, pool, watcher, budget, Handing(handing)):
-            if len(done) % len(segments) == 0:
+        for part, task, following in _solved(tasks, pool, watcher, budget, SharedChoices(sharing)):
+            if len(done) % len(segments) == 0:  # the first sub-segment of a tile
                 stitcher = Stitcher(grid)
             arrived, first = time.monotonic(), stitcher.frames
             video, quality, error = stitcher.add(
@@ -124,42 +124,43 @@ def combine(
             raise KeyboardInterrupt  # there is nothing to keep
         facts = describe_parts(recording, request, done, options)
         cut = len(done) < len(tasks) and not watcher.stopped
-        told = [*warnings, *(text for part in done for text in part["warnings"])]
-        facts |= {"balance": balance_facts, "warnings": list(dict.fromkeys(told))}
-        facts["choice"] = handed_on(done) if handing else None
+        warnings = (*warnings, *(text for part in done for text in part["warnings"]))
+        facts |= {"balance": balance_facts, "warnings": list(dict.fromkeys(warnings))}
+        facts["choice"] = sharing_facts(done) if sharing else None
         facts["state"] = "interrupted" if cut or watcher.stopped else "complete"
         facts["seconds"] = round(time.monotonic() - called, 3)
-        facts["trusted"] = _trusted_frames(request, sheet.frames, _common_stretch(request, segments, done))
+        trusted = _trusted_of_all_tiles(request, segments, done)
+        facts["trusted"] = _trusted_frames(request, sheet.frames, trusted)
         sheet.finish(facts)
     return Outcome(out, (sheet.frames, *sheet.shape), watcher.stopped, facts, cut)
 
 
 def _solved(
-    tasks: Sequence[Task], pool: Pool, watcher: Watcher, budget: Budget, handing: Handing
+    tasks: Sequence[Task], pool: Pool, watcher: Watcher, budget: Budget, choices: SharedChoices
 ) -> Iterator[tuple[Part, Task, SubSegment | None]]:
-    """Solved tasks in order, each with its tile's next sub-segment, until watcher or budget ends it.
+    """Yield solved tasks in order, each with its tile's next sub-segment, until watcher or budget ends it.
 
-    What a choice is handed to waits for it, so that the video does not depend on who is done first.
+    Tasks that share a choice wait for it, so that the video does not depend on which task finishes first.
     """
     submitted = 0
     waiting: deque[Future[Part]] = deque()
     for index, task in enumerate(tasks):
         while submitted < len(tasks) and len(waiting) <= pool.workers and not watcher.stopped:
-            if (submitted and budget.gone) or (waiting and handing.awaits(tasks[submitted])):
+            if (submitted and budget.exhausted) or (waiting and choices.pending(tasks[submitted])):
                 break
             after = len(tasks) - submitted - 1
             undone = after + 1 + sum(not each.done() for each in waiting)
-            waiting.append(pool.submit(budget.limit(handing.told(tasks[submitted]), undone, after)))
+            waiting.append(pool.submit(budget.limit(choices.with_choice(tasks[submitted]), undone, after)))
             submitted += 1
         if not waiting or (part := _result(waiting, pool, watcher)) is None:
             return
-        handing.found(task, part)
+        choices.record(task, part)
         following = tasks[index + 1 : index + 2]
         yield part, task, following[0].segment if following and following[0].tile == task.tile else None
 
 
 def _result(waiting: deque[Future[Part]], pool: Pool, watcher: Watcher) -> Part | None:
-    """The first of those that wait; None when it was cancelled."""
+    """Wait for the first future and return its part; None if it was cancelled."""
     future = waiting.popleft()
     try:
         while not wait([future], LOOK_S).done:
@@ -173,12 +174,12 @@ def _result(waiting: deque[Future[Part]], pool: Pool, watcher: Watcher) -> Part 
         return None
     except BrokenProcessPool as error:
         raise AcquireError(
-            "a process that solved a sub-segment ended by itself", hint="--workers 1: it may lack memory"
+            "a process that solved a sub-segment ended unexpectedly", hint="--workers 1: it may lack memory"
         ) from error
 
 
 def _anchor(recording: Recording, request: VideoRequest) -> tuple[int, int]:
-    """The sub-step at which the read-out of the stream's first line begins, and its UTC in ns."""
+    """Return the sub-step at which the read-out of the stream's first line begins, and its UTC in ns."""
     stream = request.stream
     row = stream.first_line - recording.first_line
     read_out_ns = int(recording.arms["a"].read("time", row, row + 1)[0])
@@ -188,11 +189,16 @@ def _anchor(recording: Recording, request: VideoRequest) -> tuple[int, int]:
 def describe_parts(
     recording: Recording, request: VideoRequest, parts: Sequence[dict[str, Any]], options: Options
 ) -> dict[str, Any]:
-    """Where the video comes from and how good it is, as JSON: as a whole, and each sub-segment."""
+    """Return origin and quality of the video as JSON: of the whole and of each sub-segment."""
     tiles = max(1, len(request.tiles))
     names, reasons = (
         each * tiles if each else ("",) * len(parts) for each in (request.names, request.reasons)
     )
+
+    def rms(key: str) -> float | None:
+        known = [part["quality"][key] for part in parts if part["quality"][key] is not None]
+        return float(np.sqrt(np.mean(np.square(known)))) if known else None
+
     segments = [
         {"name": name, "why": why, **part} for name, why, part in zip(names, reasons, parts, strict=False)
     ]
@@ -216,7 +222,7 @@ def describe_parts(
         "iterations": sum(part["iterations"] for part in parts),
         "iterations_asked": sum(part["iterations_asked"] for part in parts),
         "compiled_s": round(max(part["compiled_s"] for part in parts), 3),
-        "quality": {key: _rms([part["quality"][key] for part in parts]) for key in QUALITY_KEYS},
+        "quality": {key: rms(key) for key in QUALITY_KEYS},
         "error": combined_facts(
             [part["error"] for part in parts], [part["end_substep"] - part["begin_substep"] for part in parts]
         ),
@@ -229,46 +235,40 @@ def describe_parts(
     }
 
 
-def _rms(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.sqrt(np.mean(np.square(known)))) if known else None
-
-
-def _common_stretch(
+def _trusted_of_all_tiles(
     request: VideoRequest, segments: Sequence[SubSegment], parts: Sequence[dict[str, Any]]
 ) -> tuple[int, int]:
-    """What is trusted of every tile, in sub-steps; nothing while a tile lacks a sub-segment."""
+    """Return the sub-steps that are trusted in every tile; none if a tile lacks a sub-segment."""
     begin, count = segments[0].begin, len(segments)
     if request.tiles and len(parts) < count * len(request.tiles):
         return begin, begin
-    found = [
-        _whole_stretch([(each, part["trusted"]) for each, part in zip(segments, of_tile, strict=False)])
+    by_tile = [
+        _longest_trusted([(each, part["trusted"]) for each, part in zip(segments, of_tile, strict=False)])
         for of_tile in (parts[first : first + count] for first in range(0, len(parts), count))
     ]
-    low, high = max(low for low, _ in found), min(high for _, high in found)
+    low, high = max(low for low, _ in by_tile), min(high for _, high in by_tile)
     return low, max(low, high)
 
 
-def _whole_stretch(segments: Sequence[tuple[SubSegment, bool]]) -> tuple[int, int]:
-    """The longest run of sub-segments that are trusted, in sub-steps, without what fades into others."""
+def _longest_trusted(segments: Sequence[tuple[SubSegment, bool]]) -> tuple[int, int]:
+    """Return the longest run of trusted sub-segments, in sub-steps, without its fades into others."""
     runs = [[each for each, _ in run] for trusted, run in groupby(segments, itemgetter(1)) if trusted]
     first, last = segments[0][0], segments[-1][0]
-    found = [
+    edges = [
         (
             run[0].begin + (0 if run[0] is first else run[0].fade_in),
             run[-1].end - (0 if run[-1] is last else run[-1].fade_out),
         )
         for run in runs
     ]
-    return max(found, key=lambda edges: edges[1] - edges[0], default=(first.begin, first.begin))
+    return max(edges, key=lambda each: each[1] - each[0], default=(first.begin, first.begin))
 
 
-def _trusted_frames(request: VideoRequest, frames: int, whole: tuple[int, int]) -> list[int]:
-    """First frame that is sampled in full, of a trusted sub-segment, and the one after the last."""
+def _trusted_frames(request: VideoRequest, frames: int, trusted: tuple[int, int]) -> list[int]:
+    """Return the first frame that is fully sampled and in ``trusted``, and the one after the last."""
     T_m, begin = request.grid.voxels.temporal_merge, request.grid.begin
-    low, high = (
-        edge - begin for edge in (max(request.trusted[0], whole[0]), min(request.trusted[1], whole[1]))
-    )
+    low = max(request.trusted[0], trusted[0]) - begin
+    high = min(request.trusted[1], trusted[1]) - begin
     stop = -(-high // T_m) if begin + high >= request.grid.end else high // T_m
     first = min(frames, -(-low // T_m))
     return [first, max(first, min(frames, stop))]

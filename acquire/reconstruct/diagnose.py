@@ -1,4 +1,4 @@
-"""A stretch of a recording held against what the recording says of it."""
+"""Diagnosis of a recording: a range of its lines is compared with its description."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from acquire.recon.diagnosis import Diagnosis, diagnose
 from acquire.recon.hypotheses import MOST_LINES, Hypothesis
 from acquire.recon.search import Standing
 from acquire.reconstruct.select import by_lines
-from acquire.stream.lightcheck import Finding, Judge, Sight, Verdict, explain
+from acquire.stream.lightcheck import Judge, Sight, Verdict, explain
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -22,15 +22,14 @@ if TYPE_CHECKING:
     from acquire.calibrate import Calibration
     from acquire.fibre import Tile
     from acquire.lines import Segment
-    from acquire.recon.segments import Stream
     from acquire.store import Recording
 
 FAR_LINES = 8192
-"""That the light check takes, which finds delays of thousands of sub-steps."""
+"""Lines for the light check, which finds delays of thousands of sub-steps."""
 
 
-def stretch(recording: Recording, first_line: int | None, lines: int | None) -> tuple[int, int]:
-    """First line and number of those to look at: as asked, or the middle of the recording."""
+def diagnosed_range(recording: Recording, first_line: int | None, lines: int | None) -> tuple[int, int]:
+    """Return first line and number of the lines to diagnose: as requested, or the middle of the recording."""
     stream = by_lines(recording, first_line, lines).stream
     if lines is not None:
         return stream.first_line, lines
@@ -46,13 +45,13 @@ def diagnose_recording(
     calibration: Calibration | None = None,
     tile: Tile | None = None,
 ) -> Diagnosis:
-    """Which hypothesis explains the lines; where none near does, what the light check finds farther off.
+    """Find the hypothesis that explains the lines; if none does, ask the light check, which looks farther.
 
     Lines are read with the ``calibration``, as for a reconstruction; behind a fibre those of one ``tile``.
 
-    UsageError and DataError as `Recording.cut` raises them.
+    Raises UsageError and DataError as `Recording.cut` does.
     """
-    first, count = stretch(recording, first_line, lines)
+    first, count = diagnosed_range(recording, first_line, lines)
     segment = recording.cut(first, count, tile)
     if calibration is not None:
         segment = calibrated(segment, calibration)
@@ -65,11 +64,12 @@ def diagnose_recording(
     found = diagnose(segment, bits)
     if found.standing is not Standing.UNEXPLAINED:
         return found
-    return _farther(recording, by_lines(recording).stream, found, tile)
+    return _with_light_check(recording, found, tile)
 
 
-def _farther(recording: Recording, stream: Stream, found: Diagnosis, tile: Tile | None) -> Diagnosis:
-    """With the light check's word on as many lines as it likes, where that is more."""
+def _with_light_check(recording: Recording, found: Diagnosis, tile: Tile | None) -> Diagnosis:
+    """Complete an unexplained diagnosis with the light check's verdict on up to `FAR_LINES` lines."""
+    stream = by_lines(recording).stream
     whole = stream.end_line - stream.first_line
     count = min(FAR_LINES, whole)
     first = stream.first_line + (whole - count) // 2
@@ -82,10 +82,12 @@ def _farther(recording: Recording, stream: Stream, found: Diagnosis, tile: Tile 
         registration=dict.fromkeys(ARMS, 0),
     )
     findings = judge.look(first, _sights(segment))
-    words = f"light check of {count} lines: {explain(findings, segment.geometry.substeps)}"
-    late = _agreed_delay(findings)
-    if late is None:
+    shifted = all(finding.verdict is Verdict.SHIFTED for finding in findings.values())
+    delays = {finding.shift for finding in findings.values()}
+    if not shifted or len(delays) != 1:
+        words = f"light check of {count} lines: {explain(findings, segment.geometry.substeps)}"
         return replace(found, sentence=f"{found.sentence} ({words})")
+    late = delays.pop()
     return replace(
         found,
         standing=Standing.NAMED,
@@ -94,18 +96,12 @@ def _farther(recording: Recording, stream: Stream, found: Diagnosis, tile: Tile 
     )
 
 
-def _agreed_delay(findings: dict[str, Finding]) -> int | None:
-    """The delay that both arms show."""
-    shifted = all(finding.verdict is Verdict.SHIFTED for finding in findings.values())
-    delays = {finding.shift for finding in findings.values()}
-    return delays.pop() if shifted and len(delays) == 1 else None
-
-
 def _sights(segment: Segment) -> dict[str, Sight]:
+    """Return the mean of each line and of each column above black, per arm, over usable samples."""
     black = np.broadcast_to(np.asarray(segment.black_level_dn, float).reshape(-1), (2,))
     sights = {}
     for name, lines, mask, level in zip(ARMS, segment.lines, segment.mask, black, strict=True):
         dn = np.where(mask, lines - level, 0.0)
-        seen = np.maximum(mask.sum(1), 1), np.maximum(mask.sum(0), 1)
-        sights[name] = Sight(dn.sum(1) / seen[0], dn.sum(0) / seen[1])
+        per_line, per_column = np.maximum(mask.sum(1), 1), np.maximum(mask.sum(0), 1)
+        sights[name] = Sight(dn.sum(1) / per_line, dn.sum(0) / per_column)
     return sights

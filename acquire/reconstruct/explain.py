@@ -1,8 +1,8 @@
-"""What each part of a calibration is worth: a short reconstruction with all of it, and without one part each.
+"""The benefit of each part of a calibration: short reconstructions with all of it, and without one part each.
 
-The measure needs no truth: blocks of samples that the solver does not see are predicted, and a part that
-belongs to the instrument lets them be predicted better. Every trial has the same lines, samples held out,
-bandwidth and iterations.
+The measure needs no ground truth: held-out blocks of samples are predicted, and a part that describes the
+instrument correctly improves the prediction. All trials share the lines, the held-out samples, the bandwidth
+and the number of iterations.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ NOTHING, ALL = "nothing", "all of it"
 
 @dataclass(frozen=True, slots=True)
 class Worth:
-    """One trial: ``prediction`` is the relative error at samples held out.
+    """One trial: ``prediction`` is the relative error at held-out samples.
 
-    ``gain_db`` is how much worse they are predicted without the part (of `NOTHING` and `ALL`: None), and
-    ``time_factor`` the time with all of it beside the time without.
+    ``gain_db`` is the loss of prediction without the part and ``time_factor`` the time with all parts over
+    the time without this one; both are None for `NOTHING` and `ALL`.
     """
 
     part: str
@@ -52,12 +52,12 @@ def explain(
     temporal_merge: int,
     progress: Callable[[int, int], object] = lambda _done, _all: None,
 ) -> tuple[Worth, ...]:
-    """What the parts of a calibration give for a segment and what they cost; `NOTHING` and `ALL` first.
+    """Measure the benefit and cost of the parts of a calibration for a segment; `NOTHING` and `ALL` first.
 
     Raises what `calibrated` and `reconstruct` raise.
     """
     merges = (spatial_merge, temporal_merge)
-    # compiles, so that no trial has to
+    # A first run compiles, so that no trial is timed with it.
     reconstruct(calibrated(segment, known), *merges, iterations=1, check=False)
     frames = segment.geometry.video_shape(*merges)[0]
     parts = dict(_without(known))
@@ -92,7 +92,7 @@ def _trial(segment: Segment, merges: tuple[int, int], bandwidth: float | None) -
 
 
 def _without(known: Calibration) -> Iterator[tuple[str, Calibration]]:
-    """Name of a part → the calibration without it, as far as it holds it."""
+    """Yield the name of each part that the calibration holds, and the calibration without it."""
     for name, quantities in (
         *([("the cameras' curves", CURVE)] if curve_of(known) else []),
         ("offsets per column", OFFSETS),

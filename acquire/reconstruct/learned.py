@@ -1,7 +1,8 @@
-"""What trade-offs found out on this machine, kept for `--budget`: which preset gets furthest in a time.
+"""Results of trade-offs on this machine, kept for `--budget`: which preset reaches most in a given time.
 
-Of one scene a preset says little: what is best for lamps that blink loses where things move. So a preset is
-preferred only by what several scenes say, the same for each preset; runs that a budget cut say nothing.
+One scene says little about a preset: the best for blinking lamps is worse for moving objects. A preset is
+therefore preferred only on the evidence of several scenes, the same for each preset. Runs that a budget cut
+short do not count.
 """
 
 from __future__ import annotations
@@ -19,12 +20,12 @@ if TYPE_CHECKING:
 
 VERSION = 2
 FEWEST_SCENES = 3
-"""With fewer in common, presets are not ranked."""
+"""Fewest common scenes with which presets are ranked."""
 
 
 @dataclass(frozen=True, slots=True)
 class Learned:
-    """A solver's preset reached ``psnr_db`` in ``seconds`` for so many voxels of a scene and its noise."""
+    """A solver's preset reached ``psnr_db`` in ``seconds`` for ``voxels`` of a scene with its noise."""
 
     solver: str
     preset: str
@@ -38,32 +39,35 @@ class Learned:
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """The preset that is preferred, or None; ``why`` says by what, or why none is."""
+    """The preferred preset, or None; ``why`` states the evidence, or why there is none."""
 
     preset: str | None
     why: str
 
 
 def learned_path() -> Path:
-    """``$XDG_CACHE_HOME/acquire/tradeoff.json``, or under ``~/.cache``."""
+    """Return ``$XDG_CACHE_HOME/acquire/tradeoff.json``, or the same under ``~/.cache``."""
     cache = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
     return Path(cache) / "acquire" / "tradeoff.json"
 
 
 def remember(found: Iterable[Learned], path: Path | None = None) -> Path:
-    """Add to what is known; what was learned of the same case before is replaced."""
-    place = path or learned_path()
-    known = {_case(each): each for each in [*recall(place), *found]}
-    place.parent.mkdir(parents=True, exist_ok=True)
-    part = place.with_name(f".{place.name}.{os.getpid()}")
+    """Add results to the file; they replace earlier ones of the same case."""
+    path = path or learned_path()
+    known = {
+        (each.solver, each.preset, each.spatial_merge, each.temporal_merge, each.voxels, each.scene): each
+        for each in [*recall(path), *found]
+    }
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.name}.{os.getpid()}")
     document = {"version": VERSION, "learned": [asdict(each) for each in known.values()]}
     part.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
-    part.replace(place)
-    return place
+    part.replace(path)
+    return path
 
 
 def recall(path: Path | None = None) -> list[Learned]:
-    """What is known; nothing where the file is absent, or not ours."""
+    """Return the results in the file; none if it is absent or not ours."""
     try:
         document = json.loads((path or learned_path()).read_text(encoding="utf-8"))
         return [Learned(**each) for each in document["learned"]] if document["version"] == VERSION else []
@@ -72,12 +76,13 @@ def recall(path: Path | None = None) -> list[Learned]:
 
 
 def choose(known: Sequence[Learned], budget_s: float, voxels: int, workers: int = 1) -> Choice:
-    """The best on average that ends within ``budget_s`` for ``voxels`` voxels, of one solver's presets.
+    """Choose the best preset on average, among those that end within ``budget_s`` for ``voxels`` voxels.
 
-    Times are scaled from the nearest size; presets are compared on the scenes that all of them were tried on.
+    ``known`` is of one solver. Times are scaled from the nearest size. Presets are compared on the scenes
+    that all of them were tried on.
     """
     if not known:
-        return Choice(None, "nothing was learned yet: acquire tradeoff, with several scenes")
+        return Choice(None, "no preset was tried yet: run acquire tradeoff with several scenes")
     nearest = min(known, key=lambda each: abs(each.voxels - voxels)).voxels
     by_preset: dict[str, dict[str, Learned]] = defaultdict(dict)
     for each in known:
@@ -85,11 +90,10 @@ def choose(known: Sequence[Learned], budget_s: float, voxels: int, workers: int 
             by_preset[each.preset][each.scene] = each
     scenes = sorted(set.intersection(*(set(each) for each in by_preset.values())))
     if len(scenes) < FEWEST_SCENES:
-        seen = (
-            f"{len(scenes)} scene{'' if len(scenes) == 1 else 's'} ({', '.join(scenes) or 'none in common'})"
-        )
+        tried = f"{len(scenes)} scene{'' if len(scenes) == 1 else 's'}"
+        names = ", ".join(scenes) or "none in common"
         return Choice(
-            None, f"what was learned is of {seen}, and {FEWEST_SCENES} are needed to prefer a preset"
+            None, f"presets were tried on {tried} ({names}), and {FEWEST_SCENES} are needed to prefer one"
         )
     scale = voxels / nearest / max(1, workers)
     in_time = {
@@ -101,15 +105,4 @@ def choose(known: Sequence[Learned], budget_s: float, voxels: int, workers: int 
         return Choice(None, f"no preset ended in that time on {len(scenes)} scenes")
     return Choice(
         max(in_time, key=in_time.__getitem__), f"learned from {len(scenes)} scenes: {', '.join(scenes)}"
-    )
-
-
-def _case(each: Learned) -> tuple[str, str, int, int, int, str]:
-    return (
-        each.solver,
-        each.preset,
-        each.spatial_merge,
-        each.temporal_merge,
-        each.voxels,
-        each.scene,
     )

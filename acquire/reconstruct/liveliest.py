@@ -1,12 +1,12 @@
-"""The tile behind a fibre whose lines show most, for what is looked at on one tile and told of all.
+"""The tile behind a fibre with the most activity, for whatever is examined on one tile on behalf of all.
 
-A scene at rest is seen as a convolution of each pixel's profile with the code, which its lines determine
-where they are more than n + S − 1. What that leaves beyond the noise is what changes.
+A scene at rest appears as a convolution of each pixel's profile with the code, and more than n + S − 1 lines
+determine that profile. The residual beyond the noise is due to changes of the scene.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,22 +15,20 @@ from acquire.calibrate import calibrated
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from numpy.typing import NDArray
-
     from acquire.calibrate import Calibration
     from acquire.fibre import Tile
     from acquire.lines import Segment
     from acquire.store import Recording
 
 MOST_LINES = 4
-"""Of a tile that are looked at, in n."""
+"""Upper limit on the lines of a tile that are examined, in n."""
 SPARE_LINES = 1.25
-"""Lines beside the unknowns of a scene at rest, below which these explain too much of what moves."""
+"""Least ratio of lines to unknowns of a scene at rest; below it the fit absorbs too much of the changes."""
 MOVES = 0.05
-"""Of the noise, by which what a scene at rest leaves must exceed it: less is rounding."""
+"""Least excess of the residual over the noise, relative to the noise; less is due to rounding."""
 
 
-def speaker(
+def representative_tile(
     recording: Recording,
     tiles: Sequence[Tile],
     stretch: tuple[int, int],
@@ -38,16 +36,18 @@ def speaker(
     *,
     moving: bool = True,
 ) -> Tile | None:
-    """The tile that a look at one speaks for, of those asked for (none: all of a recording); None without a
-    fibre. ``stretch``: first line and number of lines."""
+    """Return the tile to examine on behalf of ``tiles`` (if empty, of all); None without a fibre.
+
+    ``stretch`` is the first line and the number of lines.
+    """
     if recording.fibre is None:
         return None
-    asked = tuple(tiles) or recording.fibre.tiles
-    if len(asked) == 1:
-        return asked[0]
+    candidates = tuple(tiles) or recording.fibre.tiles
+    if len(candidates) == 1:
+        return candidates[0]
     return liveliest(
         recording,
-        asked,
+        candidates,
         stretch,
         lambda lines: lines if calibration is None else calibrated(lines, calibration),
         moving=moving,
@@ -62,26 +62,33 @@ def liveliest(
     *,
     moving: bool,
 ) -> Tile:
-    """The tile in the middle of whose ``stretch`` of lines, as they are ``read``, most changes; without
-    ``moving``, or where nothing changes, that of most contrast."""
+    """Return the tile that changes most in the middle of a ``stretch`` (first line, number of lines).
+
+    ``read`` prepares the lines. Without ``moving``, or if nothing changes, it is the tile with most contrast.
+    """
     (first, count), size = stretch, recording.geometry_for(1).size
     most = min(count, MOST_LINES * size)
     begin = first + (count - most) // 2
-    seen = [energies(read(recording.cut(begin, most, tile))) for tile in tiles]
-    contrast, change = (np.array(each) for each in zip(*seen, strict=True))
+    by_tile = [energies(read(recording.cut(begin, most, tile))) for tile in tiles]
+    contrast, change = (np.array(each) for each in zip(*by_tile, strict=True))
     return tiles[int(np.argmax(change if moving and (change > 0).any() else contrast))]
 
 
 def energies(segment: Segment) -> tuple[float, float]:
-    """Mean square of a segment's lines about their mean, and of what no scene at rest explains of them, both
-    without the noise; 0 where there is no more than that, or where lines are too few."""
+    """Return the variance of a segment's lines, and that of their residual to a scene at rest.
+
+    The variance of the noise is subtracted from both. They are 0 if no more than that remains, or if there
+    are too few lines.
+    """
     geometry, samples = segment.geometry, segment.samples(np.float64)
     variance = segment.variance()
     unknowns = geometry.size + geometry.substeps - 1
-    contrast, left, noise = 0.0, 0.0, 0.0
-    design = _windows(segment.code, geometry.substeps, geometry.lines, unknowns)
+    contrast, residual, noise = 0.0, 0.0, 0.0
+    # (line, unknown): the code that exposed each line, sub-step by sub-step
+    windows = np.lib.stride_tricks.sliding_window_view(segment.code, unknowns)
+    design = windows[: geometry.lines * geometry.substeps : geometry.substeps].astype(np.float64)
     for arm, (lines, mask) in enumerate(zip(samples, segment.mask, strict=True)):
-        pixels = mask.mean(axis=0) > 0.5  # columns that see nothing are masked throughout
+        pixels = mask.mean(axis=0) > 0.5  # columns without light are masked throughout
         rows = mask[:, pixels].all(axis=1)
         good = lines[np.ix_(rows, pixels)]
         if not good.size:
@@ -91,13 +98,7 @@ def energies(segment: Segment) -> tuple[float, float]:
             noise += float(variance[arm][np.ix_(rows, pixels)].mean())
         if len(good) > SPARE_LINES * unknowns:
             fitted, *_ = np.linalg.lstsq(design[rows], good, rcond=None)
-            off = good - design[rows] @ fitted
-            left += float(np.square(off).sum() / ((len(good) - unknowns) * good.shape[1]))
-    change = left - noise
+            unexplained = good - design[rows] @ fitted
+            residual += float(np.square(unexplained).sum() / ((len(good) - unknowns) * good.shape[1]))
+    change = residual - noise
     return max(0.0, contrast - noise), change if change > MOVES * noise else 0.0
-
-
-def _windows(code: NDArray[Any], substeps: int, lines: int, length: int) -> NDArray[np.float64]:
-    """The code that each line saw, sub-step by sub-step: (line, length)."""
-    whole = np.lib.stride_tricks.sliding_window_view(code, length)
-    return whole[: lines * substeps : substeps].astype(np.float64)

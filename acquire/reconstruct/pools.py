@@ -1,6 +1,6 @@
 """Where sub-segments are solved: in this process, in processes of this machine, on a Dask cluster.
 
-All three take tasks by `submit` and give futures; the caller keeps at most ``workers`` + 1 of them waiting.
+All three take tasks by `submit` and return futures; the caller keeps at most ``workers`` + 1 of them waiting.
 """
 
 from __future__ import annotations
@@ -22,31 +22,31 @@ if TYPE_CHECKING:
 
 SCHEDULER_TIMEOUT_S = 10
 STEPS_PER_TASK = 200
-"""How finely the progress of a task in another process is known."""
+"""Resolution of the progress of a task in another process."""
 
 
 class Pool(Protocol):
-    """Solves tasks. ``workers`` of them at a time."""
+    """Solves tasks, ``workers`` of them at a time."""
 
     workers: int
 
     def submit(self, task: Task) -> Future[Part]: ...
 
     def share_done(self) -> float:
-        """Tasks done, those that are being solved counted in part."""
+        """Return the number of tasks done, counting those in progress in part."""
         ...
 
     def stop(self) -> None:
-        """What is being solved ends with the best so far; what waits is still solved unless cancelled."""
+        """End tasks in progress with their best result; waiting ones are still solved unless cancelled."""
 
 
 class Here:
-    """One task at a time, in this process, as it is submitted; ``watch`` is told how far it is."""
+    """Solves one task at a time, in this process, during its submission."""
 
     workers = 1
 
     def __init__(self, watch: Callable[[float], bool] | None = None) -> None:
-        """``watch`` takes the tasks done so far, and says whether to stop."""
+        """``watch`` is called with the number of tasks done so far and returns whether to stop."""
         self._watch, self._done, self._stopped = watch, 0.0, False
 
     def submit(self, task: Task) -> Future[Part]:
@@ -86,17 +86,17 @@ class Processes:
 
 
 class _Shared:
-    """What the processes of a pool have in common; given to each at its start."""
+    """State that the processes of a pool share; each gets it at its start."""
 
     def __init__(self) -> None:
         context = multiprocessing.get_context("spawn")
         self.stop = context.Event()
-        self._steps = context.Semaphore(0)  # counts up: shared memory of a Value would outlive the pool
+        self._steps = context.Semaphore(0)  # a counter: the shared memory of a Value would outlive the pool
         self._share = 0.0
 
     @property
     def done(self) -> float:
-        """Tasks done in all processes."""
+        """Number of tasks done in all processes."""
         return self._steps.get_value() / STEPS_PER_TASK
 
     def advance(self, share: float) -> None:
@@ -109,7 +109,7 @@ class _Shared:
 
 
 class Cluster:
-    """The workers of a Dask cluster that is already there. They read the recording by themselves."""
+    """The workers of an existing Dask cluster. They read the recording themselves."""
 
     def __init__(self, client: Any) -> None:
         self.workers = max(1, len(client.scheduler_info(n_workers=-1)["workers"]))
@@ -117,8 +117,8 @@ class Cluster:
         self._lock, self._done = threading.Lock(), 0
 
     def submit(self, task: Task) -> Future[Part]:
-        elsewhere = replace(task, due=None)  # by another clock
-        future: Future[Part] = self._executor.submit(solve, elsewhere, _Nobody())
+        without_deadline = replace(task, due=None)  # the deadline is a time of this machine's clock
+        future: Future[Part] = self._executor.submit(solve, without_deadline, _NoWatch())
         future.add_done_callback(self._count)
         return future
 
@@ -126,15 +126,15 @@ class Cluster:
         return self._done
 
     def stop(self) -> None:
-        """What a cluster works on is left to it."""
+        """Do nothing: tasks that a cluster works on are left to it."""
 
     def _count(self, _: Future[Part]) -> None:
         with self._lock:
             self._done += 1
 
 
-class _Nobody:
-    """Nobody looks on."""
+class _NoWatch:
+    """Ignores the progress and never requests a stop."""
 
     def advance(self, share: float) -> None: ...
 
@@ -149,9 +149,9 @@ def open_pool(
     cluster: str | None = None,
     watch: Callable[[float], bool] | None = None,
 ) -> Iterator[Pool]:
-    """A pool for so many tasks: on the cluster at the address ``cluster``, else on this machine's cores.
+    """Open a pool for ``tasks`` tasks: on the cluster at address ``cluster``, else on this machine's cores.
 
-    ``watch`` is called from inside a task where the caller has no time of its own (`Here`).
+    ``watch`` is called from inside a task if the caller itself solves the tasks (`Here`).
     """
     if workers is not None and workers < 1:
         raise UsageError(f"{workers} workers cannot solve anything", possible="1 or more")
@@ -171,7 +171,7 @@ def open_pool(
     )
     try:
         yield Processes(executor, count, shared)
-    except KeyboardInterrupt:  # nobody waits for what is being solved
+    except KeyboardInterrupt:  # nobody needs the tasks in progress any more
         for child in multiprocessing.active_children():
             child.kill()
         raise
@@ -206,8 +206,8 @@ _worker: _Shared | None = None
 
 
 def _begin_worker(shared: _Shared, threads: int) -> None:
-    """In a new process: Ctrl-C is for the parent; libraries keep to this process's share of the cores."""
-    global _worker  # noqa: PLW0603  # a process of a pool has no other place for what it is given at its start
+    """Initialise a worker process: ignore Ctrl-C, keep libraries to this process's share of the cores."""
+    global _worker  # noqa: PLW0603  # the only place for the state that a worker process gets at its start
     import numba
 
     signal.signal(signal.SIGINT, signal.SIG_IGN)

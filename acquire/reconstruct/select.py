@@ -1,4 +1,4 @@
-"""What of a recording is reconstructed: lines or times, in one kind of voxels or along a plan."""
+"""Selection of lines or times of a recording to reconstruct, in one kind of voxels or along a plan."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ if TYPE_CHECKING:
     from acquire.store import Recording
 
 SPANS_PER_SEGMENT = 4
-"""Sub-steps that a sub-segment keeps where nobody says otherwise, in n: a third of its lines is overlap."""
+"""Default length of a sub-segment, in n; a third of its lines is then overlap."""
 VOXELS_PER_SEGMENT = 16
 
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Sub-steps ``begin`` to ``end`` (None: as far as it goes) out of the lines of ``stream``.
+    """Sub-steps ``begin`` to ``end`` (None: to the limit) out of the lines of ``stream``.
 
-    ``times`` says them to the user.
+    ``times`` converts them for the user.
     """
 
     stream: Stream
@@ -33,7 +33,10 @@ class Selection:
     end: int | None = None
 
     def extent(self, first: Voxels, last: Voxels, *, whole: bool) -> tuple[int, int]:
-        """As asked, or as `Stream.extent`; UsageError for times that the lines do not show."""
+        """Return the requested sub-steps, by default those of `Stream.extent`.
+
+        Raises UsageError for times that the lines do not show.
+        """
         low, high = self.stream.extent(first, last, whole=whole)
         begin, end = low if self.begin is None else self.begin, high if self.end is None else self.end
         if not low <= begin < end <= high:
@@ -44,21 +47,21 @@ class Selection:
         return begin, end
 
     def length(self, substeps: int) -> str:
-        """So many sub-steps in words."""
+        """Express a number of sub-steps in words."""
         return f"{duration(substeps * self.times.substep_ns)} ({substeps} sub-steps)"
 
     def in_words(self, begin: int, end: int) -> str:
-        """Sub-steps as times and as what they are."""
+        """Express two sub-steps as times and as sub-steps."""
         return f"{self.times.words(begin)} to {self.times.words(end)} (sub-steps {begin} to {end})"
 
 
 @dataclass(frozen=True, slots=True)
 class VideoRequest:
-    """Stretches of a stream that follow one another, and the grid of their common video.
+    """Consecutive ranges of a stream (``stretches``), and the grid of their common video.
 
-    ``trusted`` are the sub-steps that are sampled in full; ``names`` and ``reasons`` are the stretches'.
-    ``glimpses`` are what is looked at where that is less than all of each stretch. ``tiles`` are those of a
-    scene behind a fibre, row by row; none: there is no fibre.
+    ``trusted`` are the fully sampled sub-steps; ``names`` and ``reasons`` belong to the ranges. ``glimpses``
+    are the sub-segments that are solved if they show only a part of each range. ``tiles`` are those of a
+    scene behind a fibre, row by row, and empty without a fibre.
     """
 
     stream: Stream
@@ -72,14 +75,14 @@ class VideoRequest:
     tiles: tuple[Tile, ...] = ()
 
     def sub_segments(self) -> tuple[SubSegment, ...]:
-        """What is solved, in order."""
+        """Return the sub-segments to solve, in order."""
         return self.glimpses or self.stream.arrange(self.stretches, self.fade)
 
 
 def in_tiles(request: VideoRequest, tiles: tuple[Tile, ...]) -> VideoRequest:
-    """The request for each of some tiles of a scene behind a fibre; none: there is no fibre.
+    """Return the request for each of ``tiles`` of a scene behind a fibre; empty without a fibre.
 
-    UsageError for voxels that do not end where a tile does: its neighbour's would begin elsewhere.
+    Raises UsageError for voxels that do not fill a tile, since those of its neighbour would then be offset.
     """
     grid = request.grid
     if tiles and grid.size % grid.voxels.spatial_merge:
@@ -93,25 +96,25 @@ def in_tiles(request: VideoRequest, tiles: tuple[Tile, ...]) -> VideoRequest:
 
 
 def stream_of(recording: Recording) -> Stream:
-    """All lines of a recording."""
+    """Return the stream of all lines of a recording."""
     geometry = recording.geometry_for(1)
     first = recording.first_line
     return Stream(geometry.stages, geometry.substeps, first, first + recording.lines)
 
 
 def by_lines(recording: Recording, first_line: int | None = None, lines: int | None = None) -> Selection:
-    """These lines and no other. UsageError for lines that are not there."""
+    """Select exactly these lines. Raises UsageError for lines that the recording does not have."""
     whole = stream_of(recording)
     first = whole.first_line if first_line is None else first_line
     end = whole.end_line if lines is None else first + lines
     if not whole.first_line <= first < end <= whole.end_line:
-        have = f"lines {whole.first_line} to {whole.end_line - 1}" if recording.lines else "no lines yet"
-        raise UsageError(f"lines {first} to {end - 1} of {recording} are not there", possible=have)
+        possible = f"lines {whole.first_line} to {whole.end_line - 1}" if recording.lines else "no lines yet"
+        raise UsageError(f"lines {first} to {end - 1} of {recording} are not there", possible=possible)
     return Selection(Stream(whole.stages, whole.substeps, first, end), Times.of(recording))
 
 
 def by_time(recording: Recording, begin_ns: int | None, end_ns: int | None) -> Selection:
-    """The video from ``begin_ns`` to ``end_ns`` after the first line's read-out, from all lines it needs."""
+    """Select the video from ``begin_ns`` to ``end_ns`` after the first read-out, from all lines it needs."""
     times = Times.of(recording)
     begin, end = (None if ns is None else times.substep(ns) for ns in (begin_ns, end_ns))
     return Selection(stream_of(recording), times, begin, end)
@@ -120,10 +123,10 @@ def by_time(recording: Recording, begin_ns: int | None, end_ns: int | None) -> S
 def in_voxels(
     selection: Selection, voxels: Voxels, *, whole_ends: bool | None = None, longest: int | None = None
 ) -> VideoRequest:
-    """All of a selection in one kind of voxels, in sub-segments of at most ``longest`` sub-steps.
+    """Request all of a selection in one kind of voxels, in sub-segments of at most ``longest`` sub-steps.
 
-    Voxels as long as two passes of the scene are sampled by every row wherever they lie: they are kept at
-    the ends too, unless ``whole_ends`` says otherwise.
+    Voxels as long as two passes of the scene are sampled by every row wherever they lie. They are kept at the
+    ends, too, unless ``whole_ends`` is given.
     """
     stream = selection.stream
     size = stream.geometry(1).size
@@ -136,9 +139,9 @@ def in_voxels(
 
 
 def in_glimpses(selection: Selection, voxels: Voxels, count: int) -> VideoRequest:
-    """One frame for each of ``count`` equal stretches, from the fewest lines about its middle that show one.
+    """Request one frame for each of ``count`` equal ranges, from the fewest lines about its middle.
 
-    How long that takes does not depend on how long the selection is. UsageError where the stretches are
+    The time this takes does not depend on the length of the selection. Raises UsageError if the ranges are
     shorter than the voxels.
     """
     stream = selection.stream
@@ -151,23 +154,20 @@ def in_glimpses(selection: Selection, voxels: Voxels, count: int) -> VideoReques
         )
     whole = Voxels(voxels.spatial_merge, length)
     stretches = tuple(Stretch(begin + i * length, begin + (i + 1) * length, whole) for i in range(count))
-    glimpses = tuple(_glimpse(stream, stretch, voxels) for stretch in stretches)
+    glimpses = []
+    for stretch in stretches:
+        first = (stretch.begin + stretch.end - voxels.temporal_merge) // 2
+        seen = (first, first + voxels.temporal_merge)
+        glimpse = stream.sub_segment(Stretch(*seen, voxels))
+        glimpses.append(replace(glimpse, begin=stretch.begin, end=stretch.end, seen=seen))
     grid = Grid.finest(stretches, stream.geometry(1).size)
-    return VideoRequest(stream, stretches, grid, (begin, stretches[-1].end), glimpses=glimpses)
-
-
-def _glimpse(stream: Stream, stretch: Stretch, voxels: Voxels) -> SubSegment:
-    middle = (stretch.begin + stretch.end - voxels.temporal_merge) // 2
-    seen = (middle, middle + voxels.temporal_merge)
-    return replace(
-        stream.sub_segment(Stretch(*seen, voxels)), begin=stretch.begin, end=stretch.end, seen=seen
-    )
+    return VideoRequest(stream, stretches, grid, (begin, stretches[-1].end), glimpses=tuple(glimpses))
 
 
 def along_plan(selection: Selection, plan: ReconstructionPlan, grid: Voxels | None = None) -> VideoRequest:
-    """The sub-segments of a plan, one after the other from the selection's beginning.
+    """Request the sub-segments of a plan, one after the other from the beginning of the selection.
 
-    UsageError for a plan that is longer than what there is.
+    Raises UsageError for a plan that is longer than the selection.
     """
     stream = selection.stream
     geometry = stream.geometry(1)
@@ -200,7 +200,7 @@ def along_plan(selection: Selection, plan: ReconstructionPlan, grid: Voxels | No
 
 
 def _trusted(stream: Stream, begin: int, end: int) -> tuple[int, int]:
-    """What of ``begin`` to ``end`` every row samples; empty where nothing is."""
+    """Return the part of ``begin`` to ``end`` that every row samples; empty if there is none."""
     origin, trusted = stream.substeps * stream.first_line, stream.geometry().trusted
     low, high = max(begin, origin + trusted.start), min(end, origin + trusted.stop)
     return (low, high) if high > low else (begin, begin)

@@ -1,4 +1,4 @@
-"""Where the frames of a video go: one after the other, or behind a fibre tile by tile onto a large sheet."""
+"""Output of a video's frames: one after the other, or behind a fibre tile by tile onto a large sheet."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class Sheet(Protocol):
-    """Takes finished frames in the order of tiles and, of each, of time."""
+    """Takes finished frames, tile after tile and in the order of time for each."""
 
     shape: tuple[int, int]
 
@@ -37,11 +37,11 @@ class Sheet(Protocol):
         quality: NDArray[np.float32],
         error: NDArray[np.float32],
     ) -> None:
-        """Frames (t, y, x) of a tile from frame ``first`` on, with their quality (t,) and error (t, 8, 8)."""
+        """Take frames (t, y, x) of a tile from ``first`` on, with their quality (t,) and error (t, 8, 8)."""
         ...
 
     def finish(self, provenance: Mapping[str, Any]) -> None:
-        """The video appears under its name."""
+        """Publish the video under its name."""
         ...
 
 
@@ -49,7 +49,7 @@ class Sheet(Protocol):
 def open_sheet(
     out: Path | str, request: VideoRequest, times: Times, anchor: tuple[int, int]
 ) -> Iterator[Sheet]:
-    """For the video of a request; without `Sheet.finish` nothing is left of it. ``anchor``: see `Times`."""
+    """Open the sheet of a video; without `Sheet.finish` nothing remains. ``anchor``: see `Times`."""
     grid = request.grid
 
     def utc_ns(first: int, stop: int) -> NDArray[np.int64]:
@@ -60,7 +60,7 @@ def open_sheet(
             out,
             (grid.side, grid.side),
             np.dtype(np.float32),
-            _place(request, times),
+            _video_grid(request, times),
             quality=True,
             regions=(REGIONS, REGIONS),
         ) as writer:
@@ -69,7 +69,7 @@ def open_sheet(
     first, last = request.tiles[0], request.tiles[-1]
     tiles = (last.row - first.row + 1, last.column - first.column + 1)
     with MosaicWriter(
-        out, tiles, grid.side, _place(request, times), utc_ns(0, grid.frames), regions=REGIONS
+        out, tiles, grid.side, _video_grid(request, times), utc_ns(0, grid.frames), regions=REGIONS
     ) as mosaic:
         yield _Mosaic(mosaic, grid.side, first, tiles)
 
@@ -87,7 +87,7 @@ class _Strip:
 
     def take(
         self,
-        tile: Tile | None,  # noqa: ARG002  # a sheet
+        tile: Tile | None,  # noqa: ARG002  # the signature of Sheet
         first: int,
         video: NDArray[np.float32],
         quality: NDArray[np.float32],
@@ -97,7 +97,7 @@ class _Strip:
 
 
 class _Mosaic:
-    """Frames of several tiles, of which ``corner`` is the topmost and leftmost."""
+    """Frames of several tiles; ``corner`` is the topmost and leftmost of them."""
 
     def __init__(self, writer: MosaicWriter, side: int, corner: Tile, tiles: tuple[int, int]) -> None:
         self.shape = (tiles[0] * side, tiles[1] * side)
@@ -121,8 +121,8 @@ class _Mosaic:
         self._writer.put(first, (row, column), video, quality, error)
 
 
-def _place(request: VideoRequest, times: Times) -> VideoGrid:
-    """Where the voxels lie: in pixels of the scene at full resolution, and seconds after the first line."""
+def _video_grid(request: VideoRequest, times: Times) -> VideoGrid:
+    """Return the voxels' positions in pixels at full resolution, and in seconds after the first line."""
     grid = request.grid
     side, begin_s = grid.voxels.spatial_merge, (grid.begin - times.first_substep) * times.substep_ns * 1e-9
     step = (times.substep_ns * grid.voxels.temporal_merge * 1e-9, float(side), float(side))

@@ -1,4 +1,4 @@
-"""From a recording on disk to a video on disk: cut, reconstruct, write."""
+"""Writing of a reconstruction that is already in memory, with its provenance."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 def save_reconstruction(
     path: Path, result: Reconstruction, recording: Recording, segment: Segment, spatial_merge: int
 ) -> dict[str, Any]:
-    """Write the whole video of a reconstruction as OME-Zarr; returns the provenance written with it.
+    """Write the whole video of a reconstruction as OME-Zarr and return the provenance written with it.
 
-    ``provenance.trusted`` holds the first frame and the frame after the last that were sampled in full; the
-    frames around them are there because the lines depend on them, not because they can be believed.
-    The side of a voxel is given in pixels of the scene at full resolution, the only length that is known.
+    ``provenance.trusted`` holds the first fully sampled frame and the one after the last. The frames around
+    them are included because the lines depend on them, not because they can be trusted. The side of a voxel
+    is given in pixels of the scene at full resolution, the only length that is known.
     """
     provenance = describe(result, recording, segment)
     interval_ns = segment.substep_ns * float(provenance["parameters"]["temporal_merge"])
@@ -46,7 +46,7 @@ def save_reconstruction(
 
 
 def describe(result: Reconstruction, recording: Recording, segment: Segment) -> dict[str, Any]:
-    """Where a video comes from and how good it is, as JSON."""
+    """Return origin and quality of a video as JSON."""
     quality = {key: value if math.isfinite(value) else None for key, value in asdict(result.quality).items()}
     return {
         "recording": str(recording),

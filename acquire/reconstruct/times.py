@@ -1,4 +1,4 @@
-"""The recording's clock in sub-steps: what a user says in time, and what is said to a user."""
+"""Conversion between a recording's sub-steps and the times that a user types and reads."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ UNITS_NS = {"s": 1e9, "ms": 1e6, "us": 1e3}
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """A recording's times count from the read-out of its first line, which begins with ``first_substep``."""
+    """Times of a recording, counted from the first line's read-out, which begins at ``first_substep``."""
 
     first_substep: int
     substep_ns: float
@@ -29,20 +29,20 @@ class Times:
         return cls(first, recording.line_period_ns / geometry.substeps)
 
     def substep(self, after_ns: int) -> int:
-        """The sub-step that begins so long after the first read-out."""
+        """Return the sub-step that begins ``after_ns`` after the first read-out."""
         return self.first_substep + round(after_ns / self.substep_ns)
 
     def words(self, substep: int) -> str:
-        """When a sub-step begins, as ``--from`` takes it: 52.03ms."""
+        """Return the time at which a sub-step begins, in the form of ``--from``: 52.03ms."""
         return duration((substep - self.first_substep) * self.substep_ns)
 
     def utc_ns(self, substeps: NDArray[np.int64], anchor: tuple[int, int]) -> NDArray[np.int64]:
-        """UTC at which sub-steps begin, given a sub-step and its UTC."""
+        """Return the UTC at which sub-steps begin; ``anchor`` is a sub-step and its UTC."""
         offset: NDArray[np.int64] = np.rint((substeps - anchor[0]) * self.substep_ns).astype(np.int64)
         return anchor[1] + offset
 
 
 def duration(ns: float) -> str:
-    """In the largest unit of which it is at least one: 52.03ms, 1.2s, 300us."""
+    """Format a duration in the largest unit that gives at least 1: 52.03ms, 1.2s, 300us."""
     unit = next((unit for unit, length in UNITS_NS.items() if abs(ns) >= length), "us")
     return f"{ns / UNITS_NS[unit]:.6g}{unit}"

@@ -1,4 +1,4 @@
-"""One sub-segment, from the recording on disk to frames on the common grid: what a worker is sent to do."""
+"""A worker's task: one sub-segment, from the recording on disk to frames on the common grid."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ if TYPE_CHECKING:
     from acquire.recon.segments import Grid, SubSegment
 
 LEAST_BUDGET_S = 0.05
-"""With less, a sub-segment is not reconstructed in less time."""
+"""Smallest useful budget of a sub-segment; a smaller one does not make it faster."""
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How to solve; see `acquire.recon.reconstruct`. ``budget_s`` is for all that is asked for.
+    """How to solve; see `acquire.recon.reconstruct`. ``budget_s`` is for the whole request.
 
-    ``calibration`` is what lines are read with; None: as the cameras' configuration says. ``turn`` is how the
-    arms are to be put right beyond that, ``balance`` what arm B's light is then divided by, ``check`` whether
-    what is not explained is looked into, and ``error`` whether the video's is estimated. The options of the
-    solver and the denoiser's name are those of whoever's solver that is. ``shared``: whether one tile's
-    choice of prior and weight is handed to the others, and one sub-segment's to those after it; None: among
-    the tiles behind a fibre.
+    ``calibration`` corrects the lines; None leaves them to the cameras' configuration. ``turn`` is a further
+    correction of the arms' orientation, ``balance`` the balance by which arm B's light is then divided,
+    ``check`` whether unexplained lines are diagnosed, and ``error`` whether the video's error is estimated.
+    The solver's options and the denoiser's name may be those of a plug-in. ``shared`` is whether one tile's
+    choice of prior and weight is handed to the others, and one sub-segment's to those after it; None shares
+    it among the tiles behind a fibre only.
     """
 
     preset: Preset = "balanced"
@@ -67,7 +67,7 @@ class Options:
 
     @property
     def chooses(self) -> bool:
-        """Whether the solver is one that chooses, and is left to."""
+        """Whether the solver can choose prior and weight, and no option overrides its choice."""
         given = (self.bandwidth, self.denoiser)
         return "choice" in SOLVERS.load(self.solver).takes and all(each is None for each in given)
 
@@ -76,10 +76,9 @@ class Options:
 class Task:
     """A sub-segment of a recording, and the grid on which its frames are wanted. Picklable.
 
-    ``tile`` is what of the scene is solved behind a fibre; None: there is none. ``choice`` is another's of
-    the same voxels, to be tried first.
-    ``due`` (`time.monotonic` of this machine) is when it is to be done; where that is not known, the options'
-    budget is for it.
+    ``tile`` is the solved part of a scene behind a fibre, or None. ``choice`` is that of another task with
+    the same voxels, to be tried first. ``due`` is the deadline (`time.monotonic` of this machine); without
+    one, the options' budget applies to this task.
     """
 
     recording: str
@@ -93,9 +92,12 @@ class Task:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Part:
-    """A solved sub-segment on the grid: ``video`` (t, y, x), the lines' residual ``quality`` (t,) and the
-    estimated ``error`` (t, 8, 8) of regions, NaN where it cannot be told; how it went, and the choice that it
-    led to, where there was one."""
+    """A solved sub-segment on the grid.
+
+    ``video`` is (t, y, x), ``quality`` the residual of the lines (t,), ``error`` the estimated error of
+    regions (t, 8, 8), NaN if unknown. ``facts`` describe the solution, and ``choice`` is the choice of prior
+    and weight that it led to, if any.
+    """
 
     video: NDArray[np.float32]
     quality: NDArray[np.float32]
@@ -105,34 +107,34 @@ class Part:
 
 
 MOST_SHARE = 0.95
-"""Of a task, that its iterations can be; it is done when its result is there."""
+"""Upper limit on the iterations' share of a task, which is complete only with its result."""
 
 
 class Watch(Protocol):
-    """Who looks on while a task is solved."""
+    """Observer of a task in progress."""
 
     def advance(self, share: float) -> None:
-        """``share`` of the task was done since the last call."""
+        """Report that ``share`` of the task was done since the last call."""
 
     def is_set(self) -> bool:
-        """The best so far is wanted now."""
+        """Whether to stop now with the best result so far."""
         ...
 
 
 def solve(task: Task, watch: Watch) -> Part:
-    """Cut, reconstruct, bring to the grid. Raises what `Recording.cut` and `reconstruct` raise."""
+    """Cut, reconstruct and resample to the grid. Raises what `Recording.cut` and `reconstruct` raise."""
     segment, options, voxels = task.segment, task.options, task.segment.voxels
     lines = open_recording(task.recording).cut(segment.first_line, segment.lines, task.tile)
     lines = as_read(lines, options)
     if options.balance is not None:
         lines = divided(lines, options.balance)
-    # by all of the recording: sub-segments by their own lines would differ in brightness
+    # Estimated from the whole recording: their own lines would make sub-segments differ in brightness.
     lines = replace(lines, balanced=True)
 
     done = 0.0
 
     def advanced(progress: Progress) -> None:
-        """Trials come beside the iterations that were asked for, and nobody knows how many."""
+        # Trials come on top of the requested iterations in unknown number, so the share is an estimate.
         nonlocal done
         share = min(progress.iteration / progress.iterations, MOST_SHARE)
         watch.advance(max(0.0, share - done))
@@ -154,14 +156,14 @@ def solve(task: Task, watch: Watch) -> Part:
         dtype=options.dtype,
         device=options.device,
         stop=watch,
-        refuse=False,  # what is begun is ended in order
+        refuse=False,  # a task that was started ends regularly
         check=options.check,
         error=options.error,
     )
     watch.advance(1 - done)
     substeps = lines.geometry.substeps
-    why = _why_not_trusted(result, segment)
-    whose = "" if task.tile is None else f"tile {task.tile}: "
+    doubt = _why_not_trusted(result, segment)
+    prefix = "" if task.tile is None else f"tile {task.tile}: "
     return Part(
         video=task.grid.resample(result.video, segment, substeps),
         quality=task.grid.resample_time(result.frame_error, segment, substeps),
@@ -180,40 +182,38 @@ def solve(task: Task, watch: Watch) -> Part:
             "processor_s": round(result.processor_s, 3),
             "compiled_s": round(result.compiled_s, 3),
             "masked": result.masked,
-            "trusted": why is None,
+            "trusted": doubt is None,
             "tile": None if task.tile is None else str(task.tile),
             "kept_choice": None if task.choice is None else task.choice.kept(result.parameters),
-            "warnings": [whose + text for text in (*([] if why is None else [why]), *result.warnings)],
+            "warnings": [prefix + text for text in (*([] if doubt is None else [doubt]), *result.warnings)],
             "parameters": result.parameters,
             "error": error_facts(result.error),
-            "quality": {name: _json(value) for name, value in asdict(result.quality).items()},
+            "quality": {  # JSON has no NaN
+                name: None if isinstance(value, float) and not np.isfinite(value) else value
+                for name, value in asdict(result.quality).items()
+            },
         },
         choice=Choice.of(result) if result.believed and result.ended != "stopped" else None,
     )
 
 
 def as_read(lines: Segment, options: Options) -> Segment:
-    """With the calibration, and the arms put right."""
+    """Return lines with the calibration and the correction of the arms' orientation applied."""
     if options.calibration is not None:
         lines = calibrated(lines, options.calibration)
     return undo_turn(lines, options.turn)
 
 
 def _why_not_trusted(result: Reconstruction, segment: SubSegment) -> str | None:
-    """Why nothing of it may be believed: it was broken off, or had too little time to explain its lines."""
+    """Return why no frame is trusted, or None: the run was stopped, or too short to explain its lines."""
     if not result.believed:
-        return "no frame of it is trusted: the lines are not what the recording says of them"
+        return "no frame of it is trusted: the lines contradict the recording's description of them"
     missed = float(np.nanmax([result.quality.misfit, result.quality.prediction]))
     if result.ended != "stopped" and (result.ended != "budget" or missed <= POOR_MISFIT):
         return None
-    why = "broken off" if result.ended == "stopped" else "ended by its budget"
+    ended = "stopped" if result.ended == "stopped" else "ended by its budget"
     last = segment.first_line + segment.lines - 1
     return (
-        f"the sub-segment of lines {segment.first_line} to {last} was {why} after {result.iterations} "
-        f"iterations and misses its lines by {missed:.0%}: it is not trusted"
+        f"the sub-segment of lines {segment.first_line} to {last} was {ended} after {result.iterations} "
+        f"iterations and leaves a misfit of {missed:.0%}: it is not trusted"
     )
-
-
-def _json(value: Any) -> Any:
-    """JSON knows no NaN."""
-    return None if isinstance(value, float) and not np.isfinite(value) else value

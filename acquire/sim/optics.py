@@ -33,7 +33,7 @@ def laid_out(scene: Scene, fibre: Fibre, arm: str) -> Scene:
     rows, columns = fibre.field()
 
     def image(frames: NDArray[np.float32]) -> NDArray[np.float32]:
-        return fibre.laid(frames[:, rows, columns], arm)
+        return fibre.lay_out(frames[:, rows, columns], arm)
 
     if isinstance(scene, SeparableScene):
         return _MappedMasks(scene, image)

@@ -1,4 +1,4 @@
-"""One instrument with everything, recorded once."""
+"""One instrument with all effects, recorded once."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from acquire.calibrate.exposure import open_exposure
 
 @pytest.fixture(scope="session")
 def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Of one instrument: dark, flat, target."""
+    """Recordings of one instrument: dark, flat, target."""
     directory = tmp_path_factory.mktemp("instrument")
     scenes: dict[str, Any] = {"dark": white(effects=ALL), "flat": white(effects=ALL)}
     scenes["target"] = dots(directory, ALL)
@@ -24,7 +24,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 @pytest.fixture(scope="session")
 def known(recordings: dict[str, Path]) -> Calibration:
-    """Dark and flat of it."""
+    """Its calibration from dark and flat."""
     first = dark(open_exposure(recordings["dark"]))
     calibration = Calibration(first.instrument).with_step(first)
     return calibration.with_step(flat(open_exposure(recordings["flat"]), calibration))

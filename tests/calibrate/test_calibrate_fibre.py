@@ -1,4 +1,4 @@
-"""Behind a fibre a column's gain is also that of what ends on it: a flat tells both, and tiles get theirs."""
+"""Behind a fibre a column's gain includes that of the fibres that end on it; each tile gets its own part."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ LED = {"name": "x", "row": 0.5, "column": 0.5, "drive": {"waveform": "constant",
 
 
 def recorded(path: Path, shape: str, effects: list[dict[str, Any]], steady: int | None = None) -> Recording:
-    """``steady``: the light's code, where it is constant."""
+    """``steady``: the light's code if it is constant."""
     scene = {"kind": "leds", "leds": [{**LED, "shape": shape, "size": 1.0}], "effects": effects}
     rig = load_rig("rig-demo", SETTINGS)
     if steady is not None:
@@ -64,7 +64,7 @@ def known(tmp_path_factory: pytest.TempPathFactory) -> Calibration:
     return begun.with_step(flat(found["flat"], begun))
 
 
-def test_a_flat_tells_the_gains_of_what_ends_on_each_column(known: Calibration, tmp_path: Path) -> None:
+def test_a_flat_gives_the_gain_of_each_column_with_its_fibres(known: Calibration, tmp_path: Path) -> None:
     assert known.instrument.columns == 103
     uneven = recorded(tmp_path / "uneven.zarr", "x", UNEVEN)
     even = recorded(tmp_path / "even.zarr", "x", [])
@@ -81,7 +81,7 @@ def test_a_flat_tells_the_gains_of_what_ends_on_each_column(known: Calibration, 
     assert np.ptp(levels) < 0.01
 
 
-def test_columns_that_no_band_ends_on_are_masked_and_not_complained_of(known: Calibration) -> None:
+def test_columns_outside_the_bands_are_masked_without_a_warning(known: Calibration) -> None:
     assert known.usable is not None
     fibre = load_rig("rig-demo", SETTINGS).laid_out
     for arm, usable in zip("ab", known.usable, strict=True):
@@ -92,11 +92,11 @@ def test_columns_that_no_band_ends_on_are_masked_and_not_complained_of(known: Ca
 def test_a_calibration_without_these_columns_is_refused(known: Calibration, tmp_path: Path) -> None:
     narrow = Calibration(known.instrument.model_copy(update={"pixels": None}))
     uneven = recorded(tmp_path / "uneven.zarr", "x", [])
-    with pytest.raises(UsageError, match="16 columns does not reach those of the lines"):
+    with pytest.raises(UsageError, match="16 columns does not cover those of the lines"):
         calibrated(uneven.cut(100, 200, uneven.fibre.tiles[-1]), narrow)
 
 
-def test_what_it_gives_is_told_of_one_tile(
+def test_explain_names_the_tile_it_measured(
     known: Calibration,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -117,7 +117,7 @@ def test_what_it_gives_is_told_of_one_tile(
     assert by_part["gains per column"]["gain_db"] > 0.3
 
 
-def test_bands_beside_their_places_are_found_tile_by_tile_and_corrected(tmp_path: Path) -> None:
+def test_displaced_bands_are_measured_tile_by_tile_and_corrected(tmp_path: Path) -> None:
     changes = {**SETTINGS, "geometry.stages": 32, "fibre.rows": 64, "fibre.columns": 96}
     rig = load_rig("rig-demo", {**changes, "fibre.sensor_pixels": 200})
     dots = np.random.default_rng(3).random((32, 32)).repeat(3, axis=0).repeat(3, axis=1) > 0.6

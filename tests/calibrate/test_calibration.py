@@ -1,4 +1,4 @@
-"""A calibration as data: on disk, in a recording's attributes, refused where it does not fit."""
+"""A calibration as data: on disk, in a recording's attributes, refused if it does not fit."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_it_is_read_as_it_was_written(tmp_path: Path, whole: Calibration) -> Non
     assert [path.name for path in tmp_path.iterdir()] == ["cal.zarr"]
 
 
-def test_it_goes_through_json(whole: Calibration) -> None:
+def test_it_survives_json(whole: Calibration) -> None:
     again = Calibration.from_attrs(json.loads(json.dumps(whole.to_attrs())))
     assert same(again, whole, digits=1e-5)
     assert len(json.dumps(whole.to_attrs())) < 20_000
@@ -61,12 +61,12 @@ def test_it_opens_in_xarray(tmp_path: Path, whole: Calibration) -> None:
     assert opened.attrs["steps"]["flat"]["lines"] == 512
 
 
-def test_a_url_will_do(tmp_path: Path, known: Calibration) -> None:
+def test_it_opens_from_a_url(tmp_path: Path, known: Calibration) -> None:
     save_calibration(f"file://{tmp_path}/far/cal.zarr", known)
     assert same(open_calibration(f"file://{tmp_path}/far/cal.zarr"), known)
 
 
-def test_a_step_made_again_takes_the_place_of_the_first(
+def test_a_repeated_step_replaces_the_first(
     tmp_path: Path, recordings: dict[str, Path], whole: Calibration
 ) -> None:
     save_calibration(tmp_path / "cal.zarr", whole)
@@ -78,7 +78,7 @@ def test_a_step_made_again_takes_the_place_of_the_first(
     assert [path.name for path in tmp_path.iterdir()] == ["cal.zarr"]
 
 
-def test_what_is_no_calibration_is_neither_read_nor_replaced(
+def test_anything_but_a_calibration_is_neither_read_nor_replaced(
     tmp_path: Path, recordings: dict[str, Path], known: Calibration
 ) -> None:
     for place in (recordings["dark"], tmp_path, tmp_path / "nothing.zarr"):
@@ -99,7 +99,7 @@ def test_what_is_no_calibration_is_neither_read_nor_replaced(
         ("usable", "x"),
     ],
 )
-def test_damage_is_told(tmp_path: Path, whole: Calibration, key: str, value: object) -> None:
+def test_damage_is_reported(tmp_path: Path, whole: Calibration, key: str, value: object) -> None:
     save_calibration(tmp_path / "cal.zarr", whole)
     root = tmp_path / "cal.zarr" / "zarr.json"
     document = json.loads(root.read_text())
@@ -109,7 +109,7 @@ def test_damage_is_told(tmp_path: Path, whole: Calibration, key: str, value: obj
         open_calibration(tmp_path / "cal.zarr")
 
 
-def test_an_array_that_is_cut_short_is_told(tmp_path: Path, whole: Calibration) -> None:
+def test_a_truncated_array_is_reported(tmp_path: Path, whole: Calibration) -> None:
     save_calibration(tmp_path / "cal.zarr", whole)
     (chunk,) = [path for path in (tmp_path / "cal.zarr" / "gain").rglob("*") if path.name == "0"][-1:]
     chunk.write_bytes(chunk.read_bytes()[:7])
@@ -120,11 +120,14 @@ def test_an_array_that_is_cut_short_is_told(tmp_path: Path, whole: Calibration) 
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"cameras.b.serial": "OTHER"}, "serial SIM-B is OTHER"),
-        ({"cameras.a.pixel_format": "Mono10", "cameras.b.pixel_format": "Mono10"}, "PixelFormat Mono12"),
-        ({"geometry.stages": 12}, "stages M 24 is 12"),
-        ({"geometry.substeps": 2}, "sub-steps S 3 is 2"),
-        ({"cameras.a.responsivity_dn": 4.0}, "responsivity_dn 8.0 is 4.0"),
+        ({"cameras.b.serial": "OTHER"}, "serial is OTHER instead of SIM-B"),
+        (
+            {"cameras.a.pixel_format": "Mono10", "cameras.b.pixel_format": "Mono10"},
+            "PixelFormat is Mono10 instead of Mono12",
+        ),
+        ({"geometry.stages": 12}, "stages M is 12 instead of 24"),
+        ({"geometry.substeps": 2}, "sub-steps S is 2 instead of 3"),
+        ({"cameras.a.responsivity_dn": 4.0}, "responsivity_dn is 4.0 instead of 8.0"),
     ],
 )
 def test_another_instruments_calibration_is_refused(
@@ -137,16 +140,16 @@ def test_another_instruments_calibration_is_refused(
         Calibration(known.instrument).with_step(dark(open_exposure(path), covered=True))
 
 
-def test_age_and_speed_are_told(tmp_path: Path, known: Calibration) -> None:
+def test_age_and_speed_are_reported(tmp_path: Path, known: Calibration) -> None:
     path = record(tmp_path / "run.zarr", white(0.2), "target", 32, **{"trigger.substep_ticks": 1800})
     old = {name: {**step, "made": "2001-01-01T00:00:00+00:00"} for name, step in known.steps.items()}
     (slow, aged) = check_fits(replace(known, steps=old), open_recording(path))
     assert "dark current" in slow
-    assert "days away" in aged
+    assert "days apart" in aged
     assert check_fits(known, open_recording(record(tmp_path / "b.zarr", white(0.2), "target", 32))) == ()
 
 
-def test_what_it_does_not_hold_is_not_corrected(recordings: dict[str, Path], known: Calibration) -> None:
+def test_unmeasured_quantities_are_not_corrected(recordings: dict[str, Path], known: Calibration) -> None:
     segment = open_recording(recordings["target"]).cut(0, 80)
     untouched = calibrated(segment, Calibration(known.instrument))
     assert untouched.black_level_dn == segment.black_level_dn
@@ -161,7 +164,7 @@ def test_what_it_does_not_hold_is_not_corrected(recordings: dict[str, Path], kno
 
 
 def test_lines_are_those_of_an_ideal_camera(recordings: dict[str, Path], known: Calibration) -> None:
-    """A flat, corrected: every column of either arm says the same light."""
+    """In a corrected flat every column of each arm shows the same light."""
     segment = open_recording(recordings["flat"]).cut(0, 512)
     plain, corrected = segment.samples(np.float64), calibrated(segment, known).samples(np.float64)
     inner = slice(2, -2)
@@ -181,14 +184,14 @@ def test_quantities_are_finite_and_of_the_instruments_size(known: Calibration) -
         Measured(np.ones(2), np.ones(3))
 
 
-def test_a_calibration_that_is_true_holds(recordings: dict[str, Path], whole: Calibration) -> None:
+def test_a_true_calibration_holds(recordings: dict[str, Path], whole: Calibration) -> None:
     for recording in recordings.values():
         found = check(open_exposure(recording), whole)
         assert found.holds
         assert found.compared
 
 
-def test_what_has_changed_is_told(tmp_path: Path, recordings: dict[str, Path], whole: Calibration) -> None:
+def test_changes_are_reported(tmp_path: Path, recordings: dict[str, Path], whole: Calibration) -> None:
     warm = [*NOISE, {"kind": "column_offsets", "sigma_dn": 4.0, "channels": 6}]
     moved = [*NOISE, {"kind": "misregistration", "rows": 2.5, "columns": -1.0, "turn_deg": 0.5}]
     halved = {"kind": "beam_splitter", "part_a": 0.5}
@@ -203,7 +206,7 @@ def test_what_has_changed_is_told(tmp_path: Path, recordings: dict[str, Path], w
         assert quantity in {each.quantity for each in found.compared if not each.holds}
 
 
-def test_a_camera_that_was_turned_is_told(tmp_path: Path, whole: Calibration) -> None:
+def test_a_turned_camera_is_reported(tmp_path: Path, whole: Calibration) -> None:
     scene = dots(tmp_path, NOISE, optics={"b": {"turn_deg": 270}})
     found = check(open_exposure(record(tmp_path / "run.zarr", scene, "target", 256)), whole)
     assert not found.holds

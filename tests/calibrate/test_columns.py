@@ -1,4 +1,4 @@
-"""Offsets, gains, noise and electrons of columns, against what the simulator drew."""
+"""Offsets, gains, noise and electrons of columns, compared with those that the simulator drew."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def measured(*exposures: Exposure) -> Calibration:
     return calibration.with_step(flat(exposures[1], calibration)) if len(exposures) > 1 else calibration
 
 
-def test_offsets_and_noise_are_as_sure_as_they_say(recordings: dict[str, Path], known: Calibration) -> None:
+def test_uncertainties_of_offsets_and_noise_are_true(recordings: dict[str, Path], known: Calibration) -> None:
     truth = columns_truth(white(effects=[{"kind": "column_offsets", "sigma_dn": 2.0, "channels": 6}]), "dark")
     offset, noise = known.quantities["offset_dn"], known.quantities["noise_dn"]
     error = offset.value - np.stack([truth[arm] for arm in ARMS])
@@ -50,8 +50,10 @@ def test_gains_to_a_part_in_a_thousand(tmp_path: Path) -> None:
         assert np.sqrt(np.mean(error**2)) < 1.5 * np.median(gain.uncertainty)
 
 
-def test_what_the_optics_hide_is_no_gain(recordings: dict[str, Path], known: Calibration) -> None:
-    """Arm B lies 1.5 and −1 fine pixels off: its edge columns get less light, and their gain stays 1."""
+def test_columns_darkened_by_the_optics_keep_their_gain(
+    recordings: dict[str, Path], known: Calibration
+) -> None:
+    """Arm B is displaced by 1.5 and −1 fine pixels: its edge columns get less light but keep the gain 1."""
     hidden = known.steps["flat"]["optics_hide_columns"]
     assert 0 in hidden["b"] or 23 in hidden["b"]
     assert hidden["a"] == []
@@ -61,8 +63,8 @@ def test_what_the_optics_hide_is_no_gain(recordings: dict[str, Path], known: Cal
 
 
 @pytest.mark.parametrize(("sigma", "hidden"), [(0.5, True), (None, False)])
-def test_a_blurred_edge_of_the_field_is_no_gain(tmp_path: Path, sigma: float | None, hidden: bool) -> None:
-    """The outermost columns lack some percent each, as much as columns differ: together they tell."""
+def test_a_blurred_edge_of_the_field_is_not_a_gain(tmp_path: Path, sigma: float | None, hidden: bool) -> None:
+    """The outermost columns lack some percent each, no more than columns differ, but together it is clear."""
     blur = [] if sigma is None else [{"kind": "psf", "sigma_pixels": sigma}]
     scene = white(effects=[*NOISE, *COLUMNS, *blur])
     paths = [record(tmp_path / f"{each}.zarr", scene, each) for each in ("dark", "flat")]
@@ -72,7 +74,7 @@ def test_a_blurred_edge_of_the_field_is_no_gain(tmp_path: Path, sigma: float | N
 
 
 def test_a_bright_column_does_not_hide_the_edge_of_its_arm() -> None:
-    """The column at the other end is dark: that both are is what the optics do."""
+    """The column at the other end is dark, and the optics darken both."""
     own = 1 + 0.018 * np.random.default_rng(3).standard_normal((2, 64))
     own[:, [0, -1]] = [[1.055, 0.966], [1.0, 1.0]]
     seen = own.copy()
@@ -99,8 +101,8 @@ def test_the_splitter(tmp_path: Path, part_a: float) -> None:
     assert calibration.steps["flat"]["part_a"] == pytest.approx(expected, abs=2e-3)
 
 
-def test_a_smooth_lamp_is_not_the_columns_doing(tmp_path: Path) -> None:
-    """With --smooth the polynomial part goes to the scene; the columns' own part stays."""
+def test_a_smooth_lamp_is_not_attributed_to_columns(tmp_path: Path) -> None:
+    """With --smooth the polynomial part is attributed to the scene, and the columns' own part stays."""
     effects = [*NOISE, {"kind": "prnu", "prnu": 0.02}]
     paths = [record(tmp_path / f"{each}.zarr", white(0.4, effects), each) for each in ("dark", "flat")]
     exposures = [open_exposure(path) for path in paths]
@@ -124,8 +126,8 @@ def test_electrons_from_the_noise(recordings: dict[str, Path], known: Calibratio
     assert "full_well_e" not in found.quantities
 
 
-def test_light_that_flickers_is_not_taken_for_electrons(tmp_path: Path) -> None:
-    """Jitter of 1 % of a sub-step shakes all columns alike, ten times as much as shot noise does."""
+def test_flickering_light_is_not_mistaken_for_shot_noise(tmp_path: Path) -> None:
+    """Jitter of 1 % of a sub-step changes all columns alike, ten times as much as shot noise does."""
     effects = [*NOISE, *COLUMNS, {"kind": "trigger_jitter", "sigma_s": 2e-6}]
     paths = [record(tmp_path / f"{each}.zarr", white(effects=effects), each) for each in ("dark", "flat")]
     exposures = [open_exposure(path) for path in paths]
@@ -142,7 +144,7 @@ def test_the_full_well_shows_where_the_noise_ends(tmp_path: Path) -> None:
     assert found.quantities["dn_per_electron"].value == pytest.approx([0.1, 0.1], rel=0.03)
 
 
-def test_ambient_light_apart_from_the_dark(tmp_path: Path) -> None:
+def test_ambient_light_is_separated_from_the_offset(tmp_path: Path) -> None:
     bright = [*NOISE, *COLUMNS, {"kind": "stray_light", "ambient": 0.02}]
     paths = {
         "covered": record(tmp_path / "covered.zarr", white(effects=[*NOISE, *COLUMNS]), "dark"),
@@ -176,9 +178,13 @@ def test_lit_lines_are_not_dark_unless_the_lens_is_covered(recordings: dict[str,
 
 @pytest.mark.parametrize(
     ("light", "level", "said"),
-    [("flat", 1.0, "saturated"), ("flat", 0.001, "the light adds"), ("target", 0.4, "no steady light")],
+    [
+        ("flat", 1.0, "saturated"),
+        ("flat", 0.001, "the light adds"),
+        ("target", 0.4, "does not have the steady light"),
+    ],
 )
-def test_flats_that_are_none_are_refused(
+def test_unsuitable_flats_are_refused(
     tmp_path: Path, known: Calibration, light: str, level: float, said: str
 ) -> None:
     path = record(tmp_path / "flat.zarr", white(level, ALL), light, 64)
@@ -197,7 +203,7 @@ def test_few_lines_are_refused(recordings: dict[str, Path]) -> None:
         open_exposure(recordings["dark"], lines=5)
 
 
-def test_noise_without_electrons_gives_no_gain_of_electrons(tmp_path: Path) -> None:
+def test_lines_without_shot_noise_are_refused(tmp_path: Path) -> None:
     effects = [{"kind": "read_noise", "sigma_e": 25.0}]
     paths = [
         record(tmp_path / f"{each}.zarr", white(effects=effects), each, 256) for each in ("dark", "flat")

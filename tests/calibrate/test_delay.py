@@ -1,4 +1,4 @@
-"""Light against charge: delays drawn at random, found by sweeps on scenes and noise of all kinds."""
+"""Delays between light and charge: drawn at random, found by sweeps with scenes and noise of all kinds."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from acquire.sim.leds import LedSceneConfig
 
 HZ = 90_000_000
 TICKS = 120
-"""Of a sub-step."""
+"""Ticks of a sub-step."""
 
 
 def uneven(effects: Any) -> LedSceneConfig:
-    """A field that is brighter here and there, at its edges, too."""
+    """Return a field of uneven brightness, at its edges, too."""
     rng = np.random.default_rng(8)
     scene = white(0.3, effects).model_dump(mode="json", exclude_unset=True)
     for k in range(12):
@@ -33,7 +33,7 @@ def uneven(effects: Any) -> LedSceneConfig:
 
 
 def taken(directory: Path, scene: Any, lines: int, ticks: tuple[int, int, int] = (0, 0, 0)) -> Exposure:
-    """Recorded with light.lead_ticks, a.delay_ticks and b.delay_ticks."""
+    """Record a scene with light.lead_ticks, a.delay_ticks and b.delay_ticks."""
     keys = ("light.lead_ticks", "a.delay_ticks", "b.delay_ticks")
     changes = {f"trigger.{key}": value for key, value in zip(keys, ticks, strict=True)}
     directory.mkdir(exist_ok=True)
@@ -42,7 +42,7 @@ def taken(directory: Path, scene: Any, lines: int, ticks: tuple[int, int, int] =
 
 
 def swept(directory: Path, scene: Any) -> Finding:
-    """As the command does it."""
+    """Make a sweep like the command."""
     first = taken(directory, scene, FIRST_LINES)
     setting, point = setting_of(first), point_of(first)
     lines = lines_for(point, first.lines, setting.substep_ticks)
@@ -52,12 +52,12 @@ def swept(directory: Path, scene: Any) -> Finding:
 
 
 def late_by(light: float, a: float, b: float) -> dict[str, Any]:
-    """The effect, in ticks."""
+    """Return the effect, with delays in ticks."""
     return {"kind": "delays", "light_s": light / HZ, "a_s": a / HZ, "b_s": b / HZ}
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_sweep_finds_delays_to_a_tick_and_they_mend_it(tmp_path: Path, seed: int) -> None:
+def test_a_sweep_finds_delays_to_a_tick_and_its_settings_correct_them(tmp_path: Path, seed: int) -> None:
     rng = np.random.default_rng(seed)
     light, a, b = rng.uniform(60, 380), rng.uniform(0, 50), rng.uniform(0, 50)
     optics = ({"kind": "psf", "sigma_pixels": 0.7}, {"kind": "vignetting", "loss": 0.3, "rows": 9.0})
@@ -78,7 +78,7 @@ def test_a_sweep_finds_delays_to_a_tick_and_they_mend_it(tmp_path: Path, seed: i
     assert "light_late_ticks" in Calibration(found.instrument).with_step(found).quantities
 
 
-def test_light_that_is_early_is_told_and_no_lead_is_promised(tmp_path: Path) -> None:
+def test_early_light_is_reported_and_no_lead_is_suggested(tmp_path: Path) -> None:
     found = swept(tmp_path, white(0.7, [*NOISE, late_by(0, 70, 30)]))
     late = found.quantities["light_late_ticks"]
     assert late.value == pytest.approx([-70, -30], abs=4 * late.uncertainty.max())
@@ -89,7 +89,7 @@ def test_light_that_is_early_is_told_and_no_lead_is_promised(tmp_path: Path) -> 
     assert any("the light is early" in text for text in found.warnings)
 
 
-def test_light_that_is_too_late_for_the_trigger_is_found_and_told(tmp_path: Path) -> None:
+def test_light_too_late_for_the_trigger_is_measured_and_reported(tmp_path: Path) -> None:
     found = swept(tmp_path, white(0.7, [*NOISE, late_by(1234, 20, 0)]))
     late = found.quantities["light_late_ticks"]
     assert late.value == pytest.approx([1214, 1234], abs=4 * late.uncertainty.max())
@@ -109,7 +109,7 @@ def test_two_recordings_of_an_interrupted_sweep_are_enough_and_one_is_not(tmp_pa
         delay([one])
 
 
-def test_what_says_nothing_is_refused(tmp_path: Path) -> None:
+def test_recordings_without_information_are_refused(tmp_path: Path) -> None:
     small = white(0.7).model_dump(mode="json")
     small["leds"][0]["size"] = 0.4
     small.pop("kind")
@@ -121,5 +121,5 @@ def test_what_says_nothing_is_refused(tmp_path: Path) -> None:
         beyond(taken(tmp_path / "wrong", wrong, 2048))
     with pytest.raises(UsageError, match="steady light"):
         beyond(open_exposure(record(tmp_path / "flat.zarr", white(), "flat", 64)))
-    with pytest.raises(UsageError, match="whole lines do not tell"):
+    with pytest.raises(UsageError, match="complete lines do not show a delay"):
         beyond(taken(tmp_path / "short", white(0.7), 64))

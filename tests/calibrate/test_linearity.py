@@ -1,4 +1,4 @@
-"""A ramp of light out of the trigger's ticks: cameras that bend, lamps that shake, edges that are slow."""
+"""A ramp of light made by the trigger's ticks: non-linear cameras, fluctuating lamps, slow edges."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from acquire.store import open_recording
 BLACK, WHITE = 20.0, 4095.0
 TICKS = 900
 LEVEL = 0.75
-"""15/16 of its light are at 89 % of white."""
+"""Level at which 15/16 of the light are 89 % of white."""
 ORDER = (1, 3, 5, 7, 9, 11, 13, 15, 14, 12, 10, 8, 6, 4, 2)
 
 
@@ -35,7 +35,7 @@ def before(directory: Path, effects: Any) -> Calibration:
 def ramp(
     directory: Path, effects: Any, longer: float = 0.0, shaky: float = 0.0, level: float = LEVEL
 ) -> list[Exposure]:
-    """On for k/16 of a sub-step, ``longer`` (ticks) by its edges, from a lamp that is ``shaky``."""
+    """Record light for k/16 of a sub-step, ``longer`` by its edges (ticks), from a lamp that is ``shaky``."""
     rng = np.random.default_rng(5)
     found = []
     for k in ORDER:
@@ -53,7 +53,7 @@ def bent(bow: float) -> list[dict[str, Any]]:
 
 
 def readings(bow: float, light_dn: np.ndarray) -> np.ndarray:
-    """Of a camera of which the simulator's formula is true, above black."""
+    """Return the excess of a camera that follows the simulator's formula, above black."""
     x = light_dn / (WHITE - BLACK)
     return light_dn + 4 * bow * (WHITE - BLACK) * x * (1 - x)
 
@@ -62,10 +62,10 @@ def readings(bow: float, light_dn: np.ndarray) -> np.ndarray:
     ("bow", "longer", "shaky", "error_dn"),
     [(0.02, 0.0, 0.0, 0.6), (-0.03, 4.0, 0.0, 1.0), (0.02, -3.0, 1e-3, 12.0)],
 )
-def test_the_curve_is_what_bends_the_camera(
+def test_the_curve_is_that_of_the_camera(
     tmp_path: Path, bow: float, longer: float, shaky: float, error_dn: float
 ) -> None:
-    """82 and 122 DN at the middle; whatever the light's edges add; as sure as it says with a shaky lamp."""
+    """82 and 122 DN in the middle, whatever the light's edges add, within the error of a shaky lamp."""
     known = before(tmp_path, bent(bow))
     found = linearity(ramp(tmp_path, bent(bow), longer, shaky), known)
     curve = curve_of(known.with_step(found))
@@ -83,8 +83,8 @@ def test_the_curve_is_what_bends_the_camera(
     assert found.warnings == ()
 
 
-def test_a_straight_camera_has_no_curve_and_costs_nothing(tmp_path: Path) -> None:
-    """Not even under a lamp that shakes by 0.3 %, which alone makes the linearity error."""
+def test_a_linear_camera_has_no_curve_and_costs_nothing(tmp_path: Path) -> None:
+    """Not even under a lamp that fluctuates by 0.3 %, which alone causes the linearity error."""
     effects = [*NOISE, *COLUMNS]
     known = before(tmp_path, effects)
     exposures = ramp(tmp_path, effects, shaky=3e-3)
@@ -99,7 +99,7 @@ def test_a_straight_camera_has_no_curve_and_costs_nothing(tmp_path: Path) -> Non
 
 
 def test_lines_are_those_of_a_linear_camera(tmp_path: Path) -> None:
-    """Samples of all levels in proportion to ticks; electrons; and arms in each other's places."""
+    """Samples of all levels are in proportion to ticks; likewise electrons, and exchanged arms."""
     known = before(tmp_path, bent(0.03))
     exposures = ramp(tmp_path, bent(0.03))
     whole = known.with_step(linearity(exposures, known))
@@ -137,7 +137,7 @@ def test_the_ramp_ends_where_pixels_are_full(tmp_path: Path) -> None:
     assert full.value == pytest.approx([25_000] * 2, rel=0.1)
 
 
-def test_what_is_no_ramp_is_refused(tmp_path: Path) -> None:
+def test_unsuitable_ramps_are_refused(tmp_path: Path) -> None:
     effects = [*NOISE]
     known = before(tmp_path, effects)
     close = {"trigger.light.close_ticks": 450}
@@ -145,7 +145,7 @@ def test_what_is_no_ramp_is_refused(tmp_path: Path) -> None:
     coded = open_exposure(record(tmp_path / "coded.zarr", white(LEVEL, effects), "target", 64, **close))
     with pytest.raises(UsageError, match="1 levels of light that are neither dark nor saturated"):
         linearity([flat], known)
-    with pytest.raises(UsageError, match="no steady light for linearity"):
+    with pytest.raises(UsageError, match="steady light that linearity needs"):
         linearity([flat, coded], known)
     with pytest.raises(UsageError, match="offsets of the columns first"):
         linearity([flat], Calibration(known.instrument))
@@ -154,8 +154,8 @@ def test_what_is_no_ramp_is_refused(tmp_path: Path) -> None:
         ConverterCurve(knots, 3000 * np.sin(knots / 200))
 
 
-def test_a_recording_that_is_cut_has_its_curve(tmp_path: Path) -> None:
-    """Slope and curve belong together: what a small difference becomes."""
+def test_a_cut_segment_has_the_curve(tmp_path: Path) -> None:
+    """The slope is the derivative of the curve."""
     knots = np.linspace(0, 4095, 65)[None].repeat(2, 0)
     curve = ConverterCurve(knots, 80 * np.sin(knots / 1300))
     dn = np.array([[100.0, 2000.0, 4090.0, 5000.0]] * 2)

@@ -1,4 +1,4 @@
-"""How wide the optics blur, from slanted edges: found, not told, and part of the model only then."""
+"""The optics' blur from slanted edges: measured or refused, and in the model only if it is clear."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def edges(directory: Path, turn_deg: float, effects: Any) -> VideoSceneConfig:
 
 
 def board(turn_deg: float) -> Any:
-    """A checkerboard of squares of 58 fine pixels, turned; a pixel holds the mean of what covers it."""
+    """Draw a turned checkerboard of 58 fine pixels per square; a pixel is the mean over its area."""
     angle = np.deg2rad(turn_deg)
     at = (np.arange(SIZE * FINER) + 0.5) / FINER - SIZE / 2
     y, x = np.meshgrid(at, at, indexing="ij")
@@ -57,7 +57,7 @@ def taken(path: Path, turn_deg: float, *effects: Any, lines: int = 1024) -> Path
 
 @pytest.fixture(scope="module")
 def unequal(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Of optics whose arms differ."""
+    """Record edges with optics whose arms differ."""
     return taken(tmp_path_factory.mktemp("unequal") / "edges.zarr", 8.0, blurred(0.7, 1.4))
 
 
@@ -68,7 +68,7 @@ def known(unequal: Path) -> Calibration:
     return empty.with_step(psf(exposure, empty))
 
 
-def test_the_width_of_either_arm_is_found(known: Calibration) -> None:
+def test_the_width_of_each_arm_is_measured(known: Calibration) -> None:
     found = known.quantities["blur_px"]
     np.testing.assert_allclose(found.value, [[0.7, 0.7], [1.4, 1.4]], atol=0.08)
     assert (np.abs(found.value - [[0.7], [1.4]]) < 2.5 * found.uncertainty).all()
@@ -77,8 +77,8 @@ def test_the_width_of_either_arm_is_found(known: Calibration) -> None:
     assert corrected(known) == ["the optics' blur"]
 
 
-def test_columns_that_differ_leave_the_widths_as_they_are(tmp_path: Path) -> None:
-    """Without a dark and a flat: why the guided step asks for neither."""
+def test_unequal_columns_do_not_change_the_widths(tmp_path: Path) -> None:
+    """Without a dark and a flat, which is why the guided step needs neither."""
     uneven = ({"kind": "prnu", "prnu": 0.03}, {"kind": "column_offsets", "sigma_dn": 5.0})
     exposure = open_exposure(taken(tmp_path / "edges.zarr", 8.0, blurred(0.7, 1.4), *uneven))
     found = psf(exposure, Calibration(exposure.instrument)).quantities["blur_px"]
@@ -86,7 +86,7 @@ def test_columns_that_differ_leave_the_widths_as_they_are(tmp_path: Path) -> Non
 
 
 def still(turn_deg: float) -> Still:
-    """Of a checkerboard before optics that do not blur."""
+    """Return the image of a checkerboard with optics that do not blur."""
     fine = board(turn_deg)
     rows = np.pad(fine, ((S - 1, S - 1), (0, 0)))
     summed = np.lib.stride_tricks.sliding_window_view(rows, S, axis=0).sum(axis=-1)
@@ -95,38 +95,38 @@ def still(turn_deg: float) -> Still:
     return Still(image + noise, 1.0, 0.1, np.ones(STAGES, np.bool_))
 
 
-def test_optics_that_do_not_blur_get_no_blur(monkeypatch: pytest.MonkeyPatch, unequal: Path) -> None:
+def test_optics_without_blur_get_none(monkeypatch: pytest.MonkeyPatch, unequal: Path) -> None:
     monkeypatch.setattr(method, "stills", lambda _segment: (still(5.0), still(12.0)))
     exposure = open_exposure(unequal)
     empty = Calibration(exposure.instrument)
     found = psf(exposure, empty)
     sharp = empty.with_step(found)
     assert len(found.warnings) == 4
-    assert "it cannot be told from no blur at all; at most 0." in found.warnings[0]
+    assert "the blur is not clearly above 0; it is at most 0." in found.warnings[0]
     assert blur_of(sharp) is None
     assert corrected(sharp) == []
-    assert "not told from 0" in known_facts(sharp)["the optics' blur"]
+    assert "not clearly above 0" in known_facts(sharp)["the optics' blur"]
     assert calibrated(exposure.whole(), sharp).blur is None
 
 
-def test_edges_along_the_grid_are_no_answer() -> None:
+def test_edges_along_the_grid_are_ignored() -> None:
     assert straight_edges(still(0.0), S, "a") == []
-    with pytest.raises(UsageError, match="cannot tell how wide the optics of arm a blur: 0 windows hold a"):
+    with pytest.raises(UsageError, match="blur of the optics of arm a cannot be measured: only 0 windows"):
         widths([], "a")
 
 
-def test_edges_that_noise_hides_are_no_answer() -> None:
+def test_edges_hidden_by_noise_are_refused() -> None:
     image = np.random.default_rng(0).standard_normal((194, 64))
     hidden = Still(image, 1.0, 0.1, np.ones(64, np.bool_))
     with pytest.raises(
-        UsageError, match=r"arm b blur: its best edge is 2\.\d times the image's noise, of 10"
+        UsageError, match=r"arm b cannot be measured: its best edge is 2\.\d times the image's noise, and 10"
     ):
         straight_edges(hidden, 3, "b")
 
 
-def test_dots_are_no_edges(tmp_path: Path) -> None:
+def test_dots_are_not_edges(tmp_path: Path) -> None:
     exposure = open_exposure(record(tmp_path / "dots.zarr", dots(tmp_path, NOISE), "target"))
-    with pytest.raises(UsageError, match="cannot tell how wide the optics of arm a"):
+    with pytest.raises(UsageError, match="blur of the optics of arm a cannot be measured"):
         psf(exposure, Calibration(exposure.instrument))
 
 
@@ -137,8 +137,8 @@ def test_steady_light_shows_no_edges(tmp_path: Path) -> None:
         psf(exposure, Calibration(exposure.instrument))
 
 
-def test_edges_that_all_lie_one_way_tell_one_axis() -> None:
-    with pytest.raises(UsageError, match="nothing of its blur across the transfer; edges along it, slanted"):
+def test_edges_in_one_direction_determine_one_axis_only() -> None:
+    with pytest.raises(UsageError, match="do not show the blur across the transfer; slanted edges along it"):
         widths([Edge((np.cos(0.1 + t), np.sin(0.1 + t)), 0.5, 0.02) for t in np.linspace(0, 0.1, 20)], "b")
 
 
@@ -152,19 +152,19 @@ def lines(unequal: Path) -> Segment:
     return open_exposure(unequal, None, 64).whole()
 
 
-def test_only_what_is_clearly_above_nothing_is_in_the_model(known: Calibration, lines: Segment) -> None:
+def test_only_widths_clearly_above_0_are_in_the_model(known: Calibration, lines: Segment) -> None:
     assert calibrated(lines, with_blur(known, [[0.5, 0.03], [0.0, 0.7]])).blur == Blur((0.5, 0), (0, 0.7))
     assert calibrated(lines, with_blur(known, [[0.5, 0.5], [0.5, 0.5]], sure=0.3)).blur is None
 
 
-def test_widths_go_with_their_camera(known: Calibration, lines: Segment) -> None:
+def test_widths_stay_with_their_camera(known: Calibration, lines: Segment) -> None:
     measured = calibrated(lines, with_blur(known, [[0.5, 0.6], [0.7, 0.8]]))
     assert oriented(measured, view_named("turn 270")).blur == Blur((0.7, 0.8), (0.5, 0.6))
     assert oriented(measured, view_named("turn 270, mirrored")).blur == measured.blur
 
 
-def test_what_laying_arm_b_on_arm_a_blurs_is_not_counted_twice(known: Calibration, lines: Segment) -> None:
-    """The interpolation's share, 1/4 of a pixel² along columns, is taken from what was measured."""
+def test_blur_by_registration_is_not_counted_twice(known: Calibration, lines: Segment) -> None:
+    """The interpolation's share, 1/4 of a pixel² along columns, is subtracted from the measured width."""
     found = AlignmentFound(Alignment(0.0, 0.5), {})
     laid = calibrated(lines, replace(with_blur(known, [[0.5, 0.6], [0.7, 0.8]]), alignment=found))
     assert laid.blur is not None
@@ -176,7 +176,7 @@ def test_what_laying_arm_b_on_arm_a_blurs_is_not_counted_twice(known: Calibratio
 
 
 def test_a_check_compares_the_focus(unequal: Path, known: Calibration) -> None:
-    """A checkerboard does not tell the orientation, but its edges tell whether the focus is what it was."""
+    """A checkerboard does not show the orientation, but its edges show whether the focus has changed."""
     exposure = open_exposure(unequal)
     assert [each.holds for each in check(exposure, known).compared] == [True] * 4
     moved = check(exposure, with_blur(known, [[0.7, 0.7], [0.9, 1.4]]))
@@ -185,9 +185,11 @@ def test_a_check_compares_the_focus(unequal: Path, known: Calibration) -> None:
     assert moved.compared[2].quantity == "blur of arm b along the transfer"
 
 
-def test_a_check_says_where_a_target_does_not_tell_of_focus(tmp_path: Path) -> None:
+def test_a_check_reports_a_target_that_does_not_show_the_focus(tmp_path: Path) -> None:
     exposure = open_exposure(record(tmp_path / "dots.zarr", dots(tmp_path, NOISE), "target"))
     held = with_blur(Calibration(exposure.instrument), [[0.7, 0.7], [0.9, 1.4]])
     found = check(exposure, held)
     assert not any("blur" in each.quantity for each in found.compared)
-    assert any("the optics' blur was not compared: cannot tell" in doubt for doubt in found.doubts)
+    assert any(
+        "the optics' blur was not compared: the blur of the optics of arm" in doubt for doubt in found.doubts
+    )

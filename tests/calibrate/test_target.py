@@ -1,4 +1,4 @@
-"""Orientation and alignment from a target at rest, and what they put right in the lines."""
+"""Orientation and alignment from a target at rest, and the corrections of lines that follow."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_each_arm_alone_shows_a_scene_at_rest(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.name)
-def test_every_orientation_is_told_from_a_target(tmp_path: Path, view: View) -> None:
+def test_every_orientation_is_found_from_a_target(tmp_path: Path, view: View) -> None:
     optics = {"b": {"turn_deg": view.turn_deg, "mirror": view.mirrored}}
     path = record(tmp_path / "target.zarr", dots(tmp_path, NOISE, optics=optics), "target", 256)
     found = orientation(open_exposure(path), empty(path))
@@ -50,25 +50,25 @@ def test_every_orientation_is_told_from_a_target(tmp_path: Path, view: View) -> 
 
 
 def test_orientation_is_relative_to_arm_a(tmp_path: Path) -> None:
-    """A turned by 90, B as the scene: the arms are swapped."""
+    """A is turned by 90 degrees and B is not: the arms are swapped."""
     optics = {"a": {"turn_deg": 90}, "b": {"turn_deg": 0}}
     path = record(tmp_path / "target.zarr", dots(tmp_path, NOISE, optics=optics), "target", 256)
     assert orientation(open_exposure(path), empty(path)).orientation == "turn 270"
 
 
 @pytest.mark.parametrize("which", ["black", "white"])
-def test_a_scene_without_texture_does_not_tell(tmp_path: Path, which: str) -> None:
+def test_a_scene_without_texture_gives_no_orientation(tmp_path: Path, which: str) -> None:
     path = record(tmp_path / "plain.zarr", white(0.4 if which == "white" else 0.0, NOISE), "target", 256)
     found = orientation(open_exposure(path), empty(path))
     assert found.orientation is None
-    assert "cannot tell" in found.warnings[0]
-    with pytest.raises(UsageError, match="does not tell how arm B lies"):
+    assert "is not clear" in found.warnings[0]
+    with pytest.raises(UsageError, match="does not determine the alignment"):
         alignment(open_exposure(path), empty(path))
 
 
 @pytest.mark.parametrize("view", [view for view in VIEWS if view.crosses], ids=lambda view: view.name)
-def test_lines_are_undo_turn(tmp_path: Path, view: View) -> None:
-    """What `oriented` gives is Eq. (4) of what the first of its cameras sees."""
+def test_lines_are_oriented(tmp_path: Path, view: View) -> None:
+    """`oriented` gives Eq. (4) of the view of the camera that then comes first."""
     scene = dots(tmp_path, optics={"b": {"turn_deg": view.turn_deg, "mirror": view.mirrored}})
     path = record(tmp_path / "run.zarr", scene, "target", 80)
     segment = replace(open_recording(path).cut(0, 80), responsivity_dn=(8.0, 8.0))
@@ -99,7 +99,7 @@ def test_cameras_along_the_same_axis_are_refused(recordings: dict[str, Path]) ->
     ],
 )
 def test_shift_and_turn_to_some_hundredths(tmp_path: Path, off: dict[str, float]) -> None:
-    """With ordinary noise and unequal columns that nothing corrects; a seventh of the paper's pixels."""
+    """With ordinary noise, uncorrected unequal columns, and a seventh of the paper's pixels."""
     effects = [*NOISE, {"kind": "prnu", "prnu": 0.01}, {"kind": "misregistration", **off}]
     path = record(tmp_path / "target.zarr", dots(tmp_path, effects), "target", 768)
     found = alignment(open_exposure(path), empty(path)).alignment
@@ -113,10 +113,10 @@ def test_shift_and_turn_to_some_hundredths(tmp_path: Path, off: dict[str, float]
         assert error < 8 * found.uncertainty[name]
 
 
-def test_a_flat_that_ends_at_the_fields_edge_is_undo_turn(
+def test_a_flat_that_ends_at_the_fields_edge_is_corrected(
     recordings: dict[str, Path], known: Calibration
 ) -> None:
-    """Arm B looks beyond it: its part looks smaller, and its turn gives the gains a slope."""
+    """Arm B sees beyond it: its share looks smaller, and its turn gives the gains a slope."""
     found = alignment(open_exposure(recordings["target"]), known)
     assert "light ends at the field's edge" in found.warnings[0]
     truth = columns_truth(white(effects=[COLUMNS[0]]))
@@ -136,7 +136,7 @@ def test_a_flat_that_ends_at_the_fields_edge_is_undo_turn(
     assert balance < 0.002
 
 
-def test_a_flat_that_goes_on_beyond_the_field_stays(tmp_path: Path) -> None:
+def test_a_flat_larger_than_the_field_is_unchanged(tmp_path: Path) -> None:
     off = {"kind": "misregistration", "rows": 1.5, "columns": -1.0, "turn_deg": 0.5, "beyond": "edge"}
     effects = [*NOISE, *COLUMNS, {"kind": "beam_splitter", "part_a": 0.46}, off]
     plain = white(effects=effects)
@@ -154,8 +154,8 @@ def test_a_flat_that_goes_on_beyond_the_field_stays(tmp_path: Path) -> None:
     assert found.alignment.alignment.rows == pytest.approx(1.5, abs=0.06)
 
 
-def test_light_that_both_arms_see_mends_the_balance(tmp_path: Path, known: Calibration) -> None:
-    """A splitter that has moved since the flat: the target says so."""
+def test_light_on_the_common_field_corrects_the_balance(tmp_path: Path, known: Calibration) -> None:
+    """The target shows that the splitter has moved since the flat."""
     effects = [*NOISE, *COLUMNS, {"kind": "beam_splitter", "part_a": 0.5}]
     path = record(tmp_path / "target.zarr", dots(tmp_path, effects), "target")
     found = alignment(open_exposure(path), known)
@@ -164,11 +164,11 @@ def test_light_that_both_arms_see_mends_the_balance(tmp_path: Path, known: Calib
     assert "the balance is corrected" in found.warnings[0]
 
 
-def test_another_orientation_than_believed_is_told(tmp_path: Path) -> None:
+def test_another_orientation_than_known_is_refused(tmp_path: Path) -> None:
     path = record(
         tmp_path / "target.zarr", dots(tmp_path, NOISE, optics={"b": {"turn_deg": 270}}), "target", 256
     )
-    with pytest.raises(UsageError, match="as was believed"):
+    with pytest.raises(UsageError, match="the known orientation"):
         alignment(open_exposure(path), empty(path))
     right = replace(empty(path), orientation="turn 270")
     found = alignment(open_exposure(path), right).alignment
@@ -176,12 +176,12 @@ def test_another_orientation_than_believed_is_told(tmp_path: Path) -> None:
     assert abs(found.alignment.rows) < 0.1
 
 
-def test_what_shows_nothing_is_refused(
+def test_recordings_without_an_image_are_refused(
     tmp_path: Path, recordings: dict[str, Path], known: Calibration
 ) -> None:
     with pytest.raises(UsageError, match="constant code"):
         orientation(open_exposure(recordings["flat"]), known)
-    with pytest.raises(UsageError, match="whole lines do not show an image"):
+    with pytest.raises(UsageError, match="complete lines do not determine an image"):
         orientation(open_exposure(recordings["target"], lines=80), known)
 
 

@@ -191,7 +191,7 @@ def test_a_budget_takes_what_was_learned(
     lessons = json.loads((tmp_path / "cache" / "acquire" / "tradeoff.json").read_text())["learned"]
     reconstructing = ("reconstruct", recording, "--nm", 2, "--lines", 100, "--budget", 40)
     answer = cli(*reconstructing, "--out", tmp_path / "one.zarr")
-    assert "preset balanced: what was learned is of 1 scene (" in answer.err
+    assert "preset balanced: presets were tried on 1 scene (" in answer.err
     for lesson in lessons:
         lesson["seconds"] = 1.0 if lesson["preset"] == "fast" else 5000.0
     of_three = [lesson | {"scene": scene} for lesson in lessons for scene in ("a", "b", "c")]

@@ -36,12 +36,12 @@ def test_a_kernel_is_as_wide_as_was_measured(sigma: float) -> None:
     np.testing.assert_array_equal(weights, weights[::-1])
 
 
-def test_what_is_not_blurred_stays_what_it_is() -> None:
+def test_an_image_without_blur_is_unchanged() -> None:
     np.testing.assert_array_equal(blur_matrix(0.0, 12), np.eye(12))
     np.testing.assert_array_equal(blur_matrix(0.0, 12, 3), np.eye(4))
 
 
-def test_it_is_the_simulators_gaussian_inside_the_field() -> None:
+def test_inside_the_field_it_is_the_simulators_gaussian() -> None:
     frame = np.random.default_rng(0).random((40, 40))
     at = np.arange(-6, 7)
     weights = np.exp(-0.5 * (at / 1.4) ** 2)
@@ -71,7 +71,7 @@ def test_voxels_are_held_blurred_and_averaged(merge: int) -> None:
 
 
 def test_each_arm_is_blurred_along_and_across_its_own_transfer() -> None:
-    """A point before arm A spreads down by its width along, before arm B to the side."""
+    """In arm A a point spreads vertically by the width along the transfer, in arm B horizontally."""
     g = Geometry(8, 3, 40)
     code = np.random.default_rng(0).integers(0, 2, g.span).astype(np.uint8)
     video = np.zeros((1, 24, 24))
@@ -126,14 +126,14 @@ def test_the_transpose_is_exact_and_the_bound_holds(
     np.testing.assert_allclose(gathered.adjoint(lines), model.adjoint(lines), atol=1e-10)
 
 
-def test_laying_arm_b_on_arm_a_blurs_by_what_it_says() -> None:
-    """A point's image, a third and a half of a pixel off, has the variance f·(1 − f)."""
+def test_registration_blurs_by_its_interpolation_variance() -> None:
+    """The image of a point displaced by a third and a half of a pixel has the variance f·(1 − f)."""
     rows, columns = interpolation_variance(Alignment(1 / 3, 0.5), 30)
     assert (rows, columns) == pytest.approx((2 / 9, 1 / 4))
     assert interpolation_variance(Alignment(2, -1), 30) == pytest.approx((0, 0))
 
 
 @pytest.mark.parametrize("values", [(-0.1, 0), (np.nan, 0), (0, 17)])
-def test_what_is_no_width_is_refused(values: tuple[float, float]) -> None:
+def test_impossible_widths_are_refused(values: tuple[float, float]) -> None:
     with pytest.raises(UsageError, match="blur is impossible"):
         Blur((0, 0), values)

@@ -118,14 +118,14 @@ def test_lines_of_one_arm_share_no_voxel_at_full_resolution() -> None:
     assert np.count_nonzero(gram - np.diag(np.diag(gram))) == 0
 
 
-def test_merge_and_hold_are_inverse_and_weigh_short_blocks_truly() -> None:
+def test_merge_inverts_hold_and_weights_short_blocks_correctly() -> None:
     g = Geometry(2, 2, 3)
     rng = np.random.default_rng(0)
     voxels = rng.random(g.video_shape(3, 4))
     np.testing.assert_allclose(merge_video(hold_video(voxels, g, 3, 4), 3, 4), voxels, rtol=1e-6)
 
 
-def test_columns_are_weighted_by_what_block_and_pixel_share() -> None:
+def test_columns_are_weighted_by_the_overlap_of_block_and_pixel() -> None:
     """C_N of Eq. (3), and its transpose: N_m·I where N_m = S, true overlap counts elsewhere."""
     np.testing.assert_array_equal(blocks_to_pixels(np.eye(2), 4, 2, 3), [[2, 1], [0, 1]])
     np.testing.assert_array_equal(blocks_to_pixels(np.eye(2), 4, 2, 2), 2 * np.eye(2))

@@ -1,4 +1,4 @@
-"""Arm B's image lies off: R, its transpose in every operator, and the simulator's effect of the same name."""
+"""Arm B's image is displaced: R, its transpose in every operator, and the effect ``misregistration``."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def cases(draw: st.DrawFn) -> tuple[Geometry, int, int, Alignment, int]:
 
 @settings(max_examples=60, deadline=None)
 @given(cases())
-def test_only_arm_b_is_off_and_the_transpose_is_exact(
+def test_only_arm_b_is_displaced_and_the_transpose_is_exact(
     case: tuple[Geometry, int, int, Alignment, int],
 ) -> None:
     g, N_m, T_m, alignment, seed = case
@@ -103,6 +103,6 @@ def test_only_arm_b_is_off_and_the_transpose_is_exact(
 @pytest.mark.parametrize(
     "values", [(np.nan, 0, 0, 1), (0, 2e4, 0, 1), (0, 0, 60, 1), (0, 0, 0, 0), (0, 0, 0, 3)]
 )
-def test_what_no_instrument_is_is_refused(values: tuple[float, float, float, float]) -> None:
+def test_impossible_alignments_are_refused(values: tuple[float, float, float, float]) -> None:
     with pytest.raises(UsageError, match="alignment"):
         Alignment(*values)

@@ -103,7 +103,7 @@ def test_an_unknown_effect_is_told_with_what_there_is_and_from_where(
         ("lab_light:Glow", "def broken(:", "SyntaxError"),
         ("lab_light:Glow", "raise SystemExit('no licence')", "SystemExit: no licence"),
         ("lab_light:Gone", GLOW, "has no attribute 'Gone'"),
-        ("lab_light:Stage", GLOW, "is no class that extends acquire.sim.effects.base.Effect"),
+        ("lab_light:Stage", GLOW, "is not a class that extends acquire.sim.effects.base.Effect"),
         ("lab_light:Glow", GLOW.replace('"glow"]', '"glare"]'), r"needs kind: Literal\['glow'\]"),
         ("lab_light:Glow", GLOW.replace("def stages", "def steps"), "does not define stages"),
     ],

@@ -141,7 +141,7 @@ def test_errors_of_sub_segments_are_combined() -> None:
     assert whole["rms"] == pytest.approx(np.sqrt((0.03**2 + 0.04**2) / 2))
     assert error_in_words(whole) == "about 1.8 % of full scale (1.3 to 3.3 % in nine of ten)"
     unknown = combined_facts([*parts, {"unknown": "the video is dark"}], [1, 1, 1])
-    assert error_in_words(unknown) == "cannot be told: the video is dark"
+    assert error_in_words(unknown) == "unknown: the video is dark"
 
 
 @pytest.mark.parametrize("camera", [CLEAN, Camera()], ids=["clean", "1e4"])

@@ -1,4 +1,4 @@
-"""Arms that get different shares of the light: corrected where nothing is known, told where it changed."""
+"""Arms with different shares of the light: corrected if unknown, reported if a calibration is wrong."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def provenance(path: Path, out: Path, calibration: Calibration | None = None) ->
         return combine(recording, request, out, options, pool, watcher).provenance
 
 
-def test_what_the_lines_tell_is_corrected_and_said(split: Path, tmp_path: Path) -> None:
+def test_a_balance_found_in_the_lines_is_corrected_and_reported(split: Path, tmp_path: Path) -> None:
     facts = provenance(split, tmp_path / "video.zarr")
     balance = facts["balance"]
     assert balance["corrected"]
@@ -53,7 +53,7 @@ def test_what_the_lines_tell_is_corrected_and_said(split: Path, tmp_path: Path) 
     assert all("balance" not in part["parameters"] for part in facts["segments"])
 
 
-def test_a_calibration_is_believed_and_its_drift_told(split: Path, tmp_path: Path) -> None:
+def test_a_calibration_takes_precedence_and_its_drift_is_reported(split: Path, tmp_path: Path) -> None:
     known = {}
     for name, effects in (("before", NOISE), ("now", (*NOISE, SPLITTER))):
         scene = white(effects=effects)

@@ -58,7 +58,7 @@ def cal(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def run(cal: Path) -> Path:
-    """A recording that carries it."""
+    """A recording that carries the calibration."""
     return record(cal.parent / "run.zarr", lit(EFFECTS), "target", 200, calibration=str(cal))
 
 
@@ -78,8 +78,8 @@ def test_the_copy_is_what_was_measured(cal: Path, run: Path) -> None:
     assert carried.steps.keys() == known.steps.keys()
 
 
-def test_calibrated_lines_give_the_picture_back(cal: Path, run: Path, tmp_path: Path) -> None:
-    """Against the same scene with noise only; everything else raises the misfit several times."""
+def test_calibrated_lines_restore_the_picture(cal: Path, run: Path, tmp_path: Path) -> None:
+    """Compared with the same scene with noise only; any other error multiplies the misfit."""
     segment = open_recording(run).cut(0, 200)
     noisy = open_recording(record(tmp_path / "noise.zarr", lit(NOISE), "target", 200)).cut(0, 200)
     known = open_calibration(cal)
@@ -100,8 +100,8 @@ def test_calibrated_lines_give_the_picture_back(cal: Path, run: Path, tmp_path: 
     assert found["all"].quality.misfit < 0.5 * found["columns"].quality.misfit
 
 
-def test_the_curve_of_a_camera_that_bends_gives_its_picture_back(tmp_path: Path) -> None:
-    """A bow of 3 % of white: 8 dB and more, nearly all that noise leaves."""
+def test_the_curve_of_a_non_linear_camera_restores_the_picture(tmp_path: Path) -> None:
+    """For a bow of 3 % of white it gains 8 dB or more, nearly to the limit of the noise."""
     effects = [*NOISE, {"kind": "adc_nonlinearity", "bow": 0.03}]
     bright = {"cameras.a.responsivity_dn": 16.0, "cameras.b.responsivity_dn": 16.0}
     first = dark(open_exposure(record(tmp_path / "dark.zarr", white(0.37, effects), "dark", 256, **bright)))
@@ -123,9 +123,9 @@ def test_the_curve_of_a_camera_that_bends_gives_its_picture_back(tmp_path: Path)
     assert quality["straight"] > quality["noise"] - 3
 
 
-def test_one_of_another_instrument_is_not_handed_on(cal: Path, tmp_path: Path) -> None:
+def test_another_instruments_calibration_is_not_copied(cal: Path, tmp_path: Path) -> None:
     other = {"cameras.a.serial": "ELSEWHERE", "calibration": str(cal)}
-    with pytest.raises(ConfigError, match="serial SIM-A is ELSEWHERE"):
+    with pytest.raises(ConfigError, match="serial is ELSEWHERE instead of SIM-A"):
         record(tmp_path / "new.zarr", lit(), "target", 60, **other)
     (tmp_path / "file.zarr").write_text("no calibration")
     with pytest.raises(ConfigError, match=r"calibration: .*file.zarr"):
@@ -133,14 +133,14 @@ def test_one_of_another_instrument_is_not_handed_on(cal: Path, tmp_path: Path) -
     assert not (tmp_path / "new.zarr").exists()
 
 
-def test_one_that_is_not_there_yet_is_said_to_be_missing(tmp_path: Path) -> None:
+def test_a_calibration_still_to_be_made_is_recorded_as_missing(tmp_path: Path) -> None:
     place = tmp_path / "later.zarr"
     record(tmp_path / "new.zarr", lit(), "target", 60, calibration=str(place))
     attrs = open_recording(tmp_path / "new.zarr").attrs
     assert (attrs["calibration_missing"], "calibration" in attrs) == (str(place), False)
 
 
-def test_a_rig_file_names_one_beside_itself(cal: Path) -> None:
+def test_a_path_in_a_rig_file_is_relative_to_it(cal: Path) -> None:
     text = (Path(__file__).parents[2] / "configs" / "rig-demo.toml").read_text()
     (cal.parent / "rig.toml").write_text('calibration = "cal.zarr"\n' + text)
     assert load_rig(cal.parent / "rig.toml").calibration == cal.resolve()

@@ -49,7 +49,7 @@ def request_of_three(recording_path):
     return in_voxels(selection, Voxels(2, 1), longest=200)
 
 
-def test_a_long_stretch_is_stitched_from_pieces(recording_path, request_of_three, tmp_path):
+def test_a_long_range_is_stitched_from_pieces(recording_path, request_of_three, tmp_path):
     outcome = run(recording_path, request_of_three, tmp_path / "v.zarr", Options(iterations=30))
     video = open_video(tmp_path / "v.zarr")
     recording = open_recording(recording_path)
@@ -76,7 +76,7 @@ def test_a_long_stretch_is_stitched_from_pieces(recording_path, request_of_three
     assert max(steps[seam - 33 : seam + 33].max() for seam in seams) < 2 * np.quantile(steps, 0.95)
 
 
-def test_processes_give_what_one_gives(recording_path, request_of_three, tmp_path):
+def test_several_processes_give_the_result_of_one(recording_path, request_of_three, tmp_path):
     run(recording_path, request_of_three, tmp_path / "one.zarr")
     run(recording_path, request_of_three, tmp_path / "two.zarr", workers=2)
     one, two = (open_video(tmp_path / name).video[:] for name in ("one.zarr", "two.zarr"))
@@ -106,7 +106,7 @@ def test_a_plan_brings_different_voxels_to_one_grid(recording_path, tmp_path):
     assert np.ptp(video[frames], axis=0).max() < 1e-6
 
 
-def test_times_ask_for_the_lines_they_need(recording_path):
+def test_times_select_the_lines_they_need(recording_path):
     recording = open_recording(recording_path)
     request = in_voxels(by_time(recording, 1_000_000, 3_000_000), Voxels(2, 1))
     assert request.grid.frames == 200
@@ -135,14 +135,14 @@ def test_glimpses_show_the_whole_range_from_few_lines(recording_path, tmp_path):
     np.testing.assert_allclose(step_ns, written.interval_ns, atol=1)
 
 
-def test_glimpses_of_a_short_stretch_are_refused(recording_path):
+def test_glimpses_of_a_short_range_are_refused(recording_path):
     selection = by_lines(open_recording(recording_path), 0, 100)
     assert len(in_glimpses(selection, Voxels(4, 8), 22).sub_segments()) == 22  # which share lines
     with pytest.raises(UsageError, match=r"23 glimpses of .*\(176 sub-steps\).*up to 22"):
         in_glimpses(selection, Voxels(4, 8), 23)
 
 
-def test_what_was_solved_before_a_stop_is_kept_and_marked(recording_path, request_of_three, tmp_path):
+def test_results_before_a_stop_are_kept_and_marked(recording_path, request_of_three, tmp_path):
     calls = iter(range(10_000))
     outcome = run(recording_path, request_of_three, tmp_path / "v.zarr", stop=lambda: next(calls) > 24)
     video = open_video(tmp_path / "v.zarr")
@@ -152,7 +152,7 @@ def test_what_was_solved_before_a_stop_is_kept_and_marked(recording_path, reques
     segments = video.attrs["provenance"]["segments"]
     assert [part["trusted"] for part in segments] == [part["ended"] != "stopped" for part in segments]
     assert not segments[-1]["trusted"]
-    assert "was broken off after" in segments[-1]["warnings"][0]
+    assert "was stopped after" in segments[-1]["warnings"][0]
     begin = segments[-1]["begin_substep"] - request_of_three.grid.begin
     first, end = video.attrs["provenance"]["trusted"]
     assert first <= end <= begin // request_of_three.grid.voxels.temporal_merge
@@ -161,7 +161,7 @@ def test_what_was_solved_before_a_stop_is_kept_and_marked(recording_path, reques
 
 @pytest.fixture
 def unrefused(monkeypatch):
-    """Budgets that this machine may be too busy for, or that nobody could keep, are tried anyway."""
+    """Accept budgets that this machine may be too busy for, or that cannot be kept at all."""
     monkeypatch.setattr(Budget, "check", lambda *_: None)
 
 
@@ -202,7 +202,7 @@ class Stalled:
 
 
 @pytest.mark.usefixtures("unrefused")
-def test_a_machine_that_gets_busy_leaves_what_is_done_by_then(recording_path, request_of_three, tmp_path):
+def test_a_budget_on_a_busy_machine_keeps_the_results_so_far(recording_path, request_of_three, tmp_path):
     recording, options = open_recording(recording_path), Options(budget_s=3.0)
     with open_pool(3, 1) as pool:
         stalled = Stalled(pool, 3.0)
@@ -214,9 +214,7 @@ def test_a_machine_that_gets_busy_leaves_what_is_done_by_then(recording_path, re
 
 
 @pytest.mark.usefixtures("unrefused")
-def test_what_had_too_little_time_to_explain_its_lines_is_not_trusted(
-    recording_path, request_of_three, tmp_path
-):
+def test_a_sub_segment_with_too_little_time_is_not_trusted(recording_path, request_of_three, tmp_path):
     options = Options(solver="twist", iterations=100_000, budget_s=0.05)
     facts = run(recording_path, request_of_three, tmp_path / "v.zarr", options).provenance
     poor = [part["quality"]["misfit"] > POOR_MISFIT for part in facts["segments"]]
@@ -225,8 +223,8 @@ def test_what_had_too_little_time_to_explain_its_lines_is_not_trusted(
     assert facts["trusted"][1] - facts["trusted"][0] < request_of_three.grid.frames
 
 
-def test_progress_never_goes_beyond_the_whole_whatever_trials_are_made(recording_path, tmp_path):
-    """Iterations of trials come beside those that were asked for."""
+def test_progress_never_exceeds_the_whole_despite_trials(recording_path, tmp_path):
+    """Iterations of trials come on top of the requested ones."""
     request = in_voxels(by_lines(open_recording(recording_path), 20, 60), Voxels(3, 20))
     seen = []
     watcher = Watcher(len(request.stretches), lambda done, tasks: seen.append(done / tasks))
@@ -246,7 +244,7 @@ def test_a_failing_sub_segment_leaves_nothing(recording_path, request_of_three, 
 
 
 def test_ctrl_c_keeps_the_best_so_far(recording_path, tmp_path):
-    """The command itself, in a process of its own, with its workers."""
+    """The command itself, in a separate process with its workers."""
     words = ["reconstruct", recording_path, "--out", tmp_path / "v.zarr", "--nm", 2, "--workers", 2, "--json"]
     with subprocess.Popen(
         [sys.executable, "-m", "acquire", *map(str, words), "--solver", "twist", "--iterations", "1000000"],
@@ -272,7 +270,7 @@ def test_ctrl_c_keeps_the_best_so_far(recording_path, tmp_path):
 
 
 def _has_worked(pid: int) -> bool:
-    """A process below it has computed for a while: it is past its imports."""
+    """Whether one of its child processes has computed for a while, and so is past its imports."""
     import psutil
 
     try:

@@ -1,4 +1,4 @@
-"""Tiles of a scene behind a fibre: each is solved as a scene of its own, and one video holds them all."""
+"""Tiles of a scene behind a fibre: each is solved like a separate scene, and one video shows them all."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_a_video_of_all_tiles_shows_the_whole_scene(
     assert {*choice["kept"], *choice["changed"]} >= {*solved} - {"0,2"}
 
 
-def test_each_tile_searches_by_itself_where_that_is_asked_for(recording: Recording, tmp_path: Path) -> None:
+def test_each_tile_searches_separately_if_requested(recording: Recording, tmp_path: Path) -> None:
     request = in_tiles(in_voxels(by_lines(recording), Voxels(6, 153)), recording.fibre.tiles[:2])
     watcher = Watcher(2)
     with open_pool(1, watch=watcher) as pool:
@@ -106,13 +106,13 @@ def test_each_tile_searches_by_itself_where_that_is_asked_for(recording: Recordi
     assert [part["kept_choice"] for part in outcome.provenance["segments"]] == [None, None]
 
 
-def test_what_changes_is_told_from_what_rests_by_the_lines(recording: Recording) -> None:
+def test_lines_distinguish_changing_tiles_from_tiles_at_rest(recording: Recording) -> None:
     change = {str(tile): energies(recording.cut(0, LINES, tile))[1] for tile in recording.fibre.tiles}
     assert max(change, key=lambda tile: change[tile]) == "0,2"
     assert max(change["0,0"], change["1,0"]) < 0.1 * change["0,2"]
 
 
-def test_a_choice_that_does_not_fit_is_searched_anew(recording: Recording) -> None:
+def test_a_choice_that_does_not_fit_is_searched_again(recording: Recording) -> None:
     segment = recording.cut(0, LINES, Tile(0, 2))
     still = Choice("still", 1, 2e-3, 0.0, error=0.001, noise=float("nan"))
     handed = reconstruct(segment, 2, 4, iterations=20, check=False, choice=still)
@@ -125,9 +125,7 @@ def test_a_choice_that_does_not_fit_is_searched_anew(recording: Recording) -> No
     assert again.quality.prediction <= 1.05 * alone.quality.prediction
 
 
-def test_a_part_is_what_the_whole_has_there_and_says_where_it_lies(
-    recording: Recording, tmp_path: Path
-) -> None:
+def test_a_part_equals_the_whole_there_and_states_its_position(recording: Recording, tmp_path: Path) -> None:
     tiles = (Tile(1, 1), Tile(1, 2))
     combined(recording, tmp_path / "part.zarr", Voxels(3, 153), tiles)
     part = open_video(tmp_path / "part.zarr")

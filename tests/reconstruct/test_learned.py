@@ -1,4 +1,4 @@
-"""What trade-offs taught is used by a budget, as far as several scenes say it."""
+"""A budget uses the results of trade-offs if there are several scenes."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ FAST = tried("fast", 2.0, 25.0, 22.0, 24.0)
 GOOD = tried("balanced", 8.0, 32.0, 22.5, 23.5)
 
 
-def test_the_best_that_ends_in_time():
+def test_the_best_preset_that_ends_in_time():
     known = [*FAST, *GOOD]
     assert choose(known, 10.0, 1000).preset == "balanced"
     assert choose(known, 5.0, 1000).preset == "fast"
     assert choose(known, 5.0, 500).preset == "balanced"  # half the voxels take half the time
     assert choose(known, 1.0, 1000).preset is None
     assert "leds" in choose(known, 10.0, 1000).why
-    assert "nothing was learned" in choose([], 1.0, 1000).why
+    assert "no preset was tried" in choose([], 1.0, 1000).why
 
 
-def test_one_scene_alone_says_nothing_of_others():
+def test_one_scene_alone_is_not_enough():
     one = [*tried("fast", 2.0, 25.0), *tried("balanced", 8.0, 32.0)]
     chosen = choose(one, 10.0, 1000)
     assert chosen.preset is None
@@ -40,12 +40,12 @@ def test_presets_are_compared_on_the_same_scenes():
     assert choose([*easy, *GOOD], 10.0, 1000).preset == "balanced"
 
 
-def test_the_slowest_scene_says_what_fits():
+def test_the_slowest_scene_decides_what_fits():
     slow = [*GOOD[:2], Learned("admm", "balanced", 3, 1, 1000, "bullet", 12.0, 23.5)]
     assert choose([*FAST, *slow], 10.0, 1000).preset == "fast"
 
 
-def test_lessons_are_kept_and_replaced(tmp_path):
+def test_results_are_kept_and_replaced(tmp_path):
     path = tmp_path / "cache" / "t.json"
     assert recall(path) == []
     remember(FAST, path)

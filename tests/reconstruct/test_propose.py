@@ -1,4 +1,4 @@
-"""A plan from the lines alone: what rests is told from what changes."""
+"""A plan from the lines alone, which distinguish rest from change."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_a_scene_that_flickers_gets_short_frames(rig, tmp_path):
     assert plan.segments[-1].is_open
 
 
-def test_a_long_recording_is_looked_at_in_some_places_and_where_it_changes():
+def test_a_long_recording_is_examined_in_some_places_and_where_it_changes():
     still, fast = (Tempo(voxels, ((0, 0.1),)) for voxels in (Voxels(1, 770), Voxels(3, 4)))
     looked, told = [], []
 

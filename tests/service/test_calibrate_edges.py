@@ -63,8 +63,8 @@ def test_the_blur_is_found_after_the_others_and_what_they_found_is_kept(tmp_path
         words = ("calibrate", "all", "--yes", "--lines", 1024, "--out", cal)
         nothing_there = daemon(*words, "--only", "dark", "--psf")
         assert nothing_there.code == 2
-        assert "cannot tell how wide the optics of arm a blur" in nothing_there.err
-        assert "a square or a checkerboard, turned a little" in nothing_there.err
+        assert "the blur of the optics of arm a cannot be measured" in nothing_there.err
+        assert "a square or a checkerboard, slightly turned" in nothing_there.err
         assert list(open_calibration(cal).steps) == ["dark"]
 
         put(tmp_path, checkerboard(8.0))

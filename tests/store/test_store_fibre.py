@@ -69,7 +69,7 @@ def test_a_damaged_table_is_told_when_the_recording_is_cut(tmp_path: Path) -> No
     document = json.loads(root.read_text())
     document["attributes"]["geometry"]["fibre"]["bands"]["a"] = [0, 3]
     root.write_text(json.dumps(document))
-    with pytest.raises(DataError, match="do not lie beside each other"):
+    with pytest.raises(DataError, match="overlap or do not fit"):
         open_recording(tmp_path / "r.zarr").cut(spec.first_line, 10, Tile(0, 0))
     document["attributes"]["geometry"]["fibre"]["bands"]["a"] = [-1, 3]
     root.write_text(json.dumps(document))
