@@ -46,7 +46,7 @@ class Task:
     committed_lines: int = 0
     tries: int = 0
     not_before_s: float = 0.0
-    told: tuple[tuple[int, str, str], ...] = ()
+    notes: tuple[tuple[int, str, str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +104,7 @@ def _salvage(mailbox: Mailbox, task: Task) -> RecoveryStatus:
         if not task.ours and not is_here(attributes or {}):
             return RecoveryStatus(path=path, state="left", text=_ELSEWHERE)
         reason = f"{RECOVERED}{task.why}" if task.why else Circumstances().reason
-        known = Circumstances(reason, has_run_on(attributes or {}), alone=False, told=task.told)
+        known = Circumstances(reason, has_run_on(attributes or {}), alone=False, notes=task.notes)
         done = recover(path, progress=lambda *_: _ask(mailbox), known=known)
     except StateError as error:
         return RecoveryStatus(path=path, state="waiting", text=error.message)

@@ -97,8 +97,8 @@ class Salvage:
             found = self._tasks.get(orphan.path)  # the search may have met it while it was being written
             if orphan.path not in self._found or (found is not None and not found.ours):
                 log.warning("%s was not sealed: %s", orphan.path, orphan.why)
-                told = tuple((note.line, note.kind, note.text) for note in orphan.told)
-                self._queue(Task(orphan.path, orphan.why, True, orphan.committed_lines, told=told))
+                notes = tuple((note.line, note.kind, note.text) for note in orphan.notes)
+                self._queue(Task(orphan.path, orphan.why, True, orphan.committed_lines, notes=notes))
 
     def poll(self, *, capturing: bool = False) -> list[RecoveryStatus]:
         """Hear what is done, begin what is next; what came to an end since the last look.

@@ -77,7 +77,7 @@ class Circumstances:
     reason: str = REASON
     committed_intact: bool = False
     alone: bool = True
-    told: tuple[tuple[int, str, str], ...] = ()
+    notes: tuple[tuple[int, str, str], ...] = ()
 
 
 UNKNOWN = Circumstances()
@@ -148,7 +148,7 @@ class _Recoverer:
         self.path = path
         self.disk = disk
         self.reason = known.reason
-        self.told = known.told
+        self.notes = known.notes
         self.sealed = recording.state == "sealed"
         self.rows = recording.lines
         self.flags_changed = 0
@@ -274,7 +274,7 @@ class _Recoverer:
             events.add({"tick": event.tick, "line": event.line, "kind": event.kind, "text": event.text})
         # A writer that dies between a line's commit and that of its event leaves a line without its mark.
         listed = {(event.line, event.kind, event.text) for event in recording.events}
-        for line, kind, said in self.told:
+        for line, kind, said in self.notes:
             if recording.first_line <= line < end and (line, kind, said) not in listed:
                 events.add({"tick": self._tick(line), "line": line, "kind": kind, "text": said})
                 listed.add((line, kind, said))
