@@ -1,4 +1,4 @@
-r"""What arming refuses: every condition is kept up to date in a register, the first that holds is named.
+r"""Checks at arming: every error condition is kept in a register, and the first one that holds is reported.
 
 ::
 
@@ -102,6 +102,6 @@ class Checks(wiring.Component):
 
 
 def _times(value: Value, factor: int) -> Value:
-    """Shifts and one addition: no multiplier is spent on 1, 2, 3 or 6."""
+    """Multiply by 1, 2, 3 or 6 with shifts and one addition, without a multiplier."""
     once = value if factor in {1, 2} else value + (value << 1)
     return once << 1 if factor in {2, 6} else once

@@ -111,7 +111,7 @@ def write_overview(
     # Twice the size, for data that do not pack well and for metadata: the recording's end must still fit.
     spare = publisher.disk.free_bytes(path) - 2 * sum(rows.nbytes for rows in arrays.values())
     if spare < SPARE_BYTES:
-        raise OSError(errno.ENOSPC, "the disk has room only for the recording's end")
+        raise OSError(errno.ENOSPC, "the disk has room for the recording's end alone")
     for name, rows in arrays.items():
         chunk = path / NAME / name / "c" / "/".join("0" * rows.ndim)
         publisher.disk.make_directory(chunk.parent, parents=True)

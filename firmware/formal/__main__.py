@@ -1,6 +1,6 @@
 """Prove the gateware: ``python -m firmware.formal [NAME ...] [--mutants] [--json]``.
 
-Exit code 0: all proved, and every mutant noticed; 1: not; 2: a tool is missing or failed.
+Exit code 0: everything proved, and every mutant detected; 1: not; 2: a tool is missing or failed.
 """
 
 from __future__ import annotations

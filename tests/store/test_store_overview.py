@@ -116,7 +116,7 @@ class NearlyFullDisk(Disk):
 
 
 @pytest.mark.parametrize(
-    ("disk", "why"), [(FullDisk(), "No space left"), (NearlyFullDisk(), "room only for the recording's end")]
+    ("disk", "why"), [(FullDisk(), "No space left"), (NearlyFullDisk(), "room for the recording's end alone")]
 )
 def test_a_recording_is_sealed_without_one(tmp_path, disk, why):
     recording = record(tmp_path / "r.zarr", 300, disk=disk)
