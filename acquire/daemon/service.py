@@ -210,11 +210,17 @@ class Service:
 
         Everything else, even a defect there, must not keep the capture path from being supervised.
         """
-        for name, poll in (("recoveries", self._poll_salvage), ("uploads", self._poll_uploads)):
-            try:
-                poll()
-            except Exception as error:  # noqa: BLE001 - shown in the status; the capture comes first
-                self.troubles.note(name, error)
+        try:
+            self._recovered(self._salvage.poll(capturing=self._run is not None))
+        except Exception as error:  # noqa: BLE001 - shown in the status; the capture comes first
+            self.troubles.note("recoveries", error)
+        try:
+            self._uploads.poll()
+            published = self._status.uploads, self._status.upload_warning
+            if (self._uploads.statuses, self._uploads.warning) != published:
+                self._publish()
+        except Exception as error:  # noqa: BLE001 - as above
+            self.troubles.note("uploads", error)
         self._disk.check(recording=self._state is State.RECORDING)
         self.news.update(self.status())
         if self._run is None:
@@ -227,15 +233,6 @@ class Service:
             self.troubles.note("watching the capture", error)
             self._fail(self._with_cause(f"defect in the daemon: {error!r}"))
         self._publish()
-
-    def _poll_salvage(self) -> None:
-        self._recovered(self._salvage.poll(capturing=self._run is not None))
-
-    def _poll_uploads(self) -> None:
-        self._uploads.poll()
-        published = self._status.uploads, self._status.upload_warning
-        if (self._uploads.statuses, self._uploads.warning) != published:
-            self._publish()
 
     def shutdown(self) -> None:
         """Seal and release, whatever the state. Bounded in time; raises only errors of closing a run."""

@@ -131,19 +131,16 @@ def ome_attributes(
     """Return the attribute ``ome``."""
     space = {"type": "space"} | ({"unit": grid.pixel_unit} if grid.pixel_unit else {})
     axes = [{"name": "t", "type": "time", "unit": "second"}, {"name": "y", **space}, {"name": "x", **space}]
-    datasets = [
-        {"path": str(number), "coordinateTransformations": _transformations(grid.level(number))}
-        for number in range(levels)
-    ]
+    datasets = []
+    for number in range(levels):
+        level = grid.level(number)
+        transformations = [
+            {"type": "scale", "scale": list(level.step)},
+            {"type": "translation", "translation": list(level.origin)},
+        ]
+        datasets.append({"path": str(number), "coordinateTransformations": transformations})
     multiscale = {"name": name, "axes": axes, "datasets": datasets} | ({"type": "mean"} if levels > 1 else {})
     return {"version": "0.5", "multiscales": [multiscale], "omero": window.to_omero(name, first_frame)}
-
-
-def _transformations(grid: VideoGrid) -> list[dict[str, Any]]:
-    return [
-        {"type": "scale", "scale": list(grid.step)},
-        {"type": "translation", "translation": list(grid.origin)},
-    ]
 
 
 def coordinate_attributes(axis: str, grid: VideoGrid) -> dict[str, Any]:

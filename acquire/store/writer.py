@@ -298,7 +298,12 @@ class RecordingWriter:
         except (TypeError, ValueError) as error:
             raise UsageError(f"the ledger of a recording is not JSON: {error}") from error
         with self._failing("sealing"):
-            rows = self._rescue() if self._failure else self._pad()
+            if self._failure:
+                rows = self._rescue()
+            else:
+                rows = min(arm.next_line for arm in self._arms.values()) - self.spec.first_line
+                for arm in self._arms.values():
+                    arm.pad()
             self._disk.remove(self._reserve)
             self._disk.sync_tree(self.path)  # lines before their metadata
             nodes = self._publish_parts(rows, own=True) | self._publish_overview(rows)
@@ -348,12 +353,6 @@ class RecordingWriter:
         for arm in self._arms.values():
             arm.publish_chunks()
         return self._whole_rows()
-
-    def _pad(self) -> int:
-        rows = min(arm.next_line for arm in self._arms.values()) - self.spec.first_line
-        for arm in self._arms.values():
-            arm.pad()
-        return rows
 
     def _publish_parts(self, rows: int, *, own: bool) -> dict[str, layout.Document]:
         """Replace all metadata except the root's; return it by path below the recording.

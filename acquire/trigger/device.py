@@ -171,15 +171,15 @@ class Device:
 
     def compare_clocks(self) -> tuple[int, int, int]:
         """Return UTC (ns), the device's TIME at that moment, and the uncertainty of their relation (ns)."""
-        return min((self._compare_once() for _ in range(_COMPARISONS)), key=lambda found: found[2])
-
-    def _compare_once(self) -> tuple[int, int, int]:
-        # The device read its clock at an unknown moment between request and answer: in the middle, plus or
-        # minus half of the time (Cristian 1989). The time is measured with the monotonic clock.
-        before_ns, utc_ns = time.monotonic_ns(), time.time_ns()
-        tick = self.read(r.TIME)
-        half_ns = (time.monotonic_ns() - before_ns) // 2
-        return utc_ns + half_ns, tick, half_ns
+        found = []
+        for _ in range(_COMPARISONS):
+            # The device read its clock at an unknown moment between request and answer: in the middle, plus
+            # or minus half of the time (Cristian 1989). The time is measured with the monotonic clock.
+            before_ns, utc_ns = time.monotonic_ns(), time.time_ns()
+            tick = self.read(r.TIME)
+            half_ns = (time.monotonic_ns() - before_ns) // 2
+            found.append((utc_ns + half_ns, tick, half_ns))
+        return min(found, key=lambda one: one[2])
 
 
 def facts_of(status: DeviceStatus | Capabilities) -> dict[str, Any]:
