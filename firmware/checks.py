@@ -35,7 +35,7 @@ class Checks(wiring.Component):
     def elaborate(self, platform: object) -> Elaboratable:
         m = Module()
         m.d.sync += [self.error.eq(0), self.address.eq(0)]
-        # Reversed, since the last assignment counts: of several faults the first of the list is told.
+        # Reversed, since the last assignment counts: of several faults the first of the list is reported.
         for code, register, condition in reversed(self._conditions(m)):
             failed = Signal(name=f"{code.name}_{register.name}".lower())
             m.d.sync += failed.eq(condition)

@@ -105,7 +105,7 @@ class Commands(wiring.Component):
         # ARM of the run that is armed or runs already is the same request once more: its answer was lost.
         with m.Elif(active | self.busy):
             m.d.sync += self.error.eq(Mux(same & active, 0, ErrorCode.BUSY))
-        # An ARM that is late must not begin a run anew that has ended: a run id is used once.
+        # A late ARM must not restart a run that has ended: a run id is used once.
         with m.Elif(same):
             m.d.sync += self.error.eq(ErrorCode.RUN_OVER)
         with m.Else():

@@ -201,9 +201,8 @@ class SyncTrigger(wiring.Component):
 
     def _registers(self, m: Module) -> None:
         host, file, commands, idle = self.host, self.file, self.commands, Signal()
-        m.d.sync += idle.eq(
-            commands.idle
-        )  # only the host ends it, and waits for its answer before it goes on
+        # A register is early enough: only the host ends idleness, and it waits for its answer.
+        m.d.sync += idle.eq(commands.idle)
         m.d.comb += [
             file.address.eq(host.address),
             host.known.eq(file.known),
@@ -353,7 +352,7 @@ class SyncTrigger(wiring.Component):
             value(r.PPS_TIME).eq(timestamp.pps_time),
             value(r.PPS_COUNT).eq(timestamp.pps_count),
         ]
-        # Counted: a loss that is over by the time when somebody looks has spoilt the run all the same.
+        # Counted, since a loss that is over before the host reads the status has spoilt the run all the same.
         losses = field(r.STATUS, "clock_losses")
         was_locked = Signal()
         m.d.sync += was_locked.eq(self.locked.level)

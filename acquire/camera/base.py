@@ -54,7 +54,7 @@ class CameraBlock:
 
     ``first_line`` counts since arm, gaps included; ``pixels`` is (line, pixel), uint8 or uint16;
     ``flags`` is (line) uint16 of LineFlag. ``losses`` explains, in order, the lines that are missing just
-    before the first; ``time_ns`` is the camera's own clock at the first line, where it tells.
+    before the first; ``time_ns`` is the camera's own clock at the first line, if it has stamps.
     """
 
     first_line: int

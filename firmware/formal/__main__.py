@@ -58,9 +58,9 @@ def _as_table(names: list[str], first: bool) -> bool:
         proof = PROOFS[name]()
         verdict = prove(proof, first)
         good &= verdict.proved
-        told = "proved" if verdict.proved else "BROKEN: " + ", ".join(verdict.broken + verdict.uncovered)
+        result = "proved" if verdict.proved else "BROKEN: " + ", ".join(verdict.broken + verdict.uncovered)
         sizes = (len(proof.claims), proof.lemmas, len(proof.covers))
-        table.add_row(name, *map(str, sizes), told, f"{verdict.seconds:.1f}")
+        table.add_row(name, *map(str, sizes), result, f"{verdict.seconds:.1f}")
     OUTPUT.print(table)
     return good
 

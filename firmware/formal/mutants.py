@@ -48,7 +48,7 @@ def _changed(mutant: Mutant) -> Iterator[None]:
     if text.count(mutant.old) != 1:
         raise ToolError(f"{mutant.old!r} occurs {text.count(mutant.old)} times in {mutant.file}, not once")
     code = compile(text.replace(mutant.old, mutant.new), str(file), "exec", dont_inherit=True)
-    # All of the gateware is imported anew: a module that was imported before would still hold the original.
+    # Import all of the gateware again: modules imported before would still refer to the original.
     finder = _Finder(f"{firmware.__name__}.{file.stem}", code)
     original = {name: sys.modules.pop(name) for name in list(sys.modules) if _is_ours(name)}
     sys.meta_path.insert(0, finder)
