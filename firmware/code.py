@@ -1,4 +1,4 @@
-r"""The code bit of the sub-step that comes next, from whichever source the run has.
+r"""The code bit of the next sub-step, from the source of the run.
 
 ::
 

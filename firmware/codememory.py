@@ -81,7 +81,7 @@ class CodeMemory(wiring.Component):
         return m
 
     def _check(self, m: Module, word: Signal, scan: Signal) -> None:
-        """One byte per clock: the word of ``scan`` is in the register when its first byte is wanted."""
+        """Compute the CRC, a byte per clock: a word of ``scan`` is there before its first byte is due."""
         m.submodules.crc = crc = Crc32()
         phase = Signal(3)
         m.d.comb += [self.crc.eq(crc.value), crc.data.eq(word.word_select(phase[:2], 8))]

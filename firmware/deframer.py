@@ -1,4 +1,4 @@
-r"""Bytes of the link → frames: COBS undone, CRC-32 checked, one frame kept until it is released.
+r"""Bytes of the link → frames: COBS decoded, CRC-32 checked, one frame kept until it is released.
 
 ::
 

@@ -1,7 +1,7 @@
-"""The compiled gateware as a device at the end of a link: bytes in, bytes out, time passes in between.
+"""The compiled gateware as a device at the end of a link: bytes in, bytes out, with simulated time.
 
-Its time is its own: as many clocks as this machine can compute, about two million per second, while
-something goes on, few while nothing does, none while the host takes no bytes.
+Its time runs independently: as many clocks as this machine can compute, about two million per second, while
+it is busy, few while it is idle, none while the host takes no bytes.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _WORK_S = 0.01
 
 
 class RtlDevice:
-    """What `acquire.sim.twin_links` asks of a twin. Thread-safe.
+    """The interface of a twin for `acquire.sim.twin_links`. Thread-safe.
 
     Parameters
     ----------
@@ -37,16 +37,16 @@ class RtlDevice:
 
     @property
     def busy(self) -> bool:
-        """Something goes on: whoever waits between calls takes its time away."""
+        """Whether the device is active: pauses between calls would slow it down."""
         return self.twin.link_busy or bool(self.twin.pins & Pin.RUNNING)
 
     def feed(self, data: bytes) -> None:
-        """Bytes from the host; they take their time on the line."""
+        """Take bytes from the host; their transmission takes simulated time."""
         with self._lock:
             self.twin.feed(data)
 
     def take(self) -> bytes:
-        """Let time pass, at most 10 ms of the host's, until there are bytes for the host."""
+        """Simulate for at most 10 ms of the host's time, until there are bytes for the host; return them."""
         limit_s = time.monotonic() + _WORK_S
         with self._lock:
             while True:
@@ -62,11 +62,11 @@ class RtlDevice:
                     return data
 
     def set(self, name: str, level: bool) -> None:
-        """An input pin."""
+        """Set an input pin."""
         with self._lock:
             self.twin.set(name, level)
 
     def close(self) -> None:
-        """Idempotent; nobody may use it any more."""
+        """Close the device, which must not be used any more. Idempotent."""
         with self._lock:
             self.twin.close()

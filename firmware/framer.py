@@ -6,8 +6,8 @@
     memory        [code] b b b [code] b b ... crc×4 [00]
     bytes         sent once the frame is whole; no byte is taken meanwhile
 
-COBS in one pass: the place of the code byte is left free and filled in when the next zero (or the end) is
-met, so that every byte costs one write. It needs frames shorter than 254 bytes.
+COBS in one pass: the place of the code byte is left free and filled in at the next zero (or the end), so that
+every byte takes one write. It requires frames shorter than 254 bytes.
 """
 
 from amaranth.hdl import Elaboratable, Module, Signal

@@ -7,8 +7,8 @@ r"""Carries out the host's requests one after the other, and sends tags in betwe
     tags.valid       ───────/‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾\
     state                                       IDLE | SEND      then at least one tag has its turn
 
-Everything to be sent goes through one shift register, the next byte in its low end. A request that comes
-while a tag is being sent waits in the receive queue before the deframer: neither can push the other out.
+Everything to be sent goes through one shift register, with the next byte at its low end. A request that comes
+while a tag is being sent waits in the receive queue before the deframer: neither can starve the other.
 """
 
 from amaranth.hdl import Cat, Const, Elaboratable, Module, Mux, Signal, Value
@@ -148,7 +148,7 @@ class Host(wiring.Component):
             m.next = "CHECK"
 
     def _check(self, m: Module) -> None:
-        """The request's form, and what kind it is."""
+        """Check the form of the request, and find its type."""
         version, kind, asked = self._head[:8], self._head[8:16], self._head[48:56]
         payload = self.length - deframer.HEADER_BYTES
         words = (payload - 2)[2:8]

@@ -8,8 +8,8 @@ r"""The registers that `acquire.trigger.registers` defines, as words the host re
     data      -------------X w      READ_LATENCY clocks after the address
     write     _____/‾‾‾\_______     writable registers take ``write_data`` (COMMAND: see `commands`)
 
-``known``, ``writable`` and ``guarded`` tell of ``address`` a clock later: is there such a word, may it be
-written, and only while nothing is armed or runs.
+``known``, ``writable`` and ``guarded`` refer to ``address`` of the previous clock: whether the word exists,
+may be written, and may be written only while nothing is armed or running.
 """
 
 from collections.abc import Mapping
@@ -27,7 +27,7 @@ GROUP = 8
 
 
 class RegisterFile(wiring.Component):
-    """``value(REGISTER)`` is what the host wrote, and takes the source of what it reads."""
+    """``value(REGISTER)`` is the value that the host wrote, or the one to be assigned for it to read."""
 
     address: In(ADDRESS_BITS)
     known: Out(1)
@@ -39,7 +39,7 @@ class RegisterFile(wiring.Component):
     write_data: In(32)
 
     def __init__(self, constants: Mapping[r.Register, int | Value], resets: dict[r.Register, int]) -> None:
-        """``resets``: values at power-up of a board that needs others than the definition's."""
+        """``resets``: power-up values of a board that differ from the definition's."""
         super().__init__()
         self._constants = constants
         self._values = {

@@ -1,4 +1,4 @@
-r"""The device tests itself: it fills the code memory from the pseudo-random register and looks at all three.
+r"""The device's self test: it fills the code memory from the pseudo-random register, and checks the results.
 
 ::
 
@@ -6,8 +6,8 @@ r"""The device tests itself: it fills the code memory from the pseudo-random reg
     busy     __/‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾‾\_
              seed | fill | seed | compare | sum | wait | done
 
-After the fill the register's state must be the one that Python worked out when the gateware was made, so
-must the memory's CRC-32, and every word read back must equal the register run a second time.
+After the fill, the register's state and the memory's CRC-32 must be those that Python computed when the
+gateware was generated, and every word read back must equal that of a second run of the register.
 """
 
 import zlib
@@ -26,7 +26,7 @@ SEED = 0x0123456789ABCDEF
 
 @cache
 def expected(words: int) -> tuple[int, int]:
-    """The register's state after ``words`` steps, and the CRC-32 of the low halves of the states before."""
+    """Return the register's state after ``words`` steps, and the CRC-32 of earlier states' low halves."""
     state, crc = SEED, 0
     for _ in range(words):
         crc = zlib.crc32((state & 0xFFFFFFFF).to_bytes(4, "little"), crc)
@@ -35,7 +35,7 @@ def expected(words: int) -> tuple[int, int]:
 
 
 class SelfTest(wiring.Component):
-    """Has register and memory to itself while ``busy``."""
+    """Uses register and memory exclusively while ``busy``."""
 
     def __init__(self, words: int) -> None:
         self._words = words

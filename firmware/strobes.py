@@ -1,4 +1,4 @@
-r"""One camera's strobe output against the pulses it was sent: what is missed, what nobody asked for.
+r"""Comparison of one camera's strobes with its trigger pulses: missed and unexpected strobes.
 
 ::
 

@@ -1,4 +1,4 @@
-r"""What the trigger reports by itself: every N-th line, and events, each with its time stamp.
+r"""The trigger's unsolicited reports: every N-th line, and events, each with its time stamp.
 
 ::
 
@@ -7,8 +7,8 @@ r"""What the trigger reports by itself: every N-th line, and events, each with i
     put        ____/‾\_______/‾\____________________/‾\______     a line's tag goes first
     tag            LINE,FIRST    MISSED_A               LINE
 
-A line's tag that finds the queue full is counted, and the next one that finds room says so (TAGS_LOST). An
-event waits for room, its time stamp with it: the end of a run is always told.
+A line's tag that finds the queue full is counted, and the next one that finds room reports it (TAGS_LOST). An
+event waits for room together with its time stamp: the end of a run is always reported.
 """
 
 from amaranth.hdl import Cat, Elaboratable, Module, Mux, Signal

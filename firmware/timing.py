@@ -1,4 +1,4 @@
-r"""The heartbeat: sub-steps, lines and the instants at which the light goes to its next code bit.
+r"""The time base: sub-steps, lines and the instants at which the light advances to its next code bit.
 
 ::
 
@@ -10,7 +10,7 @@ r"""The heartbeat: sub-steps, lines and the instants at which the light goes to 
     line      ____________/‾‾‾\___________________________________/‾‾‾       first clock of every S-th
 
 Clock 0 of a run is that of its first ``substep``: START_CLOCKS + lead after ``start``.
-Whether a line is the last is settled at the ``advance`` that leads out of it, so that the light never
+Whether a line is the last one is decided at the ``advance`` that leads out of it, so that the light never
 begins a sub-step that does not come. A stop therefore takes effect after a whole line.
 """
 
@@ -26,7 +26,7 @@ SUBSTEP_CLOCKS_MIN = 5
 
 
 class Timing(wiring.Component):
-    """Settings must hold still while ``running``; the host's side sees to that."""
+    """Settings must be constant while ``running``, which the host's side ensures."""
 
     substep_clocks: In(CLOCK_BITS)
     substeps: In(3)

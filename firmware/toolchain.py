@@ -32,22 +32,23 @@ PACKAGES = {
 
 
 class ToolError(RuntimeError):
-    """A tool is missing, failed or took too long; the message ends with what it said last."""
+    """A tool is missing, failed or took too long; the message ends with its last output."""
 
 
 def missing_tools(*names: str) -> str:
-    """Which of them are not here and how to get them; empty if all are."""
+    """Return the missing tools and how to install them; empty if there are none."""
     missing = [name for name in names if shutil.which(name, path=_path()) is None]
     packages = dict.fromkeys(PACKAGES[name] for name in missing)
     return f"no {', '.join(missing)} (pip install {' '.join(packages)})" if missing else ""
 
 
 def run_tool(name: str, *arguments: str, cwd: Path, processor_s: float, fails: bool = False) -> str:
-    """What the tool prints. A nonzero exit is a `ToolError` unless it ``fails`` as an answer.
+    """Run a tool and return its output. A nonzero exit raises `ToolError`, unless that is an answer
+    (``fails``).
 
-    Its limit is ``processor_s`` of processor time, so that a busy machine costs patience and no more; the
-    variable in `PATIENCE` multiplies it. The first run of a YoWASP tool on a machine compiles it, which takes
-    a minute or two of that.
+    Its limit is ``processor_s`` of processor time, so that a busy machine only takes longer; the variable in
+    `PATIENCE` multiplies it. The first run of a YoWASP tool on a machine compiles it, which takes a minute or
+    two.
     """
     executable = shutil.which(name, path=_path())
     if executable is None:
@@ -81,7 +82,7 @@ def run_tool(name: str, *arguments: str, cwd: Path, processor_s: float, fails: b
 
 
 def _wait(process: subprocess.Popen[bytes], name: str, limit_s: int) -> bool:
-    """Until it has ended, telling that it goes on; True if it has not by far: it waits, it does not work."""
+    """Wait until the tool has ended, reporting progress; return True if it hangs without working."""
     began_s = time.monotonic()
     while (waited_s := time.monotonic() - began_s) < _IDLE_FACTOR * limit_s:
         try:
@@ -94,7 +95,7 @@ def _wait(process: subprocess.Popen[bytes], name: str, limit_s: int) -> bool:
 
 
 def tell_progress() -> None:
-    """What goes on is said on standard error from now on."""
+    """Report progress on standard error from now on."""
     LOG.addHandler(logging.StreamHandler())
     LOG.setLevel(logging.INFO)
 

@@ -50,7 +50,7 @@ START_LATENCY = inputs.LATENCY + timing.START_CLOCKS + PIN_CLOCKS
 
 @dataclass(frozen=True)
 class Build:
-    """What a board decides."""
+    """Parameters that depend on the board."""
 
     clock_hz: int = 90_000_000
     baud: int = 3_000_000
@@ -98,7 +98,7 @@ class Build:
         }
 
     def resets(self) -> dict[r.Register, int]:
-        """Registers that this build resets to another value than the definition's."""
+        """Registers whose reset value differs from the definition's in this build."""
         return {r.LED: r.LED.pack(invert=1)} if self.light_low else {}
 
 
@@ -186,7 +186,7 @@ class SyncTrigger(wiring.Component):
         ]
 
     def _bytes(self, m: Module, queue: Queue, framer: Framer) -> None:
-        """Where bytes come from and go to: the UART, here."""
+        """Return the source and sink of bytes: here the UART."""
         m.submodules.receiver = receiver = UartReceiver(self.build.divisor)
         m.submodules.transmitter = transmitter = UartTransmitter(self.build.divisor)
         clear = self._input(m, "clear_to_send_input", self.clear_to_send)
@@ -201,9 +201,8 @@ class SyncTrigger(wiring.Component):
 
     def _registers(self, m: Module) -> None:
         host, file, commands, idle = self.host, self.file, self.commands, Signal()
-        m.d.sync += idle.eq(
-            commands.idle
-        )  # only the host ends it, and waits for its answer before it goes on
+        # A register is early enough: only the host ends idleness, and it waits for its answer.
+        m.d.sync += idle.eq(commands.idle)
         m.d.comb += [
             file.address.eq(host.address),
             host.known.eq(file.known),
@@ -353,7 +352,7 @@ class SyncTrigger(wiring.Component):
             value(r.PPS_TIME).eq(timestamp.pps_time),
             value(r.PPS_COUNT).eq(timestamp.pps_count),
         ]
-        # Counted: a loss that is over by the time when somebody looks has spoilt the run all the same.
+        # Counted, since a loss that is over before the host reads the status has spoilt the run all the same.
         losses = field(r.STATUS, "clock_losses")
         was_locked = Signal()
         m.d.sync += was_locked.eq(self.locked.level)

@@ -5,8 +5,8 @@
     $ python -m firmware.twin
     {"port": "/dev/pts/7", "clock_hz": 90000000}        acquire trigger info --port /dev/pts/7
 
-It runs until Ctrl-C or SIGTERM; with ``--owned`` until its standard input is closed, which also happens
-when whoever holds the other end is killed.
+It runs until Ctrl-C or SIGTERM; with ``--owned`` until its standard input is closed, which also happens when
+the process at the other end is killed.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class Publisher:
-    """Writes what the pins did on a page, as often as it is shown the twin."""
+    """Publishes the activity of the pins in a page of memory at every call."""
 
     def __init__(self, page: PinPage, clock_hz: int) -> None:
         self._page, self._clock_hz = page, clock_hz

@@ -5,9 +5,9 @@ r"""The link over USB: one vendor-specific interface with a bulk endpoint each w
     host ── OUT 1 ─▶ endpoint ─▶ queue ══▶ receive queue ─▶ deframer        ══ from the clock of USB
     host ◀─ IN 1 ─── endpoint ◀─ queue ◀══ framer                               to the trigger's, or back
 
-Packets mean nothing here: frames have their own ends, and what is there is sent as soon as the host asks.
-Vendor and product are those that `acquire.trigger.transports.usb` looks for. LUNA (PyPI: luna-usb) is the
-device's logic; ``bus`` is a UTMI or ULPI bus, or a pair of pins at full speed.
+Packet boundaries have no meaning: frames have delimiters, and available bytes are sent as soon as the host
+polls. Vendor and product are those that `acquire.trigger.transports.usb` looks for. LUNA (PyPI: luna-usb) is
+the device's logic; ``bus`` is a UTMI or ULPI bus, or a pair of pins at full speed.
 """
 
 import warnings
@@ -78,7 +78,7 @@ class UsbLink(wiring.Component):
 
 
 class UsbSyncTrigger(SyncTrigger):
-    """The trigger with USB for its link. The pins of the UART rest."""
+    """The trigger with USB as its link. The pins of the UART are idle."""
 
     def __init__(self, build: Build, bus: Any) -> None:
         self._bus = bus
@@ -96,7 +96,7 @@ class UsbSyncTrigger(SyncTrigger):
 
 
 def descriptors(serial: int) -> DeviceDescriptorCollection:
-    """What the host is told when it asks who is there."""
+    """Return the descriptors for the host's enumeration."""
     collection = DeviceDescriptorCollection()
     with collection.DeviceDescriptor() as device:
         device.idVendor, device.idProduct = VENDOR, PRODUCT

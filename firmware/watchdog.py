@@ -1,4 +1,4 @@
-r"""Ends a run whose host has gone silent: it watches from the run's first clock, whoever started the run.
+r"""Ends a run whose host has fallen silent: it watches from the run's first clock, however that was started.
 
 ::
 

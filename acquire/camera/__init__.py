@@ -1,1 +1,1 @@
-"""Cameras: what the capture path asks of one, whatever library drives it."""
+"""Cameras: their interface to the capture path, and drivers over several libraries."""

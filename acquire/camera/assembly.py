@@ -1,6 +1,4 @@
-"""What every GenICam camera has in common, whichever library moves its buffers: from features and delivered
-frames to blocks of lines.
-"""
+"""The common part of all GenICam cameras, for any library: from features and frames to blocks of lines."""
 
 from __future__ import annotations
 
@@ -29,14 +27,14 @@ if TYPE_CHECKING:
 STATISTICS = ("lines", "lost", "incomplete_frames", "stale_frames")
 """Lines delivered and lost; frames that arrived incomplete; frames that were late or sent twice."""
 _WAITING_SHARE = 4
-"""Of a camera's buffers, one in so many may hold frames whose place is not known yet."""
+"""One in this many of a camera's buffers may hold frames whose place is not known yet."""
 _LEAST_BUFFERS = 16
 _MOST_BUFFER_BYTES = 1 << 30
 
 
 @dataclass(frozen=True, slots=True)
 class FrameFormat:
-    """Pixels per line, lines per frame, and how pixels lie in a buffer."""
+    """Pixels per line, lines per frame, and layout of pixels in a buffer."""
 
     width: int
     height: int
@@ -44,7 +42,7 @@ class FrameFormat:
 
 
 def frame_format(modules: Mapping[str, Features]) -> FrameFormat:
-    """As the camera is set now; of a grabber's stream the height is what counts."""
+    """Return the format as the camera is set now; the height of a frame grabber's stream takes precedence."""
     height = modules["stream"].find("BufferHeight") if "stream" in modules else None
     return FrameFormat(
         width=int(demand(modules, "Width").read()),
@@ -54,7 +52,7 @@ def frame_format(modules: Mapping[str, Features]) -> FrameFormat:
 
 
 def demand(modules: Mapping[str, Features], name: str) -> Node:
-    """A feature of the camera itself. Raises CameraError when it has none of that name."""
+    """Return a feature of the camera itself. Raises CameraError if it has none of that name."""
     node = modules["remote"].find(name)
     if node is None:
         raise CameraError(f"the camera has no feature {name}", hint="acquire camera features")
@@ -62,7 +60,7 @@ def demand(modules: Mapping[str, Features], name: str) -> Node:
 
 
 def check_format(found: FrameFormat, spec: GenicamSpec) -> None:
-    """Raise CameraError unless the lines are what the rig expects."""
+    """Raise CameraError unless the lines have the format that the rig expects."""
     if spec.pixels and found.width != spec.pixels:
         raise CameraError(
             f"camera {spec.serial} delivers lines of {found.width} pixels",
@@ -78,26 +76,26 @@ def check_format(found: FrameFormat, spec: GenicamSpec) -> None:
 
 
 def buffer_count(spec: GenicamSpec, found: FrameFormat) -> int:
-    """Buffers for ``buffer_s`` of lines, within reason."""
+    """Return the number of buffers for ``buffer_s`` of lines, within limits."""
     size = found.height * found.layout.row_bytes(found.width)
     wanted = math.ceil(spec.buffer_s * spec.line_rate_hz / found.height)
     return max(_LEAST_BUFFERS, min(wanted, _MOST_BUFFER_BYTES // size))
 
 
 def read_settings(modules: Mapping[str, Features]) -> dict[str, Any]:
-    """Every readable number, entry, boolean and text of the camera and its stream, as it is now."""
+    """Return the current value of every readable number, entry, boolean and text of camera and stream."""
     facts: dict[str, Any] = {}
     for module in ("stream", "remote"):
         for name in modules[module].names() if module in modules else ():
             node = modules[module].find(name)
-            with suppress(CameraError):  # a feature that its maker got wrong is not worth the camera
+            with suppress(CameraError):  # a defective feature must not make the camera unusable
                 if node is not None and node.kind not in ("command", "other") and node.readable:
                     facts[name] = node.read()
     return facts
 
 
 class MissedTriggers:
-    """The camera's counter of line triggers that it missed, where a setting has made one of it."""
+    """The camera's counter of missed line triggers, if a setting has configured one."""
 
     def __init__(self, modules: Mapping[str, Features]) -> None:
         source = modules["remote"].find("CounterEventSource")
@@ -109,17 +107,17 @@ class MissedTriggers:
         return int(self._value.read()) if self._value is not None else 0
 
     def count(self) -> int:
-        """Missed since the counter was found."""
+        """Return the triggers missed since the counter was found."""
         return self._tally.note(self._read())
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Frame:
-    """One buffer as the driver got it: its lines are in the first ``filled`` bytes of ``memory``, each
-    followed by ``padding`` bytes; not more than ``rows``, where the library says how many (else 0).
+    """One buffer from the driver.
 
-    ``buffer`` is the driver's handle. ``facts`` have no frame id where the frame did not arrive whole and the
-    library does not vouch for it.
+    Its lines are in the first ``filled`` bytes of ``memory``, each followed by ``padding`` bytes; not more
+    than ``rows``, if the library reports them (otherwise 0). ``buffer`` is the driver's handle. ``facts``
+    have no frame ID if the frame is incomplete and its ID not reliable.
     """
 
     buffer: Any
@@ -132,7 +130,7 @@ class Frame:
 
 
 class Assembly:
-    """Makes blocks of the frames of one acquisition, and counts.
+    """Makes blocks from the frames of one acquisition, and counts them.
 
     A frame without a number waits until the next one with a number has come: see `acquire.camera.frames`.
     """
@@ -150,9 +148,10 @@ class Assembly:
         self._statistics = dict.fromkeys(STATISTICS, 0)
 
     def take(self, frame: Frame) -> tuple[list[tuple[CameraBlock, Any]], list[Any]]:
-        """Blocks that have their place now, with their buffers and in order; buffers that are free again.
+        """Return blocks that have their place now, in order with their buffers, and buffers that are free
+        again.
 
-        Raises CameraError when the camera's frame ids make no sense.
+        Raises CameraError if the camera's frame IDs make no sense.
         """
         self._statistics["incomplete_frames"] += not frame.complete
         if frame.facts.frame_id is None:
@@ -179,7 +178,7 @@ class Assembly:
         )
 
     def _wait(self, frame: Frame) -> list[Any]:
-        """The buffers that have to be given up for the frame to wait."""
+        """Let the frame wait for a number; return the buffers that have to be given up for that."""
         self._unnumbered += 1
         self._waiting.append(frame)
         if len(self._waiting) <= self._most_waiting:
@@ -188,8 +187,9 @@ class Assembly:
         return free
 
     def _block(self, frame: Frame, place: FramePlace) -> CameraBlock | None:
-        """Lines of a frame that is not complete are flagged; those that it lacks are losses before the next
-        block. None for a frame without a line.
+        """Return the block of a frame; None if it has no line.
+
+        Lines of an incomplete frame are flagged; those that it lacks are losses before the next block.
         """
         height, reader, filled = self._format.height, self._reader, frame.filled
         assert reader is not None
@@ -210,7 +210,7 @@ class Assembly:
         )
 
     def count(self, block: CameraBlock) -> None:
-        """The block is being delivered."""
+        """Count a block that is being delivered."""
         self._statistics["lines"] += len(block.flags)
         self._statistics["lost"] += sum(loss.count for loss in block.losses)
 

@@ -1,7 +1,7 @@
 """The protocol of a camera: it is armed, delivers blocks of lines, and is disarmed.
 
-A camera counts the lines it delivers from 0 since it was armed. It knows nothing of the trigger's
-line numbers: the grabber subtracts the sensor's depth.
+A camera counts the lines that it delivers from 0 since it was armed. It has no trigger line numbers: the
+grabber subtracts the sensor's depth.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class CameraIdentity:
-    """Who answers: vendor, model, serial number, firmware version."""
+    """Identity of a camera: vendor, model, serial number, firmware version."""
 
     vendor: str
     model: str
@@ -26,7 +26,7 @@ class CameraIdentity:
 
 
 class LossCause(StrEnum):
-    """Why lines did not come out of the camera; the words that a recording's gaps carry."""
+    """Why the camera did not deliver lines; the words that are stored with a recording's gaps."""
 
     NO_BUFFER = "no_buffer"
     """The host had no free buffer: its reader was late."""
@@ -35,7 +35,7 @@ class LossCause(StrEnum):
     ID_GAP = "id_gap"
     """Frame numbers jumped: lost on the link."""
     MISSED_TRIGGER = "missed_trigger"
-    """The camera did not see the line triggers."""
+    """The camera missed line triggers."""
     DEVICE_LOST = "device_lost"
     """The camera was away, and was opened again."""
 
@@ -54,7 +54,7 @@ class CameraBlock:
 
     ``first_line`` counts since arm, gaps included; ``pixels`` is (line, pixel), uint8 or uint16;
     ``flags`` is (line) uint16 of LineFlag. ``losses`` explains, in order, the lines that are missing just
-    before the first; ``time_ns`` is the camera's own clock at the first line, where it tells.
+    before the first; ``time_ns`` is the camera's own clock at the first line, if it has stamps.
     """
 
     first_line: int
@@ -70,15 +70,15 @@ class Camera(Protocol):
     def identify(self) -> CameraIdentity: ...
 
     def settings(self) -> dict[str, Any]:
-        """Settings as read back from the camera, under their SFNC names."""
+        """Return the settings as read back from the camera, under their SFNC names."""
         ...
 
     def arm(self) -> None:
-        """Be ready for line triggers; the count of lines begins at 0."""
+        """Get ready for line triggers; the line count begins at 0."""
         ...
 
     def next_block(self, timeout_s: float) -> CameraBlock | None:
-        """The next lines, or None when ``timeout_s`` passed without any."""
+        """Return the next lines, or None if none came within ``timeout_s``."""
         ...
 
     def release(self, block: CameraBlock) -> None:
@@ -90,7 +90,7 @@ class Camera(Protocol):
         ...
 
     def statistics(self) -> dict[str, int]:
-        """Counters since arm: at least ``lines`` delivered and ``lost`` by the camera itself."""
+        """Return counters since arm: at least ``lines`` delivered and ``lost`` by the camera itself."""
         ...
 
     def close(self) -> None:
@@ -99,6 +99,6 @@ class Camera(Protocol):
 
 
 class CameraOpener(Protocol):
-    """Opens one camera in the process that calls it; picklable, so that a spawned grabber can be given it."""
+    """Opens one camera in the process that calls it; picklable, to be passed to a grabber's process."""
 
     def __call__(self) -> Camera: ...

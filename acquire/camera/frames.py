@@ -1,23 +1,22 @@
-"""Which lines a buffer holds: from frame ids, counters and time stamps to line numbers and located losses.
+"""Line numbers of buffers, and located losses, from frame IDs, counters and time stamps.
 
-A buffer is a frame of ``height`` lines. The camera numbers frames; every loss shows as a hole in the
-numbers, and what the host counts (no free buffer) tells holes apart. Line triggers that the camera did not
-see leave no hole: its counter of missed triggers says how many, the time from this frame to the next in
-which frame::
+A buffer is a frame of ``height`` lines. The camera numbers frames; every loss shows as a hole in the numbers,
+and the host's counts (no free buffer) give the causes of holes. Line triggers that the camera missed leave no
+hole: its counter of missed triggers gives their number, the time from one frame to the next their frame::
 
     id        0    1    2  │ 5    6        7
     lines     0-   h-  2h- │ 5h-  6h-      7h + m -
                            └ 3, 4 lost     └ m triggers missed in frame 6
 
-The number of a frame that arrived incomplete may be that of whatever was in its buffer before, and so may
-its time: such a frame has no number of its own. It lies between the frames before and after it, and when
-the hole between those is as large as the number of such frames, each has its place::
+The number and the time of a frame that arrived incomplete may be those of an earlier frame in its buffer, so
+such a frame counts as unnumbered. It is between the frames before and after it; if the hole between those is
+as large as the number of unnumbered frames, each has its place::
 
     id        7    ?    ?    10   ?    13
     lines     7h-  8h-  9h-  10h-      13h-
                              └ two frames are missing, one came: its place is not known, both are lost
 
-A number that is a little behind the last one is a frame that was late or sent twice: it has been counted.
+A number slightly behind the last one belongs to a frame that was late or sent twice, and was counted already.
 """
 
 from __future__ import annotations
@@ -32,25 +31,25 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 # GigE Vision's block ids have 16 bits and go from 65535 to 1 (0 is for test packets), or 64 with extended
-# ids, as in USB3 Vision. GenTL gives all of them as 64 bits (BUFFER_INFO_FRAMEID) and does not say which,
-# and grabbers have widths of their own: it shows at the first wrap.
+# ids, as in USB3 Vision. GenTL returns all of them as 64 bits (BUFFER_INFO_FRAMEID) without their width, and
+# frame grabbers have other widths: it is found at the first wrap.
 _ID_BITS = (8, 16, 24, 32, 48, 64)
 _COUNTER_BITS = (16, 32, 64)
 _MOST_DOUBT = 256
-"""Frames after which missed triggers that no time stamp shows are taken as before the next frame."""
+"""Frames after which missed triggers that no time stamp has located are assumed before the next frame."""
 _CERTAIN = 0.25
-"""Of a frame: what is further from a whole number of frames than this says nothing."""
+"""Largest distance from a whole number of frames, in frames, that is conclusive."""
 _MOST_STALE = 256
-"""Frames in a row with numbers behind the last one; more are a camera that has begun to count anew."""
+"""Consecutive frames with numbers behind the last one; after more, the camera has restarted its count."""
 
 
 @dataclass(frozen=True, slots=True)
 class FrameFacts:
-    """What is known of one delivered frame.
+    """Facts of one delivered frame.
 
-    ``frame_id`` is None where nothing vouches for it. ``underruns`` and ``missed`` are counts since the
-    beginning, read after the frame came: frames that found no free buffer, line triggers that the camera did
-    not see. ``time_ns`` is the camera's clock at the first line, None where it is not known.
+    ``frame_id`` is None if it is not reliable. ``underruns`` and ``missed`` are counts since the beginning,
+    read after the frame came: frames that found no free buffer, line triggers that the camera missed.
+    ``time_ns`` is the camera's clock at the first line, None if it is unknown.
     """
 
     frame_id: int | None
@@ -60,18 +59,18 @@ class FrameFacts:
 
 
 class Tally:
-    """What a device's counter has counted since the tally was begun, though it may be reset or wrap."""
+    """Total of a device's counter since the tally was created, although the counter may be reset or wrap."""
 
     def __init__(self, reading: int) -> None:
         self._reading = reading
         self._total = 0
 
     def note(self, reading: int) -> int:
-        """The total, now that the counter reads ``reading``."""
+        """Return the total when the counter reads ``reading``."""
         grown = reading - self._reading
         if grown < 0:
             wrapped = (grown + (1 << bits) for bits in _COUNTER_BITS if self._reading < 1 << bits)
-            # A counter that wrapped has grown by little since the last frame; another was reset.
+            # A counter that wrapped has grown little since the last frame; otherwise it was reset.
             grown = next((grown for grown in wrapped if grown < 1 << 15), reading)
         self._reading = reading
         self._total += grown
@@ -80,9 +79,11 @@ class Tally:
 
 @dataclass(frozen=True, slots=True)
 class FramePlace:
-    """Lines of a frame since arm, what was lost just before it, and whether its own numbers are in doubt:
-    the camera has missed triggers in it or soon after. ``kept``: the frames without a number that came since
-    the last one fill the lines just before it; else they are among the losses.
+    """Lines of a frame since arm, and the losses just before it.
+
+    ``doubtful``: the camera has missed triggers in the frame or soon after, so its line numbers are in doubt.
+    ``kept``: the unnumbered frames since the last one fill the lines just before it; otherwise they are among
+    the losses.
     """
 
     first_line: int
@@ -98,11 +99,10 @@ class FrameCount:
     ----------
     height : lines per frame
     id_bits : width of frame ids; 0: found when they wrap
-    first_id : id of the first frame; None: whichever comes first is the first, as with cameras whose ids go
-        on from one acquisition to the next. (A camera that loses its first frame then seems to have lost
-        none.)
-    skips_zero : whether ids begin again at 1 after a wrap, not at 0; None: as the time stamps at the wrap
-        say, else as the first frame's id suggests
+    first_id : id of the first frame; None: that of the first one to come, for cameras whose ids continue from
+        one acquisition to the next. (The loss of the very first frame is not detected then.)
+    skips_zero : whether ids restart at 1 after a wrap, not at 0; None: according to the time stamps at the
+        wrap, or else to the first frame's id
     """
 
     def __init__(
@@ -122,25 +122,23 @@ class FrameCount:
         self._period_ns: float | None = None
 
     def place(self, frame: FrameFacts, unnumbered: int = 0, *, keep: bool = True) -> FramePlace | None:
-        """The place of a frame that has a number, given that the ones before were placed; None for a frame
-        that has been counted already.
+        """Return the place of a numbered frame after the earlier ones; None if it was counted already.
 
-        ``unnumbered`` frames without a number have come since the last one; ``keep`` says whether their
-        lines are still there.
+        ``unnumbered`` frames have come since the last one; ``keep``: their lines are still available.
 
         Raises
         ------
-        CameraLostError : the camera has begun to count anew
+        CameraLostError : the camera has restarted its count
         CameraError : the first frame has an id below the first one
         """
         assert frame.frame_id is not None
         lost = self._lost_frames(frame, frame.frame_id, unnumbered)
         if lost is None:
             self._stale += 1
-            # A few are late or were sent twice; a camera that restarted stays behind for ever.
+            # A few are late or were sent twice; after a restart all frames stay behind.
             if self._stale > _MOST_STALE:
                 raise CameraLostError(
-                    f"the camera counts its frames anew: after id {self._last_id} came {self._stale} frames "
+                    f"the camera has restarted its count: after id {self._last_id} came {self._stale} frames "
                     f"with ids behind it, the last one {frame.frame_id}"
                 )
             return None
@@ -158,7 +156,7 @@ class FrameCount:
         return FramePlace(first, losses, doubtful=self._pending > 0, kept=kept)
 
     def _lost_frames(self, frame: FrameFacts, number: int, unnumbered: int) -> int | None:
-        """Frames between the last one and this one; None when this one is not after the last."""
+        """Return the number of frames between the last one and this one; None if this is not after it."""
         if self._last is not None:
             ahead = self._ahead(frame, number)
             return None if ahead is None else ahead - 1
@@ -173,13 +171,13 @@ class FrameCount:
         return number - self._first_id
 
     def _ahead(self, frame: FrameFacts, number: int) -> int | None:
-        """Frames from the last one to this one, over a wrap; None when this one is behind it, or the same."""
+        """Return the frames from the last one to this one, across a wrap; None if this is not after it."""
         if not self._id_bits and number >= self._last_id:
             return number - self._last_id or None
-        # Ids wrap where the narrowest counter that can have made them does.
+        # Assume the narrowest counter that can have produced the ids.
         bits = self._id_bits or next(bits for bits in _ID_BITS if self._largest_id < 1 << bits)
         ahead = (number - self._last_id) % (1 << bits)
-        # More than half of all numbers ahead is less than half behind: late, rather than a day of losses.
+        # More than half of the range ahead is less than half behind: a late frame, not a day of losses.
         if ahead == 0 or ahead > 1 << (bits - 1) or (not self._id_bits and self._is_earlier(frame)):
             return None
         if number < self._last_id:
@@ -193,7 +191,7 @@ class FrameCount:
         return before is not None and now is not None and now < before
 
     def _skips(self, frame: FrameFacts, number: int, ahead: int) -> bool:
-        """Whether ids skip 0, at a frame after a wrap that is ``ahead`` frames ahead if they do not."""
+        """Return whether ids skip 0, at a frame after a wrap; it is ``ahead`` frames ahead if they do not."""
         assert self._last is not None
         if number == 0:
             self._skips_zero = False
@@ -206,17 +204,17 @@ class FrameCount:
         return self._skips_zero
 
     def _missed_before(self, frame: FrameFacts, lost: int) -> int:
-        """Missed triggers of the frames before this one, of those that the counter has announced."""
+        """Return how many of the missed triggers counted so far are before this frame."""
         last = self._last
         if last is None or last.time_ns is None or frame.time_ns is None or self._doubtful > _MOST_DOUBT:
             missed, self._pending = self._pending, 0
             return missed
-        # The counter is read when a frame is taken from its queue, and may by then have counted what the
-        # camera missed after it: before it there were no more than the time stamps leave room for.
+        # The counter is read when a frame is taken from its queue, and may then include triggers missed after
+        # it: before the frame, there were no more than the time stamps leave room for.
         elapsed_ns = frame.time_ns - last.time_ns
         lines = (1 + lost) * self._height
         if not self._pending or self._period_ns is None:
-            # The line period is measured where nothing is missing, so that it means what it says.
+            # Measure the line period only where nothing is missing.
             if not self._pending and not lost:
                 self._period_ns = elapsed_ns / lines
             missed = self._pending

@@ -1,4 +1,4 @@
-"""How bright and how sharp an image is, from its lines as they come: for whoever turns a lens or a lamp."""
+"""Brightness and sharpness of an image from its lines as they come, for adjusting a lens or a lamp."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 MOST_PIXELS = 2**15
-"""Of a block that are looked at; whole lines, spread over it."""
+"""Number of pixels of a block that are used, in whole lines spread over it."""
 FAINT = 0.01
-"""Level, of white, below which sharpness would be that of the noise."""
+"""Level, relative to white, below which sharpness would be that of the noise."""
 _NO_IMAGE = LineFlag.MISSING | LineFlag.INCOMPLETE
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What some lines of one arm show.
+    """Brightness and sharpness of some lines of one arm.
 
-    ``level`` and ``brightest`` are parts of the way from black to white; ``saturated`` is the part of the
-    pixels that are white; ``focus`` is the RMS difference of neighbouring pixels beside the mean light, None
-    where there is too little light for it. All are None where there was no line. ``lost`` lines did not come,
-    or not whole.
+    ``level`` and ``brightest`` are fractions of the range from black to white; ``saturated`` is the fraction
+    of white pixels; ``focus`` is the RMS difference of neighbouring pixels relative to the mean light, None
+    if there is too little light. All are None if there was no line. ``lost`` lines did not come, or not
+    whole.
     """
 
     lines: int
@@ -39,7 +39,7 @@ class Reading:
 
 @dataclass(slots=True)
 class Sums:
-    """Over the pixels of some lines that were looked at, in DN and DN²."""
+    """Sums over the pixels of some lines, in DN and DN²."""
 
     lines: int = 0
     lost: int = 0
@@ -57,11 +57,11 @@ class Sums:
 
 
 class Gauge:
-    """Of one arm: blocks go in by `look` and `keep`, `take` says what they showed since it was last asked.
+    """Gauge of one arm: blocks go in by `look` and `keep`, `take` returns the reading since its last call.
 
     Focus is √⟨(y_{j+1} − y_j)²⟩ / ⟨y − black⟩ over pixels j and lines. A lens out of focus moves light to the
-    neighbours and takes none away, so that at steady light the number is largest in focus; noise and the
-    columns' own gains add the same to it everywhere.
+    neighbouring pixels without losing any, so that at steady light the number is largest in focus; noise and
+    the columns' gains add the same to it at any focus.
     """
 
     def __init__(self, black_dn: float, white_dn: int) -> None:
@@ -69,7 +69,7 @@ class Gauge:
         self._sums = Sums()
 
     def look(self, pixels: NDArray[Any], flags: NDArray[np.uint16], lost: int = 0) -> Sums:
-        """Of consecutive lines (line, pixel) and their flags (line), ``lost`` lines missing before them."""
+        """Return the sums of consecutive lines (line, pixel) and flags (line) after ``lost`` lost ones."""
         good = (flags & _NO_IMAGE) == 0
         sums = Sums(int(good.sum()), lost + int(len(flags) - good.sum()))
         stride = max(1, -(-pixels.size // MOST_PIXELS))
@@ -82,11 +82,11 @@ class Gauge:
         return sums
 
     def keep(self, sums: Sums) -> None:
-        """What was looked at counts."""
+        """Add sums to the reading."""
         self._sums.add(sums)
 
     def take(self) -> Reading:
-        """Of what was kept since the last call."""
+        """Return the reading of the sums kept since the last call."""
         sums, self._sums = self._sums, Sums()
         if not sums.samples:
             return Reading(sums.lines, sums.lost)

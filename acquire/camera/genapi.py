@@ -1,4 +1,4 @@
-"""What a camera describes of itself: GenApi node maps, through the genicam package.
+"""Features of a camera's own description: GenApi node maps, through the genicam package.
 
 genicam is imported when first used, never with this module: importing it changes warning filters.
 """
@@ -51,9 +51,9 @@ class GenapiFeatures:
         return [name for names in self.categories().values() for name in names]
 
     def categories(self) -> dict[str, list[str]]:
-        """Category → its features, in the order of the description."""
+        """Return, per category, its features in the order of the description."""
         found: dict[str, list[str]] = {}
-        with told("read the features"):
+        with translated("read the features"):
             self._collect(self._map.get_node("Root"), "Root", found)
         return found
 
@@ -90,32 +90,32 @@ class GenapiNode:
     def _mode(self) -> str:
         from genicam import genapi
 
-        with told(self.name):
+        with translated(self.name):
             return str(genapi.EAccessMode(self._node.get_access_mode()).name)
 
     @property
     def selected(self) -> bool:
-        with told(self.name):
+        with translated(self.name):
             return bool(self._node.node.selecting_features)
 
     @property
     def about(self) -> str:
-        """What the camera says of the feature."""
+        """The camera's description of the feature."""
         return str(self._node.node.tooltip or self._node.node.description)
 
     def read(self) -> Value:
-        with told(f"read {self.name}"):
+        with translated(f"read {self.name}"):
             value: Value = self._node.value
             return value
 
     def read_afresh(self) -> None:
-        """Read the register itself, not what is remembered of it."""
-        with told(f"read {self.name}"):
+        """Read the register itself, not a cached value."""
+        with translated(f"read {self.name}"):
             self._node.node.invalidate_node()
             self._node.to_string()
 
     def write(self, value: Value) -> None:
-        with told(f"set {self.name} to {value!r}"):
+        with translated(f"set {self.name} to {value!r}"):
             if self.kind != "command":
                 self._node.value = value
             elif value:
@@ -127,18 +127,18 @@ class GenapiNode:
                     time.sleep(0.001)
 
     def limits(self) -> tuple[float, float, float]:
-        with told(self.name):
+        with translated(self.name):
             if self.kind == "integer":
                 return self._node.min, self._node.max, self._node.inc
             return self._node.min, self._node.max, self._node.inc if self._node.has_inc() else 0
 
     def entries(self) -> list[str]:
-        with told(self.name):
+        with translated(self.name):
             return list(self._node.symbolics)
 
 
 class Words(logging.Handler):
-    """What harvesters only logs, such as a description that cannot be parsed."""
+    """Keeps messages that harvesters only logs, for example about a description that cannot be parsed."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -162,8 +162,8 @@ def is_gone(error: Exception) -> bool:
 
 
 @contextmanager
-def told(what: str, words: Words | None = None) -> Iterator[None]:
-    """Errors of the libraries as ours: CameraLostError when the device is gone, else CameraError."""
+def translated(what: str, words: Words | None = None) -> Iterator[None]:
+    """Translate errors of the libraries: to CameraLostError if the device is gone, otherwise CameraError."""
     try:
         from genicam import genapi, gentl
     except ImportError as error:

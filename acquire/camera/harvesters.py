@@ -1,13 +1,13 @@
 """Cameras through harvesters: any camera whose maker gives a GenTL producer (.cti).
 
-The only file that imports harvesters, and only when a camera is opened: importing it changes
-warning filters, opening takes over SIGINT (both are put back), and a producer must never be forked. Their
-binding holds the interpreter's lock while it waits, so a camera wants a process of its own.
+The only file that imports harvesters, and only when a camera is opened: importing it changes warning filters,
+opening takes over SIGINT (both are restored), and a producer must never be forked. The binding holds the
+interpreter's lock while it waits, so a camera needs a separate process.
 
-What harvesters does: find producers and devices, load the node maps, announce buffers, start and stop.
-What it is not asked to do: fetch. It requeues incomplete buffers without a word, so buffers are taken from
-its NewBuffer monitor directly. A buffer is announced once, shown as an array without a copy, and queued
-again by `release`.
+harvesters is used to find producers and devices, load the node maps, announce buffers, start and stop. It is
+not used to fetch buffers, because it silently requeues incomplete ones: they are taken from its NewBuffer
+monitor directly. A buffer is announced once, accessed as an array without a copy, and queued again by
+`release`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from acquire.camera.assembly import (
 )
 from acquire.camera.base import CameraIdentity
 from acquire.camera.frames import FrameFacts, Tally
-from acquire.camera.genapi import GenapiFeatures, Words, is_gone, told
+from acquire.camera.genapi import GenapiFeatures, Words, is_gone, translated
 from acquire.camera.producers import find_producers
 from acquire.camera.settings import apply_settings
 from acquire.camera.spec import spec_of
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from acquire.config import RigConfig
 
 _ALIVE_S = 0.5
-"""How often a silent camera is asked whether it is still there."""
+"""How often a silent camera is checked."""
 _log = logging.getLogger(__name__)
 
 
@@ -85,7 +85,7 @@ class HarvestersCameras(CameraVariant):
 
 
 def list_cameras(cti: str = "") -> list[FoundCamera]:
-    """Every camera that the producers show now. Raises CameraError where there is no producer."""
+    """Return every camera that the producers list now. Raises CameraError if there is no producer."""
     with _Library(cti) as library:
         return library.found()
 
@@ -121,7 +121,7 @@ class HarvestersCamera:
         return read_settings(self._features)
 
     def features(self) -> dict[str, GenapiFeatures]:
-        """Module → its features, for a look at everything (`acquire.camera.settings.Features`)."""
+        """Return, per module, all its features (`acquire.camera.settings.Features`)."""
         return self._features
 
     def arm(self) -> None:
@@ -131,26 +131,26 @@ class HarvestersCamera:
         self._missed = MissedTriggers(self._features)
         buffers = buffer_count(self._spec, found)
         self._assembly = Assembly(found, self._spec, buffers)
-        with told(f"arm camera {self._spec.serial}"), _signals_kept():
+        with translated(f"arm camera {self._spec.serial}"), _signals_kept():
             acquirer = self._acquirer
             acquirer.num_buffers = buffers
-            # harvesters keeps its monitors to itself; without one there is no word of incomplete buffers.
+            # harvesters' monitors are private, but the only way to learn of incomplete buffers.
             self._stream = acquirer.data_streams[0]
             self._monitor = acquirer._new_buffer_event_monitor_dict[self._stream]
-            # GenTL counts STREAM_INFO_NUM_UNDERRUN from the opening of the stream on, not from its start.
+            # GenTL counts STREAM_INFO_NUM_UNDERRUN since the stream was opened, not since it was started.
             self._underruns = Tally(self._read_underruns())
             acquirer.start()
             self._armed = True
         self._heard_s = time.monotonic()
 
     def next_block(self, timeout_s: float) -> CameraBlock | None:
-        """The next frame's lines; those of an incomplete one are flagged, absent ones are losses."""
+        """Return the next frame's lines; those of an incomplete one are flagged, absent ones are losses."""
         if not self._armed:
-            raise CameraError("a block was asked of a camera that is not armed", hint="arm it")
+            raise CameraError("a block was requested of a camera that is not armed", hint="arm it")
         if not self._ready:
             buffer = self._await_buffer(timeout_s)
             if buffer is None:
-                # Some producers are silent when their camera goes: reading a register is not.
+                # Some producers do not report that their camera is gone; reading a register does.
                 if time.monotonic() - self._heard_s > _ALIVE_S:
                     self._heard_s = time.monotonic()
                     remote = self._features["remote"]
@@ -159,7 +159,7 @@ class HarvestersCamera:
                         node.read_afresh()
                 return None
             self._heard_s = time.monotonic()
-            with told(f"camera {self._spec.serial}"):
+            with translated(f"camera {self._spec.serial}"):
                 self._take(buffer)
         if not self._ready:
             return None
@@ -173,8 +173,8 @@ class HarvestersCamera:
         from genicam import gentl
 
         try:
-            with told(f"camera {self._spec.serial}"):
-                # In whole ms, as GenTL has them; 0 would not wait at all, and the loop above would spin.
+            with translated(f"camera {self._spec.serial}"):
+                # In whole ms, GenTL's unit; 0 would not wait at all, and the caller's loop would spin.
                 self._monitor.update_event_data(max(1, round(timeout_s * 1000)))
                 return self._monitor.buffer
         except CameraError as error:
@@ -183,10 +183,10 @@ class HarvestersCamera:
             raise
 
     def _take(self, buffer: Any) -> None:
-        """Put a filled buffer in its place among the frames."""
+        """Take a filled buffer, and assemble its frame to blocks."""
         complete = bool(buffer.is_complete())
         time_ns = _or(lambda: int(buffer.timestamp_ns), 0) or None
-        # Buffers are announced once and come round: each is made an array once, without a copy.
+        # Buffers are announced once and reused: each becomes an array once, without a copy.
         key = buffer.context
         if key not in self._views:
             self._views[key] = np.frombuffer(buffer.raw_buffer, np.uint8)
@@ -194,7 +194,7 @@ class HarvestersCamera:
             buffer,
             self._views[key],
             int(buffer.size_filled),
-            FrameFacts(  # producers differ in what they say of a frame that is not complete
+            FrameFacts(  # producers differ in the facts of an incomplete frame
                 int(buffer.frame_id) if complete else None,
                 self._underruns.note(self._read_underruns()),
                 self._missed.count(),
@@ -215,19 +215,19 @@ class HarvestersCamera:
 
     def release(self, block: CameraBlock) -> None:
         buffer = self._held.pop(block, None)
-        # A stream that has ended has its buffers back: to queue one of them again is an error.
+        # A stopped stream has its buffers back: queueing one of them again is an error.
         if buffer is not None and self._armed:
-            with told(f"camera {self._spec.serial}"):
+            with translated(f"camera {self._spec.serial}"):
                 self._stream.module.queue_buffer(buffer, False)
 
     def disarm(self) -> None:
-        """Stop, whatever state the camera is in."""
+        """Stop, in any state of the camera."""
         if not self._armed:
             return
         self._armed = False
         self._held.clear()
         self._ready.clear()
-        self._views.clear()  # before the memory that they show is freed
+        self._views.clear()  # before their memory is freed
         _stop(self._acquirer)
 
     def statistics(self) -> dict[str, int]:
@@ -246,7 +246,7 @@ class _Library:
     def __init__(self, cti: str) -> None:
         self._producers = find_producers(cti)
         self._words = Words()
-        with warnings.catch_warnings(), told("load harvesters"):
+        with warnings.catch_warnings(), translated("load harvesters"):
             warnings.simplefilter("ignore")
             try:
                 from harvesters.core import Harvester, ParameterKey, ParameterSet
@@ -266,7 +266,7 @@ class _Library:
         return [_describe(info) for info in self._harvester.device_info_list]
 
     def pick(self, serial: str, model: str) -> FoundCamera:
-        """The camera with this serial number. Raises CameraError that says who is there instead."""
+        """Return the camera with this serial number. Raises CameraError that lists the cameras found."""
         found = self.found()
         chosen = next((camera for camera in found if serial in (camera.serial, "")), None)
         if chosen is None:
@@ -287,7 +287,7 @@ class _Library:
     def create(self, camera: FoundCamera) -> Any:
         infos = self._harvester.device_info_list
         index = next(k for k, info in enumerate(infos) if _describe(info) == camera)
-        with told(f"open camera {camera.serial}", self._words), _signals_kept():
+        with translated(f"open camera {camera.serial}", self._words), _signals_kept():
             acquirer = self._harvester.create(index)
         node_map = acquirer.remote_device.node_map
         if node_map is None or GenapiFeatures(node_map).find("Width") is None:
@@ -297,9 +297,9 @@ class _Library:
         return acquirer
 
     def close(self) -> None:
-        """Idempotent; what a camera that is gone refuses does not matter any more."""
-        # `reset` and not the acquirer's `destroy` alone: harvesters keeps what was destroyed until then.
-        with suppress(CameraError), told("close"), _signals_kept():
+        """Close the library, ignoring errors of a camera that is gone. Idempotent."""
+        # `reset`, not only the acquirer's `destroy`: harvesters keeps destroyed objects until then.
+        with suppress(CameraError), translated("close"), _signals_kept():
             self._harvester.reset()
 
     def __enter__(self) -> _Library:
@@ -310,7 +310,7 @@ class _Library:
 
 
 def _modules(acquirer: Any) -> dict[str, GenapiFeatures]:
-    """The node maps of a camera; a producer need not have all."""
+    """Return the node maps of a camera; producers may lack some of them."""
     streams: Sequence[Any] = acquirer.data_streams
     maps = {
         "remote": acquirer.remote_device.node_map,
@@ -323,7 +323,7 @@ def _modules(acquirer: Any) -> dict[str, GenapiFeatures]:
 
 
 def _map_of(module: Any) -> Any:
-    """harvesters makes node maps of modules without a description: they have no root."""
+    # harvesters also creates node maps of modules without a description, which have no root.
     node_map = module.node_map
     return node_map if node_map is not None and GenapiFeatures(node_map).find("Root") is not None else None
 
@@ -349,10 +349,10 @@ _ACCESS = {2: "open for reading only", 3: "not accessible", 4: "in use by anothe
 
 
 def _stop(acquirer: Any) -> None:
-    """Stop as harvesters does; where the camera is gone that ends half-way, so finish by hand."""
+    """Stop with harvesters; if the camera is gone that fails half-way, so finish by hand."""
     from genicam import gentl
 
-    with suppress(CameraError), told("stop"):
+    with suppress(CameraError), translated("stop"):
         acquirer.stop()
         return
     stream = acquirer.data_streams[0]
@@ -361,12 +361,12 @@ def _stop(acquirer: Any) -> None:
         acquirer._release_buffers,
         lambda: [monitor.flush_event_queue() for monitor in acquirer._new_buffer_event_monitor_dict.values()],
     ):
-        with suppress(CameraError), told("stop"):
+        with suppress(CameraError), translated("stop"):
             step()
 
 
 def _or(ask: Any, otherwise: Any) -> Any:
-    """What a producer says, or ``otherwise`` where it does not know the question."""
+    """Return a producer's answer, or ``otherwise`` if it does not support the query."""
     from genicam import gentl
 
     try:
@@ -383,7 +383,7 @@ def _or_zero(ask: Any) -> int:
 
 @contextmanager
 def _signals_kept() -> Iterator[None]:
-    """harvesters takes SIGINT over in the main thread; here it is given back."""
+    """Restore the handler of SIGINT, which harvesters replaces in the main thread."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

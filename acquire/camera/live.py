@@ -1,4 +1,4 @@
-"""One camera looked at for as long as somebody wants, in a process of its own that tells again and again."""
+"""Live readings of one camera, repeated until it is closed, from a separate process."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ if TYPE_CHECKING:
     from acquire.processes.worker import Mailbox
 
 TURN_S = 0.2
-"""Between two readings."""
+"""Time between two readings."""
 _WAIT_S = 0.05
 _END_S = 30.0
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """What of a camera is looked at: an arm's columns, its black and white; None: all, and as it tells."""
+    """Part of a camera's image: an arm's columns, black and white. None: all columns, the format's white."""
 
     columns: tuple[int, int] | None = None
     black_dn: float = 0.0
@@ -33,19 +33,20 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """By the names of the views."""
+    """Name of the view → reading."""
 
     of: dict[str, Reading]
 
 
 class LiveCamera:
-    """One camera, opened and armed in a process that ends with `close`. Line triggers are others' business.
+    """One camera, opened and armed in a process that ends with `close`. Line triggers must come from
+    elsewhere.
 
-    A camera may have several views, as one with both arms' images has.
+    A camera may have several views, for example one with both arms' images.
     """
 
     def __init__(self, name: str, opener: CameraOpener, views: dict[str, View], timeout_s: float) -> None:
-        """Returns once the camera waits for lines. Raises CameraError, or DeviceError, in ``timeout_s``."""
+        """Wait until the camera waits for lines. Raises CameraError, or DeviceError after ``timeout_s``."""
         self._worker = Worker(name, _look, opener, views)
         try:
             self.facts: dict[str, Any] = self._worker.expect(Ready, time.monotonic() + timeout_s).facts
@@ -54,7 +55,7 @@ class LiveCamera:
             raise
 
     def take(self, timeout_s: float) -> dict[str, Reading]:
-        """The next readings by view; empty when none came in time. Raises what the camera failed with."""
+        """Return the next readings by view; empty if none came in time. Raises the camera's error."""
         message = self._worker.message(timeout_s)
         if isinstance(message, Failed):
             raise message.error
@@ -93,15 +94,15 @@ def _look(mailbox: Mailbox, opener: CameraOpener, views: dict[str, View]) -> Non
 
 
 def _white(view: View, settings: dict[str, Any]) -> int:
-    """Of the view, or by the name of the camera's pixel format, ``Mono12p`` being Mono12 in a tight pack."""
+    """Return the white of the view, or of the camera's pixel format; ``Mono12p`` is packed Mono12."""
     if view.white_dn is not None:
         return view.white_dn
     pixel_format = str(settings.get("PixelFormat", ""))
     bits = PIXEL_BITS.get(pixel_format.removesuffix("p").removesuffix("Packed"))
     if bits is None:
         raise CameraError(
-            f"the camera's PixelFormat is {pixel_format!r}: what is white is not known",
+            f"the camera's PixelFormat is {pixel_format!r}, for which the white level is unknown",
             possible=", ".join(PIXEL_BITS),
-            hint="a rig file, which says so",
+            hint="a rig file, which states it",
         )
     return (1 << bits) - 1

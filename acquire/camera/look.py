@@ -1,4 +1,4 @@
-"""A look at one camera, for people: who it is, what it offers, what it sees. Runs in the camera's process."""
+"""Inspection of one camera for users: identity, features, a snapshot. Runs in the camera's process."""
 
 from __future__ import annotations
 
@@ -40,12 +40,14 @@ class FeatureCamera(Protocol):
 
 
 def facts(camera: Camera, _: Callable[[], None]) -> dict[str, Any]:
-    """Identity and settings as read back."""
+    """Return identity and settings as read back."""
     return {"identity": asdict(camera.identify()), "settings": camera.settings()}
 
 
 def feature_table(camera: Camera, _: Callable[[], None]) -> list[dict[str, Any]]:
-    """A row per feature, in the camera's order: module, category, feature, value, access, kind, possible."""
+    """Return a row per feature, in the camera's order: module, category, feature, value, access, kind,
+    possible.
+    """
     if isinstance(camera, FeatureCamera):
         return list(_rows(camera.features()))
     return [
@@ -65,7 +67,7 @@ def _rows(modules: Mapping[str, FeatureTree]) -> Iterator[dict[str, Any]]:
 
 def _row(node: Node) -> dict[str, Any]:
     row: dict[str, Any] = {"value": None, "access": "", "kind": node.kind, "possible": ""}
-    with suppress(CameraError):  # a feature that its maker got wrong hides nothing but itself
+    with suppress(CameraError):  # a defective feature must not hide the others
         row["access"] = ("r" if node.readable else "") + ("w" if node.writable else "")
         row["value"] = node.read() if node.readable else None
         row["possible"] = describe(node) if node.writable else ""
@@ -75,9 +77,10 @@ def _row(node: Node) -> dict[str, Any]:
 def snapshot(
     camera: Camera, armed: Callable[[], None], lines: int, timeout_s: float
 ) -> tuple[NDArray[Any], NDArray[np.uint16]]:
-    """The next ``lines`` lines (line, pixel) and their flags (line); ``armed`` is called once it is.
+    """Return the next ``lines`` lines (line, pixel) and their flags (line).
 
-    Lines that the camera lost are 0 and flagged missing. Raises CameraError when they do not come in time.
+    ``armed`` is called once the camera is armed. Lines that the camera lost are 0 and flagged missing. Raises
+    CameraError if they do not come in time.
     """
     camera.arm()
     armed()

@@ -1,4 +1,4 @@
-"""Pixel formats as they lie in a camera's buffer, and how they become (line, pixel) arrays.
+"""Pixel formats in a camera's buffer, and their conversion to (line, pixel) arrays.
 
 ::
 
@@ -7,7 +7,7 @@
     Mono10p, Mono12p        PFNC: a stream of bits, lowest first; 4 pixels in 5 bytes, 2 in 3
     Mono10/12Packed         GigE Vision: two pixels in three bytes, high 8 bits outside, the rest between
 
-What is not packed is a view of the buffer without a copy. Row padding is never part of the result.
+Unpacked formats are views of the buffer without a copy. Row padding is never part of the result.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class PixelLayout:
-    """``bits`` that count, ``stored_bits`` that a pixel takes in the buffer."""
+    """``bits``: significant bits; ``stored_bits``: bits of a pixel in the buffer."""
 
     name: str
     bits: int
@@ -35,7 +35,7 @@ class PixelLayout:
 
     @property
     def dtype(self) -> str:
-        """Of the pixels once they are unpacked."""
+        """Type of unpacked pixels."""
         return "uint8" if self.bits <= 8 else "uint16"
 
     def row_bytes(self, width: int) -> int:
@@ -58,16 +58,16 @@ LAYOUTS = {
 
 
 def layout_of(name: str) -> PixelLayout:
-    """The layout of an SFNC PixelFormat. Raises CameraError for one that cannot be recorded."""
+    """Return the layout of an SFNC PixelFormat. Raises CameraError for one that cannot be recorded."""
     if name not in LAYOUTS:
         raise CameraError(f"pixel format {name!r} cannot be recorded", possible=", ".join(LAYOUTS))
     return LAYOUTS[name]
 
 
 class LineReader:
-    """Reads lines of ``width`` pixels out of buffers; ``padding`` bytes follow each line.
+    """Reads lines of ``width`` pixels from buffers; ``padding`` bytes follow each line.
 
-    ``joined``: packed lines begin inside a byte where the one before ends, all one run of pixels.
+    ``joined``: a packed line may begin inside the byte in which the previous one ends, without a gap.
     """
 
     def __init__(self, layout: PixelLayout, width: int, padding: int = 0, *, joined: bool = False) -> None:
@@ -77,7 +77,7 @@ class LineReader:
         self.pitch = self._row + padding
 
     def lines(self, memory: NDArray[np.uint8], count: int) -> NDArray[Any]:
-        """(count, width) pixels from the beginning of ``memory`` (bytes)."""
+        """Return (count, width) pixels from the beginning of ``memory`` (bytes)."""
         layout = self._layout
         if self._joined:
             pixels = count * self._width
@@ -91,7 +91,7 @@ class LineReader:
         return _UNPACK[layout.name](rows, self._width)
 
     def size(self, count: int) -> int:
-        """Bytes of ``count`` lines."""
+        """Return the bytes of ``count`` lines."""
         if self._joined:
             return -(-count * self._width * self._layout.stored_bits // 8)
         return count * self.pitch
@@ -100,14 +100,14 @@ class LineReader:
     def for_frames(
         cls, layout: PixelLayout, width: int, padding: int, height: int, filled: int
     ) -> LineReader:
-        """The reader for a camera of whose frames one of ``height`` lines fills ``filled`` bytes."""
-        # Standards leave open whether a packed line begins at a byte; how much a whole frame fills tells.
+        """Return the reader for a camera whose frame of ``height`` lines fills ``filled`` bytes."""
+        # Standards leave open whether a packed line begins at a byte boundary; the size of a frame shows it.
         joined, aligned = cls(layout, width, joined=True), cls(layout, width, padding)
         return joined if filled == joined.size(height) != aligned.size(height) else aligned
 
 
 def _groups(rows: NDArray[np.uint8], group: int) -> NDArray[np.uint16]:
-    """Rows cut into groups of ``group`` bytes, the last filled up: (row, group, byte) as uint16."""
+    """Divide rows into groups of ``group`` bytes, padding the last: (row, group, byte) as uint16."""
     short = -rows.shape[1] % group
     if short:
         rows = np.pad(rows, ((0, 0), (0, short)))
@@ -131,7 +131,8 @@ def _mono10p(rows: NDArray[np.uint8], width: int) -> NDArray[np.uint16]:
 
 
 def _mono12packed(rows: NDArray[np.uint8], width: int) -> NDArray[np.uint16]:
-    b = _groups(rows, 3)  # the byte between: low bits of the first pixel below, of the second above
+    # The middle byte has the first pixel's low bits in its lower half, the second's in its upper half.
+    b = _groups(rows, 3)
     return _join([b[..., 0] << 4 | b[..., 1] & 0xF, b[..., 2] << 4 | b[..., 1] >> 4], width)
 
 

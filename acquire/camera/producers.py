@@ -1,4 +1,4 @@
-"""Where GenTL producers (.cti files) are: as configured, else as GENICAM_GENTL64_PATH says."""
+"""Finds GenTL producers (.cti files), as configured or in the directories of GENICAM_GENTL64_PATH."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ PATH = "GENICAM_GENTL64_PATH"
 
 
 def find_producers(cti: str = "") -> list[Path]:
-    """The producer ``cti``, or all that the environment names. Raises CameraError where there is none."""
+    """Return the producer ``cti``, or all in the environment's directories.
+
+    Raises CameraError if none exists.
+    """
     if cti:
         path = Path(cti).expanduser()
         if not path.is_file():

@@ -1,8 +1,8 @@
-"""Settings of a camera as a list: written in order, coerced by the feature's type, read back, compared.
+"""A camera's list of settings: written in order, converted to the feature's type, read back, compared.
 
-What a GenICam feature accepts depends on others (a selector, a width, a mode), so the order is the user's
-and an error says what the camera offers at that moment. This module knows no GenICam library: a camera's
-driver gives it nodes.
+The values that a GenICam feature accepts depend on others (a selector, a width, a mode), so the user
+determines the order, and an error states what the camera accepts at that moment. This module is independent
+of GenICam libraries: a camera's driver provides the nodes.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
 MODULES = ("remote", "interface", "device", "stream", "system")
-"""GenTL modules that have features: the camera itself, then the host's side of it."""
+"""GenTL modules with features: the camera itself, then the host's side."""
 
 Kind = Literal["integer", "float", "enumeration", "boolean", "text", "command", "other"]
 Value = bool | int | float | str
 
 _LONG = 1e15
-"""Limits from here on are those of the type, not of the camera: not worth their digits."""
+"""Limits from here on are those of the type, not of the camera, and are shown with few digits."""
 FLOAT_TOLERANCE = 1e-3
-"""Cameras round what they cannot have exactly; more than this is another value."""
+"""Relative tolerance for the rounding of cameras; a larger difference is another value."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,7 @@ class Setting:
 
 
 class Node(Protocol):
-    """One feature of a camera, whatever library shows it. Access raises CameraError."""
+    """One feature of a camera, through any library. Access raises CameraError."""
 
     name: str
     kind: Kind
@@ -55,7 +55,7 @@ class Node(Protocol):
 
     @property
     def selected(self) -> bool:
-        """Its value belongs to what a selector points at."""
+        """Whether its value depends on a selector."""
         ...
 
     def read(self) -> Value: ...
@@ -65,11 +65,11 @@ class Node(Protocol):
         ...
 
     def limits(self) -> tuple[float, float, float]:
-        """Minimum, maximum, increment (0 for any) of a number."""
+        """Return minimum, maximum, increment (0 for any) of a number."""
         ...
 
     def entries(self) -> list[str]:
-        """The names that an enumeration takes now."""
+        """Return the names that an enumeration accepts now."""
         ...
 
 
@@ -82,9 +82,9 @@ class Features(Protocol):
 
 
 def apply_settings(settings: Iterable[Setting], modules: Mapping[str, Features]) -> None:
-    """Write every setting in order. Raises CameraError at the first that cannot be had.
+    """Write every setting in order. Raises CameraError at the first that cannot be applied.
 
-    Each is read back at once; at the end all but selected ones are read again, since a later setting may
+    Each is read back at once; at the end all except selected ones are read again, since a later setting may
     have changed an earlier one.
     """
     written: dict[tuple[str, str], tuple[Setting, Node]] = {}
@@ -95,7 +95,7 @@ def apply_settings(settings: Iterable[Setting], modules: Mapping[str, Features])
             now = f", it reads {node.read()!r}" if node.readable else ""
             raise CameraError(
                 f"{setting}: it cannot be written now{now}",
-                hint="a setting that frees it first (a selector or mode), or none: it may be read-only",
+                hint="first a setting that makes it writable (a selector or mode), unless it is read-only",
             )
         node.write(value)
         if node.kind != "command":
@@ -107,7 +107,7 @@ def apply_settings(settings: Iterable[Setting], modules: Mapping[str, Features])
 
 
 def find_node(module: str, feature: str, modules: Mapping[str, Features]) -> Node:
-    """The feature. Raises CameraError that names what is there instead."""
+    """Return the feature. Raises CameraError that lists similar ones."""
     if module not in modules:
         raise CameraError(f"the camera has no module {module!r}", possible=", ".join(modules))
     node = modules[module].find(feature)
@@ -123,14 +123,14 @@ def find_node(module: str, feature: str, modules: Mapping[str, Features]) -> Nod
 
 
 def coerce(setting: Setting, node: Node) -> Value:
-    """The value as the feature's type has it. Raises CameraError for another type, or out of range."""
+    """Convert the value to the feature's type. Raises CameraError for another type, or out of range."""
     value: Value | None = _COERCE[node.kind](setting.value)
     if value is None:
         raise CameraError(f"{setting}: the feature cannot have this value", possible=describe(node))
     if node.kind in ("integer", "float"):
         low, high, step = node.limits()
         inside = low <= float(value) <= high
-        # Steps of floats are what the camera rounds to; those of integers it insists on.
+        # The camera rounds floats to their steps, but insists on those of integers.
         if not inside or (step and node.kind == "integer" and (float(value) - low) % step):
             raise CameraError(f"{setting}: the value is out of range", possible=describe(node))
     elif node.kind == "enumeration" and value not in node.entries():
@@ -139,7 +139,7 @@ def coerce(setting: Setting, node: Node) -> Value:
 
 
 def describe(node: Node) -> str:
-    """What the feature accepts now."""
+    """Return what the feature accepts now, as text."""
     if node.kind in ("integer", "float"):
         low, high, step = node.limits()
         every = f" in steps of {step:g}" if step not in (0, 1) else ""
@@ -169,7 +169,7 @@ def _compare(setting: Setting, node: Node, when: str) -> None:
 
 
 def coerce_loosely(setting: Setting, node: Node) -> Value:
-    """As `coerce`, of a value that has been accepted: the limits may have moved since."""
+    """Convert a value that `coerce` has accepted, without checking limits, which may have changed since."""
     value: Value | None = _COERCE[node.kind](setting.value)
     assert value is not None
     return value

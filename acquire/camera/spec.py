@@ -1,4 +1,4 @@
-"""What a GenICam camera is asked to be, for whichever library opens it."""
+"""Specification of a GenICam camera, for any library that opens it."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class GenicamSpec:
-    """Which camera, how it is set, and what it must then be. Picklable.
+    """Which camera to open, its settings, and its expected format. Picklable.
 
     Attributes
     ----------
-    serial, model : who it must be; an empty model is any
-    settings : in order; Width, PixelFormat and the stream's BufferHeight usually among them
-    pixels, bits : what its lines must then be; 0: whatever they are
-    line_rate_hz, buffer_s : buffers for so long at that rate are announced
+    serial, model : required identity; an empty model matches any
+    settings : settings in order, usually with Width, PixelFormat and the stream's BufferHeight
+    pixels, bits : required format of lines; 0: any
+    line_rate_hz, buffer_s : buffers for this time at this rate are announced
     cti : the producer; empty: those of GENICAM_GENTL64_PATH. For Aravis: the camera's network address;
-        empty: whichever has the serial number
+        empty: any camera with the serial number
     frame_id_bits, frame_id_first : see `acquire.camera.frames.FrameCount`
     """
 
@@ -39,7 +39,7 @@ class GenicamSpec:
 
 
 def spec_of(config: RigConfig, arm: str, cti: str | None = None) -> GenicamSpec:
-    """The camera of an arm as the rig's file has it; ``cti`` instead of the file's producer."""
+    """Return the camera of an arm by the rig's file; ``cti`` replaces the file's producer."""
     camera = config.cameras.arm(arm)
     return GenicamSpec(
         serial=camera.serial,

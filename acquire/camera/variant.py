@@ -1,4 +1,4 @@
-"""What a camera driver is to a rig: options of its own, and what opens an arm's camera."""
+"""A rig's view of a camera driver: its options, and the opener of an arm's camera."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class CameraVariant(FrozenModel, ABC):
 
     @abstractmethod
     def opener(self, config: RigConfig, arm: str, bench: Any) -> CameraOpener:
-        """What opens the camera of an arm, "a" or "b"; called here, picklable, opening nothing yet.
+        """Return the picklable opener of the camera of an arm, "a" or "b"; nothing is opened yet.
 
-        ``bench`` is the rig's `acquire.sim.instrument.SimulatedDevices` where anything of it is simulated,
-        else None. Raises ConfigError for what the rig's file asks for and this driver cannot do.
+        ``bench`` is the rig's `acquire.sim.instrument.SimulatedDevices` if anything of it is simulated,
+        otherwise None. Raises ConfigError for settings of the rig's file that this driver does not support.
         """

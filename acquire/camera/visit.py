@@ -1,4 +1,4 @@
-"""A short visit to one camera: in a fresh process, as a grabber has it, and ended afterwards."""
+"""Short access to one camera in a new process, like a grabber's, which is ended afterwards."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Armed:
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What came of the visit."""
+    """Result of the visit."""
 
     result: Any
 
@@ -37,10 +37,11 @@ def visit(
     timeout_s: float = 30.0,
     armed: Callable[[], object] | None = None,
 ) -> T:
-    """``look(camera, tell, *args)`` in a process that opens the camera; its result, or its error.
+    """Call ``look(camera, tell, *args)`` in a process that opens the camera; return its result or raise its
+    error.
 
-    ``armed`` is called here when ``look`` calls ``tell``, which it then must do. DeviceError when the
-    process does not answer within ``timeout_s``.
+    If ``armed`` is given, ``look`` must call ``tell``, upon which ``armed`` is called here. Raises
+    DeviceError if the process does not answer within ``timeout_s``.
     """
     worker = Worker("camera", _visit, opener, look, args)
     deadline = time.monotonic() + timeout_s

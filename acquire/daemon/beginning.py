@@ -1,7 +1,7 @@
-"""What the daemon does on its own once it has started: `[service] begin`.
+"""The daemon's automatic commands after its start: `[service] begin`.
 
-A daemon that came back after a crash arms, or records, as the rig says. What refuses is told and tried again;
-whoever gives a command of their own takes over, and nothing is tried any more.
+A daemon that was restarted after a crash arms or records according to the rig. A refusal is reported and
+retried; once a user gives a command, the automatic ones end.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ log = logging.getLogger("acquire.daemon")
 async def begin(
     config: ServiceConfig, service: Service, run: Callable[[Callable[[], None]], Awaitable[None]]
 ) -> None:
-    """Arm, and record, as ``config`` says; ``run`` carries out what is to be done in the devices' thread."""
+    """Arm, or arm and record, according to ``config``; ``run`` calls a function in the devices' thread."""
     if config.begin == "idle":
         return
     log.info("service.begin: %s", config.begin)
@@ -44,6 +44,6 @@ async def _is_done(
     except AcquireError as error:
         text = f"service.begin: {error}; tried again in {config.retry_s:g} s"
         log.warning("%s", text)
-        service.news.tell("waiting", text, level="warning")
+        service.news.add("waiting", text, level="warning")
         return False
     return True

@@ -1,16 +1,16 @@
-"""Connections to the control socket, bounded in number, time and size: the status is answered at any limit.
+"""Connections to the control socket, limited in number, time and size, so that status can always be answered.
 
 ::
 
-    accept ── a descriptor is set aside for the moment when none is left
+    accept ── a spare descriptor is reserved for the moment when none is left
        ▼
-    Connection ── at most MOST_CONNECTIONS: the one that has been idle for longest is closed for the next
-       │          a request has REQUEST_S to arrive, whole; an answer SEND_S to be taken
+    Connection ── at most MOST_CONNECTIONS: the one idle for longest is closed for the next
+       │          a request must arrive completely within REQUEST_S; an answer be read within SEND_S
        ▼
     the API ── a body of at most `control.MAX_BODY_BYTES`
 
-Whoever opens two hundred connections, or begins a request and stops in the middle, is disconnected; the
-capture path, in processes of its own, never notices.
+A client that opens two hundred connections, or stops in the middle of a request, is disconnected; the capture
+path, in separate processes, is not affected.
 """
 
 from __future__ import annotations
@@ -35,28 +35,28 @@ if TYPE_CHECKING:
 
 MOST_CONNECTIONS = 32
 AT_ONCE = 16
-"""Connections that one turn of the event loop takes."""
+"""Connections accepted in one turn of the event loop."""
 WAITING = 1024
-"""Connections that wait in the system, at no cost to us, until they are taken."""
+"""Connections that may wait in the kernel until they are accepted."""
 REQUEST_S = 10.0
-"""From a connection, or the first byte of a further request on it, to the last byte of the request."""
+"""Time from a connection, or the first byte of a further request on it, to the last byte of the request."""
 SEND_S = 10.0
-"""For a reader that does not read."""
+"""Time for a client that does not read."""
 IDLE_S = 5
-"""Between two requests on one connection."""
+"""Time between two requests on one connection."""
 GRACE_S = 2
-"""Time that requests under way are given when the daemon ends, in whole seconds."""
+"""Time for current requests when the daemon ends, in whole seconds."""
 LAST_S = 0.7
-"""For whatever is under way when the server ends: a stream has no end of its own, and half a request may stay
-half. Left to be cancelled when the time is up, they would be answered with 500."""
+"""Time for open connections when the server ends: a stream never ends by itself, and half a request may stay
+incomplete. If uvicorn cancelled them after `GRACE_S`, they would be answered with 500."""
 MOST_DESCRIPTORS = 65536
 
 log = logging.getLogger("acquire.daemon")
 
 
 def raise_descriptor_limit() -> int:
-    """As many descriptors as this user may have, within reason; the limit from now on."""
-    # The usual 1024 is for programs that call select(2), which cannot take more. Nothing here does.
+    """Raise the limit of descriptors as far as permitted and reasonable; return the new limit."""
+    # The usual 1024 protects programs that use select(2), which cannot take more. Nothing here does.
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = MOST_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, MOST_DESCRIPTORS)
     if soft == resource.RLIM_INFINITY or soft >= wanted:
@@ -74,18 +74,18 @@ class Listener(socket.socket):
     _paused = False
 
     def keep_spare(self) -> None:
-        """Set a descriptor aside, unless there is one."""
+        """Reserve a spare descriptor, unless there is one."""
         if self._spare < 0:
             with contextlib.suppress(OSError):
                 self._spare = os.open(os.devnull, os.O_RDONLY | os.O_CLOEXEC)
 
     def listen(self, backlog: int = WAITING, /) -> None:
-        """With a queue of `WAITING`: the event loop's own number is how many it takes in one turn."""
+        """Listen with a queue of `WAITING`: the event loop passes only the number accepted in one turn."""
         super().listen(max(backlog, WAITING))
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """As any socket's. At the limit the spare descriptor serves; then the event loop waits a second."""
-        if self._paused:  # it has been told once in this turn of the loop, which asks again at once
+        """Accept a connection; at the limit with the spare descriptor, then the event loop waits a second."""
+        if self._paused:  # the error was raised once in this turn of the loop, which calls again at once
             self._paused = False
             raise BlockingIOError(errno.EAGAIN, "no descriptor is left")
         self.keep_spare()
@@ -112,7 +112,7 @@ class Listener(socket.socket):
 
 
 class Connection(H11Protocol):
-    """One client. uvicorn ends what is idle after an answer; the rest is ended here."""
+    """One client's connection. uvicorn closes it if idle after an answer; other limits are applied here."""
 
     most_connections = MOST_CONNECTIONS
 
@@ -124,7 +124,7 @@ class Connection(H11Protocol):
 
     @property
     def is_working(self) -> bool:
-        """A whole request is here and not answered."""
+        """Whether a complete request is being answered."""
         cycle: RequestResponseCycle | None = self.cycle  # none before the first request
         return cycle is not None and not cycle.more_body and not cycle.response_complete
 
@@ -132,7 +132,7 @@ class Connection(H11Protocol):
         super().connection_made(transport)
         self._wait(REQUEST_S)
         if len(self.connections) > self.most_connections:
-            # The one that has waited for longest is closed; this one, where all others are at work.
+            # Close the connection that has waited for longest, or this one if all others are at work.
             others = [cast("Connection", one) for one in self.connections if one is not self]
             idle = [one for one in others if not one.is_working] or [self]
             longest = min(idle, key=lambda one: one._waiting_since or 0.0)
@@ -144,7 +144,7 @@ class Connection(H11Protocol):
         super().data_received(data)
         if self.is_working:
             self._cancel()
-        elif self._timer is None:  # else it runs already: a byte now and then does not prolong it
+        elif self._timer is None:  # a running timer is not prolonged by a byte now and then
             self._wait(REQUEST_S)
 
     def on_response_complete(self) -> None:
@@ -163,7 +163,7 @@ class Connection(H11Protocol):
 
     def shutdown(self) -> None:
         super().shutdown()
-        self.loop.call_later(LAST_S, self.transport.abort)  # does nothing to one that has closed
+        self.loop.call_later(LAST_S, self.transport.abort)  # no effect if it has closed by then
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._cancel()
@@ -182,11 +182,11 @@ class Connection(H11Protocol):
 
 
 class ApiServer(uvicorn.Server):
-    """Serves an API on a listener, within the bounds of this module. Signals are its owner's business.
+    """Serves an API on a listener, within the limits of this module. The owner handles signals.
 
     Attributes
     ----------
-    answering : set once requests are answered; what this takes, such as modules, is loaded by then
+    answering : set once requests are answered, and so all necessary modules are loaded
     """
 
     def __init__(self, app: ASGIApp, listener: Listener) -> None:
@@ -207,7 +207,7 @@ class ApiServer(uvicorn.Server):
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """They must drain the recording before the API goes away."""
+        """Leave signals to the daemon, which must drain the recording before the API goes away."""
         yield
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
@@ -215,6 +215,6 @@ class ApiServer(uvicorn.Server):
         self.answering.set()
 
     async def answer(self) -> None:
-        """Until `should_exit`."""
+        """Serve until `should_exit`."""
         self._listener.keep_spare()
         await self.serve(sockets=[self._listener])

@@ -1,7 +1,7 @@
 """The control API: one route per command, described at /openapi.json.
 
-Commands run one after the other in the service's thread; the status is answered from what that thread
-published last, so that it never waits for a device.
+Commands run one after the other in the service's thread; the status is the latest one that this thread has
+published, so that it never waits for a device.
 """
 
 from __future__ import annotations
@@ -26,27 +26,27 @@ if TYPE_CHECKING:
     from acquire.daemon.routes import Api
 
 MAX_BODY_BYTES = 2**16
-"""No request is longer than a path and a number."""
+"""Ample, since a request is hardly more than a path and a number."""
 MOST_EXPLAINED = 5
-"""Things to mend that an answer lists."""
+"""Number of errors that an answer lists."""
 REFUSALS = {
     400: "the body is not JSON",
     404: "there is no such path",
     405: "the path takes another method",
     413: f"the body is longer than {MAX_BODY_BYTES} bytes",
 }
-"""What is refused before any command sees it."""
+"""Refusals before any command sees the request."""
 
 
 def build_app(api: Api) -> FastAPI:
-    """What the daemon serves, over its own service."""
+    """Return the daemon's API, over its own service."""
     app = new_app("Control of the capture service.")
     app.include_router(routes(api, Answers()))
     return app
 
 
 def new_app(description: str, **options: Any) -> FastAPI:
-    """An API without routes: what it refuses with, and how much it reads."""
+    """Return an API without routes, with error handlers and a limit for the body."""
     app = FastAPI(
         title="acquire",
         version=__version__,
@@ -76,7 +76,7 @@ class BoundedBody:
         async def bounded() -> Message:
             nonlocal left
             message = await receive()
-            left -= len(message.get("body", b""))  # what has come: a length that is told may be no truth
+            left -= len(message.get("body", b""))  # the bytes received: Content-Length may be wrong
             if left < 0:
                 raise HTTPException(413, f"more than {MAX_BODY_BYTES} bytes")
             return message
@@ -92,27 +92,27 @@ def _add_errors(app: FastAPI) -> None:
     @app.exception_handler(RequestValidationError)
     async def malformed(_: Request, error: RequestValidationError) -> JSONResponse:
         found = error.errors()
-        told = [_explain(item) for item in found[:MOST_EXPLAINED]]
+        explained = [_explain(item) for item in found[:MOST_EXPLAINED]]
         more = [f"and {len(found) - MOST_EXPLAINED} more"] if len(found) > MOST_EXPLAINED else []
-        return _answer(UsageError("; ".join(told + more), possible="/openapi.json"))
+        return _answer(UsageError("; ".join(explained + more), possible="/openapi.json"))
 
     @app.exception_handler(HTTPException)
     async def unknown(request: Request, error: HTTPException) -> JSONResponse:
         asked = shortened(f"{request.method} {request.url.path}")
-        told = UsageError(
+        refusal = UsageError(
             f"the daemon cannot answer {asked}: {shortened(error.detail)}", possible="/openapi.json"
         )
-        return JSONResponse(error_body(told), error.status_code, error.headers)
+        return JSONResponse(error_body(refusal), error.status_code, error.headers)
 
     @app.exception_handler(Exception)
     async def defect(_: Request, error: Exception) -> JSONResponse:
-        # The server logs the traceback; the user gets one line, and is told where the rest is.
-        told = f"defect in the daemon: {shortened(repr(error), 400)}"
-        return _answer(AcquireError(told, hint="see the daemon's log"))
+        # The server logs the traceback; the user gets one line that refers to it.
+        text = f"defect in the daemon: {shortened(repr(error), 400)}"
+        return _answer(AcquireError(text, hint="see the daemon's log"))
 
 
 def _explain(item: dict[str, Any]) -> str:
-    """What is wrong with a value; of a long one its beginning, since it comes from whoever asked."""
+    """Return what is wrong with a value, which is shortened since it comes from the client."""
     key = ".".join(str(part) for part in item["loc"] if part != "body") or "request"
     return f"{shortened(key)} = {shown(item.get('input'))}: {shortened(item['msg'], 400)}"
 

@@ -1,12 +1,12 @@
-"""The process that copies recordings to where the rig wants them: `recording.upload_to`.
+"""The process that copies recordings to the rig's remote store: `recording.upload_to`.
 
 ::
 
-    Uploads ──▶ Copy, Reach                     the recording that grows, one shard at a time ─┐
-    copier  ──▶ UploadStatus, Reached           the others, as long as it has nothing new ─────┴▶ Mirror
+    Uploads ──▶ Copy, Reach                     the growing recording, one shard at a time ──┐
+    copier  ──▶ UploadStatus, Reached           the others, while it has nothing new ────────┴▶ Mirror
 
-It stands back for those who capture, and never keeps one waiting: what is not copied yet lies on the local
-disk. A store that fails is tried again after growing waits, and a copy that was cut off goes on where it was;
+It runs at low priority, and the capture never waits for it: lines that are not copied yet are on the local
+disk. A store that fails is retried after growing waits, and an interrupted copy continues where it stopped,
 so the process may be ended, or killed, at any moment.
 """
 
@@ -37,18 +37,20 @@ if TYPE_CHECKING:
 
 FIRST_WAIT_S = 1.0
 MOST_WAIT_S = 60.0
-"""Between two tries, from the first to the last."""
+"""First and longest wait between two tries."""
 UNBORN_S = 30.0
-"""A recording that is not there after so long will not come."""
+"""A recording that does not exist after this time will not be created."""
 IDLE_S = 60.0
-"""Longest sleep; a message ends it."""
+"""Longest sleep; a message ends it earlier."""
 _NICE = 10
 
 
 @dataclass(frozen=True, slots=True)
 class Copy:
-    """Copy the recording at ``path``. ``ours``: this daemon's runs write it, and it may be copied while it
-    grows; of any other that is open it is not known what a crash has done to it before it is recovered.
+    """Copy the recording at ``path``.
+
+    ``ours``: written by this daemon's runs, and so may be copied while it grows. Any other open recording may
+    have been damaged by a crash, and has to be recovered first.
     """
 
     path: Path
@@ -57,14 +59,14 @@ class Copy:
 
 @dataclass(frozen=True, slots=True)
 class Reach:
-    """Find out whether the store takes anything; ``number`` of the question."""
+    """Find out whether the store accepts files; ``number`` identifies the query."""
 
     number: int
 
 
 @dataclass(frozen=True, slots=True)
 class Reached:
-    """It does, or ``error`` says why not; ``refused``: it was asked, and said no."""
+    """The store accepts files, or ``error`` is why not; ``refused``: it answered, and refused."""
 
     number: int
     error: ErrorMessage | None = None
@@ -73,39 +75,40 @@ class Reached:
 
 @dataclass(slots=True)
 class Job:
-    """One recording on its way."""
+    """One recording to be copied."""
 
     path: Path
     ours: bool
-    said: UploadStatus
+    status: UploadStatus
+    """As reported last."""
     begun_s: float = field(default_factory=time.monotonic)
     grows: bool = True
     """As far as is known."""
     tries: int = 0
-    """That failed, since the last that did not."""
+    """Failed tries since the last success."""
     not_before_s: float = 0.0
     mirror: Mirror | None = None
     shards: int = 0
-    """Copied by ``mirror``."""
+    """Shards copied by ``mirror``."""
     lock: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
 
-    def let_go(self) -> None:
-        """The next try begins with a look at what is there."""
+    def reset(self) -> None:
+        """Close the copy: the next try checks what is at the target."""
         self.mirror, self.shards = None, 0
         self.lock.close()
 
 
 def wait_s(tries: int) -> float:
-    """Until the next one, after so many that failed one after the other, and one more."""
+    """Return the wait before the next try, after ``tries + 1`` consecutive failures."""
     return min(math.ldexp(FIRST_WAIT_S, min(tries, 16)), MOST_WAIT_S)
 
 
 def copy_recordings(mailbox: Mailbox, target: str, copies: tuple[Copy, ...]) -> None:
-    """Life of the process, until its owner ends it; it begins with ``copies``."""
+    """Main function of the process, until its owner ends it; it begins with ``copies``."""
     stand_back(_NICE, EARLY)
     be_patient()
-    with contextlib.suppress(UsageError):  # each try says so
-        check_url(target)  # what it imports takes a moment
+    with contextlib.suppress(UsageError):  # each try reports it
+        check_url(target)  # imports packages, which takes a moment
     mailbox.post(Reached(0))
     copier = Copier(mailbox, target)
     for copy in copies:
@@ -115,7 +118,7 @@ def copy_recordings(mailbox: Mailbox, target: str, copies: tuple[Copy, ...]) -> 
 
 
 class Copier:
-    """What is to be copied, and how far it is."""
+    """Copies the recordings of its list."""
 
     def __init__(self, mailbox: Mailbox, target: str) -> None:
         self._mailbox = mailbox
@@ -123,12 +126,12 @@ class Copier:
         self._jobs: dict[Path, Job] = {}
 
     def turn(self) -> None:
-        """Hear what is asked for, and copy one shard, or wait."""
-        self._listen()
+        """Read messages, and copy one shard, or wait."""
+        self._read_messages()
         now_s = time.monotonic()
         due = [job for job in self._jobs.values() if job.not_before_s <= now_s]
         if due:
-            # The one that grows goes first: it is the one that retention waits for.
+            # The growing recording comes first, since its retention waits for the copy.
             self._serve(min(due, key=lambda job: not (job.ours and job.grows)))
             return
         until_s = min([now_s + IDLE_S, *(job.not_before_s for job in self._jobs.values())])
@@ -136,8 +139,8 @@ class Copier:
         waiting.register(self._mailbox, select.POLLIN)
         waiting.poll(1000 * (until_s - now_s))
 
-    def _listen(self) -> None:
-        """Take what the owner says. Raises OwnerGone."""
+    def _read_messages(self) -> None:
+        """Read the owner's messages. Raises OwnerGone."""
         while (message := self._mailbox.take()) is not None:
             if isinstance(message, Copy):
                 self.add(message.path, ours=message.ours)
@@ -145,12 +148,12 @@ class Copier:
                 self._mailbox.post(self._reach(message.number))
 
     def add(self, path: Path, *, ours: bool) -> None:
-        """Copy a recording, too; one that waits is tried at once."""
+        """Add a recording to the list; one that is waiting already is tried at once."""
         if (job := self._jobs.get(path)) is not None:
             job.ours, job.not_before_s = job.ours or ours, 0.0
             return
-        said = UploadStatus(path=path, url=url_below(self._target, path), state="waiting")
-        self._jobs[path] = Job(path, ours, said)
+        status = UploadStatus(path=path, url=url_below(self._target, path), state="waiting")
+        self._jobs[path] = Job(path, ours, status)
 
     def _reach(self, number: int) -> Reached:
         try:
@@ -158,8 +161,8 @@ class Copier:
         except UsageError as error:
             return Reached(number, ErrorMessage.of(error), refused=True)
         except OSError as error:
-            told = refusal(self._target, error, "written")
-            return Reached(number, ErrorMessage.of(told), refused=isinstance(told, PlaceError))
+            found = refusal(self._target, error, "written")
+            return Reached(number, ErrorMessage.of(found), refused=isinstance(found, PlaceError))
         return Reached(number)
 
     def _serve(self, job: Job) -> None:
@@ -167,7 +170,7 @@ class Copier:
             if job.mirror is not None or self._begin(job):
                 assert job.mirror is not None
                 self._advance(job, job.mirror)
-        except PlaceError as error:  # a bucket, rights or credentials may come
+        except PlaceError as error:  # the bucket, permissions or credentials may still be created
             self._put_off(job, error.message, error.hint)
         except UsageError as error:
             self._end(job, state="refused", error=error.message, hint=error.hint)
@@ -177,22 +180,22 @@ class Copier:
             self._put_off(job, f"{job.path}: {error.strerror or error}")
 
     def _begin(self, job: Job) -> bool:
-        """Open the copy, if its time has come. Raises as `Mirror` does."""
+        """Open the copy; return False if it has to wait, or will never come. Raises as `Mirror` does."""
         if not (job.path / "zarr.json").exists():
-            # It is not made yet, or its disk is not there, or it was removed.
+            # It does not exist yet, or its disk is not mounted, or it was removed.
             young = job.ours and time.monotonic() - job.begun_s < UNBORN_S
             if not young and job.path.parent.is_dir():
                 self._end(job, state="gone", error=f"{job.path} is not there any more", hint="")
             else:
                 self._put_off(job, "" if young else f"{job.path.parent} is not there")
             return False
-        # Open and not ours: what a crash has done to it is known once it is recovered. Copied now, it would
-        # have to be copied again.
+        # An open recording of another daemon may be damaged until it is recovered. If it were copied now, it
+        # would have to be copied again.
         if not job.ours and read_root(LocalSource(job.path))["attributes"].get("state") != "sealed":
             self._put_off(job, "it is open, and not recovered yet", f"acquire recover {job.path}")
             return False
         job.lock.enter_context(only_copy(job.path))
-        job.mirror = Mirror(job.path, job.said.url, pause=self._listen)
+        job.mirror = Mirror(job.path, job.status.url, pause=self._read_messages)
         return True
 
     def _advance(self, job: Job, mirror: Mirror) -> None:
@@ -201,34 +204,33 @@ class Copier:
         job.tries, job.grows = 0, mirror.grows
         facts = {"lines": done.lines, "waiting_lines": done.waiting_lines, "bytes": done.bytes}
         if done.sealed:
-            # The first recording of a run lists its segments, this one by now: its root has to be copied
-            # again.
+            # The first recording of a run lists this segment by now: its root has to be copied again.
             segment = segment_of(read_root(LocalSource(job.path))["attributes"])
             if segment is not None and (first := job.path.with_name(segment[0])).exists():
                 self.add(first, ours=False)
-                self._mailbox.post(self._jobs[first].said)
+                self._mailbox.post(self._jobs[first].status)
             self._end(job, state="copied", error="", hint="", **facts)
             return
-        self._tell(job, state="copying", error="", hint="", **facts)
+        self._report(job, state="copying", error="", hint="", **facts)
         if done.shards == before:
             job.not_before_s = time.monotonic() + LOOK_S
 
     def _end(self, job: Job, **facts: Any) -> None:
         del self._jobs[job.path]
-        job.let_go()
-        self._tell(job, **facts)
+        job.reset()
+        self._report(job, **facts)
 
     def _put_off(self, job: Job, error: str = "", hint: str = "") -> None:
-        job.let_go()
+        job.reset()
         job.not_before_s = time.monotonic() + wait_s(job.tries)
         job.tries += 1
         here: int | None = None
         with contextlib.suppress(AcquireError):
             here = open_recording(job.path).lines
-        waiting = None if here is None else max(0, here - job.said.lines)
-        self._tell(job, state="waiting", error=error, hint=hint, waiting_lines=waiting)
+        waiting = None if here is None else max(0, here - job.status.lines)
+        self._report(job, state="waiting", error=error, hint=hint, waiting_lines=waiting)
 
-    def _tell(self, job: Job, **facts: Any) -> None:
-        before, job.said = job.said, job.said.model_copy(update=facts)
-        if job.said != before:
-            self._mailbox.post(job.said)
+    def _report(self, job: Job, **facts: Any) -> None:
+        before, job.status = job.status, job.status.model_copy(update=facts)
+        if job.status != before:
+            self._mailbox.post(job.status)

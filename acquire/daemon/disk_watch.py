@@ -1,7 +1,7 @@
 """How long the disk of the recordings lasts.
 
-A file system that is gone, as a server that does not answer, holds whoever asks it for ever: a thread of its
-own asks, and the status goes on with what it learnt last.
+A query of a file system that is gone, such as a network share whose server does not answer, may block for
+ever. So a separate thread makes it, and the status keeps the latest answer.
 """
 
 from __future__ import annotations
@@ -26,24 +26,24 @@ if TYPE_CHECKING:
 LOOK_EVERY_S = 2.0
 WINDOW_S = 60.0
 LEAST_S = 5.0
-"""Of a recording, before its own rate is believed."""
+"""Duration of a recording before its measured rate is used."""
 
 
 def disk_watch(config: RigConfig) -> DiskWatch:
-    """Of the rig's directory."""
+    """Return the watch of the rig's directory."""
     line_bytes = config.pixels * np.dtype(config.cameras.a.dtype).itemsize
     per_s = len(ARMS) * line_bytes * config.line_rate_hz * config.simulation.speed
     return DiskWatch(config.recording.directory.absolute(), round(config.recording.reserve_gb * 1e9), per_s)
 
 
 class DiskWatch:
-    """The directory's disk, looked at now and then; `check` never waits.
+    """Queries the directory's disk now and then; `check` never waits.
 
     Parameters
     ----------
-    directory : of recordings without a path of their own
-    reserve_bytes : of its disk that recordings leave free
-    expected_bytes_per_s : of the cameras, not compressed
+    directory : directory of recordings for which no path is given
+    reserve_bytes : bytes of its disk that recordings leave free
+    expected_bytes_per_s : uncompressed rate of the cameras
     """
 
     def __init__(
@@ -64,13 +64,13 @@ class DiskWatch:
         self._thread: threading.Thread | None = None
 
     def keep(self, reserve_bytes: int) -> None:
-        """Recordings leave so much free from now on."""
+        """Set the bytes that recordings leave free from now on."""
         self._reserve_bytes = reserve_bytes
 
     def check(self, *, recording: bool) -> None:
-        """Ask again, if it is time and the last question was answered."""
+        """Query again, if it is time and the last query was answered."""
         if not recording:
-            while len(self._looks) > 1:  # what others write says nothing of the next recording
+            while len(self._looks) > 1:  # other programs' writes do not predict the next recording
                 self._looks.popleft()
         if self._thread is not None and self._thread.is_alive():
             return
@@ -83,7 +83,7 @@ class DiskWatch:
     def _ask(self) -> None:
         try:
             free = self._free_bytes(self._directory)
-        except OSError:  # gone, or not to be asked: nothing is known of it, which the status says
+        except OSError:  # gone or inaccessible: the status becomes None
             self._looks.clear()
             return
         self._looks.append((self._now_s(), free))
@@ -92,7 +92,7 @@ class DiskWatch:
 
     @property
     def status(self) -> DiskStatus | None:
-        """None before the first answer, and where the disk cannot be asked."""
+        """Latest answer; None before the first one, and if the disk cannot be queried."""
         looks = list(self._looks)
         if not looks:
             return None
@@ -108,6 +108,6 @@ class DiskWatch:
         )
 
     def close(self) -> None:
-        """Wait for the question under way, a moment: a thread that hangs is left."""
+        """Wait a moment for the current query; a thread that hangs is left behind."""
         if self._thread is not None:
             self._thread.join(1.0)

@@ -1,6 +1,6 @@
-"""Is this host fit to capture? One finding per thing, and what to do about it. Nothing is changed.
+"""Is this host fit to capture? One finding per subject, with advice. Nothing is changed.
 
-Limits are judged for what the rig needs, where one is given: a host that only simulates lacks nothing.
+Limits are judged by the needs of the rig, if one is given: a host that only simulates needs little.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ if TYPE_CHECKING:
 Level = Literal["good", "warning", "bad"]
 LEAST_DESCRIPTORS = 4096
 GIGE_RECEIVE_BYTES = 32 * 2**20
-"""Of a socket's buffer: packets of a tenth of a second at 10 Gbit/s, in part."""
+"""Size of a socket's buffer: part of the packets of a tenth of a second at 10 Gbit/s."""
 USB_BUFFER_MB = 1000
 DISK_GB = 50.0
 """Less than this is soon full."""
 SPARE_MEMORY = 1.5
-"""Of what the rings take, for the rest of the capture."""
+"""Required memory relative to that of the rings, to leave some for the rest of the capture."""
 NETWORK_DISKS = ("nfs", "nfs4", "cifs", "smb3", "fuse.sshfs", "9p", "ceph")
 _TIME_ERROR = 5
 _STA_UNSYNC = 0x40
@@ -45,7 +45,7 @@ _STA_UNSYNC = 0x40
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """What was looked at, how it is, and what to do where it is not good."""
+    """What was examined, its condition, and what to do if it is not good."""
 
     name: str
     level: Level
@@ -54,9 +54,9 @@ class Finding:
 
 
 def examine(rig: RigConfig | None, running: str | None) -> Iterator[Finding]:
-    """All findings about the host, one after the other; devices are looked at elsewhere.
+    """Yield all findings about the host; devices are examined elsewhere.
 
-    ``running`` is the version of the daemon that runs here, if one does.
+    ``running`` is the version of the daemon that runs here, if any.
     """
     yield _python()
     yield _foreign_package()
@@ -81,7 +81,7 @@ def _python() -> Finding:
 
 
 def _foreign_package() -> Finding:
-    """PyPI has another distribution that installs a package `acquire`; side by side they break each other."""
+    """Find other distributions with a package `acquire`, of which PyPI has one: they break each other."""
     owners = set(metadata.packages_distributions().get("acquire", ()))
     others = sorted(owners - {"tdi-acquire"})
     if not others:
@@ -89,13 +89,13 @@ def _foreign_package() -> Finding:
     return Finding(
         "package",
         "bad",
-        f"{', '.join(others)} installs a package `acquire`, too: the one hides the other",
-        f"pip uninstall {' '.join(others)}, and install tdi-acquire anew; or an environment for each",
+        f"{', '.join(others)} installs a package `acquire`, too: one hides the other",
+        f"pip uninstall {' '.join(others)}, and reinstall tdi-acquire; or an environment for each",
     )
 
 
 def _plugins() -> Finding:
-    """Those of other distributions; ours are as whole as the installation."""
+    """Check the plug-ins of other distributions; those of this one are part of the installation."""
     others = [(group, each) for group in GROUPS for each in group.found() if each.distribution != OURS]
     broken = [f"{group.what} {each.name} of {each.origin}" for group, each in others if group.trouble(each)]
     if broken:
@@ -187,7 +187,7 @@ def _disk(directory: Path) -> Iterator[Finding]:
 
 
 def _file_system(path: Path) -> str:
-    """The type of the mount that has the longest name above the path."""
+    """Return the type of the mount with the longest name above the path."""
     best, kind = "", ""
     for line in _read(Path("/proc/self/mounts")).splitlines():
         _, place, found, *_ = line.split(" ")
@@ -198,7 +198,7 @@ def _file_system(path: Path) -> str:
 
 
 class _Timex(ctypes.Structure):
-    """The head of struct timex; the rest is room for what the kernel writes."""
+    """The first fields of struct timex; ``rest`` is room for the others, which the kernel writes."""
 
     _fields_ = (
         ("modes", ctypes.c_uint),
@@ -220,7 +220,7 @@ def _clock() -> Finding:
         return Finding(
             "clock",
             "warning",
-            "the host's clock is not synchronised: UTC in recordings is what it says",
+            "the host's clock is not synchronised: UTC in recordings is as wrong as this clock",
             "chrony or systemd-timesyncd; the lines' own times come from the trigger",
         )
     return Finding("clock", "good", f"synchronised, within {timex.maxerror / 1000:.1f} ms")
@@ -231,7 +231,7 @@ def _uses(rig: RigConfig | None, *drivers: str) -> bool:
 
 
 def _network(rig: RigConfig | None) -> Iterator[Finding]:
-    """GigE Vision loses packets where a socket's buffer is small."""
+    """Check the size of a socket's buffer: with a small one, GigE Vision loses packets."""
     if not _uses(rig, "aravis"):
         return
     most = int(_read(Path("/proc/sys/net/core/rmem_max")) or 0)
@@ -297,7 +297,7 @@ def _daemon(running: str | None) -> Finding:
         return Finding("daemon", "good", "none is running")
     if running != __version__:
         text = f"the one that runs is acquire {running}, and this is {__version__}"
-        return Finding("daemon", "warning", text, "start it anew")
+        return Finding("daemon", "warning", text, "restart it")
     return Finding("daemon", "good", f"acquire {running} is running")
 
 

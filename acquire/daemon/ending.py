@@ -1,7 +1,7 @@
-"""The end that always comes: what does not end in order ends by force, with a word about what it hung on.
+"""A guaranteed end of the process: if it does not end in order it ends by force, and logs what it hung on.
 
-A thread that waits for the system, such as one that opens a named pipe somebody left where a file should be,
-cannot be interrupted. Neither a signal nor the end of the interpreter may wait for it.
+A thread that waits for the kernel, such as one that opens a named pipe left in the place of a file, cannot be
+interrupted. Neither a signal nor the end of the interpreter may wait for it.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 END_S = 15.0
-"""For a daemon that records nothing, and for one that was told twice."""
+"""Time for a daemon that records nothing, and for one that got a second signal."""
 LINGER_S = 2.0
-"""For threads that are still at work when all else has ended."""
+"""Time for threads that are still at work when everything else has ended."""
 FORCED = 1
-"""Exit code of an end by force."""
+"""Exit code of a forced end."""
 
 log = logging.getLogger("acquire.daemon")
 
 
 class LastResort:
-    """Ends the process when its time is up, wherever its threads are. Only the kernel is needed for that.
+    """Ends the process when its time is up, wherever its threads are. That needs only the kernel.
 
-    Recorder and grabbers are processes of their own: they see that their owner has gone, seal what they
-    hold, and end.
+    Recorder and grabbers are separate processes: they detect that their owner is gone, seal their lines, and
+    end.
     """
 
     def __init__(self, clean_up: Callable[[], None]) -> None:
@@ -39,7 +39,7 @@ class LastResort:
         self._timer: threading.Timer | None = None
 
     def within(self, seconds: float) -> None:
-        """The process ends within this time, unless `cancel` is called. A later call changes the time."""
+        """End the process after this time, unless `cancel` is called. A later call changes the time."""
         self.cancel()
         self._timer = threading.Timer(seconds, self._end, args=(seconds,))
         self._timer.name, self._timer.daemon = "last-resort", True
@@ -58,7 +58,7 @@ class LastResort:
 
 
 def leave(code: int) -> int:
-    """The exit code, once every thread has ended; threads that do not end are left behind by force."""
+    """Return the exit code once every thread has ended; if some do not, exit without waiting for them."""
     deadline = time.monotonic() + LINGER_S
     for thread in _others():
         thread.join(max(0.0, deadline - time.monotonic()))
@@ -71,15 +71,15 @@ def leave(code: int) -> int:
 
 
 def busy_threads() -> list[str]:
-    """Threads whose end the interpreter would wait for, and the line of code that each is at."""
+    """Return the threads for which the interpreter would wait, each with its current line of code."""
     frames = sys._current_frames()
-    told = []
+    found = []
     for thread in threading.enumerate():
         frame = frames.get(thread.ident or 0)
         if frame is not None and not thread.daemon:
             at = traceback.extract_stack(frame)[-1]
-            told.append(f"thread {thread.name} at {at.filename}:{at.lineno} ({at.name})")
-    return told
+            found.append(f"thread {thread.name} at {at.filename}:{at.lineno} ({at.name})")
+    return found
 
 
 def _others() -> list[threading.Thread]:

@@ -1,11 +1,11 @@
 """The control socket: one daemon at a time, reachable by its user only.
 
-The default socket lies in a directory that only its user can enter; one that another user has made first,
-in /tmp, is refused. `acquire.daemon.peer` is the client's side of that.
+The default socket is in a directory that only its user can enter; a directory that another user created
+first, in /tmp, is refused. `acquire.daemon.peer` is the client's counterpart.
 
-A lock on a file beside the socket says whether a daemon lives. The kernel frees it when the process
-ends, however it ends, so that a socket left behind by a killed daemon is recognised and replaced.
-The lock file stays: to remove it would let two daemons lock two files of one name.
+A lock on a file next to the socket shows whether a daemon is alive. The kernel releases it however the
+process ends, so that a socket left behind by a killed daemon is recognised and replaced. The lock file stays:
+removing it would let two daemons lock two files of the same name.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from acquire.errors import StateError, UsageError
 from acquire.place import default_socket
 
 LONGEST_PATH = 107
-"""Bytes of a Unix socket's path that the kernel takes."""
+"""Longest path of a Unix socket that the kernel accepts, in bytes."""
 LONGEST_LOCK = 32
-"""Bytes of a lock file: a process number and a newline."""
+"""Largest lock file, in bytes: a process number and a newline."""
 
 
 class Endpoint:
@@ -34,7 +34,7 @@ class Endpoint:
     def __init__(self, path: Path) -> None:
         """Lock and listen.
 
-        Raises UsageError where ``path`` cannot be a socket, StateError where another daemon has it.
+        Raises UsageError if ``path`` cannot be a socket, StateError if another daemon has it.
         """
         self.path = path
         _check(path)
@@ -46,7 +46,7 @@ class Endpoint:
             raise
 
     def remove(self) -> None:
-        """Nobody finds the socket any more. From any thread; the lock ends with the process."""
+        """Remove the socket's name. May be called from any thread; the lock ends with the process."""
         with contextlib.suppress(OSError):
             self.path.unlink(missing_ok=True)
 
@@ -76,14 +76,14 @@ def _check(path: Path) -> None:
     if not path.parent.is_dir():
         raise UsageError(f"control socket {path}: its directory does not exist", hint=ELSEWHERE)
     if os.path.lexists(path) and not stat.S_ISSOCK(path.lstat().st_mode):
-        raise UsageError(f"control socket {path}: something else lies there, it stays untouched")
+        raise UsageError(f"control socket {path}: something else is there, and stays untouched")
 
 
 def _own(directory: Path) -> None:
-    """Make the directory of the default socket, or make sure that it is this user's alone."""
+    """Create the directory of the default socket, or make sure that it belongs to this user alone."""
     in_tmp = not os.environ.get("XDG_RUNTIME_DIR")
     if in_tmp:
-        with contextlib.suppress(OSError):  # what keeps it from being made is told by what is found
+        with contextlib.suppress(OSError):  # if it cannot be created, the checks below report why
             directory.mkdir(mode=0o700)
     try:
         found = directory.lstat() if in_tmp else directory.stat()
@@ -92,7 +92,7 @@ def _own(directory: Path) -> None:
             f"the control socket cannot be made in {directory}: {error.strerror}", hint=ELSEWHERE
         ) from error
     if not stat.S_ISDIR(found.st_mode):
-        raise UsageError(f"control socket in {directory}: that is no directory", hint=ELSEWHERE)
+        raise UsageError(f"control socket in {directory}: that is not a directory", hint=ELSEWHERE)
     if found.st_uid != os.geteuid():
         raise UsageError(
             f"control socket in {directory}: that directory belongs to user {found.st_uid}", hint=ELSEWHERE
@@ -106,7 +106,7 @@ def _own(directory: Path) -> None:
 
 
 def _lock(path: Path) -> int:
-    # In a directory that others write to, a link would have us empty a file of theirs, a pipe wait for ever.
+    # If others can write to the directory, a link could make us truncate another file, a pipe wait for ever.
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
     try:
         lock = os.open(lock_path(path), flags, 0o600)
@@ -115,7 +115,9 @@ def _lock(path: Path) -> int:
     found = os.fstat(lock)
     if not stat.S_ISREG(found.st_mode) or found.st_size > LONGEST_LOCK:
         os.close(lock)
-        raise UsageError(f"control socket {path}: {lock_path(path)} is no lock of ours, it stays untouched")
+        raise UsageError(
+            f"control socket {path}: {lock_path(path)} is not a lock of acquire, and stays untouched"
+        )
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         os.ftruncate(lock, 0)
@@ -136,7 +138,7 @@ def _lock(path: Path) -> int:
 def _listen(path: Path) -> Listener:
     path.unlink(missing_ok=True)  # left by a daemon that was killed: the lock was free
     listener = Listener(socket.AF_UNIX, socket.SOCK_STREAM)
-    # By umask, and not by chmod afterwards: in between anybody could connect.
+    # With umask rather than chmod afterwards: in between anybody could connect.
     before = os.umask(0o177)
     try:
         listener.bind(str(path))

@@ -1,4 +1,4 @@
-"""Recordings that start automatically: what the rig's ``[events]`` ask for, in lines."""
+"""Recordings that start automatically: the rig's ``[events]``, in lines."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ if TYPE_CHECKING:
 
 
 def budget_lines(request: StartRequest, line_rate_hz: float) -> int | None:
-    """Lines of the recording in all; None: until stopped, or as its window says."""
+    """Return the total lines of the recording; None: until stopped, or according to its window."""
     if request.duration_s is None:
         return request.lines
     return math.ceil(request.duration_s * line_rate_hz)
 
 
 def window_of(request: StartRequest, line_rate_hz: float) -> Window:
-    """The lines around the moment of the request; refused where the ring does not hold them."""
+    """Return the lines around the moment of the request; an exact window, refused if the ring lacks lines."""
     post_lines = None if request.post_s is None else max(1, math.ceil(request.post_s * line_rate_hz))
     window = Window(None, math.ceil(request.pre_s * line_rate_hz), post_lines)
     return window if window.is_now else replace(window, kind="mark", text="acquire start")
 
 
 class StandingOrder:
-    """What is to happen at an event, from one arming to the next.
+    """The action at an event, from one arming to the next.
 
     Attributes
     ----------
@@ -45,20 +45,20 @@ class StandingOrder:
 
     @property
     def waits(self) -> bool:
-        """The next event starts a recording."""
+        """Whether the next event starts a recording."""
         return self.rearm or not self.used
 
     def covers(self, note: Note) -> bool:
-        """The event starts a recording, or prolongs the one that an event started."""
+        """Return whether the event starts a recording, or prolongs one that an event started."""
         return note.kind in self._events.sources
 
     def window(self, note: Note) -> Window:
-        """From before the event, as far as the ring still holds it: an event cannot come again."""
+        """Return the lines around the event; not exact, since an event cannot be repeated."""
         pre_lines = math.ceil(self._events.pre_s * self._rate_hz)
         return Window(note.line, pre_lines, self._post_lines, exact=False)
 
     def end_line(self, note: Note) -> int:
-        """The recording goes on to this line at least."""
+        """Return the line before which the recording must not end."""
         return note.line + self._post_lines
 
     @property

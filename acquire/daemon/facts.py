@@ -1,4 +1,4 @@
-"""What the API tells besides the status: news, health, version, setup, and where the lines pass."""
+"""Facts that the API provides besides the status: news, health, version, setup, and the rings' places."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from acquire.daemon.messages import Message, Place, Text
 from acquire.daemon.states import State
 
 API_VERSION = 1
-"""Raised by what an older client could not understand."""
+"""Incremented by changes that an older client could not understand."""
 NewsKind = Literal[
     "state",
     "mark",
@@ -33,51 +33,51 @@ Level = Literal["info", "warning", "error"]
 
 
 class News(Message):
-    """Something that happened. ``id`` is what a client that was away gives back to hear what came after."""
+    """Something that happened. After a reconnection a client sends the latest ``id`` to get later news."""
 
-    id: str = Field(description="of this daemon's life, and a number that rises")
+    id: str = Field(description="identifies this daemon process, with a rising number")
     time: datetime
     kind: NewsKind = Field(
-        description="'missed': what happened before is not known any more, since the daemon was started anew "
-        "or keeps only the latest; 'event': of a kind that this version does not know"
+        description="'missed': earlier news are not available any more, since the daemon was restarted or "
+        "keeps only the latest; 'event': of a kind that this version does not know"
     )
     level: Level = "info"
     text: Text
-    state: State = Field(description="of the daemon, after it")
+    state: State = Field(description="state of the daemon afterwards")
     arm: str | None = None
-    line: int | None = Field(default=None, description="the trigger's number")
+    line: int | None = Field(default=None, description="the trigger's line number")
     lines: int | None = Field(default=None, description="'loss': lines lost since the last news of it")
     path: Place | None = None
 
 
 class HealthCheck(Message):
-    """One thing that is judged, with the threshold that judges it."""
+    """One check, with its threshold."""
 
     name: str
     level: Literal["good", "unknown", "warning", "bad"]
     text: Text
     value: float | None = None
     unit: str = ""
-    limit: str = Field(default="", description="what is good and what is bad, in words")
+    limit: str = Field(default="", description="the thresholds, in words")
 
 
 class Health(Message):
-    """The glance: one word, one sentence, and what they follow from."""
+    """Health at a glance: one word, one sentence, and the checks behind them."""
 
     level: Literal["idle", "good", "degraded", "lost", "fault"] = Field(
-        description="degraded: nothing is lost yet; lost: lines were, since the instrument was armed"
+        description="degraded: nothing is lost yet; lost: lines were lost since the instrument was armed"
     )
     sentence: Text
-    lost_lines: int = Field(description="since the instrument was armed, both arms")
+    lost_lines: int = Field(description="lines lost since the instrument was armed, both arms")
     checks: list[HealthCheck]
 
 
 class Version(Message):
-    """Who answers."""
+    """Identity of the daemon."""
 
     acquire: str
     api: int = API_VERSION
-    name: Text = Field(description="of the rig")
+    name: Text = Field(description="name of the rig")
     pid: int
     python: str
 
@@ -86,37 +86,39 @@ class Setup(Message):
     """The resolved configuration, and how it differs from the defaults."""
 
     name: Text
-    file: Text = Field(description="that it was read from; empty: not from a file")
+    file: Text = Field(description="file that the configuration was read from; empty: none")
     config: dict[str, Any]
-    changed: dict[str, Any] = Field(description="dotted key → value, where it is not the default")
-    line_rate_hz: float = Field(description="as lines pass here: simulated time may run faster")
-    line_period_ns: float = Field(description="by the trigger's clock")
+    changed: dict[str, Any] = Field(description="dotted key → value that differs from the default")
+    line_rate_hz: float = Field(description="rate of the lines here: simulated time may run faster")
+    line_period_ns: float = Field(description="line period by the trigger's clock")
     white_dn: int
     black_dn: dict[str, float]
-    history_s: float = Field(description="of lines from the past that the rings hold")
-    versions: dict[str, str] = Field(description="of the libraries on the way from camera to disk")
+    history_s: float = Field(description="seconds of past lines that the rings hold")
+    versions: dict[str, str] = Field(description="versions of the libraries between camera and disk")
 
 
 class ChangedKey(Message):
-    """A key of the configuration that has another value since the file was read anew."""
+    """A key of the configuration with a new value after a reload of the file."""
 
-    key: Text = Field(description="dotted")
+    key: Text = Field(description="dotted key")
     old: Any
     new: Any
-    holds: Text = Field(description="when: at once, from the next recording on, when the service starts next")
+    holds: Text = Field(
+        description="when it takes effect: at once, from the next recording on, when the service starts next"
+    )
 
 
 class Reloaded(Message):
-    """What a reload has changed; one that is refused changes nothing."""
+    """The changes by a reload; a refused one changes nothing."""
 
-    file: Text = Field(description="that was read")
-    changed: list[ChangedKey] = Field(description="empty: the file says what it said before")
+    file: Text = Field(description="file that was read")
+    changed: list[ChangedKey] = Field(description="empty: the file has not changed")
 
 
 class RingPlace(Message):
-    """The ring of one arm: memory that a process of the same user can map and read, never write."""
+    """The ring of one arm: memory that a process of the same user can map and read, but not write."""
 
-    path: str = Field(description="of the memory, while the daemon lives")
+    path: str = Field(description="path of the memory while the daemon lives")
     slots: int
     rows: int
     width: int
@@ -126,7 +128,7 @@ class RingPlace(Message):
 
 
 class Rings(Message):
-    """Where the lines pass; empty while nothing is armed."""
+    """The memory through which the lines pass; empty while nothing is armed."""
 
     run_id: str | None
     arms: dict[str, RingPlace]

@@ -1,8 +1,8 @@
-"""The daemon's status without the models that check it: for a command that is typed again and again.
+"""The daemon's status as plain JSON, without the models: for a command that is typed again and again.
 
-The models take longer to import than the daemon takes to answer. That nobody listens is said as quickly;
-what else is not as expected is left to `acquire.client.Client`, which has patience with a daemon that is
-starting and words for one that refuses.
+The models take longer to import than the daemon takes to answer. That no daemon listens is reported as
+quickly. All other cases are left to `acquire.client.Client`, which waits for a daemon that is starting, and
+explains the errors of one that refuses.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 
 CONNECT_TIMEOUT_S = 5.0
 NO_ANSWER = (OSError, http.client.HTTPException, LookupError, TypeError, ValueError)
-"""What `status_document`, and showing a document of another version, raise."""
+"""Exceptions of `status_document`, and of showing a document of another version."""
 
 
 def status_document(place: Path | None) -> dict[str, Any]:
-    """The status of the daemon on a Unix socket, the default one for None, as JSON.
+    """Return the status of the daemon on a Unix socket (None: the default one), as JSON.
 
-    Raises NoDaemonError where none listens and none is starting, else one of `NO_ANSWER`.
+    Raises NoDaemonError if none listens and none is starting, otherwise one of `NO_ANSWER`.
     """
     connection = _Connection("acquire", timeout=CONNECT_TIMEOUT_S)
     connection.sock = _connected(place or default_socket())
@@ -41,7 +41,7 @@ def status_document(place: Path | None) -> dict[str, Any]:
     finally:
         connection.close()
     if not isinstance(document, dict):
-        raise TypeError("the status is no object")
+        raise TypeError("the status is not an object")
     return document
 
 
@@ -51,10 +51,10 @@ def _connected(place: Path) -> socket.socket:
     except NoDaemonError:
         if is_one_starting(place):
             raise ConnectionRefusedError("a daemon is starting") from None
-        return connect(place, CONNECT_TIMEOUT_S)  # one that has just begun to listen does not start any more
+        return connect(place, CONNECT_TIMEOUT_S)  # a daemon may have begun to listen in between
 
 
 class _Connection(http.client.HTTPConnection):
-    """One over a socket that is connected already."""
+    """An HTTP connection over a socket that is connected already."""
 
     sock: socket.socket

@@ -1,4 +1,4 @@
-"""Is all well? One word, one sentence and what they follow from; the thresholds are here and nowhere else."""
+"""Health of the daemon: one word, one sentence and the checks behind them, with all their thresholds."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ if TYPE_CHECKING:
     from acquire.daemon.messages import ArmStatus, DiskStatus, Status
 
 RING_GOOD, RING_BAD, RING_STOP = 0.25, 0.60, 0.95
-"""Shares of a ring that wait for the recorder: well below the first, lines are lost from the last on."""
+"""Fill of a ring: good below the first, bad above the second; lines are lost from the third on."""
 DISK_GOOD_S, DISK_BAD_S = 3600.0, 600.0
 """Time until the disk is full."""
 SATURATED_GOOD, SATURATED_BAD = 0.001, 0.05
-"""Shares of the lines that have a saturated pixel."""
+"""Shares of lines with a saturated pixel."""
 RATE_TOLERANCE = 0.02
-"""By which the lines may come slower than configured."""
+"""Relative deviation by which lines may come slower than configured."""
 SETTLED_S = 6.0
-"""After arming: rates are taken over five seconds."""
+"""Time after arming until rates are judged, since they are averaged over five seconds."""
 
 CheckLevel = Literal["good", "unknown", "warning", "bad"]
 _RANK = {"good": 0, "unknown": 0, "warning": 1, "bad": 2}
 
 
 def health_of(status: Status, line_rate_hz: float, age_s: float = 0.0) -> Health:
-    """Judge a status. ``line_rate_hz``: at which lines ought to come; ``age_s``: since it was armed."""
+    """Judge a status. ``line_rate_hz``: expected line rate; ``age_s``: time since arming."""
     lost = sum(sum(arm.lost.values()) for arm in status.arms.values()) if status.run_id else 0
     checks = [*_of_arms(status, line_rate_hz, age_s), *_of_service(status)]
     worst = max((check for check in checks), key=lambda check: _RANK[check.level])
@@ -60,8 +60,8 @@ def _of_arms(status: Status, line_rate_hz: float, age_s: float) -> list[HealthCh
 
 
 def _ring(name: str, arm: ArmStatus, state: State) -> HealthCheck:
-    """While nothing is recorded, blocks are released at once."""
     fill = arm.ring.fill / arm.ring.slots
+    # While nothing is recorded blocks are released at once, and a moderate fill means nothing.
     busy = state in (State.RECORDING, State.DRAINING)
     level: CheckLevel = "bad" if fill > RING_BAD else "warning" if fill >= RING_GOOD and busy else "good"
     return HealthCheck(
@@ -117,7 +117,9 @@ def _of_service(status: Status) -> list[HealthCheck]:
     if status.trigger is not None:
         answers = status.trigger.answers
         text = (
-            "the trigger answers" if answers else f"the trigger is silent for {status.trigger.silent_s:.0f} s"
+            "the trigger answers"
+            if answers
+            else f"the trigger has been silent for {status.trigger.silent_s:.0f} s"
         )
         level: CheckLevel = "good" if answers else "bad"
         found.append(
@@ -137,7 +139,7 @@ def _of_service(status: Status) -> list[HealthCheck]:
 
 
 def disk_check(disk: DiskStatus | None) -> HealthCheck:
-    """How long the disk lasts, judged."""
+    """Judge how long the disk lasts."""
     limit = f"good from {DISK_GOOD_S / 3600:.0f} h on, bad below {DISK_BAD_S / 60:.0f} min"
     if disk is None:
         return HealthCheck(name="disk", level="unknown", text="the disk has not answered yet", limit=limit)

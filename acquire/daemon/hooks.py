@@ -1,7 +1,7 @@
-"""Whom the daemon notifies on its own: a command or a webhook, at a fault, lost lines, a disk that fills.
+"""Notifications by the daemon: a command or a webhook, at a fault, lost lines, or a disk that fills.
 
-A thread of its own tells one after the other. It listens to the news as anybody does: what is slow or hangs
-is given up after its time, and what happened meanwhile is told afterwards, as far as the log still has it.
+A separate thread sends them one after the other. It follows the news like any client: a slow or hanging hook
+is given up after a timeout, and later news are sent afterwards, as far as the log still has them.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 
 END_S = 2.0
 MOST_AT_ONCE = 20
-"""News that are told one by one; of more the latest."""
+"""Number of news that are sent one by one; of more only the latest."""
 
 log = logging.getLogger("acquire.daemon")
 
 
 class Hooks:
-    """Nothing is started where nobody is to be told."""
+    """Sends news to the configured hooks; no thread is started if there are none."""
 
     def __init__(self, config: HooksConfig, news: NewsLog, rig: str) -> None:
         self._news, self._rig = news, rig
@@ -38,7 +38,7 @@ class Hooks:
         self.reconfigure(config)
 
     def reconfigure(self, config: HooksConfig) -> None:
-        """Tell as ``config`` says what happens from now on."""
+        """Use the hooks of ``config`` from now on."""
         self._config = config
         if (config.command or config.webhook) and not self._thread.is_alive():
             self._last_id = self._news.last_id
@@ -46,7 +46,7 @@ class Hooks:
             self._thread.start()
 
     def close(self) -> None:
-        """Tell what is still to be told, for a moment. Idempotent."""
+        """Send the remaining news, for `END_S` at most. Idempotent."""
         self._ended = True
         self._happened.set()
         self._news.forget(self._happened.set)
@@ -60,8 +60,8 @@ class Hooks:
             found = self._news.after(self._last_id)
             self._last_id = found[-1].id if found else self._last_id
             for news in [one for one in found if self._concerns(one)][-MOST_AT_ONCE:]:
-                told = news.model_copy(update={"text": f"{self._rig}: {news.text}"})
-                text = told.model_dump_json().encode()
+                named = news.model_copy(update={"text": f"{self._rig}: {news.text}"})
+                text = named.model_dump_json().encode()
                 if self._config.command:
                     self._call(text)
                 if self._config.webhook:
@@ -76,7 +76,7 @@ class Hooks:
     def _call(self, text: bytes) -> None:
         words, limit_s = list(self._config.command), self._config.timeout_s
         try:
-            done = subprocess.run(  # noqa: S603 - the rig's own words
+            done = subprocess.run(  # noqa: S603 - the command is in the rig's configuration
                 words,
                 input=text,
                 stdout=subprocess.DEVNULL,
@@ -93,7 +93,7 @@ class Hooks:
     def _post(self, url: str, text: bytes) -> None:
         request = urllib.request.Request(url, text, {"Content-Type": "application/json"})  # noqa: S310 - http, checked
         try:
-            with urllib.request.urlopen(request, timeout=self._config.timeout_s):  # noqa: S310
+            with urllib.request.urlopen(request, timeout=self._config.timeout_s):  # noqa: S310 - as above
                 return
         except OSError as error:
             log.warning("hook %s: %s", url, error)

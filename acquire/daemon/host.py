@@ -1,6 +1,6 @@
-"""Whether this host has what a rig needs: a directory, room on its disk, and memory.
+"""Check that this host has what a rig needs: a directory, room on its disk, and memory.
 
-What would fail at `start`, after the devices were armed, is refused before the daemon begins.
+A rig that would fail at `start`, after the devices were armed, is refused before the daemon begins.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
     from acquire.config import RigConfig
 
 MEMORY_PART = 0.8
-"""Of the host's memory; the rest is the system's and the programs'."""
+"""Share of the host's memory that may be used; the rest is for the system and other programs."""
 SIMULATING = 3
 """Processes that hold a simulated scene: the daemon, to check it, and a camera for each arm."""
 SCENE_BYTES = 32
-"""Per fine pixel of a simulated scene in each of them, as measured; of four LEDs as well as of frames."""
+"""Measured bytes per fine pixel of a simulated scene in each of them, with four LEDs or with frames."""
 _CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
 
 def check_host(config: RigConfig) -> None:
-    """Raise ConfigError for what cannot be recorded here, with what could be."""
+    """Raise ConfigError if the rig cannot be recorded on this host, stating what could be."""
     check_directory(config)
     _check_disk(config)
     _check_spec(config)
@@ -49,7 +49,7 @@ def check_host(config: RigConfig) -> None:
 
 
 def _check_spec(config: RigConfig) -> None:
-    """The recording that `start` would make, but for what only the devices know."""
+    """Check the specification that `start` would create, except facts that only the devices have."""
     cameras = {
         arm: config.cameras.arm(arm).model_dump(include={"black_level_dn", "responsivity_dn"})
         | {"white_dn": config.cameras.arm(arm).white_dn}
@@ -102,14 +102,14 @@ def _check_disk(config: RigConfig) -> None:
 
 
 def needed_bytes(config: RigConfig) -> tuple[int, int]:
-    """Of memory: for the rings, and for a simulated scene."""
+    """Return the memory needed for the rings, and for a simulated scene."""
     line_bytes = config.pixels * np.dtype(config.cameras.a.dtype).itemsize
     rings = len(ARMS) * config.ring_slots * config.stream.block_lines * line_bytes
     return rings, SIMULATING * _scene_bytes(config)
 
 
 def _scene_bytes(config: RigConfig) -> int:
-    """In one process; 0 where no camera computes what it sees."""
+    """Return the memory of a scene in one process; 0 if no camera is simulated from one."""
     if not config.needs_scene:
         return 0
     scene = load_scene(config.scene_file())
@@ -121,7 +121,7 @@ def _scene_bytes(config: RigConfig) -> int:
 
 
 def memory_bytes() -> int:
-    """Of this host, or what its control group leaves of it."""
+    """Return the memory of this host, or the limit of its control group."""
     # A container sees the host's memory in /proc, and is killed at its group's limit.
     host = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     with contextlib.suppress(OSError, ValueError):  # no control group, or "max"

@@ -1,4 +1,4 @@
-"""Paths that the next daemon has to hear of, in a small file beside the recordings."""
+"""A small file next to the recordings with paths that the next daemon has to deal with."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
 MOST_PATHS = 10_000
-"""That a journal is believed to name."""
+"""Number of entries of a journal that are read."""
 
 log = logging.getLogger("acquire.daemon")
 
 
 class Journal:
-    """The file and its one list, ``key``; ``what`` names in a log what the paths are for."""
+    """The file and its only list, ``key``; ``what`` describes the paths in log messages."""
 
     def __init__(self, file: Path | None, key: str, what: str) -> None:
         self._file = file
@@ -29,7 +29,7 @@ class Journal:
         self._written: list[str] | None = None
 
     def read(self) -> list[Path]:
-        """What an earlier daemon has left; nothing, and a line in the log, where that is not clear."""
+        """Return the paths left by an earlier daemon; none, and a line in the log, if the file is damaged."""
         if self._file is None:
             return []
         try:
@@ -38,15 +38,15 @@ class Journal:
         except FileNotFoundError:
             return []
         except (OSError, ValueError, LookupError, TypeError) as error:
-            log.error("%s does not say what is %s: %s", self._file, self._what, error)  # noqa: TRY400
+            log.error("%s does not say what is %s: %s", self._file, self._what, error)  # noqa: TRY400 - no traceback
             return []
         if (odd := len(named) - len(paths)) > 0:
-            log.error("%s: %d entries are no absolute paths, or too many", self._file, odd)
+            log.error("%s: %d entries are not absolute paths, or too many", self._file, odd)
         self._written = paths
         return [Path(path) for path in paths]
 
     def write(self, paths: Iterable[Path]) -> None:
-        """Write down what is left now, or remove the file; a failure costs a line in the log."""
+        """Write the paths that are left now, or remove the file; a failure is logged."""
         left = [str(path) for path in paths]
         if self._file is None or left == self._written:
             return
@@ -59,7 +59,7 @@ class Journal:
             else:
                 self._file.unlink(missing_ok=True)
         except OSError as error:
-            log.error(  # noqa: TRY400
+            log.error(  # noqa: TRY400 - no traceback
                 "%s cannot be written: %s; the next daemon will not know what is %s",
                 self._file,
                 error.strerror or error,

@@ -1,5 +1,7 @@
-"""The API over the service in this process: commands run in the thread that owns the devices, one by one;
-all else is answered from what that thread published last, so that it never waits for a device.
+"""The API over the service in this process.
+
+Commands run one by one in the thread that owns the devices; everything else is answered from the latest
+status that this thread has published, so that it never waits for a device.
 """
 
 from __future__ import annotations
@@ -52,7 +54,7 @@ class Local:
         return await self._do("mark", lambda: self._service.mark(request.text))
 
     async def stop(self) -> Status:
-        """Returns once the recording is sealed; a fault meanwhile is raised."""
+        """Stop, and return once the recording is sealed. Raises a fault that occurs in the meantime."""
         await self._do("stop", self._service.stop)
         while (status := self._service.status()).state is State.DRAINING:
             await asyncio.sleep(POLL_S)
@@ -70,9 +72,11 @@ class Local:
         return found
 
     async def reload(self) -> Reloaded:
-        """The file is read in a thread of its own: a slow disk must not keep devices from being watched."""
+        """Reload the rig file, which is read in a separate thread: a slow disk must not stop supervision."""
         if self._reloading is None:
-            raise UsageError("this daemon's configuration is of no file", hint="end it, and start another")
+            raise UsageError(
+                "this daemon's configuration is not from a file", hint="end it, and start another"
+            )
         done: list[Reloaded] = []
         who = WHO.get() or "the control socket"
         new, apply = await asyncio.to_thread(self._reloading.read, who), self._reloading.apply

@@ -1,6 +1,6 @@
-"""What travels over the control socket: requests, the status, and errors as JSON.
+"""Messages on the control socket: requests, the status, and errors as JSON.
 
-The daemon and its clients share these models; the API description is made from them.
+The daemon and its clients share these models; the API description is generated from them.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ def _on_the_wire(text: object) -> str:
 
 
 Text = Annotated[str, PlainSerializer(_on_the_wire, return_type=str, when_used="json")]
-"""Whatever is in it, such as the name of a file that is not UTF-8: in JSON it is readable, and harmless."""
+"""Text that is made readable and harmless in JSON, such as a file name that is not UTF-8."""
 Place = Annotated[Path, PlainSerializer(_on_the_wire, return_type=str, when_used="json")]
 LONGEST_NAME = 200
-"""Bytes of a recording's name: what lies beside it, such as a further segment, has a longer one."""
+"""Longest name of a recording in bytes: names derived from it, such as a further segment's, are longer."""
 LONGEST_MARK = 400
-"""Characters."""
+"""Longest text of a mark, in characters."""
 
 
 class Message(BaseModel):
@@ -37,11 +37,11 @@ class Message(BaseModel):
 
 
 LightCode = Literal["rig", "dark", "steady"]
-"""What the light follows in a run: the rig's code, or off, or on, as calibration asks for."""
+"""What the light follows in a run: the rig's code, or constantly off or on, for calibrations."""
 
 
 class TriggerDelays(Message):
-    """When light and lines start beside each other, in ticks of the trigger's clock."""
+    """When light and lines start relative to each other, in ticks of the trigger's clock."""
 
     light_lead: int = Field(ge=0, le=255, description="by which light precedes its sub-step")
     a: int = Field(ge=0, lt=2**24, description="from a line's start to camera A's pulse")
@@ -56,7 +56,7 @@ class TriggerWindow(Message):
 
 
 class ArmRequest(Message):
-    """How to arm."""
+    """Options of arming."""
 
     code: LightCode = Field(
         default="rig",
@@ -64,18 +64,18 @@ class ArmRequest(Message):
     )
 
     calibration: Literal["rig", "none"] = Field(
-        default="rig", description="'none': recordings get no copy of the one that the rig names"
+        default="rig", description="'none': recordings get no copy of the rig's calibration"
     )
     delays: TriggerDelays | None = Field(
-        default=None, description="in place of the rig's, as a search for them asks"
+        default=None, description="delays instead of the rig's, for a search of the delays"
     )
     window: TriggerWindow | None = Field(
-        default=None, description="of the light, in place of the rig's, as a ramp of light asks"
+        default=None, description="window of the light instead of the rig's, for a ramp of light"
     )
     force: bool = Field(
         default=False,
         strict=True,
-        description="even where the host is too slow for the configured rate, or uploads are refused",
+        description="arm even if the host is too slow for the configured rate, or uploads are refused",
     )
 
 
@@ -104,7 +104,7 @@ class StartRequest(Message):
         ge=0,
         le=1e6,
         allow_inf_nan=False,
-        description="of it, from before the request",
+        description="seconds of it from before the request",
     )
     post_s: float | None = Field(
         default=None,
@@ -117,18 +117,18 @@ class StartRequest(Message):
     resume: bool = Field(
         default=False,
         strict=True,
-        description="path is a sealed recording: go on with it in a further segment beside it",
+        description="path is a sealed recording: continue it in a further segment next to it",
     )
 
     @model_validator(mode="after")
     def _one_budget(self) -> StartRequest:
         given = [name for name in ("lines", "duration_s", "post_s") if getattr(self, name) is not None]
         if len(given) > 1:
-            raise ValueError(f"{' and '.join(given)} are ways to say the same: give one")
+            raise ValueError(f"{' and '.join(given)} exclude each other: give one")
         if self.duration_s is not None and self.pre_s >= self.duration_s:
             raise ValueError("pre_s is a part of duration_s: give a smaller one")
         if self.resume and self.path is None:
-            raise ValueError("resume needs the path of the recording to go on with")
+            raise ValueError("resume needs the path of the recording to continue")
         if self.path is not None and not self.path.is_absolute():
             raise ValueError(f"path {str(self.path)!r} is not absolute: the daemon has another directory")
         return self
@@ -145,7 +145,7 @@ class StartRequest(Message):
 
 
 class MarkRequest(Message):
-    """What happens now, in the operator's words."""
+    """A remark on what happens now, in the operator's words."""
 
     text: str = Field(
         default="", max_length=LONGEST_MARK, description="one line, as long as a sentence or two"
@@ -165,29 +165,29 @@ class RingStatus(Message):
 class LedgerStatus(Message):
     """Every pulse since arm: issued = preroll + stored + discarded + lost + waiting + pending."""
 
-    issued: int = Field(description="by the trigger, as far as tags and lines tell")
+    issued: int = Field(description="issued by the trigger, according to tags and lines")
     preroll: int = Field(description="exposed before the run's start")
-    stored: int = Field(description="in recordings; a line that several hold counts once")
-    discarded: int = Field(description="in none: nobody asked for them, or the recording had ended before")
+    stored: int = Field(description="in recordings; a line in several counts once")
+    discarded: int = Field(description="in no recording: none was requested, or it had ended before")
     lost: dict[str, int] = Field(description="cause → lines")
     waiting: int = Field(description="in the ring")
     pending: int = Field(
-        description="in camera or driver; once idle: what was there when the trigger stopped, of no recording"
+        description="in camera or driver; once idle: lines there when the trigger stopped, in no recording"
     )
     balanced: bool
 
 
 class CheckStatus(Message):
-    """What the lines say of the light's code."""
+    """Result of checking the lines against the light's code."""
 
     verdict: Text = Field(description="verified, shifted, inverted, wrong_code, dark or unknown")
     shift: int = Field(description="sub-steps by which the lines are late")
-    checked_line: int = Field(description="the line after the last that was looked at")
-    lapped: int = Field(description="ring slots that came and went unseen by the check")
+    checked_line: int = Field(description="the line after the last one checked")
+    lapped: int = Field(description="ring slots that were overwritten before the check read them")
 
 
 class ArmStatus(Message):
-    """One arm since it was armed: what its camera delivered and what became of it, in lines."""
+    """One arm since it was armed: the lines that its camera delivered, and what became of them."""
 
     delivered: int = Field(description="by the camera, the preroll included")
     preroll: int = Field(description="exposed before the run's start, discarded")
@@ -198,16 +198,16 @@ class ArmStatus(Message):
     )
     lost: dict[str, int] = Field(description="cause → lines")
     recorded: int = Field(description="rows of the latest recording")
-    missing: int = Field(description="those of them that hold no line")
+    missing: int = Field(description="rows of it without a line")
     rate_hz: float = Field(description="lines per second over the last five seconds")
     saturated: int = Field(default=0, description="lines with a saturated pixel, of those delivered")
     saturated_part: float = Field(default=0.0, description="of the lines of the last five seconds, 0 to 1")
     drift_ppb: int = Field(
-        default=0, description="by which the camera's clock is faster than the trigger's, if it tells time"
+        default=0, description="by which the camera's clock is faster than the trigger's; 0 without stamps"
     )
     ring: RingStatus
     ledger: LedgerStatus | None = None
-    check: CheckStatus | None = Field(default=None, description="null: the rig does not check")
+    check: CheckStatus | None = Field(default=None, description="null: the rig has no check")
 
 
 class RecordingStatus(Message):
@@ -225,46 +225,48 @@ class LastRecording(Message):
 
     path: Place
     lines: int
-    condition: Text | None = Field(description="what the lines are worth; null: it could not be sealed")
+    condition: Text | None = Field(description="condition of the lines; null: it could not be sealed")
     end_reason: Text | None
 
 
 class RecoveryStatus(Message):
-    """A recording that its recorder did not seal, and what the daemon made of it."""
+    """A recording that its recorder did not seal, and the state of its recovery."""
 
     path: Place
     state: Literal["waiting", "recovered", "left", "failed", "gone"] = Field(
-        description="waiting for its turn or a lock; sealed; not to be touched by this daemon, or not a "
-        "recording at all; could not be; not there, or nothing was ever recorded to it"
+        description="waiting: for its turn or a lock; recovered: it is sealed; left: not to be changed by "
+        "this daemon, or not a recording; failed: it could not be recovered; gone: it is not there, or "
+        "nothing was ever recorded to it"
     )
-    lines: int | None = Field(default=None, description="of each arm that a reader finds")
-    condition: Text | None = Field(default=None, description="what the lines are worth, once it is recovered")
-    text: Text = Field(default="", description="how it came to that; once it is recovered, its end reason")
+    lines: int | None = Field(default=None, description="lines of each arm that a reader finds")
+    condition: Text | None = Field(default=None, description="condition of the lines, once it is recovered")
+    text: Text = Field(default="", description="reason for the state; once it is recovered, its end reason")
 
 
 class UploadStatus(Message):
-    """A recording on its way to `recording.upload_to`."""
+    """A recording to be copied to `recording.upload_to`."""
 
     path: Place
     url: Text
     state: Literal["waiting", "copying", "copied", "refused", "gone"] = Field(
-        description="waiting for its turn, its end or the store; under way, while it grows or after; whole "
-        "there; something else is there; deleted here before it was copied"
+        description="waiting: for its turn, its end or the store; copying: under way, while it grows or "
+        "after; copied: complete there; refused: something else is there; gone: deleted here before it was "
+        "copied"
     )
-    lines: int = Field(default=0, description="of each arm that are there")
-    waiting_lines: int | None = Field(default=None, description="that a reader finds here only")
-    bytes: int = Field(default=0, description="sent since the copy was begun or gone on with")
-    error: Text = Field(default="", description="why the last try failed; it is tried again while waiting")
+    lines: int = Field(default=0, description="lines of each arm at the store")
+    waiting_lines: int | None = Field(default=None, description="lines that a reader finds only here")
+    bytes: int = Field(default=0, description="bytes sent since the copy was begun or continued")
+    error: Text = Field(default="", description="why the last try failed; it is retried while waiting")
     hint: Text = ""
 
 
 class CapacityStatus(Message):
-    """What this host sustains, as measured before the run was armed; line rates of both arms."""
+    """The rate that this host sustains, measured before the run was armed; line rates of both arms."""
 
-    line_rate_hz: float = Field(description="configured")
+    line_rate_hz: float = Field(description="configured rate")
     sustained_hz: float | None = Field(default=None, description="null: could not be measured")
-    codec: Text | None = Field(default=None, description="that was measured, chosen where the rig says auto")
-    limit: Text | None = Field(default=None, description="what allows least")
+    codec: Text | None = Field(default=None, description="measured codec; chosen if the rig has auto")
+    limit: Text | None = Field(default=None, description="the lowest of the limits")
     limits_hz: dict[str, float] = Field(default={}, description="ring, codec, recorder, processors")
     warning: Text | None = None
 
@@ -273,37 +275,37 @@ class TriggerStatus(Message):
     """The instrument's clock, since it was armed."""
 
     clock_hz: int
-    uncertainty_ns: int = Field(description="of its relation to UTC")
-    pulses: int = Field(description="lines that it has begun")
-    silent_s: float = Field(description="since it last sent a tag or an answer")
-    answers: bool = Field(description="it was not silent for longer than it should be")
+    uncertainty_ns: int = Field(description="uncertainty of its relation to UTC")
+    pulses: int = Field(description="number of lines that it has begun")
+    silent_s: float = Field(description="seconds since its last tag or answer")
+    answers: bool = Field(description="it has not been silent for too long")
 
 
 class DiskStatus(Message):
-    """Room for recordings that have no path of their own."""
+    """Room for recordings in the configured directory."""
 
     directory: Place
     free_bytes: int
-    reserve_bytes: int = Field(description="of it, that no recording takes")
+    reserve_bytes: int = Field(description="bytes of it that no recording takes")
     bytes_per_s: float = Field(
-        description="at which it fills, over the last minute of a recording; else what the cameras would "
-        "give, not compressed"
+        description="rate at which it fills, over the last minute of a recording; otherwise the cameras' "
+        "uncompressed rate"
     )
-    seconds_to_full: float = Field(description="at that rate, to the reserve")
+    seconds_to_full: float = Field(description="time to the reserve at that rate")
 
 
 class TroubleStatus(Message):
-    """A failure that nobody foresaw, in something that nobody asked for; the service goes on."""
+    """An unforeseen failure outside any command; the service continues."""
 
-    text: Text = Field(description="where, and what")
+    text: Text = Field(description="place and error")
     times: int
     last: datetime
 
 
 class CalibrationStatus(Message):
-    """What recordings of this run carry of a calibration."""
+    """The calibration in the recordings of this run."""
 
-    path: Place | None = Field(description="of the calibration that the rig names")
+    path: Place | None = Field(description="path of the rig's calibration")
     carried: bool = Field(description="recordings get a copy")
     text: Text
 
@@ -317,7 +319,7 @@ class Status(Message):
     busy: Text | None = Field(
         description="the command being carried out, and after a colon what it is waiting for"
     )
-    name: Text = Field(description="of the rig")
+    name: Text = Field(description="name of the rig")
     version: Text
     pid: int
     uptime_s: float
@@ -326,30 +328,31 @@ class Status(Message):
     arms: dict[str, ArmStatus]
     last: LastRecording | None
     waiting: Text | None = Field(
-        default=None, description="what takes longer than it should, and how long that can be borne, in words"
+        default=None,
+        description="what takes longer than it should, and how long the rings can make up for it, in words",
     )
     fault: Text | None
     trigger: TriggerStatus | None = Field(default=None, description="null: not armed")
-    disk: DiskStatus | None = Field(default=None, description="null: it has not been seen yet")
+    disk: DiskStatus | None = Field(default=None, description="null: it has not answered yet")
     capacity: CapacityStatus | None = None
     calibration: CalibrationStatus | None = Field(
         default=None, description="null: not armed, or the rig names none"
     )
-    processes: dict[str, int] = Field(default={}, description="of the run: name → process number")
+    processes: dict[str, int] = Field(default={}, description="processes of the run: name → process number")
     recoveries: list[RecoveryStatus] = Field(
         default=[], description="the latest recordings that were not sealed"
     )
     uploads: list[UploadStatus] = Field(
         default=[],
-        description="recordings that are not copied to where the rig wants them, and the latest that are",
+        description="recordings that are not copied to the store yet, and the latest that are",
     )
-    uploads_left: int = Field(default=0, description="recordings that are not copied, listed or not")
+    uploads_left: int = Field(default=0, description="number of recordings not copied, listed or not")
     upload_warning: Text | None = Field(default=None, description="why copies may have to wait")
     troubles: list[TroubleStatus] = Field(default=[], description="unforeseen failures, the latest last")
 
 
 class ErrorMessage(Message):
-    """An AcquireError on the wire."""
+    """An AcquireError as JSON."""
 
     error: Text = Field(description="name of the class in acquire.errors")
     message: Text
@@ -362,7 +365,7 @@ class ErrorMessage(Message):
         return cls(**error.to_dict())
 
     def rebuild(self) -> AcquireError:
-        """The error again, of its own class where this version knows it."""
+        """Return the error, of its original class if this version knows it."""
         known = getattr(errors, self.error, None)
         if not (isinstance(known, type) and issubclass(known, AcquireError)):
             known = AcquireError
@@ -375,7 +378,7 @@ HTTP_STATUS: tuple[tuple[type[AcquireError], int], ...] = (
     (DeviceError, 503),
     (AcquireError, 500),
 )
-"""The first class that fits decides."""
+"""The first class that matches decides."""
 
 
 def http_status(error: AcquireError) -> int:
@@ -383,7 +386,7 @@ def http_status(error: AcquireError) -> int:
 
 
 def fault_error(fault: str | None) -> DeviceError:
-    """What a command raises that ends in a fault."""
+    """Return the error of a command that ends in a fault."""
     return DeviceError(f"fault: {fault}", hint="acquire disarm, then look at the device")
 
 

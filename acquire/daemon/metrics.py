@@ -1,6 +1,6 @@
 """The status for Prometheus: one prefix, base units, counters that end in _total.
 
-A counter begins anew with every run, as Prometheus expects of one that was reset.
+A counter restarts from 0 with every run, which Prometheus handles as a reset.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ __all__ = ["CONTENT_TYPE", "metrics_text"]
 
 
 def metrics_text(status: Status, health: Health) -> bytes:
-    """In the text format."""
+    """Return the metrics in the text format."""
     registry = CollectorRegistry(auto_describe=False)
     registry.register(_Metrics(status, health))
     return generate_latest(registry)
@@ -46,7 +46,7 @@ class _Metrics(Collector):
         status = self._status
         yield _gauge(
             "acquire_build_info",
-            "A constant 1 with what runs.",
+            "A constant 1 with version and rig.",
             [((status.version, status.name), 1)],
             "version rig",
         )
@@ -55,13 +55,13 @@ class _Metrics(Collector):
         levels = ("idle", "good", "degraded", "lost", "fault")
         found = [((level,), int(self._health.level == level)) for level in levels]
         yield _gauge("acquire_health", "1 for the level of health.", found, "level")
-        yield _gauge("acquire_uptime_seconds", "Since the daemon began.", [((), status.uptime_s)])
+        yield _gauge("acquire_uptime_seconds", "Time since the daemon began.", [((), status.uptime_s)])
         troubles = sum(one.times for one in status.troubles)
-        yield _counter("acquire_troubles", "Unforeseen failures in what nobody asked for.", [((), troubles)])
+        yield _counter("acquire_troubles", "Unforeseen failures outside commands.", [((), troubles)])
         if status.trigger is not None:
             yield _gauge(
                 "acquire_trigger_silent_seconds",
-                "Since the trigger last sent anything.",
+                "Time since the trigger last sent anything.",
                 [((), status.trigger.silent_s)],
             )
 
@@ -83,7 +83,7 @@ class _Metrics(Collector):
         rates = [((arm,), facts.rate_hz) for arm, facts in arms.items()]
         yield _gauge("acquire_line_rate_hertz", "Lines delivered, over five seconds.", rates, "arm")
         fills = [((arm,), facts.ring.fill / facts.ring.slots) for arm, facts in arms.items()]
-        yield _gauge("acquire_ring_fill_ratio", "Of the ring, what waits for the recorder.", fills, "arm")
+        yield _gauge("acquire_ring_fill_ratio", "Share of the ring not recorded yet.", fills, "arm")
         verified = [
             ((arm,), int(facts.check.verdict == "verified")) for arm, facts in arms.items() if facts.check
         ]
@@ -94,8 +94,10 @@ class _Metrics(Collector):
     def _of_places(self) -> Iterator[Metric]:
         status = self._status
         if (disk := status.disk) is not None:
-            yield _gauge("acquire_disk_free_bytes", "Of the recordings' disk.", [((), disk.free_bytes)])
-            yield _gauge("acquire_disk_full_seconds", "Until the disk is full.", [((), disk.seconds_to_full)])
+            yield _gauge("acquire_disk_free_bytes", "Free on the recordings' disk.", [((), disk.free_bytes)])
+            yield _gauge(
+                "acquire_disk_full_seconds", "Time until the disk is full.", [((), disk.seconds_to_full)]
+            )
         if status.capacity is not None and status.capacity.sustained_hz is not None:
             yield _gauge(
                 "acquire_capacity_sustained_hertz",
@@ -104,8 +106,10 @@ class _Metrics(Collector):
             )
         if (now := status.recording) is not None:
             waiting = now.recorded_lines - now.committed_lines
-            yield _gauge("acquire_uncommitted_lines", "Recorded, and not readable yet.", [((), waiting)])
-        yield _gauge("acquire_upload_pending_recordings", "Not copied yet.", [((), status.uploads_left)])
+            yield _gauge("acquire_uncommitted_lines", "Lines not readable yet.", [((), waiting)])
+        yield _gauge(
+            "acquire_upload_pending_recordings", "Recordings not copied yet.", [((), status.uploads_left)]
+        )
 
 
 def _gauge(

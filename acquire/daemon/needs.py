@@ -1,4 +1,4 @@
-"""What the service needs of what it is given: a run, how one is made, the proof that the host keeps up."""
+"""Interfaces of the objects given to the service: a run, its factory, and the proof of capacity."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class CapturePath(Protocol):
-    """What the service needs of `acquire.stream.Capture`."""
+    """The part of `acquire.stream.Capture` that the service needs."""
 
     def start(self, begin: Begin) -> None: ...
     def note(self, kind: str, text: str) -> int: ...
@@ -28,7 +28,7 @@ class CapturePath(Protocol):
 
 
 class Run(Protocol):
-    """What the service needs of `acquire.daemon.plan.Run`."""
+    """The part of `acquire.daemon.plan.Run` that the service needs."""
 
     run_id: str
 
@@ -42,14 +42,14 @@ class Run(Protocol):
 
 
 class OpenRun(Protocol):
-    """Makes the next run, as it is asked to be armed."""
+    """Creates the next run for a request to arm."""
 
     def __call__(self, request: ArmRequest) -> Run: ...
 
 
 class Prove(Protocol):
-    """What the service needs of `acquire.daemon.proof.Proof`."""
+    """The part of `acquire.daemon.proof.Proof` that the service needs."""
 
     def __call__(
-        self, *, force: bool, tell: Callable[[str], object], anew: bool = False
+        self, *, force: bool, tell: Callable[[str], object], fresh: bool = False
     ) -> CapacityStatus: ...

@@ -1,11 +1,11 @@
-"""What happened, for those who want to be told: the latest, in order, each with a number.
+"""Log of the latest news, in order, each with a number, for clients that follow them.
 
 ::
 
-    Service (device thread) ──tell, look──▶ News ──wake──▶ streams (event loop): each reads on from its number
+    Service (device thread) ──add, update─▶ News ──wake──▶ streams (event loop): each reads on from its number
 
-Nobody is waited for, and nothing is kept per listener: who reads too slowly finds that what it has not read
-is gone, and is told so. What must be kept for good lies in the recordings' own events.
+No listener is waited for, and nothing is kept per listener: one that reads too slowly is informed that it
+missed news. Facts that must be kept permanently are in the recordings' own events.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ if TYPE_CHECKING:
 
 MOST_KEPT = 2000
 LOSSES_EVERY_S = 1.0
-"""Between two news of lines lost for one cause: the first is told at once, later ones are summed."""
+"""Time between two news of lines lost for one cause: the first is reported at once, later ones are summed."""
 DISK_EVERY_S = 10.0
-"""Between two news of how long the disk lasts."""
+"""Time between two news of how long the disk lasts."""
 
 
 class NewsLog:
-    """Any thread may call everything here."""
+    """All methods may be called from any thread."""
 
     def __init__(self, kept: int = MOST_KEPT, now_s: Callable[[], float] = time.monotonic) -> None:
         self.life = secrets.token_hex(4)
-        """Of this log: numbers of another one mean nothing here."""
+        """Identifies this log: numbers of another one mean nothing here."""
         self._lock = threading.Lock()
         self._kept: deque[News] = deque(maxlen=kept)
         self._count = 0
@@ -47,8 +47,8 @@ class NewsLog:
         self._listeners: set[Callable[[], None]] = set()
         self.closed = False
 
-    def tell(self, kind: str, text: str, state: State | None = None, **facts: Any) -> None:
-        """Something happened; ``facts`` as `News` has them."""
+    def add(self, kind: str, text: str, state: State | None = None, **facts: Any) -> None:
+        """Add news; ``facts`` are further fields of `News`."""
         known = cast("NewsKind", kind if kind in get_args(NewsKind) else "event")
         with self._lock:
             self._state = state or self._state
@@ -59,12 +59,12 @@ class NewsLog:
         self.wake()
 
     def update(self, status: Status) -> None:
-        """Tell what has changed since the last status."""
+        """Add news about the changes since the last status."""
         for facts in self._changes.of(status):
-            self.tell(**facts)
+            self.add(**facts)
 
     def after(self, last_id: str | None) -> list[News]:
-        """What came after the news ``last_id``, or all that is kept; first of all, if any of it is gone."""
+        """Return the news after ``last_id``, or all; preceded by a 'missed' if some are not kept any more."""
         with self._lock:
             life, _, number = (last_id or "").partition("-")
             ours = life == self.life and number.isdecimal()
@@ -73,8 +73,8 @@ class NewsLog:
             news = [one for k, one in enumerate(self._kept, first) if k > seen]
             if last_id is None or (ours and seen >= first - 1):
                 return news
-            # Who asks for what came after a news that is gone has to hear that something is missing.
-            text = "the daemon was started anew: what happened before is in its log and in the recordings"
+            # A client that continues after news that are gone must learn that it missed some.
+            text = "the daemon was restarted: earlier news are in its log and in the recordings"
             if ours:
                 text = f"{first - 1 - seen} news are not kept any more"
             made, now = f"{self.life}-{first - 1}", datetime.now(UTC)
@@ -82,29 +82,29 @@ class NewsLog:
 
     @property
     def last_id(self) -> str:
-        """Of the latest; with it, only what is still to come is heard."""
+        """ID of the latest news; after it, only future ones follow."""
         return f"{self.life}-{self._count}"
 
     def listen(self, wake: Callable[[], None]) -> None:
-        """Call ``wake``, which must not wait, when something has happened, until `forget`."""
+        """Call ``wake``, which must not wait, whenever there are news, until `forget`."""
         self._listeners.add(wake)
 
     def forget(self, wake: Callable[[], None]) -> None:
         self._listeners.discard(wake)
 
     def wake(self) -> None:
-        """Have the listeners look."""
-        for wake in tuple(self._listeners):  # one of another thread may come or go meanwhile
+        """Wake the listeners."""
+        for wake in tuple(self._listeners):  # another thread may add or remove one in the meantime
             wake()
 
     def close(self) -> None:
-        """End the streams: nothing more will happen."""
+        """End the streams: no more news will come."""
         self.closed = True
         self.wake()
 
 
 class Changes:
-    """What two statuses, one after the other, tell of what happened between them."""
+    """Derives news from the differences between consecutive statuses."""
 
     def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
         self._now_s = now_s
@@ -113,21 +113,21 @@ class Changes:
         self._disk = ("unknown", -DISK_EVERY_S)
 
     def of(self, status: Status) -> list[dict[str, Any]]:
-        """Facts for `NewsLog.tell`. The daemon's own state is told by whoever changes it."""
+        """Return facts for `NewsLog.add`. The service itself reports changes of its state."""
         before, self._before = self._before, status
-        # Counts begin anew with a run: a difference to those of the run before means nothing.
+        # Counts restart with every run: a difference to those of the run before means nothing.
         same_run = before is not None and before.run_id == status.run_id
         if not same_run:
             self._lost.clear()
         found = []
         for arm, facts in status.arms.items():
             for cause, lines in facts.lost.items():
-                told, at_s = self._lost.get((arm, cause), (0, -LOSSES_EVERY_S))
-                if lines <= told or self._now_s() - at_s < LOSSES_EVERY_S:
+                reported, at_s = self._lost.get((arm, cause), (0, -LOSSES_EVERY_S))
+                if lines <= reported or self._now_s() - at_s < LOSSES_EVERY_S:
                     continue
                 self._lost[arm, cause] = lines, self._now_s()
-                text = f"arm {arm} lost {lines - told} lines: {cause.replace('_', ' ')}"
-                found.append(_fact("loss", text, "error", arm=arm, lines=lines - told))
+                text = f"arm {arm} lost {lines - reported} lines: {cause.replace('_', ' ')}"
+                found.append(_fact("loss", text, "error", arm=arm, lines=lines - reported))
         if before is not None and same_run:
             found += _verdicts(before, status) + _segment(before, status)
         known = {one.text: one.times for one in before.troubles} if before else {}
@@ -137,12 +137,12 @@ class Changes:
         return found + _waiting(before, status) + _recoveries(before, status) + _uploads(before, status)
 
     def _disk_level(self, status: Status) -> list[dict[str, Any]]:
-        """The estimate jumps where a recording begins: it is not told too often."""
-        check, (told, at_s) = disk_check(status.disk), self._disk
-        if check.level in (told, "unknown") or self._now_s() - at_s < DISK_EVERY_S:
+        # Not too often: the estimate jumps when a recording begins.
+        check, (reported, at_s) = disk_check(status.disk), self._disk
+        if check.level in (reported, "unknown") or self._now_s() - at_s < DISK_EVERY_S:
             return []
         self._disk = check.level, self._now_s()
-        if told == "unknown" and check.level == "good":
+        if reported == "unknown" and check.level == "good":
             return []
         level: Level = {"good": "info", "warning": "warning"}.get(check.level, "error")  # type: ignore[assignment]
         return [_fact("disk", check.text, level)]
@@ -169,15 +169,15 @@ def _verdicts(before: Status, after: Status) -> list[dict[str, Any]]:
 
 
 def _segment(before: Status, after: Status) -> list[dict[str, Any]]:
-    """A recording that goes on in a further one."""
+    """Report that a recording continues in a further segment."""
     old, new = before.recording, after.recording
     if old is None or new is None or old.path == new.path:
         return []
-    return [_fact("segment", f"{old.path} goes on in {new.path}", "warning", path=new.path)]
+    return [_fact("segment", f"{old.path} continues in {new.path}", "warning", path=new.path)]
 
 
 def _waiting(before: Status | None, after: Status) -> list[dict[str, Any]]:
-    """Its words change with every second: only beginning and end are told."""
+    """Report the beginning and end of a wait, whose text changes every second."""
     was, now = bool(before and before.waiting), after.waiting
     if now and not was:
         return [_fact("waiting", now, "warning")]

@@ -1,4 +1,4 @@
-"""Readiness and liveness for systemd (``Type=notify``): datagrams to the socket it names, if it does."""
+"""Readiness and liveness for systemd (``Type=notify``): datagrams to the socket that it names, if any."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import socket
 
 
 def notify(message: str) -> bool:
-    """Send ``READY=1``, ``STOPPING=1``, ``WATCHDOG=1`` …; False where nobody asked to be told.
+    """Send ``READY=1``, ``STOPPING=1``, ``WATCHDOG=1`` …; return whether it was sent.
 
-    A notification that cannot be delivered must not end a measurement: False as well.
+    An error is no exception here: a notification that cannot be delivered must not end a measurement.
     """
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address.startswith(("/", "@")):

@@ -1,7 +1,7 @@
-"""The operator's page, started where the rig has ``[web]``: a process of its own that nobody waits for.
+"""The operator's page, started if the rig has ``[web]``: a separate process for which nobody waits.
 
-It ends when its standard input does, which the daemon holds, however that ends. One that ends on its own is
-started anew, after growing waits.
+It ends when its standard input is closed, which happens however the daemon ends. If it ends unexpectedly it
+is restarted, after growing waits.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 FIRST_WAIT_S, MOST_WAIT_S = 0.5, 30.0
 LIVED_S = 60.0
-"""One that lived for so long is started anew at once when it ends."""
+"""A page that lived for this long is restarted with the shortest wait when it ends."""
 END_S = 5.0
 
 log = logging.getLogger("acquire.daemon")
@@ -32,7 +32,7 @@ class Page:
     """For one thread; `poll` never waits."""
 
     def __init__(self, socket: Path) -> None:
-        """Nothing is started yet, and nothing ever where the rig has no ``[web]``."""
+        """Nothing is started yet."""
         self._socket = socket
         self._words: list[str] | None = None
         self._process: subprocess.Popen[bytes] | None = None
@@ -42,9 +42,9 @@ class Page:
         self._left_s = 0.0
 
     def poll(self, config: RigConfig) -> None:
-        """Start it as ``config`` says, or anew where it has ended or is to be another."""
+        """Start it according to ``config``; restart it if it has ended or ``[web]`` has changed."""
         now_s = time.monotonic()
-        words = None if config.web is None else self._said(config, config.web)
+        words = None if config.web is None else self._command(config, config.web)
         if words != self._words:
             if self._process is not None:
                 self._leaving, self._left_s = self._process, now_s
@@ -61,7 +61,7 @@ class Page:
             code = self._process.poll()
             if code is None:
                 return
-            log.warning("the operator's page has ended (%s); it is started anew", code)
+            log.warning("the operator's page has ended (%s); it is restarted", code)
             self._forget()
             self._wait_s = (
                 FIRST_WAIT_S if now_s - self._begun_s > LIVED_S else min(MOST_WAIT_S, 2 * self._wait_s)
@@ -70,15 +70,15 @@ class Page:
             return
         self._begun_s = now_s
         try:
-            self._process = subprocess.Popen(  # noqa: S603 - ourselves
+            self._process = subprocess.Popen(  # noqa: S603 - this package
                 self._words, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, start_new_session=True
             )
         except OSError as error:
-            log.error("the operator's page cannot be started: %s", error)  # noqa: TRY400
+            log.error("the operator's page cannot be started: %s", error)  # noqa: TRY400 - no traceback
             self._not_before_s = now_s + MOST_WAIT_S
 
-    def _said(self, config: RigConfig, web: WebConfig) -> list[str]:
-        """The words that start it."""
+    def _command(self, config: RigConfig, web: WebConfig) -> list[str]:
+        """Return the command line that starts it."""
         given = {
             "socket": str(self._socket),
             "directory": str(config.recording.directory.absolute()),
@@ -91,7 +91,7 @@ class Page:
         return None if self._process is None else self._process.pid
 
     def close(self) -> None:
-        """End it: by its standard input, then by force. Idempotent."""
+        """End it by closing its standard input, then by force. Idempotent."""
         processes = [one for one in (self._process, self._leaving) if one is not None]
         self._forget()
         self._leaving = None

@@ -1,7 +1,7 @@
-"""The client's way to the daemon: nothing is sent before the system has said whose process listens.
+"""The client's connection to the daemon: nothing is sent before the listening process is identified.
 
-In /tmp another user may have been quicker and listen in the daemon's place. Owners of directory and socket
-are looked at, and then, on the connection itself, the user of the process behind it (SO_PEERCRED).
+In /tmp another user may have been faster, and listen in the daemon's place. The owners of directory and
+socket are checked, and then, on the connection itself, the user of the process behind it (SO_PEERCRED).
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ _AGAIN_S = 0.02
 
 
 def connect(path: Path, timeout_s: float) -> socket.socket:
-    """A connection to the daemon of this user, and to nobody else.
+    """Return a connection to the daemon of this user.
 
-    Raises NoDaemonError where nobody listens within the time, or somebody else does.
+    Raises NoDaemonError if none listens within the time, or a process of another user does.
     """
     deadline = time.monotonic() + timeout_s
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -36,7 +36,7 @@ def connect(path: Path, timeout_s: float) -> socket.socket:
             try:
                 connection.connect(str(path))
                 break
-            except BlockingIOError:  # as many wait as can: the daemon is busy
+            except BlockingIOError:  # the queue of waiting connections is full: the daemon is busy
                 if time.monotonic() > deadline:
                     raise
                 time.sleep(_AGAIN_S)
@@ -54,7 +54,7 @@ def connect(path: Path, timeout_s: float) -> socket.socket:
 
 
 def _check_owner(path: Path) -> None:
-    """Whoever may replace the socket, or made it, is this user or root."""
+    """Check that only this user or root can have created the socket, or can replace it."""
     directory = path.parent.stat()
     others_write = directory.st_mode & 0o022 and not directory.st_mode & stat.S_ISVTX
     for owner in (directory.st_uid, path.stat().st_uid):
@@ -66,8 +66,8 @@ def _check_owner(path: Path) -> None:
 
 def _check_peer(connection: socket.socket, path: Path) -> None:
     form = "=3i"
-    told = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize(form))
-    process, user, _ = struct.unpack(form, told)
+    credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize(form))
+    process, user, _ = struct.unpack(form, credentials)
     if user != os.geteuid():
         raise _impostor(path, f"is listened on by process {process} of user {user}")
 

@@ -1,4 +1,4 @@
-"""From the rig's configuration to one run: the capture's plan, and what its recording says of itself."""
+"""From the rig's configuration to one run: the capture's plan, and the recording's specification."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ class Run:
     def __init__(
         self, config: RigConfig, rig: Rig, choose: Callable[[RigConfig], CodecChoice] = choose_for
     ) -> None:
-        """Nothing is touched yet; ``choose`` finds the codec, where that is ``auto``.
+        """Prepare a run without touching a device; ``choose`` finds the codec if that is ``auto``.
 
-        Raises UsageError for a configuration that cannot work, its calibration included.
+        Raises UsageError for a configuration, or calibration, that cannot work.
         """
         self.run_id = new_run_id(config.name)
         self._config = config
@@ -50,7 +50,7 @@ class Run:
 
     @property
     def calibration(self) -> CalibrationStatus | None:
-        """What recordings carry of the calibration that the rig names; None where it names none."""
+        """The calibration in recordings; None if the rig names none."""
         handed = self._calibration
         if handed.text is None:
             return None
@@ -58,27 +58,27 @@ class Run:
 
     @property
     def _codec(self) -> Codec:
-        """As configured, or as it was chosen at arm."""
+        """The codec as configured, or as chosen by `arm`."""
         configured = self._config.recording.codec
         if configured != "auto":
             return configured
         return self._choice.codec if self._choice else "none"
 
     def arm(self, tell: Callable[[str], object] = lambda _: None) -> None:
-        """Cameras and trigger run; on failure everything is undone and the first error raised.
+        """Start cameras and trigger; on failure everything is undone and the first error raised.
 
-        ``tell`` is called with what is being waited for.
+        ``tell`` is called with each step being waited for.
         """
         if self._config.recording.codec == "auto":
             self._choice = self._choose(self._config)
         self.capture.arm(self._config.stream.arm_timeout_s, tell)
 
     def adopt(self, recording: RecordingConfig) -> None:
-        """Make the next recording as ``recording`` says."""
+        """Use the settings ``recording`` for the next recording."""
         self._config = self._config.model_copy(update={"recording": recording})
 
     def spec(self) -> RecordingSpec:
-        """What the recording says of itself; the recorder fills in its first line."""
+        """Return the recording's specification; the recorder fills in its first line."""
         config = self._config
         return RecordingSpec(
             run_id=self.run_id,
@@ -115,9 +115,9 @@ class Run:
 
 
 def recording_of(request: StartRequest, config: RigConfig, spec: RecordingSpec) -> Begin:
-    """What the recorder is asked for; to resume what is at a path, that is a segment beside it.
+    """Return the request for the recorder; to resume the recording at a path, that of a segment next to it.
 
-    Raises UsageError where it cannot be, before anything is touched.
+    Raises UsageError if it is impossible, before anything is changed.
     """
     path = request.path or default_path(config)
     if request.resume:
@@ -127,7 +127,7 @@ def recording_of(request: StartRequest, config: RigConfig, spec: RecordingSpec) 
 
 
 def armed_as(config: RigConfig, request: ArmRequest) -> RigConfig:
-    """The rig as a run of it is asked for."""
+    """Return the rig with the options of the request."""
     config = with_code(config, request.code)
     if request.calibration == "none":
         config = config.model_copy(update={"calibration": None})
@@ -140,7 +140,7 @@ def armed_as(config: RigConfig, request: ArmRequest) -> RigConfig:
 
 
 def with_code(config: RigConfig, code: LightCode) -> RigConfig:
-    """The rig with another code for its light."""
+    """Return the rig with another code for its light."""
     if code == "rig":
         return config
     constant = ConstantCodeConfig(kind="constant", value=0 if code == "dark" else 1)
@@ -148,7 +148,7 @@ def with_code(config: RigConfig, code: LightCode) -> RigConfig:
 
 
 def worker_modules(rig: Rig) -> tuple[str, ...]:
-    """What the processes of a run import: to be imported once, before any run is armed."""
+    """Return the modules that a run's processes import, to be imported once before any run is armed."""
     modules = {type(opener).__module__ for opener in rig.openers().values()}
     modules |= {f"acquire.stream.{name}" for name in ("recorder", "grabber", "watcher")}
     if rig.config.simulates_cameras:
@@ -157,7 +157,7 @@ def worker_modules(rig: Rig) -> tuple[str, ...]:
 
 
 def capture_plan(config: RigConfig, rig: Rig, run_id: str) -> CapturePlan:
-    """What the capture path is asked to do. Raises UsageError for what cannot work."""
+    """Return the capture's plan. Raises UsageError for settings that cannot work."""
     return CapturePlan(
         run=trigger_run(config, run_id),
         stages=config.geometry.stages,
@@ -181,7 +181,7 @@ def capture_plan(config: RigConfig, rig: Rig, run_id: str) -> CapturePlan:
 
 
 def trigger_run(config: RigConfig, run_id: str) -> TriggerRun:
-    """What the trigger is asked to do."""
+    """Return the trigger's settings for a run."""
     return TriggerRun(
         run_id=run_id,
         code=config.code.build(),
@@ -194,12 +194,12 @@ def trigger_run(config: RigConfig, run_id: str) -> TriggerRun:
 
 
 def new_run_id(name: str) -> str:
-    """A name for a run that no other run has: rig, UTC, and chance for runs within one second."""
+    """Return a unique name for a run: rig, UTC, and a random part for runs within one second."""
     return f"{name}-{_stamp()}-{secrets.token_hex(3)}"
 
 
 def default_path(config: RigConfig) -> Path:
-    """A free path in the configured directory, named after rig and UTC."""
+    """Return a free path in the configured directory, named after rig and UTC."""
     directory = config.recording.directory.absolute()
     path = directory / f"{config.name}-{_stamp()}.zarr"
     number = 2

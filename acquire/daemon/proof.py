@@ -1,8 +1,8 @@
-"""Before a run is armed: can ring, codec and disk of this host keep up with what is configured?
+"""Before a run is armed: can ring, codec and disk of this host sustain the configured rate?
 
-What is enough is remembered for some minutes: a disk fills, and others come to use it. What is not enough is
-measured again at once, the best of three counts, and it is not remembered. A codec that is ``auto`` is chosen
-first, and what is measured is what was chosen: the run records with it.
+A sufficient result is valid for some minutes: a disk fills, and other programs use it. An insufficient one is
+measured again at once, the best of three counts, and it is not kept. If the codec is ``auto`` it is chosen
+first, then measured, and used by the run.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ if TYPE_CHECKING:
 
 VALID_S = 600.0
 TRIES = 3
-"""Measurements before a rig is refused: one that was disturbed says too little."""
+"""Number of measurements before a rig is refused: a disturbed one gives too little."""
 TIGHT = 0.7
-"""Of what is sustained; a rate above it is armed with a warning."""
+"""Share of the sustained rate above which a rig is armed with a warning."""
 
 log = logging.getLogger("acquire.daemon")
 
 
 class Proof:
-    """What one rig's recordings need, and what the host has to offer."""
+    """Compares the needs of one rig's recordings with the host's capacity."""
 
     def __init__(self, config: RigConfig) -> None:
         self._config = config
@@ -45,38 +45,38 @@ class Proof:
         self._measured: tuple[float, Parts] | None = None
 
     def choose(self, config: RigConfig) -> CodecChoice:
-        """The codec for the rig, measured; for some minutes the same. Raises DataError."""
+        """Return the measured codec for the rig, kept for some minutes. Raises DataError."""
         now_s = time.monotonic()
         if self._chosen is None or now_s - self._chosen[0] > VALID_S:
             self._chosen = now_s, choose_for(config)
-            self._measured = None  # it was of the codec before
+            self._measured = None  # it may have been of another codec
         return self._chosen[1]
 
     def __call__(
-        self, *, force: bool = False, tell: Callable[[str], object] = lambda _: None, anew: bool = False
+        self, *, force: bool = False, tell: Callable[[str], object] = lambda _: None, fresh: bool = False
     ) -> CapacityStatus:
-        """What is sustained, ``anew`` whatever was measured lately.
+        """Return the sustained rate; ``fresh`` measures it again even if a recent result is valid.
 
-        Raises UsageError where that is less than what is configured, unless forced.
+        Raises UsageError if it is below the configured rate, unless forced.
         """
-        if anew:
+        if fresh:
             self._chosen = self._measured = None
         try:
             parts = self._parts(tell)
         except (UsageError, DataError) as error:
-            log.warning("capacity: nothing can be recorded to measure it: %s", error)
+            log.warning("capacity: it cannot be measured: %s", error)
             rate_hz = self._config.line_rate_hz * self._config.simulation.speed
             return CapacityStatus(line_rate_hz=rate_hz, warning=f"not measured: {error}")
         load = parts.load
         tight = parts.line_rate_hz * TIGHT < load.line_rate_hz
         warning = f"{_configured(load)}; {_sustained(parts)}" if tight else None
-        # Simulated cameras wait for a host that is busy, but not for one that has too few processors.
+        # Simulated cameras wait for a busy host, but cannot do with too few processors.
         limit_hz = parts.limits["processors"] if self._config.simulates_cameras else parts.line_rate_hz
         if limit_hz < load.line_rate_hz and not force:
             raise UsageError(
                 f"arm: {_configured(load)} is more than this host sustains",
                 possible=f"{_sustained(parts)}; the best of {TRIES} measurements at a load of {_load()}",
-                hint="with less beside it, another codec or directory (acquire bench), or arm --force",
+                hint="end other programs, try another codec or directory (acquire bench), or arm --force",
             )
         if warning:
             log.warning("capacity: %s", warning)
@@ -90,7 +90,7 @@ class Proof:
         )
 
     def _parts(self, tell: Callable[[str], object]) -> Parts:
-        """What was measured lately, or is now; what is too little is measured again, and not remembered."""
+        """Return a valid measurement, or make one; see the module for insufficient ones."""
         if self._measured is not None and time.monotonic() - self._measured[0] <= VALID_S:
             return self._measured[1]
         tell("measuring what this host sustains")
@@ -110,7 +110,7 @@ class Proof:
 
 
 def _load() -> str:
-    """What else wants the processors, as far as the kernel's average of a minute tells."""
+    """Return the load of the processors by the kernel's average of a minute."""
     return f"{os.getloadavg()[0]:.1f} on {usable_cores()} processors"
 
 

@@ -1,7 +1,8 @@
-"""The process that recovers what a recorder did not seal, one recording; and the search for such recordings.
+"""The process that recovers one recording that its recorder did not seal; and the search for such recordings.
 
-What is not a recording, holds links, or was written elsewhere is named and left alone. What its recorder had
-not begun is removed, if nobody ever counted a line of it; everything else stays, whatever is missing of it.
+Anything that is not a recording, holds links, or was written on another machine is reported and left alone. A
+recording that was prepared and not begun is removed, if no line of it was ever committed; everything else
+stays, whatever is missing of it.
 """
 
 from __future__ import annotations
@@ -29,15 +30,17 @@ if TYPE_CHECKING:
     from acquire.processes.worker import Mailbox
 
 RECOVERED = "recovered: "
-"""How the end reason begins of a recording that was recovered."""
+"""Beginning of a recovered recording's end reason."""
 _NICE = 10
-_ELSEWHERE = "open, and not written on this machine, where it could be seen whether it still is"
+_ELSEWHERE = "it is open, and was not written on this machine: it may still be growing"
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """One recording to be recovered. ``ours``: this daemon's run has left it, ``why``, after its recorder
-    had acknowledged ``committed_lines`` and heard what was ``told``: line, kind and text.
+    """One recording to be recovered.
+
+    ``ours``: left by a run of this daemon, for the reason ``why``. Its recorder had acknowledged
+    ``committed_lines``, and was sent ``notes``: line, kind and text.
     """
 
     path: Path
@@ -46,21 +49,21 @@ class Task:
     committed_lines: int = 0
     tries: int = 0
     not_before_s: float = 0.0
-    told: tuple[tuple[int, str, str], ...] = ()
+    notes: tuple[tuple[int, str, str], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What a search has met: recordings that are not sealed, and what nothing can be done about."""
+    """Result of a search: recordings that are not sealed, and entries that cannot be recovered."""
 
     open: list[Path]
     odd: list[RecoveryStatus]
 
 
 def search(directory: Path, recorded: Collection[Path] = ()) -> Found:
-    """Recordings in a directory that are not sealed, and of those that are known to have been ``recorded``.
+    """Find recordings that are not sealed, in a directory and among those ``recorded`` by earlier daemons.
 
-    Raises OSError where the directory cannot be read.
+    Raises OSError if the directory cannot be read.
     """
     paths = sorted(path for path in directory.iterdir() if path.name.endswith(".zarr"))
     known, found = set(recorded), Found([], [])
@@ -70,7 +73,7 @@ def search(directory: Path, recorded: Collection[Path] = ()) -> Found:
 
 
 def _look_at(path: Path, found: Found, *, known: bool) -> None:
-    """``known``: it is not only a name that looks like a recording's."""
+    """Add the path to ``found``. ``known``: it was recorded, and does not just have a recording's name."""
     try:
         attributes = read_root(LocalSource(path))["attributes"]
     except AcquireError as error:
@@ -89,7 +92,7 @@ def _look_at(path: Path, found: Found, *, known: bool) -> None:
 
 
 def salvage(mailbox: Mailbox, task: Task) -> None:
-    """Life of the process: one recovery, with less of the processors than others get."""
+    """Main function of the process: one recovery, at low priority."""
     stand_back(_NICE, EARLY)
     mailbox.post(_salvage(mailbox, task))
 
@@ -104,8 +107,8 @@ def _salvage(mailbox: Mailbox, task: Task) -> RecoveryStatus:
         if not task.ours and not is_here(attributes or {}):
             return RecoveryStatus(path=path, state="left", text=_ELSEWHERE)
         reason = f"{RECOVERED}{task.why}" if task.why else Circumstances().reason
-        known = Circumstances(reason, has_run_on(attributes or {}), alone=False, told=task.told)
-        done = recover(path, progress=lambda *_: _ask(mailbox), known=known)
+        known = Circumstances(reason, has_run_on(attributes or {}), alone=False, notes=task.notes)
+        done = recover(path, progress=lambda *_: _check_owner(mailbox), known=known)
     except StateError as error:
         return RecoveryStatus(path=path, state="waiting", text=error.message)
     except FileNotFoundError:
@@ -124,8 +127,8 @@ def _salvage(mailbox: Mailbox, task: Task) -> RecoveryStatus:
     )
 
 
-def _ask(mailbox: Mailbox) -> None:
-    """Ends the process, by an exception, once its owner has gone."""
+def _check_owner(mailbox: Mailbox) -> None:
+    """End the process, by an exception, once its owner has gone."""
     mailbox.take()
 
 
@@ -139,21 +142,19 @@ def _gone(task: Task) -> str:
 
 
 def _remove_unborn(task: Task) -> RecoveryStatus:
-    """Its recorder was killed while it made it: no line is in it, and it was never a recording."""
+    """Remove a recording whose recorder was killed while preparing it: it has no line and no root."""
     if not task.path.is_dir():
         return RecoveryStatus(path=task.path, state="gone", text=_gone(task))
     if not task.ours:
         return RecoveryStatus(path=task.path, state="left", text="it holds no line and has no root")
     with locked(task.path, "removing", surely=True):
         remove(DISK, task.path, Unborn(task.committed_lines))
-    text = (
-        "its recorder was killed before it had begun: no line was committed, and what it had made is removed"
-    )
+    text = "its recorder was killed before it had begun: no line was committed, and its files are removed"
     return RecoveryStatus(path=task.path, state="gone", lines=0, text=text)
 
 
 def hindrance(task: Task) -> RecoveryStatus | None:
-    """What keeps a recording from being recovered now."""
+    """Return the status of a recording that cannot be recovered now, or None."""
     path = task.path
     try:
         refuse_link(path, path)

@@ -1,14 +1,14 @@
-"""The rig file read anew while the service works: what may change is applied, all else is refused.
+"""Reload of the rig file while the service works: permitted changes are applied, all others are refused.
 
 ::
 
-    read      the file, with the options that the daemon was started with; checked like at the start
-    compare   with what the daemon works with, key by key
-    refuse    all of it, where one key cannot change: the file and the daemon must not drift apart
+    read      the file, with the options that the daemon was started with; checked as at the start
+    compare   with the daemon's configuration, key by key
+    refuse    everything if one key cannot change: file and daemon must not drift apart
     apply     in the thread that owns the devices, between two commands
 
-Who reads a value when it is needed, as the end of a recording or the next hook, sees the new one. What
-devices, rings, a capture under way and recordings are made of cannot change.
+Values that are read when they are needed, such as at the end of a recording or by the next hook, can change.
+Those that devices, rings, a running capture and recordings were created with cannot.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ MAY_CHANGE = {
     "service.retry_s": NEXT_START,
     "web": AT_ONCE,
 }
-"""Table or key → when the new value holds."""
-MOST_TOLD = 10
-"""Keys that an error lists."""
+"""Table or key → when the new value takes effect."""
+MOST_LISTED = 10
+"""Number of keys that an error lists."""
 
 log = logging.getLogger("acquire.daemon")
 
@@ -54,40 +54,40 @@ class Reloading:
         self._read, self._service, self._hooks = read, service, hooks
 
     def read(self, who: str) -> RigConfig:
-        """The configuration as the file has it now. What is wrong with it is told, and changes nothing."""
+        """Return the configuration in the file. Errors in it are reported, and nothing is changed."""
         try:
             return self._read()
         except AcquireError as error:
-            self._tell(f"reload by {who}: nothing was changed: {error}", refused=True)
+            self._report(f"reload by {who}: nothing was changed: {error}", refused=True)
             raise
 
     def apply(self, new: RigConfig, who: str) -> Reloaded:
-        """Raises UsageError, with every key that cannot change, before anything is changed."""
+        """Apply the changes. Raises UsageError, listing keys that cannot change, before changing anything."""
         service = self._service
         changed = changes(service.config, new)
         if fixed := [one for one in changed if not one.holds]:
             error = refusal(fixed)
-            self._tell(f"reload by {who}: nothing was changed: {error}", refused=True)
+            self._report(f"reload by {who}: nothing was changed: {error}", refused=True)
             raise error
-        told = "; ".join(f"{words(one)} ({one.holds})" for one in changed)
-        told = f"reload by {who}: {told or 'the file says what it said before'}"
+        text = "; ".join(f"{words(one)} ({one.holds})" for one in changed)
+        text = f"reload by {who}: {text or 'the file has not changed'}"
         if changed:
-            service.reconfigure(new, shortened(told, LONGEST_MARK))
+            service.reconfigure(new, shortened(text, LONGEST_MARK))
             self._hooks.reconfigure(new.hooks)
-        # Told at the more talkative of the two levels, so that the change itself is in the log.
+        # Log at the more verbose of the two levels, so that the change itself is in the log.
         root, level = logging.getLogger(), new.service.level
         root.setLevel(min(root.level, level))
-        self._tell(told)
+        self._report(text)
         root.setLevel(level)
         return Reloaded(file=service.origin, changed=changed)
 
-    def _tell(self, text: str, *, refused: bool = False) -> None:
+    def _report(self, text: str, *, refused: bool = False) -> None:
         log.log(logging.WARNING if refused else logging.INFO, "%s", text)
-        self._service.news.tell("reload", text, level="warning" if refused else "info")
+        self._service.news.add("reload", text, level="warning" if refused else "info")
 
 
 def changes(old: RigConfig, new: RigConfig) -> list[ChangedKey]:
-    """Every key whose value differs, dotted; of a table that comes or goes, the table."""
+    """Return every dotted key whose value differs; for an added or removed table, the table."""
     return list(_differences("", old.model_dump(mode="json"), new.model_dump(mode="json")))
 
 
@@ -105,10 +105,10 @@ def words(one: ChangedKey) -> str:
 
 
 def refusal(fixed: list[ChangedKey]) -> UsageError:
-    told = "; ".join(words(one) for one in fixed[:MOST_TOLD])
-    more = f"; and {len(fixed) - MOST_TOLD} more" if len(fixed) > MOST_TOLD else ""
+    listed = "; ".join(words(one) for one in fixed[:MOST_LISTED])
+    more = f"; and {len(fixed) - MOST_LISTED} more" if len(fixed) > MOST_LISTED else ""
     return UsageError(
-        f"cannot change while the service works: {told}{more}",
+        f"cannot change while the service works: {listed}{more}",
         possible=f"changes of {', '.join(MAY_CHANGE)}",
-        hint="end the service when it is idle and start it anew, or take these back in the file",
+        hint="restart the service when it is idle, or revert these changes in the file",
     )

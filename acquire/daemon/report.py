@@ -1,4 +1,4 @@
-"""The capture path's counters as the status shows them, with rates."""
+"""The capture path's counters in the form of the status, with rates."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 RATE_WINDOW_S = 5.0
 LOOK_EVERY_S = 0.1
 ANSWER_S = 5.0
-"""A trigger that is silent for longer does not answer: it is asked every second."""
+"""A trigger that is silent for longer does not answer: it is queried every second."""
 
 
 class Rates:
-    """Lines per second of each arm over the last seconds, and the part of them that is saturated.
+    """Lines per second of each arm over the last seconds, and the saturated share of them.
 
-    Lines come in blocks: a rate is taken from one change of the count to another, so that neither the size
+    Lines come in blocks: a rate is measured from one change of the count to another, so that neither the size
     of a block nor the moment of a look makes two arms differ.
     """
 
@@ -44,7 +44,7 @@ class Rates:
                 changes.popleft()
 
     def of(self, arm: str) -> float:
-        """0 before the second change, and where nothing came for the length of the window."""
+        """Return the rate; 0 before the second change, and if nothing came for the length of the window."""
         changes = self._changes.get(arm)
         if changes is None or len(changes) < 2:
             return 0.0
@@ -53,12 +53,12 @@ class Rates:
         quiet_s = self._looked_s - last_s
         if quiet_s >= RATE_WINDOW_S:
             return 0.0
-        # A change that is overdue lowers the rate; one that is merely not due yet must not.
+        # An overdue change lowers the rate; one that is merely not due yet must not.
         over_s = last_s - first_s + (quiet_s if quiet_s > 2 * usual_s else 0.0)
         return (last - first) / over_s
 
     def saturated_part(self, arm: str) -> float:
-        """Of the lines that came in the window, 0 to 1."""
+        """Return the saturated share of the lines in the window, 0 to 1."""
         changes = self._changes.get(arm)
         if changes is None or len(changes) < 2:
             return 0.0
@@ -67,14 +67,14 @@ class Rates:
 
 
 def trigger_status(seen: CaptureStatus) -> TriggerStatus | None:
-    """What the status says of the trigger."""
+    """Return the status of the trigger."""
     if not seen.trigger:
         return None
     return TriggerStatus.model_validate({**seen.trigger, "answers": seen.trigger["silent_s"] < ANSWER_S})
 
 
 def arm_statuses(seen: CaptureStatus, rates: Rates) -> dict[str, ArmStatus]:
-    """What the status says of each arm."""
+    """Return the status of each arm."""
     return {
         arm: ArmStatus(
             delivered=counts["delivered"],
@@ -96,6 +96,6 @@ def arm_statuses(seen: CaptureStatus, rates: Rates) -> dict[str, ArmStatus]:
 
 
 def _lost(seen: CaptureStatus, arm: str) -> dict[str, int]:
-    """The ledger's losses, once there is a ledger: it alone knows what never came."""
+    """Return the arm's losses; those of the ledger, if any, include lines that never came."""
     counted = {str(cause): lines for cause, lines in seen.lines[arm]["lost"].items()}
     return counted | (seen.accounts[arm].lost if arm in seen.accounts else {})

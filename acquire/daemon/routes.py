@@ -1,6 +1,6 @@
-"""The routes of the API, over whatever offers it: the daemon's service, or a client that passes it on.
+"""The routes of the API, over any implementation: the daemon's service, or a client that forwards to it.
 
-So a page, a script and the command line speak to the same API, whichever process answers.
+So a page, a script and the command line use the same API, whichever process answers.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ RequestId = Annotated[
         min_length=1,
         max_length=LONGEST_ID,
         pattern="^[!-~]+$",
-        description="chosen by the client, new for every command: the same again gives the same answer, and "
+        description="chosen by the client, new for every command: repeating it gives the same answer, and "
         "the command is carried out once",
     ),
 ]
@@ -48,7 +48,7 @@ NO_STORE = {"Cache-Control": "no-store"}
 
 
 class Api(Protocol):
-    """What the API offers: the daemon's own service, or a client that passes it on (`acquire.web`)."""
+    """Implementation of the API: the daemon's own service, or a client that forwards (`acquire.web`)."""
 
     async def status(self) -> Status: ...
     async def arm(self, request: ArmRequest) -> Status: ...
@@ -68,7 +68,7 @@ class Api(Protocol):
 async def _note_who(
     acquire_by: Annotated[
         str | None,
-        Header(max_length=LONGEST, pattern="^[ -~]+$", description="who asks, for the log and the recording"),
+        Header(max_length=LONGEST, pattern="^[ -~]+$", description="user, for the log and the recording"),
     ] = None,
 ) -> None:
     if acquire_by and not WHO.get():
@@ -76,7 +76,7 @@ async def _note_who(
 
 
 def routes(api: Api, answers: Answers) -> APIRouter:
-    """All that ``api`` offers; a command's request id is looked up in ``answers``."""
+    """Return the routes of ``api``; a command's request ID is looked up in ``answers``."""
     router = APIRouter(dependencies=[Depends(_note_who)])
     _add_commands(router, api, answers)
     _add_facts(router, api)
@@ -112,7 +112,7 @@ def _add_commands(router: APIRouter, api: Api, answers: Answers) -> None:
     async def measure() -> CapacityStatus:
         return await api.measure()
 
-    @router.post("/reload", summary="Read the rig file anew; refused as a whole where a key cannot change")
+    @router.post("/reload", summary="Reload the rig file; refused as a whole if a key cannot change")
     async def reload() -> Reloaded:
         return await api.reload()
 
@@ -122,15 +122,15 @@ def _add_facts(router: APIRouter, api: Api) -> None:
     async def status() -> Status:
         return await api.status()
 
-    @router.get("/health", summary="Is all well? One word, one sentence, and what they follow from")
+    @router.get("/health", summary="Is all well? One word, one sentence, and the checks behind them")
     async def health() -> Health:
         return await api.health()
 
-    @router.get("/version", summary="Who answers")
+    @router.get("/version", summary="Identity of the daemon")
     async def version() -> Version:
         return await api.version()
 
-    @router.get("/setup", summary="The resolved configuration, and where it is not the default")
+    @router.get("/setup", summary="The resolved configuration, and how it differs from the defaults")
     async def setup() -> Setup:
         return await api.setup()
 
@@ -142,7 +142,7 @@ def _add_facts(router: APIRouter, api: Api) -> None:
     async def events(
         last_event_id: Annotated[
             str | None,
-            Header(max_length=LONGEST_ID, description="of the last news heard: what came after it"),
+            Header(max_length=LONGEST_ID, description="id of the latest news received: only later ones"),
         ] = None,
         status_s: Annotated[
             float | None,
@@ -150,10 +150,10 @@ def _add_facts(router: APIRouter, api: Api) -> None:
                 ge=LEAST_STATUS_S,
                 le=MOST_STATUS_S,
                 allow_inf_nan=False,
-                description="also the status, so often and whenever something happens",
+                description="also the status, at this interval and with every news",
             ),
         ] = None,
-        history: Annotated[bool, Query(description="first all that is known, not only what comes")] = False,
+        history: Annotated[bool, Query(description="begin with all news that are kept")] = False,
     ) -> StreamingResponse:
         stream = api.events(last_event_id, status_s, history=history)
         return StreamingResponse(stream, media_type="text/event-stream", headers=NO_STORE)
@@ -163,7 +163,7 @@ def _add_facts(router: APIRouter, api: Api) -> None:
         text = metrics_text(await api.status(), await api.health())
         return Response(text, headers={"Content-Type": CONTENT_TYPE} | NO_STORE)
 
-    @router.get("/healthz", summary="200 as long as the service works; 503 with the fault where it does not")
+    @router.get("/healthz", summary="200 while the service works; 503 with the fault if it does not")
     async def healthz() -> Health:
         found = await api.health()
         if found.level == "fault":

@@ -1,4 +1,4 @@
-"""Recordings that nobody sealed: the daemon recovers them automatically, in a process of low priority.
+"""Automatic recovery of recordings that were not sealed, in a process of low priority.
 
 ::
 
@@ -6,10 +6,10 @@
     found open when the daemon started ──────────────┼▶ Salvage ─▶ process: recover, one by one ─▶ status
     an earlier daemon recorded it (`Journal`) ───────┘
 
-What another process still writes is left to it: the lock of its directory tells. So is what another machine
-wrote, what lies where there are no locks, what holds links, and what is no recording: it is named in the
-status and in the log, once, and not touched. The process ends at once when a run is armed, unless it is
-after what that run itself has left; a recovery that was cut off begins anew afterwards.
+A recording that another process still writes, as the lock of its directory shows, is left to it. Others are
+reported once, in the status and in the log, and not touched: those written by another machine, on a file
+system without locks, or with links, and anything that is no recording. The process ends at once when a run is
+armed, unless it recovers a recording of that run; an interrupted recovery is repeated afterwards.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ if TYPE_CHECKING:
     from acquire.stream import Orphan
 
 AGAIN_S = 5.0
-"""Between two looks at a recording that another process holds."""
+"""Time between two attempts at a recording that another process holds."""
 MOST_TRIES = 6
 MOST_LISTED = 32
-"""Recordings of which the status tells, the latest: more than one run can leave."""
+"""Number of latest recordings in the status: more than one run can leave."""
 MOST_ODD = 8
-"""Entries of the directory that are no recordings, of which the status tells."""
+"""Number of entries of the directory in the status that are no recordings."""
 _END_S = 5.0
 _POLL_S = 0.02
 
@@ -48,12 +48,12 @@ log = logging.getLogger("acquire.daemon")
 
 
 class Salvage:
-    """What is to be recovered, and what became of it. For one thread; only `wait` and `close` wait.
+    """Recordings to be recovered, and the results. For one thread; only `wait` and `close` wait.
 
     Parameters
     ----------
-    directory : searched for recordings that were left open, once `search` is called
-    journal : file that names what is being recorded, wherever that is
+    directory : directory in which `search` looks for recordings that were left open
+    journal : file that lists what is being recorded, wherever that is
     """
 
     def __init__(self, directory: Path, journal: Path | None = None) -> None:
@@ -68,55 +68,55 @@ class Salvage:
 
     @property
     def recoveries(self) -> list[RecoveryStatus]:
-        """The latest; for the status."""
+        """The latest recoveries, for the status."""
         return list(self._found.values())
 
     def search(self) -> None:
-        """Look for recordings that a killed daemon has left; `poll` will find them."""
+        """Start a search for recordings that a killed daemon has left; `poll` takes its result."""
         self._not_sealed = dict.fromkeys(self._journal.read())
-        # In a thread: a directory of thousands, or on a slow disk, does not keep the daemon from beginning.
+        # In a thread: a directory of thousands, or on a slow disk, must not delay the daemon's start.
         thread = ThreadPoolExecutor(1, "salvage")
         self._searching = thread.submit(search, self._directory, list(self._not_sealed))
         thread.shutdown(wait=False)
 
     def began(self, path: Path) -> None:
-        """A run records there; the next daemon has to know, should this one be killed."""
+        """Note that a run records there, for the next daemon, should this one be killed."""
         if path not in self._not_sealed:
             self._not_sealed[path] = None
             self._journal.write(self._not_sealed)
 
     def ended(self, path: Path) -> None:
-        """It is sealed; or it is among the orphans, and not forgotten yet."""
+        """Note that the recording is sealed. If it is an orphan, it stays in the journal."""
         if path not in self._tasks and path in self._not_sealed:
             del self._not_sealed[path]
             self._journal.write(self._not_sealed)
 
     def add(self, orphans: Iterable[Orphan]) -> None:
-        """Recover what a run has left; what is known already is passed over."""
+        """Recover a run's orphans, except those known already."""
         for orphan in orphans:
-            found = self._tasks.get(orphan.path)  # the search may have met it while it was being written
+            found = self._tasks.get(orphan.path)  # the search may have found it while it was being written
             if orphan.path not in self._found or (found is not None and not found.ours):
                 log.warning("%s was not sealed: %s", orphan.path, orphan.why)
-                told = tuple((note.line, note.kind, note.text) for note in orphan.told)
-                self._queue(Task(orphan.path, orphan.why, True, orphan.committed_lines, told=told))
+                notes = tuple((note.line, note.kind, note.text) for note in orphan.notes)
+                self._queue(Task(orphan.path, orphan.why, True, orphan.committed_lines, notes=notes))
 
     def poll(self, *, capturing: bool = False) -> list[RecoveryStatus]:
-        """Hear what is done, begin what is next; what came to an end since the last look.
+        """Take results, begin the next recovery, and return those that ended since the last call.
 
-        While ``capturing``, only what the run itself has left is recovered.
+        While ``capturing``, only the run's own recordings are recovered.
         """
         if self._searching is not None and self._searching.done():
-            searching, self._searching = self._searching, None  # taken once, whatever comes of it
+            searching, self._searching = self._searching, None  # taken once, even if it failed
             self._take_search(searching)
-        ended = self._hear()
+        ended = self._take_result()
         if capturing and self._under_way is not None and not self._under_way.ours:
-            self._stand_back()
+            self._cut_off()
         if self._worker is None:
             ended += self._begin(capturing=capturing)
         return ended
 
     def wait(self, timeout_s: float) -> list[RecoveryStatus]:
-        """Until what this daemon's runs have left is recovered, or the time is up; what came to an end."""
+        """Wait until the recordings of this daemon's runs are recovered, or the time is up; return these."""
         deadline = time.monotonic() + timeout_s
         ended: list[RecoveryStatus] = []
         while any(task.ours and not task.tries for task in self._tasks.values()):
@@ -128,15 +128,15 @@ class Salvage:
         return ended
 
     def close(self) -> None:
-        """End what is under way; a daemon that comes later finds it. Idempotent."""
-        self._stand_back()
+        """End the current recovery; a later daemon will find the recording. Idempotent."""
+        self._cut_off()
         self._tasks.clear()
 
     def _queue(self, task: Task) -> None:
         self._tasks[task.path] = task
-        self._tell(RecoveryStatus(path=task.path, state="waiting", text=task.why))
+        self._list(RecoveryStatus(path=task.path, state="waiting", text=task.why))
 
-    def _tell(self, status: RecoveryStatus) -> None:
+    def _list(self, status: RecoveryStatus) -> None:
         self._found.pop(status.path, None)  # the latest come last
         self._found[status.path] = status
         while len(self._found) > MOST_LISTED:
@@ -151,7 +151,7 @@ class Salvage:
         for one in found.odd[:MOST_ODD]:
             log.warning("%s %s: %s", one.path, one.state, one.text)
             if one.path not in self._found:
-                self._tell(one)
+                self._list(one)
         if len(found.odd) > MOST_ODD:
             log.warning("%d more like these in %s", len(found.odd) - MOST_ODD, self._directory)
         for path in found.open:
@@ -162,7 +162,7 @@ class Salvage:
             self.ended(path)
 
     def _begin(self, *, capturing: bool) -> list[RecoveryStatus]:
-        """The next that nobody holds, our own first; those that are held come later, and end some time."""
+        """Begin the next recovery that is possible, of this daemon's runs first; return those that ended."""
         now_s = time.monotonic()
         able = [
             task
@@ -174,7 +174,7 @@ class Salvage:
             hindered = hindrance(task) or self._spawn(task)
             if hindered is None:
                 break
-            ended += self._heed(task, hindered)
+            ended += self._settle(task, hindered)
         return ended
 
     def _spawn(self, task: Task) -> RecoveryStatus | None:
@@ -185,44 +185,46 @@ class Salvage:
         self._under_way = task
         return None
 
-    def _hear(self) -> list[RecoveryStatus]:
+    def _take_result(self) -> list[RecoveryStatus]:
         worker, task = self._worker, self._under_way
         if worker is None or task is None:
             return []
-        death = worker.death  # asked first: what a process said last is still in its pipe then
-        said = worker.message()
-        if said is None and death is None:
+        death = worker.death  # read first, so that the last message of a dead process is seen
+        message = worker.message()
+        if message is None and death is None:
             return []
         self._worker = self._under_way = None
         _end(worker, _END_S)
-        if not isinstance(said, RecoveryStatus):
-            why = said.error if isinstance(said, Failed) else death
-            said = RecoveryStatus(path=task.path, state="failed", text=f"the recovering process: {why}")
-        return self._heed(task, said)
+        if isinstance(message, RecoveryStatus):
+            return self._settle(task, message)
+        why = message.error if isinstance(message, Failed) else death
+        text = f"the recovering process: {why}"
+        return self._settle(task, RecoveryStatus(path=task.path, state="failed", text=text))
 
-    def _heed(self, task: Task, said: RecoveryStatus) -> list[RecoveryStatus]:
+    def _settle(self, task: Task, status: RecoveryStatus) -> list[RecoveryStatus]:
+        """Put a waiting recording off, or return its final status."""
         del self._tasks[task.path]
-        self._tell(said)
-        if said.state == "waiting" and task.tries + 1 < MOST_TRIES:
+        self._list(status)
+        if status.state == "waiting" and task.tries + 1 < MOST_TRIES:
             later = time.monotonic() + AGAIN_S
             self._tasks[task.path] = replace(task, tries=task.tries + 1, not_before_s=later)
             return []
-        if said.state == "waiting":
-            said = said.model_copy(update={"state": "left"})
-            self._tell(said)
-        if said.state == "recovered" or (said.state == "gone" and not task.committed_lines):
-            self.ended(said.path)
-        level = logging.INFO if said.state == "recovered" else logging.WARNING
-        log.log(level, "%s %s: %s", said.path, said.state, said.text.removeprefix(RECOVERED))
-        return [said]
+        if status.state == "waiting":
+            status = status.model_copy(update={"state": "left"})
+            self._list(status)
+        if status.state == "recovered" or (status.state == "gone" and not task.committed_lines):
+            self.ended(status.path)
+        level = logging.INFO if status.state == "recovered" else logging.WARNING
+        log.log(level, "%s %s: %s", status.path, status.state, status.text.removeprefix(RECOVERED))
+        return [status]
 
-    def _stand_back(self) -> None:
+    def _cut_off(self) -> None:
         worker, self._worker, self._under_way = self._worker, None, None
         if worker is not None:
             _end(worker, 0.0)
 
 
 def _end(worker: Worker, within_s: float) -> None:
-    """By force after a while, which costs nothing: what was cut off begins anew."""
+    """End the process, by force after a while, which does no harm: an interrupted recovery is repeated."""
     with contextlib.suppress(DeviceError):
         worker.end(time.monotonic() + within_s)

@@ -1,8 +1,8 @@
-"""The daemon's process: socket, signals, supervision, and the order in which all of it ends.
+"""The daemon's process: socket, signals, supervision, and the order in which everything ends.
 
-The event loop answers requests; one thread owns the devices, so that commands and supervision come one
-after the other and a slow device never keeps the status from being answered. A signal always ends the
-process: in order where that is possible, by force where a thread hangs (`acquire.daemon.ending`).
+The event loop answers requests; one thread owns the devices, so that commands and supervision run one after
+the other and a slow device never delays the status. A signal always ends the process: in order if possible,
+by force if a thread hangs (`acquire.daemon.ending`).
 """
 
 from __future__ import annotations
@@ -47,33 +47,32 @@ if TYPE_CHECKING:
     from acquire.config import RigConfig
 
 SUPERVISE_S = 0.2
-"""Time between two looks at the capture path."""
+"""Time between two checks of the capture path."""
 DRAIN_S = 0.05
-"""The same while somebody waits for a recording to be sealed."""
+"""The same while a recording is being sealed."""
 COMMAND_S = 60.0
-"""For the command that is under way when the daemon is told to end, such as `arm` on a busy host."""
+"""Time for the current command when the daemon gets a signal to end, such as `arm` on a busy host."""
 WATCHDOG_S = 0.5
-"""Between two words to systemd: `WatchdogSec` has to be a few of these."""
+"""Time between two watchdog messages to systemd: `WatchdogSec` has to be several times as long."""
 MOST_WAITING = 8
-"""Commands that wait for the one under way; each holds a connection."""
+"""Number of commands that may wait for the current one; each holds a connection."""
 
 log = logging.getLogger("acquire.daemon")
 T = TypeVar("T")
 
 
 def serve(config: RigConfig, origin: str = "", reread: Callable[[], RigConfig] | None = None) -> int:
-    """Own the devices of ``config``, read from the file ``origin``, until a signal; the exit code.
+    """Own the devices of ``config``, read from the file ``origin``, until a signal; return the exit code.
 
-    ``reread`` gives the configuration as the file has it by now. Raises StateError where another daemon has
-    the socket, before any device is touched.
+    ``reread`` reads the configuration again. Raises StateError if another daemon has the socket, before any
+    device is touched.
     """
     raise_descriptor_limit()
     troubles = Troubles()
     threading.excepthook = troubles.in_thread
     with contextlib.closing(Endpoint(config.control.socket.absolute())) as endpoint, Rig(config) as rig:
-        warm_up(
-            *worker_modules(rig)
-        )  # first: it imports while the rest begins, and the first arm finds it warm
+        # First: it imports modules while the rest begins, so that the first `arm` need not wait for it.
+        warm_up(*worker_modules(rig))
         salvage = Salvage(config.recording.directory.absolute(), _journal(config, "recordings"))
         salvage.search()
         uploads = Uploads(config.recording.upload_to, _journal(config, "uploads"))
@@ -98,7 +97,7 @@ def serve(config: RigConfig, origin: str = "", reread: Callable[[], RigConfig] |
 
 
 def has_terminal() -> bool:
-    """Whether a terminal is this process's: when that is closed, SIGHUP means the end."""
+    """Return whether this process has a controlling terminal, and so SIGHUP means that it was closed."""
     try:
         os.close(os.open("/dev/tty", os.O_RDWR | os.O_NOCTTY))
     except OSError:
@@ -107,7 +106,7 @@ def has_terminal() -> bool:
 
 
 def _journal(config: RigConfig, what: str) -> Path:
-    """The file that says which recordings are not copied, or not sealed yet."""
+    """Return the file that lists recordings that are not copied, or not sealed, yet."""
     return config.recording.directory.absolute() / f".{what}-{config.name}.json"
 
 
@@ -137,14 +136,14 @@ class Daemon:
         self._server = ApiServer(build_app(self._api), endpoint.socket)
 
     async def run(self) -> int:
-        """Serve until a signal; the exit code."""
+        """Serve until a signal; return the exit code."""
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             loop.add_signal_handler(number, self._on_signal, number)
         loop.set_exception_handler(self._troubles.in_loop)
         serving = asyncio.create_task(self._server.answer())
-        # READY=1 only once requests are answered: a daemon that has told systemd that it is ready, and then
-        # cannot load what it needs, would never be restarted.
+        # READY=1 only once requests are answered: a daemon that reports it to systemd, and then cannot load
+        # its modules, would never be restarted.
         if await self._is_answering(serving):
             log.info("listening on %s (process %d)", self._endpoint.path, os.getpid())
             notify("READY=1")
@@ -160,7 +159,7 @@ class Daemon:
         return self._exit_code
 
     async def _is_answering(self, serving: asyncio.Task[None]) -> bool:
-        """Wait until requests are answered; False where that has failed, and `serving` says why."""
+        """Wait until requests are answered; return False if that failed: `serving` then has the error."""
         answering = asyncio.create_task(self._server.answering.wait())
         await asyncio.wait((serving, answering), return_when=asyncio.FIRST_COMPLETED)
         answering.cancel()
@@ -171,16 +170,16 @@ class Daemon:
             try:
                 if self._page is not None:
                     self._page.poll(self._service.config)
-                nursery()  # another one, where it has died: the next run must find it warm
+                nursery()  # restarts it if it has died: the next run must not wait for its imports
                 await self._in_device_thread(self._service.supervise)
-            except Exception as error:  # noqa: BLE001 - a defect in one look must not end the service
+            except Exception as error:  # noqa: BLE001 - a defect in one step must not end the service
                 self._troubles.note("supervision", error)
             draining = self._service.status().state is State.DRAINING
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(self._ending.wait(), DRAIN_S if draining else SUPERVISE_S)
 
     async def _feed_watchdog(self) -> None:
-        """Tell systemd that all is well: while nothing is under way, or what is under way goes on."""
+        """Send watchdog messages to systemd, while there is no command, or the current one makes progress."""
         while True:
             begun_s = self._begun_s
             moved_s = max(begun_s or 0.0, self._service.moved_s)
@@ -206,7 +205,7 @@ class Daemon:
         log.info("ended")
 
     async def _wait_for_the_disk(self) -> None:
-        """Grant a recording that is being sealed more time, as long as more of it reaches the disk."""
+        """Grant a recording that is being sealed more time, as long as it makes progress on disk."""
         known = None
         while not self._service.hurried:
             now = self._service.status().recording
@@ -238,7 +237,7 @@ class Daemon:
 
     async def _reload(self) -> None:
         WHO.set(signal.SIGHUP.name)
-        with contextlib.suppress(AcquireError):  # it is in the log, and among the news
+        with contextlib.suppress(AcquireError):  # reported in the log and the news
             await self._api.reload()
 
     def _on_signal(self, number: signal.Signals) -> None:

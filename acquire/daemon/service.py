@@ -1,4 +1,4 @@
-"""The capture service: carries the commands out, watches the capture path, and says what it sees.
+"""The capture service: carries out commands, supervises the capture path, and publishes its status.
 
 One thread calls everything here except `Service.status` and `Service.hurry`, which any thread may call:
 the device thread publishes an immutable `Status` after every change, and others read the latest.
@@ -40,17 +40,17 @@ if TYPE_CHECKING:
     from acquire.stream.ring import RingShape
 
 RECOVERY_S = 20.0
-"""How long the end of a recording waits for parts of it that are being recovered; they are in any case."""
+"""How long the end of a recording waits for parts that are being recovered, which continues in any case."""
 POLL_S = 0.05
 ARM = ArmRequest()
-TOLD = ("mark", "input", "threshold")
-"""Kinds of events that are news; what the check of the code notes is told by its verdict."""
+NEWSWORTHY = ("mark", "input", "threshold")
+"""Kinds of events that become news; those of the code check do not, since its verdict does."""
 
 log = logging.getLogger("acquire.daemon")
 
 
 class Service:
-    """One instrument, at most one run at a time. See the module for who may call what."""
+    """One instrument, at most one run at a time. See the module for threads."""
 
     def __init__(
         self,
@@ -85,25 +85,25 @@ class Service:
         self._take: Take | None = None
         self._last: LastRecording | None = None
         self._fault: str | None = None
-        self._told: tuple[State, str | None] = self._state, None
+        self._published: tuple[State, str | None] = self._state, None
         self._publish()
 
     # ---- any thread
 
     def status(self) -> Status:
-        """What was published last; never waits."""
+        """Return the latest published status; never waits."""
         uptime_s = round(time.monotonic() - self._born, 3)
-        told = {"uptime_s": uptime_s, "troubles": self.troubles.statuses, "disk": self._disk.status}
-        return self._status.model_copy(update=told)
+        update = {"uptime_s": uptime_s, "troubles": self.troubles.statuses, "disk": self._disk.status}
+        return self._status.model_copy(update=update)
 
     def ring_places(self) -> tuple[str | None, dict[str, tuple[str, RingShape]]]:
-        """The run, and arm → path and shape of the memory through which its lines pass."""
+        """Return the run's ID, and per arm the path and shape of its ring's memory."""
         run = self._run
         return (None, {}) if run is None else (run.run_id, run.capture.ring_places())
 
     @property
     def patience_s(self) -> float:
-        """Longest step of a command, or time in which nothing more of a recording reaches the disk."""
+        """Longest time for a step of a command, or without progress of a recording on disk."""
         return max(self.config.recording.seal_timeout_s + RECOVERY_S, self.config.stream.arm_timeout_s)
 
     @property
@@ -111,22 +111,25 @@ class Service:
         return self._hurried.is_set()
 
     def hurry(self) -> None:
-        """Do not wait for lines on the way any more: seal what there is."""
+        """Do not wait any more for lines on their way: seal the recording as it is."""
         self._hurried.set()
 
     # ---- commands
 
     def arm(self, request: ArmRequest = ARM) -> None:
-        """idle → armed. Raises what the devices refuse with, and UsageError where the host is too slow for
-        them, or where recordings are to be copied is refused, and that is not forced; the state is idle then.
+        """idle → armed.
+
+        Raises the devices' errors, and, unless forced, UsageError if the host is too slow or the store for
+        uploads refuses; the state is idle then.
         """
         with self._doing(Event.ARM):
-            self._recovered(self._salvage.poll(capturing=True))  # what is under way would be measured, too
+            # First end a recovery, which would disturb the measurement.
+            self._recovered(self._salvage.poll(capturing=True))
             self._uploads.prove(force=request.force)
             if self._prove is not None:
-                self._capacity = self._prove(force=request.force, tell=self._tell)
+                self._capacity = self._prove(force=request.force, tell=self._show)
             run = self._open_run(request)
-            run.arm(self._tell)
+            run.arm(self._show)
             self._run, self._seen, self._rates = run, CaptureStatus(), Rates()
             self.armed_since = datetime.now(UTC)
             self._order = StandingOrder(self.config)
@@ -136,21 +139,23 @@ class Service:
             self.supervise()
 
     def start(self, request: StartRequest) -> None:
-        """armed → recording. Raises UsageError for a path that cannot be; the state is armed then."""
+        """armed → recording. Raises UsageError for an impossible path; the state is armed then."""
         with self._doing(Event.START):
             assert self._run is not None
             self._begin(recording_of(request, self.config, self._run.spec()))
             self.supervise()
 
     def mark(self, text: str) -> None:
-        """An event at the newest line; the state changes where it starts a recording."""
+        """Add an event at the newest line; the state changes if the event starts a recording."""
         with self._doing(Event.MARK):
             assert self._run is not None
-            self._heed(Note(self._run.capture.note("mark", text), "mark", text))
+            self._handle_event(Note(self._run.capture.note("mark", text), "mark", text))
 
     def stop(self) -> None:
-        """recording → draining. What is on the way is written and sealed while `supervise` looks after it:
-        marks can be taken meanwhile.
+        """recording → draining.
+
+        `supervise` then follows the recording until its last lines are written and it is sealed; marks are
+        possible in the meantime.
         """
         with self._doing(Event.STOP):
             self._stop("stopped")
@@ -166,13 +171,13 @@ class Service:
                 self._go(Event.DISARM)
 
     def sign(self, command: str, who: str) -> None:
-        """Write down who gave a command: in the log, and among the events of the recording under way."""
+        """Record who gave a command, in the log and among the events of the current recording."""
         log.info("%s by %s", command, who)
         if self._run is not None and self._state in (State.RECORDING, State.DRAINING):
             self._run.capture.note("operator", f"{command} by {who}")
 
     def measure(self) -> None:
-        """What the host sustains, anew; nothing may be armed, since that would be measured, too."""
+        """Measure again what the host sustains; only while idle, since a run would disturb it."""
         if self._state is not State.IDLE:
             raise StateError(f"cannot measure while {self._state}", possible=possible(self._state))
         if self._prove is None:
@@ -180,60 +185,57 @@ class Service:
         self._busy = "capacity"
         self._publish()
         try:
-            self._capacity = self._prove(force=True, anew=True, tell=self._tell)
+            self._capacity = self._prove(force=True, fresh=True, tell=self._show)
         finally:
             self._busy = None
             self._publish()
 
-    def reconfigure(self, config: RigConfig, told: str) -> None:
-        """Work with ``config`` from now on; it differs where that does no harm (`acquire.daemon.reload`).
+    def reconfigure(self, config: RigConfig, text: str) -> None:
+        """Use ``config`` from now on, of which only permitted keys differ (`acquire.daemon.reload`).
 
-        ``told``: who has changed what, for the recording under way.
+        ``text`` describes the changes, and is added to the events of the current recording.
         """
         self.config = config
         self._disk.keep(round(config.recording.reserve_gb * 1e9))
         if self._run is not None:
             self._run.adopt(config.recording)
             if self._state in (State.RECORDING, State.DRAINING):
-                self._run.capture.note("operator", told)
+                self._run.capture.note("operator", text)
         self._publish()
 
     # ---- supervision
 
     def supervise(self) -> None:
-        """Look at the capture path once and act on what is seen. Any failure of it becomes a fault.
+        """Check the capture path once and act on the result. Any failure of it becomes a fault.
 
-        What happens beside it, a defect there included, must not keep the capture path from being watched.
+        Everything else, even a defect there, must not keep the capture path from being supervised.
         """
-        for name, look in (("recoveries", self._look_at_salvage), ("uploads", self._look_at_uploads)):
-            try:
-                look()
-            except Exception as error:  # noqa: BLE001 - told in the status; the capture comes first
-                self.troubles.note(name, error)
+        try:
+            self._recovered(self._salvage.poll(capturing=self._run is not None))
+        except Exception as error:  # noqa: BLE001 - shown in the status; the capture comes first
+            self.troubles.note("recoveries", error)
+        try:
+            self._uploads.poll()
+            published = self._status.uploads, self._status.upload_warning
+            if (self._uploads.statuses, self._uploads.warning) != published:
+                self._publish()
+        except Exception as error:  # noqa: BLE001 - as above
+            self.troubles.note("uploads", error)
         self._disk.check(recording=self._state is State.RECORDING)
         self.news.update(self.status())
         if self._run is None:
             return
         try:
-            self._look()
+            self._step()
         except (AcquireError, OSError) as error:
             self._fail(self._with_cause(str(error)))
-        except Exception as error:  # noqa: BLE001 - nobody would watch the devices otherwise
+        except Exception as error:  # noqa: BLE001 - otherwise the devices would be left unsupervised
             self.troubles.note("watching the capture", error)
             self._fail(self._with_cause(f"defect in the daemon: {error!r}"))
         self._publish()
 
-    def _look_at_salvage(self) -> None:
-        self._recovered(self._salvage.poll(capturing=self._run is not None))
-
-    def _look_at_uploads(self) -> None:
-        self._uploads.poll()
-        told = self._status.uploads, self._status.upload_warning
-        if (self._uploads.statuses, self._uploads.warning) != told:
-            self._publish()
-
     def shutdown(self) -> None:
-        """Whatever the state: seal, release. Bounded in time; raises only what closing a run raises."""
+        """Seal and release, whatever the state. Bounded in time; raises only errors of closing a run."""
         try:
             if self._state is State.RECORDING:
                 self._stop("signal")
@@ -244,7 +246,7 @@ class Service:
             if self._state is State.ARMED:
                 self.disarm()
         except (AcquireError, OSError) as error:
-            log.error("while ending: %s", error)  # noqa: TRY400 - users get no traceback
+            log.error("while ending: %s", error)  # noqa: TRY400 - no traceback for users
         finally:
             try:
                 self._release()
@@ -255,11 +257,11 @@ class Service:
                 self._disk.close()
 
     def _idles(self, take: Take) -> bool:
-        """Nothing more of the recording has reached the disk for as long as is allowed."""
+        """Return whether the recording has made no progress for longer than allowed."""
         return take.idle_s(self._seen) > self.config.recording.seal_timeout_s
 
     def _waits_too_long(self) -> bool:
-        """A disk that does not answer must not keep the daemon from ending; the next one recovers."""
+        """Return whether the disk keeps the daemon from ending; the next daemon recovers the recording."""
         return self._take is not None and bool(self._seen.waiting) and self._idles(self._take)
 
     def _stop(self, reason: str) -> None:
@@ -267,15 +269,15 @@ class Service:
         self._run.capture.stop(reason)
         self._go(Event.STOP, reason)
 
-    def _look(self) -> None:
-        """One step of the state table, as the capture path dictates it."""
+    def _step(self) -> None:
+        """Make one step of the state machine, according to the capture path."""
         seen = self._poll()
         if seen.fault is not None:
             self._fail(seen.fault)
             return
         assert self._run is not None
         for note in self._run.capture.take_events():
-            self._heed_unasked(note)
+            self._try_event(note)
         if self._state is State.RECORDING and (seen.draining or seen.done):
             self._go(Event.FULL)
         if self._state is not State.DRAINING:
@@ -283,7 +285,7 @@ class Service:
         assert self._take is not None
         if seen.done or self.hurried:
             self._finish(self._take)
-        elif self._idles(self._take) and not seen.waiting:  # a disk may take its time
+        elif self._idles(self._take) and not seen.waiting:  # a slow disk is waited for
             limit_s = self.config.recording.seal_timeout_s
             self._fail(f"the recording was not sealed: nothing more of it reached the disk for {limit_s:g} s")
 
@@ -295,7 +297,7 @@ class Service:
         elif before.waiting and not self._seen.waiting:
             log.warning("over: %s", before.waiting)
         if self._seen.recording and before.recording and before.path != self._seen.path:
-            log.warning("%s goes on in %s", before.path, self._seen.path)
+            log.warning("%s continues in %s", before.path, self._seen.path)
         self._salvage.add(self._seen.orphans)
         if self._seen.path is not None:
             if self._take is not None:
@@ -306,7 +308,7 @@ class Service:
 
     def _begin(self, begin: Begin, *, by_event: bool = False) -> None:
         assert self._run is not None
-        # Before anything is written down of it: a start that is refused leaves no trace.
+        # First, so that a refused start leaves no trace in the journals.
         self._run.capture.start(begin)
         path, lines = begin.path, begin.budget_lines
         self._salvage.began(path)
@@ -315,19 +317,19 @@ class Service:
         self._take = Take(path, lines, by_event)
         self._go(Event.START, f"{path}, {'until stopped' if lines is None else f'{lines} lines'}")
 
-    def _heed_unasked(self, note: Note) -> None:
-        """A disk that does not create a recording must not end the watch for the next event."""
+    def _try_event(self, note: Note) -> None:
+        """Handle an event; if its recording cannot be created, the next event is still waited for."""
         try:
-            self._heed(note)
+            self._handle_event(note)
         except AcquireError as error:
             self.troubles.note(f"event {note.kind} at line {note.line}", error)
 
-    def _heed(self, note: Note) -> None:
-        """Do at an event what the rig asks for."""
+    def _handle_event(self, note: Note) -> None:
+        """Carry out the rig's action for an event."""
         assert self._run is not None
         log.info("event: %s at line %d%s", note.kind, note.line, f": {note.text}" if note.text else "")
-        if note.kind in TOLD:
-            self.news.tell(note.kind, note.text or note.kind, line=note.line)
+        if note.kind in NEWSWORTHY:
+            self.news.add(note.kind, note.text or note.kind, line=note.line)
         if not self._order.covers(note):
             return
         take = self._take
@@ -343,7 +345,7 @@ class Service:
             take.late = note
 
     def _finish(self, take: Take) -> None:
-        """The recording is over: stay armed for the next, or release the devices."""
+        """Finish a recording that is over: stay armed for the next, or release the devices."""
         aborted = self._seen.condition is RunCondition.ABORTED
         stays = self.config.recording.after == "armed" or (take.by_event and self._order.rearm)
         stays = stays and self._seen.done and not aborted and not self.hurried
@@ -358,12 +360,12 @@ class Service:
         last = self._last
         why = f"{last.path}, {last.lines} lines, {last.condition}, {last.end_reason}" if last else ""
         self._go(Event.SEALED if stays else Event.RELEASED, why)
-        # An event that came while its predecessor's recording was being sealed was put off, not forgotten.
+        # An event that came while the recording of its predecessor was being sealed was postponed.
         if stays and take.late is not None:
-            self._heed_unasked(take.late)
+            self._try_event(take.late)
 
     def _with_cause(self, trouble: str) -> str:
-        """What went wrong while ending often follows from what ended it: that comes first."""
+        """Return the text of a failure, after its probable cause: the reason why the recording ended."""
         seen, cause = self._seen, self._seen.fault
         ending = self._state in (State.RECORDING, State.DRAINING)
         if cause is None and ending and seen.condition is not RunCondition.GOOD:
@@ -371,7 +373,7 @@ class Service:
         return f"{cause}; then, while ending: {trouble}" if cause else trouble
 
     def _fail(self, text: str) -> None:
-        """Tell the fault at once, release the devices, then wait to be read."""
+        """Publish the fault at once, release the devices, and wait until it is read."""
         self._fault = text
         self._publish()
         try:
@@ -381,10 +383,10 @@ class Service:
         self._go(Event.FAULT, self._fault)
 
     def _release(self) -> None:
-        """Close the run and remember its recording. Raises what closing raises, OSError as DeviceError."""
+        """Close the run and remember its recording. Raises errors of closing it, OSError as DeviceError."""
         if self._run is None:
             return
-        # Forgotten first: whatever closing comes to, it is not tried a second time.
+        # Cleared first, so that a run that cannot be closed is not closed a second time.
         run, self._run = self._run, None
         try:
             run.capture.close()
@@ -393,7 +395,7 @@ class Service:
         finally:
             self._seen, self._rates = run.capture.poll(), Rates()
             self._salvage.add(self._seen.orphans)
-            # Nothing can be done about it any more, and nobody may find out a year later.
+            # Nothing can be done about it any more, but it must not be discovered only a year later.
             for arm, account in self._seen.accounts.items():
                 if not account.balanced:
                     log.error("the ledger of arm %s does not balance: %s", arm, account)
@@ -407,7 +409,7 @@ class Service:
                 self._salvage.ended(self._last.path)
 
     def _recovered(self, found: list[RecoveryStatus]) -> None:
-        """The latest recording may have been among what its recorder did not seal."""
+        """Take the results of recoveries, one of which may be of the latest recording."""
         for one in found:
             if one.state == "recovered":
                 self._uploads.recovered(one.path)
@@ -421,9 +423,9 @@ class Service:
 
     @contextlib.contextmanager
     def _doing(self, command: Event) -> Iterator[None]:
-        """Refuse what the state does not allow, before anything is touched; say what is under way.
+        """Refuse a command that the state does not allow, before any change; else mark it busy.
 
-        A command that ends in a fault raises it.
+        Raises the fault if the command ends in one.
         """
         after(self._state, command)
         self._busy = command
@@ -433,14 +435,14 @@ class Service:
             if self._state is State.FAULTED:
                 raise fault_error(self._fault)
         except AcquireError as error:
-            log.error("%s: %s", command, error)  # noqa: TRY400
+            log.error("%s: %s", command, error)  # noqa: TRY400 - no traceback for users
             raise
         finally:
             self._busy = None
             self._publish()
 
-    def _tell(self, what: str) -> None:
-        """What the command under way is waiting for; for the status."""
+    def _show(self, what: str) -> None:
+        """Show in the status what the current command is waiting for."""
         self._busy = f"{(self._busy or '').split(':')[0]}: {what}"
         self._publish()
 
@@ -452,7 +454,7 @@ class Service:
         path = self._take.path if self._take else self._last.path if self._last else None
         news = f"{event}: {why}" if why else str(event)
         importance = "error" if event is Event.FAULT else "info"
-        self.news.tell("state", news, self._state, level=importance, path=path)
+        self.news.add("state", news, self._state, level=importance, path=path)
         self._publish()
 
     def _publish(self) -> None:
@@ -482,6 +484,6 @@ class Service:
             upload_warning=self._uploads.warning,
         )
         self.news.update(self.status())
-        told, self._told = self._told, (self._state, self._busy)
-        if told != self._told:
+        before, self._published = self._published, (self._state, self._busy)
+        if before != self._published:
             self.news.wake()

@@ -1,4 +1,4 @@
-"""What the daemon is set up with: configuration, versions, the place of its rings."""
+"""The daemon's setup: configuration, versions, the places of its rings."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def version_of(config: RigConfig) -> Version:
 
 
 def setup_of(config: RigConfig, origin: str) -> Setup:
-    """All of it, read from the file ``origin``: a rig file holds no secrets (`acquire.config.recording`)."""
+    """Return the whole setup, read from the file ``origin``; it holds no secrets (`config.recording`)."""
     rate_hz = config.line_rate_hz
     return Setup(
         name=config.name,
@@ -53,14 +53,14 @@ def setup_of(config: RigConfig, origin: str) -> Setup:
 
 
 def rings_of(service: Service) -> Rings:
-    """Empty while nothing is armed."""
+    """Return the places of the rings; empty while nothing is armed."""
     run_id, places = service.ring_places()
     arms = {arm: RingPlace(path=path, **asdict(shape)) for arm, (path, shape) in places.items()}
     return Rings(run_id=run_id, arms=arms)
 
 
 def _changed(model: BaseModel, prefix: str = "") -> list[tuple[str, Any]]:
-    """Dotted keys that a file or an option has set to something else than the default."""
+    """Return the dotted keys that differ from the default, with their values."""
     found: list[tuple[str, Any]] = []
     dumped = model.model_dump(mode="json")
     for name, field in type(model).model_fields.items():

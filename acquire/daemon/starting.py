@@ -1,4 +1,4 @@
-"""Whether a daemon of this user is only starting: its interpreter runs, and its socket is still to come."""
+"""Detects a daemon of this user that is starting: its interpreter runs, and its socket is still to come."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from pathlib import Path
 from acquire.cores import process_age_s
 
 LONGEST_S = 60.0
-"""A daemon that is older than this does not start any more."""
+"""A daemon older than this is not starting any more."""
 ACCEPTS = "00010000"
-"""Of the flags in ``/proc/net/unix``: the socket is listening."""
+"""Flags in ``/proc/net/unix`` of a listening socket."""
 
 
 def is_one_starting(socket: Path) -> bool:
-    """Some ``acquire serve`` has just been started that may listen on ``socket``."""
+    """Return whether an ``acquire serve`` has just been started that may listen on ``socket``."""
     return any(may_listen(process, socket) for process in Path("/proc").iterdir() if process.name.isdigit())
 
 
 def may_listen(process: Path, socket: Path) -> bool:
-    """The process, in ``/proc``, is a daemon of this user that was just started, perhaps for this socket."""
+    """Return whether the process, in ``/proc``, is a starting daemon of this user, maybe for this socket."""
     try:
         if process.stat().st_uid != os.geteuid():
             return False
@@ -31,11 +31,11 @@ def may_listen(process: Path, socket: Path) -> bool:
         may_be = given is None or Path(given).name == socket.name
         return may_be and process_age_s(process) < LONGEST_S and not _listens(process)
     except (OSError, ValueError):
-        return False  # it has ended meanwhile
+        return False  # it has ended in the meantime
 
 
 def _socket_of(words: list[str], environment: bytes) -> str | None:
-    """The socket that the process was told to listen on; None: its configuration says so."""
+    """Return the socket given to the process by option or environment; None: by its configuration."""
     for word, following in zip(words, [*words[1:], ""], strict=True):
         if word == "--socket":
             return following
@@ -48,11 +48,11 @@ def _socket_of(words: list[str], environment: bytes) -> str | None:
 
 
 def _listens(process: Path) -> bool:
-    """The process has a Unix socket that it accepts connections on: it listens, somewhere else."""
+    """Return whether the process listens on a Unix socket already, which must be another one."""
     rows = [row.split() for row in (process / "net" / "unix").read_text(errors="replace").splitlines()[1:]]
     accepting = {f"socket:[{row[6]}]" for row in rows if row[3] == ACCEPTS and len(row) > 7}
     for descriptor in (process / "fd").iterdir():
-        with suppress(FileNotFoundError):  # who is starting opens and closes files all the time
+        with suppress(FileNotFoundError):  # a starting process opens and closes files all the time
             if str(descriptor.readlink()) in accepting:
                 return True
     return False

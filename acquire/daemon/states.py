@@ -1,4 +1,4 @@
-"""What the daemon may do next: a table of (state, event) → state.
+"""The daemon's state machine: a table of (state, event) → state.
 
 ::
 
@@ -12,10 +12,10 @@
          │               ▼                    ▼                      │
          └── DISARM ── faulted ◀─────────────────────────────────────┘
 
-ARM, START, MARK (armed, recording or draining, which it stays), STOP and DISARM are commands. The others come
-from the capture path: FULL (the line budget is recorded), SEALED (the recording is closed, the instrument
-stays armed for the next), RELEASED (it is closed, and the devices are released, as the rig or a signal asks)
-and FAULT. What is not drawn is refused.
+ARM, START, MARK (while armed, recording or draining, without a change of state), STOP and DISARM are
+commands. The others come from the capture path: FULL (the line budget is recorded), SEALED (the recording is
+closed, the instrument stays armed for the next), RELEASED (it is closed, and the devices are released, by
+configuration or a signal) and FAULT. Transitions that are not drawn are refused.
 """
 
 from __future__ import annotations
@@ -31,21 +31,21 @@ class State(StrEnum):
     IDLE = "idle"
     """No device is in use."""
     ARMED = "armed"
-    """The trigger runs, the cameras deliver; the rings hold the latest lines, and let the oldest go."""
+    """The trigger runs, the cameras deliver; the rings hold the latest lines, older ones are discarded."""
     RECORDING = "recording"
     """Lines are written."""
     DRAINING = "draining"
-    """The last line is known; what is on the way is written, then the recording is sealed."""
+    """The last line is known; lines on their way are written, then the recording is sealed."""
     FAULTED = "faulted"
     """A device or the capture path failed; the devices are released, the fault waits to be read."""
 
 
 SEALED = frozenset({State.IDLE, State.ARMED})
-"""States in which no recording is under way."""
+"""States without a current recording."""
 
 
 class Event(StrEnum):
-    """What can happen to the daemon."""
+    """Events of the state machine."""
 
     ARM = "arm"
     START = "start"
@@ -80,7 +80,7 @@ TABLE: dict[tuple[State, Event], State] = {
 
 
 def after(state: State, event: Event) -> State:
-    """The state that ``event`` leads to; StateError where the table has no row for it."""
+    """Return the state that ``event`` leads to. Raises StateError if the table has no row for it."""
     try:
         return TABLE[state, event]
     except KeyError:
@@ -88,10 +88,10 @@ def after(state: State, event: Event) -> State:
 
 
 def commands(state: State) -> tuple[Event, ...]:
-    """The commands that ``state`` allows."""
+    """Return the commands that ``state`` allows."""
     return tuple(event for event in COMMANDS if (state, event) in TABLE)
 
 
 def possible(state: State) -> str:
-    """The same, in words."""
+    """Return the commands that ``state`` allows, as text."""
     return ", ".join(commands(state))

@@ -1,4 +1,4 @@
-"""How recordings are stored, from the rig's configuration; the codec measured where it says ``auto``."""
+"""Storage settings of recordings by the rig; an ``auto`` codec is chosen by a measurement."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from acquire.store import CodecChoice
 
 SAMPLE_BYTES = 4 * 2**20
-"""Of lines that codecs are tried on."""
+"""Bytes of lines on which codecs are tried."""
 
 
 def storage_settings(config: RigConfig) -> dict[str, Any]:
-    """Fields of a RecordingSpec that ``[recording]`` decides, but for an ``auto`` codec."""
+    """Return the fields of a RecordingSpec that ``[recording]`` determines, except an ``auto`` codec."""
     recording = config.recording
     whole = config.chunk_lines * config.tag_chunks
     return {
@@ -43,10 +43,10 @@ def storage_settings(config: RigConfig) -> dict[str, Any]:
 def choose_for(
     config: RigConfig, lines: NDArray[Any] | None = None, directory: Path | None = None
 ) -> CodecChoice:
-    """The codec for both arms at full rate, measured here in about a second: on ``lines`` (line, pixel) like
-    those to come, or on shot noise at half the range; with the disk of ``directory``, or of the rig's.
+    """Choose the codec for both arms at full rate, by measurements of about a second.
 
-    Raises DataError where the disk cannot be written to.
+    They use ``lines`` (line, pixel) like those to come, or shot noise at half the range, and the disk of
+    ``directory``, or of the rig's directory. Raises DataError if the disk cannot be written to.
     """
     sample = shot_noise(config) if lines is None else lines
     needed = len(ARMS) * config.line_rate_hz * sample[0].nbytes
@@ -58,10 +58,10 @@ def choose_for(
 
 
 def shot_noise(config: RigConfig) -> NDArray[Any]:
-    """(line, pixel) lines of even light at half the range, with the noise of photons."""
+    """Return lines (line, pixel) of even light at half the range, with photon noise."""
     camera, pixels = config.cameras.a, config.pixels
     count = max(1, SAMPLE_BYTES // (pixels * np.dtype(camera.dtype).itemsize))
-    # Noise hardly packs: a codec that keeps up with it keeps up with a scene, too.
+    # Noise is hardly compressible: a codec that sustains it sustains a scene, too.
     light = np.random.default_rng(0).poisson(camera.white_dn / 2, (count, pixels))
     return np.minimum(light, camera.white_dn).astype(camera.dtype)
 

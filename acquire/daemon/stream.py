@@ -1,14 +1,14 @@
-"""The news as a stream of server-sent events: what happened, the status, a sign of life each second.
+"""The news as a stream of server-sent events: news, the status, and a sign of life each second.
 
 ::
 
-    id: 5f3a9c01-17                       id: of the news; given back as Last-Event-ID after a reconnection
+    id: 5f3a9c01-17                       id of the news; sent as Last-Event-ID after a reconnection
     event: news | status
     data: {…}                             `News` | `Status`
-    : alive                               nothing more to tell for now
+    : alive                               nothing more for now
 
-A stream reads on from its place in the log when it is woken. It waits in its socket for a slow reader, and
-the connection is ended where one does not read at all (`connections.SEND_S`).
+When a stream is woken it continues from its position in the log. A slow reader is waited for in the socket,
+and one that does not read at all is disconnected (`connections.SEND_S`).
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ if TYPE_CHECKING:
 
 ALIVE_S = 1.0
 ALIVE = ": alive\n\n"
-"""Also after the news with which a stream begins: whoever listens knows then that this was all."""
+"""Also sent after the news with which a stream begins: the client then knows that these were all."""
 MOST_STREAMS = 16
 """Each holds a connection (`connections.MOST_CONNECTIONS`)."""
 LEAST_STATUS_S, MOST_STATUS_S = 0.05, 60.0
 
 
 class Streams:
-    """All streams of one event loop, of which there are only so many."""
+    """All streams of one event loop, `MOST_STREAMS` at most."""
 
     def __init__(self, log: NewsLog, status: Callable[[], Status]) -> None:
         self._log = log
@@ -43,16 +43,16 @@ class Streams:
         self._open = 0
 
     def open(self, last_id: str | None, status_s: float | None, *, history: bool) -> AsyncIterator[str]:
-        """The text of a stream. Raises StateError where there are as many as can be.
+        """Return the text of a stream. Raises StateError if there are too many already.
 
-        ``last_id``: of the last news that was heard; else all that is known comes first, where ``history`` is
-        asked for. ``status_s``: time between two statuses, which also come with every news; None: none.
+        ``last_id``: ID of the latest news that the client has; without one, all news that are kept come first
+        if ``history``. ``status_s``: time between two statuses, which also come with every news; None: none.
         """
         if self._open >= MOST_STREAMS:
             raise StateError(
                 f"{MOST_STREAMS} clients follow the news already", possible="status", hint="close one of them"
             )
-        # As of the request, not of the stream's first step: what happens in between is not missed.
+        # As of the request, not of the stream's first step: news in between must not be missed.
         if last_id is None and not history:
             last_id = self._log.last_id
         return self._stream(last_id, status_s)
@@ -69,14 +69,14 @@ class Streams:
         due_s, begins = time.monotonic(), True
         try:
             while not self._log.closed:
-                told = woken.is_set()
+                was_woken = woken.is_set()
                 woken.clear()
                 news = self._log.after(last_id)
                 for one in news:
                     last_id = one.id
                     yield news_text(one)
                 now_s = time.monotonic()
-                if status_s is not None and (told or now_s >= due_s):
+                if status_s is not None and (was_woken or now_s >= due_s):
                     due_s = now_s + status_s
                     yield status_text(self._status())
                 elif begins or not news:
@@ -89,7 +89,7 @@ class Streams:
 
 
 async def wait(woken: asyncio.Event, seconds: float) -> None:
-    """Until the event is set, at most so long."""
+    """Wait until the event is set, for ``seconds`` at most."""
     try:
         async with asyncio.timeout(seconds):
             await woken.wait()

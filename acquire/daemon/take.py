@@ -1,4 +1,4 @@
-"""The recording that the daemon is making: what was asked for, how far it is, and what became of it."""
+"""The daemon's current recording: the request, its progress, and its result."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ class Take:
 
     Attributes
     ----------
-    path : where it begins; a recorder that is killed and replaced goes on beside it
+    path : path at its start; the successor of a killed recorder continues next to it
     lines : its budget; None: until it is stopped
     by_event : an event started it, and later events prolong it
-    late : the first event that came when it could not be prolonged any more
+    late : the first event that came too late to prolong it
     """
 
     path: Path
@@ -34,15 +34,15 @@ class Take:
     _moved_s: float = field(default_factory=time.monotonic)
 
     def idle_s(self, seen: CaptureStatus) -> float:
-        """Seconds since more of it was last seen to reach the recorder or the disk."""
-        # Either: what is recorded may wait for its commit, and what is committed was recorded long before.
+        """Return the seconds since it last made progress in the recorder or on disk."""
+        # Either one: recorded lines may wait for their commit, and committed ones were recorded before.
         progress = seen.recorded_lines, seen.committed_lines
         if progress != self._progress:
             self._progress, self._moved_s = progress, time.monotonic()
         return time.monotonic() - self._moved_s
 
     def status(self, seen: CaptureStatus) -> RecordingStatus:
-        """For the daemon's status, while it is being made."""
+        """Return the status of the recording while it is being written."""
         return RecordingStatus(
             path=Path(seen.path or self.path),
             first_line=seen.first_line,
@@ -52,7 +52,7 @@ class Take:
         )
 
     def result(self, seen: CaptureStatus) -> LastRecording:
-        """For the daemon's status, once it has ended."""
+        """Return the result for the daemon's status, once the recording has ended."""
         return LastRecording(
             path=Path(seen.path or self.path),
             lines=seen.committed_lines,

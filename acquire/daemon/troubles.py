@@ -1,7 +1,7 @@
-"""Failures that nobody foresaw: logged with their traceback, counted, and named in the status.
+"""Unforeseen failures: logged with their traceback, counted, and listed in the status.
 
-A defect in one thread must neither end the service nor pass unseen. What a command fails with goes to
-whoever gave it; this is for everything that runs without being asked.
+A defect in one thread must neither end the service nor go unnoticed. The error of a command is returned to
+its client; this is for everything that runs outside commands.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ log = logging.getLogger("acquire.daemon")
 
 
 class Troubles:
-    """Any thread may call everything here."""
+    """All methods may be called from any thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -32,12 +32,12 @@ class Troubles:
 
     @property
     def statuses(self) -> list[TroubleStatus]:
-        """The latest last."""
+        """All failures, the latest last."""
         with self._lock:
             return list(self._found.values())
 
     def note(self, where: str, error: BaseException) -> None:
-        """Log and remember; the same failure again is counted."""
+        """Log and list a failure; a repeated one is counted."""
         log.error("%s failed: %s", where, type(error).__name__, exc_info=error)
         text = f"{where}: {type(error).__name__}: {shortened(error, 400)}"
         with self._lock:
@@ -48,12 +48,12 @@ class Troubles:
                 del self._found[next(iter(self._found))]
 
     def in_thread(self, failed: threading.ExceptHookArgs) -> None:
-        """For `threading.excepthook`."""
+        """Handle `threading.excepthook`."""
         if failed.exc_value is not None and not isinstance(failed.exc_value, SystemExit):
             self.note(f"thread {failed.thread.name if failed.thread else '?'}", failed.exc_value)
 
     def in_loop(self, _loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """For `loop.set_exception_handler`. A connection that fails is not worth a traceback."""
+        """Handle `loop.set_exception_handler`. A failed connection is logged without a traceback."""
         error = context.get("exception")
         if error is None or isinstance(error, OSError):
             log.warning("%s: %s", context["message"], error)

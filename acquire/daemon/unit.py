@@ -1,4 +1,4 @@
-"""The daemon as a service of systemd: when it is ready, when it hangs, what it needs and what not."""
+"""The daemon as a systemd service: readiness, watchdog, required and denied privileges."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from acquire.config import RigConfig
 
 WATCHDOG_S = 30
-"""Without a word from the daemon, which gives one twice a second, systemd ends and restarts it."""
+"""Time without a message from the daemon, which sends two a second, after which systemd restarts it."""
 STOP_S = 60
-"""Beyond what sealing a recording may take (`recording.seal_timeout_s`)."""
+"""Time to stop, in addition to that of sealing a recording (`recording.seal_timeout_s`)."""
 PROCESSES_BYTES = 600_000_000
-"""Daemon, nursery, recorder, watcher, grabbers and page; 250 MB were measured (`pss`, 8 stages)."""
+"""Memory of daemon, nursery, recorder, watcher, grabbers and page; 250 MB were measured (`pss`, 8 stages)."""
 UNIT = "acquire.service"
 SOCKET = "/run/acquire/acquire.sock"
-"""Of the host's service, unless the rig says otherwise."""
+"""Default socket of the host's service."""
 RULES = "70-acquire.rules"
 
 UDEV = """\
@@ -38,7 +38,7 @@ SUBSYSTEM=="tty", ATTRS{idVendor}=="0403", MODE="0660", GROUP="plugdev", TAG+="u
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Where the unit goes, and for whom: the host, or one user."""
+    """Directory of the unit, and whether it is for one user or the host."""
 
     user: bool
     directory: Path
@@ -52,7 +52,7 @@ class Place:
 
 
 def unit_text(rig: RigConfig, config: Path, *, user: bool, account: str | None = None) -> str:
-    """The unit for a rig file. ``account``: who runs the host's service; absent: who asks."""
+    """Return the unit for a rig file. ``account``: user of the host's service; None: the current one."""
     recordings = rig.recording.directory.absolute()
     stop_s = round(rig.recording.seal_timeout_s) + STOP_S
     command = f"{sys.executable} -m acquire serve --config {_quoted(config.absolute())}"
@@ -97,7 +97,7 @@ def unit_text(rig: RigConfig, config: Path, *, user: bool, account: str | None =
 
 
 def _hardening(recordings: Path, rig: RigConfig) -> list[str]:
-    """What the service does not need it cannot do. (Not MemoryDenyWriteExecute: the simulator compiles.)"""
+    """Return settings that deny everything unneeded. (Not MemoryDenyWriteExecute: the simulator compiles.)"""
     writable = {recordings, rig.control.socket.absolute().parent}
     return [
         "# Where the host's memory ends, others are killed before the capture is; only root may ask for it.",
@@ -123,13 +123,13 @@ def _hardening(recordings: Path, rig: RigConfig) -> list[str]:
 
 
 def _socket(rig: RigConfig) -> str:
-    """Which the service's environment does not say."""
+    """Return the option for a socket that is not the default one of the service's environment."""
     socket = rig.control.socket
     return "" if socket == default_socket() else f" --socket {_quoted(socket.absolute())}"
 
 
 def _memory(rig: RigConfig) -> list[str]:
-    """What holds where memory ends, told where it is read by whoever would change it."""
+    """Return the settings for memory shortage, with comments for administrators who want to change them."""
     needed_mb = math.ceil((sum(needed_bytes(rig)) + PROCESSES_BYTES) / 1e6)
     return [
         "# What the kernel kills where memory ends is replaced, and the capture goes on: the page's jobs go",
@@ -142,13 +142,13 @@ def _memory(rig: RigConfig) -> list[str]:
 
 
 def _groups() -> list[str]:
-    """Those of this host whose members may use ports and USB devices."""
+    """Return the setting for this host's groups whose members may use ports and USB devices."""
     here = {group.gr_name for group in grp.getgrall()}
     names = [name for name in ("dialout", "plugdev") if name in here]
     return [f"SupplementaryGroups={' '.join(names)}"] if names else []
 
 
 def _quoted(path: Path) -> str:
-    """As systemd reads words: % is its own, and spaces part them."""
+    """Quote a path for systemd, which separates words at spaces and expands %."""
     text = str(path).replace("\\", "\\\\").replace('"', '\\"').replace("%", "%%")
     return f'"{text}"' if " " in text or '"' in text else text

@@ -1,14 +1,14 @@
-"""Recordings are copied to a remote store automatically, while they grow: `recording.upload_to`.
+"""Automatic copies of recordings to a remote store while they grow: `recording.upload_to`.
 
 ::
 
     Service ──add──▶ Uploads ══ Copy, Reach ═▶ process: `copier` ──▶ <upload_to>/run.zarr
                         │   ◀═ UploadStatus, Reached ═══
-                        └▶ .uploads-<rig>.json: what is not copied, for the next daemon
+                        └▶ .uploads-<rig>.json: recordings not copied, for the next daemon
 
-Nobody waits for it: recordings are written to the local disk, which is the spool, and retention leaves alone
-what is not copied (`Retention.copied_to`). The process is ended by force when it does not end in time, and
-replaced when it dies: a copy goes on where it was.
+Nobody waits for it: recordings are written to the local disk, which is the spool, and retention does not drop
+lines that are not copied (`Retention.copied_to`). The process is killed if it does not end in time, and
+replaced if it dies: copies continue where they stopped.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ if TYPE_CHECKING:
     from acquire.config import RigConfig
 
 MOST_LISTED = 32
-"""Recordings that are copied, and that are not, of which the status tells: the latest."""
+"""Number of latest recordings in the status, of those copied and of those not copied."""
 ANSWER_S = 20.0
-"""How long arming waits for the store's answer, once the process that asks is there."""
+"""How long arming waits for the store's answer, once the process that queries it is there."""
 START_S = 60.0
-"""How long it waits for that process: an interpreter takes its time on a busy machine."""
+"""How long it waits for that process: an interpreter may start slowly on a busy machine."""
 _END_S = 3.0
 _POLL_S = 0.02
 _OVER = ("copied", "gone")
@@ -48,7 +48,7 @@ log = logging.getLogger("acquire.daemon")
 
 
 def check_upload(config: RigConfig) -> None:
-    """Raise ConfigError where the rig's `recording.upload_to` can never be reached from here."""
+    """Raise ConfigError if the rig's `recording.upload_to` can never be reached from here."""
     url = config.recording.upload_to
     if url is None:
         return
@@ -61,7 +61,7 @@ def check_upload(config: RigConfig) -> None:
 
 
 def _wants_copy(path: Path) -> bool:
-    """The rig that recorded it copies its recordings."""
+    """Return whether the rig that recorded it copies its recordings."""
     try:
         return upload_target(read_root(LocalSource(path))["attributes"]) is not None
     except AcquireError:
@@ -69,12 +69,12 @@ def _wants_copy(path: Path) -> bool:
 
 
 class Uploads:
-    """What is to be copied, and how far it is. For one thread; only `prove` and `close` wait.
+    """Recordings to be copied, and their progress. For one thread; only `prove` and `close` wait.
 
     Parameters
     ----------
     target : URL below which recordings are copied; None: they are not
-    journal : file that names what is not copied yet
+    journal : file that lists recordings not copied yet
     """
 
     def __init__(self, target: str | None = None, journal: Path | None = None) -> None:
@@ -82,50 +82,50 @@ class Uploads:
         self._journal = Journal(journal, "not_uploaded", "to be uploaded")
         self._found: dict[Path, UploadStatus] = {}
         self._noted = True
-        """The journal names those that are left."""
+        """The journal is up to date."""
         self._ours: set[Path] = set()
         self._worker: Worker | None = None
         self._born_s = 0.0
         self._deaths = 0
-        """Within so short a time that something must be wrong."""
+        """Deaths in quick succession."""
         self._not_before_s = 0.0
         self._awake = False
-        """The process has said something."""
-        self._questions = 0
+        """The process has sent a message."""
+        self._queries = 0
         self._answer: Reached | None = None
         self.warning: str | None = None
-        """Why copies may have to wait; for the status."""
+        """Why copies may have to wait, for the status."""
 
     @property
     def statuses(self) -> list[UploadStatus]:
-        """The latest of those that are copied, and of those that are not."""
+        """The latest recordings, of those copied and of those not copied."""
         left = [one for one in self._found.values() if one.state not in _OVER]
         over = [one for one in self._found.values() if one.state in _OVER]
         return [*over, *left[-MOST_LISTED:]]
 
     @property
     def left(self) -> int:
-        """Recordings that are not copied, those that are refused included."""
+        """Number of recordings that are not copied, including refused ones."""
         return sum(one.state not in _OVER for one in self._found.values())
 
     def begin(self) -> None:
-        """Start the process; it goes on with what an earlier daemon has not finished."""
+        """Start the process, which continues the copies that an earlier daemon has not finished."""
         for path in self._journal.read():
             if self._target is None:
                 log.warning("%s was not uploaded, and will not be: recording.upload_to is not set", path)
             else:
-                log.info("%s was not uploaded: going on with it", path)
+                log.info("%s was not uploaded: continuing", path)
                 self._expect(path)
         self._spawn()
 
     def add(self, path: Path) -> None:
-        """Copy what a run writes; what is known already is passed over."""
+        """Copy a recording of a run, unless it is known already."""
         if path not in self._ours:
             self._ours.add(path)
             self.renew(path)
 
     def forget(self, path: Path) -> None:
-        """A run begins to write there: what was there before is no more."""
+        """Note that a run begins to write there: an earlier recording there is gone."""
         self._ours.discard(path)
 
     def renew(self, path: Path) -> None:
@@ -136,19 +136,19 @@ class Uploads:
             self._post(Copy(path, path in self._ours))
 
     def recovered(self, path: Path) -> None:
-        """A recording that was left open is sealed by now: copy it, if it says that it should be."""
+        """Note that a recording is sealed after recovery: copy it if its configuration asks for that."""
         if path in self._found or _wants_copy(path):
             self.renew(path)
 
     def poll(self) -> None:
-        """Hear how far it is; replace a process that has died."""
+        """Read messages; replace a process that has died."""
         worker = self._worker
         if worker is None:
             if time.monotonic() >= self._not_before_s:
                 self._spawn()
             return
-        death = worker.death  # asked first: what a process said last is still in its pipe then
-        why = self._hear(worker)
+        death = worker.death  # read first, so that the last message of a dead process is seen
+        why = self._read_messages(worker)
         if death is not None or why is not None:
             self._worker = None
             with contextlib.suppress(DeviceError):
@@ -157,21 +157,21 @@ class Uploads:
         self._note()
 
     def prove(self, *, force: bool = False) -> None:
-        """Ask the store, before a run is armed, whether it takes what will be copied.
+        """Query the store, before a run is armed, whether it accepts files.
 
-        A store that says no will go on saying it: UsageError, unless ``force``. One that cannot be reached
-        is a `warning` only: an experiment does not wait for a network, and the copy can.
+        A refusal is permanent: UsageError, unless ``force``. A store that cannot be reached is only a
+        `warning`: an experiment does not wait for a network, but the copy can.
         """
         self.warning = None
         if self._target is None:
             return
-        answer = self._ask()
+        answer = self._query()
         if answer is not None and answer.refused and not force:
-            told = answer.error.rebuild() if answer.error else UsageError(f"{self._target} refuses")
+            error = answer.error.rebuild() if answer.error else UsageError(f"{self._target} refuses")
             raise UsageError(
-                f"arm: recordings cannot be uploaded: {told.message}",
-                possible=told.possible,
-                hint=f"{told.hint or 'recording.upload_to'}; or arm --force",
+                f"arm: recordings cannot be uploaded: {error.message}",
+                possible=error.possible,
+                hint=f"{error.hint or 'recording.upload_to'}; or arm --force",
             )
         if answer is not None and answer.error is not None:
             self.warning = answer.error.message
@@ -181,12 +181,12 @@ class Uploads:
             log.warning("recordings stay on this disk until they can be uploaded: %s", self.warning)
 
     def close(self) -> None:
-        """End the process; a daemon that comes later goes on. Idempotent."""
+        """End the process; a later daemon continues. Idempotent."""
         worker, self._worker = self._worker, None
         self._target = None
         if worker is not None:
-            self._hear(worker)
-            with contextlib.suppress(DeviceError):  # by force, which costs nothing
+            self._read_messages(worker)
+            with contextlib.suppress(DeviceError):  # ended by force, which does no harm
                 worker.end(time.monotonic() + _END_S)
             self._note()
 
@@ -194,13 +194,13 @@ class Uploads:
         assert self._target is not None
         before = self._found.get(path)
         if before is None or before.state in _OVER:
-            self._tell(UploadStatus(path=path, url=url_below(self._target, path), state="waiting"))
+            self._list(UploadStatus(path=path, url=url_below(self._target, path), state="waiting"))
 
-    def _tell(self, said: UploadStatus) -> None:
-        before = self._found.pop(said.path, None)  # the latest come last
-        self._found[said.path] = said
+    def _list(self, status: UploadStatus) -> None:
+        before = self._found.pop(status.path, None)  # the latest come last
+        self._found[status.path] = status
         was_left = before is not None and before.state not in _OVER
-        if was_left == (said.state not in _OVER):
+        if was_left == (status.state not in _OVER):
             return
         self._noted = False
         over = [path for path, one in self._found.items() if one.state in _OVER]
@@ -224,27 +224,27 @@ class Uploads:
         except DeviceError as error:
             self._wait_for_another(str(error))
 
-    def _hear(self, worker: Worker) -> str | None:
-        """Take what the process says; why it ends, if it says so."""
-        while (said := worker.message()) is not None:
+    def _read_messages(self, worker: Worker) -> str | None:
+        """Read the process's messages; return why it ends, if it reports that."""
+        while (message := worker.message()) is not None:
             self._awake = True
-            if isinstance(said, UploadStatus):
-                self._heed(said)
-            elif isinstance(said, Reached):
-                self._answer = said
-            elif isinstance(said, Failed):
-                return str(said.error)
+            if isinstance(message, UploadStatus):
+                self._take_status(message)
+            elif isinstance(message, Reached):
+                self._answer = message
+            elif isinstance(message, Failed):
+                return str(message.error)
         return None
 
-    def _heed(self, said: UploadStatus) -> None:
-        before = self._found.get(said.path)
-        if said.error and (before is None or (said.state, said.error) != (before.state, before.error)):
-            log.warning("upload of %s %s: %s", said.path, said.state, said.error)
-        elif said.state == "copied":
-            log.info("upload of %s: %d lines are in %s", said.path, said.lines, said.url)
-        if said.state in ("copying", "copied"):
+    def _take_status(self, new: UploadStatus) -> None:
+        before = self._found.get(new.path)
+        if new.error and (before is None or (new.state, new.error) != (before.state, before.error)):
+            log.warning("upload of %s %s: %s", new.path, new.state, new.error)
+        elif new.state == "copied":
+            log.info("upload of %s: %d lines are in %s", new.path, new.lines, new.url)
+        if new.state in ("copying", "copied"):
             self.warning = None
-        self._tell(said)
+        self._list(new)
 
     def _wait_for_another(self, why: str) -> None:
         if time.monotonic() - self._born_s > MOST_WAIT_S:
@@ -255,17 +255,17 @@ class Uploads:
         self.warning = f"the uploading process: {why}"
         log.error("%s; another takes its place in %g s", self.warning, later_s)
 
-    def _ask(self) -> Reached | None:
-        """The store's answer, or None when there is none in time."""
-        self._questions += 1
+    def _query(self) -> Reached | None:
+        """Return the store's answer, or None if there is none in time."""
+        self._queries += 1
         self._answer = None
-        self._post(Reach(self._questions))
+        self._post(Reach(self._queries))
         deadline = time.monotonic() + START_S
-        asked = False
-        # The store's time counts from when the process that asks is there: it may be only starting.
-        while self._answer is None or self._answer.number != self._questions:
-            if self._awake and not asked:
-                asked, deadline = True, min(deadline, time.monotonic() + ANSWER_S)
+        is_timed = False
+        # The store's time counts once the process is there, which may be only starting.
+        while self._answer is None or self._answer.number != self._queries:
+            if self._awake and not is_timed:
+                is_timed, deadline = True, min(deadline, time.monotonic() + ANSWER_S)
             if time.monotonic() > deadline:
                 return None
             self.poll()
@@ -273,7 +273,7 @@ class Uploads:
         return self._answer
 
     def _note(self) -> None:
-        """Write down what is not copied, where that has changed."""
+        """Update the journal of recordings not copied, if it has changed."""
         if not self._noted:
             self._noted = True
             self._journal.write(path for path, one in self._found.items() if one.state not in _OVER)

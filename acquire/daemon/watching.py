@@ -1,4 +1,4 @@
-"""From the rig's configuration to what the watcher looks for in the lines."""
+"""From the rig's configuration to the watcher's settings."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ if TYPE_CHECKING:
     from acquire.config import RigConfig
 
 _CHECK_S = 0.25
-"""Of lines that a check takes, in seconds as they pass: verdicts come within a second."""
+"""Duration of the lines of a check, so that verdicts come within a second."""
 _MOST_LINES = 8192
 _LEAST_SENSORS = 8
-"""A check takes the lines of so many passes over the sensor at least."""
+"""Least number of passes over the sensor whose lines a check takes."""
 
 
 def watch_plan(config: RigConfig) -> WatchPlan | None:
-    """None where nothing is looked for: no process is started then."""
+    """Return the watcher's settings; None if there is nothing to check, and no process to start."""
     threshold = threshold_plan(config)
-    # A camera that shows a pattern has no light whose code could be checked.
+    # A camera with a test pattern has no light whose code could be checked.
     judge = (
         judge_of(config)
         if config.check.enable
@@ -39,7 +39,7 @@ def watch_plan(config: RigConfig) -> WatchPlan | None:
 
 
 def judge_of(config: RigConfig) -> Judge:
-    """What the lines must show."""
+    """Return the judge of the code."""
     return Judge(
         stages=config.geometry.stages,
         substeps=config.geometry.substeps,
@@ -51,7 +51,7 @@ def judge_of(config: RigConfig) -> Judge:
 
 
 def threshold_plan(config: RigConfig) -> ThresholdPlan | None:
-    """The level of the rig's ``[events]``, if it is a source."""
+    """Return the threshold of the rig's ``[events]``, if it is a source of events."""
     events = config.events
     if "threshold" not in events.sources:
         return None

@@ -1,7 +1,7 @@
-"""Who asks, on the way through one request: what passes it on tells the daemon, which writes it down.
+"""The user behind a request: passed on to the daemon, which records it.
 
-A claim, not a proof: whoever reaches the control socket is the daemon's user. The page's process has seen a
-token, and says which role it was for, and from where.
+It is a claim, not a proof: everybody who reaches the control socket is the daemon's user. The page's process
+has verified a token, and states its role and the client's address.
 """
 
 from __future__ import annotations
@@ -11,4 +11,4 @@ from contextvars import ContextVar
 LONGEST = 120
 HEADER = "Acquire-By"
 WHO: ContextVar[str] = ContextVar("acquire_who", default="")
-"""Empty: nobody has said."""
+"""Empty: unknown."""

@@ -1,5 +1,6 @@
-"""Child processes and the memory that they share. Each child has one owner, one pipe to it, and ends with it.
+"""Child processes and their shared memory. Each child has one owner, one pipe to it, and ends with it.
 
-`worker` a child, seen from its owner, and its life · `nursery` where children are forked from, in
-milliseconds · `shared` memory without a name that could be left behind · `messages` of all children
+`worker`: a child, as seen by its owner, and its main function · `nursery`: the process from which children
+are forked, in milliseconds · `shared` memory without a name that could be left behind · `messages` of all
+children
 """

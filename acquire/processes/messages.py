@@ -1,4 +1,4 @@
-"""What every worker and its owner say to each other, whatever the work."""
+"""Messages between every worker and its owner."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Ready:
-    """The process has what it needs; a grabber tells who its camera is and how it is set."""
+    """The process is ready; a grabber's ``facts`` are its camera's identity and settings."""
 
     facts: dict[str, Any] = field(default_factory=dict)
 
@@ -25,4 +25,4 @@ class Failed:
 
 @dataclass(frozen=True, slots=True)
 class Quit:
-    """Finish what is under way and end."""
+    """Finish the current work and end."""

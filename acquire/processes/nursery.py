@@ -1,4 +1,4 @@
-"""Worker processes that begin in milliseconds: forked from one that has imported what they need.
+"""Worker processes that start in milliseconds: forked from one that has imported their modules.
 
 ::
 
@@ -6,14 +6,14 @@
       ▲                                           │  ▲                  │
       └──────── process number, how it ended ─────┘  └───── its end ────┘
 
-The nursery imports modules and does nothing else: it has one thread, no device, no file. Whatever must not be
-forked, such as a GenTL producer or a library's threads, is loaded by the worker, in a process of its own. It
-ends with its owner, since the kernel closes the owner's end of the socket; workers see their owner's end by
-themselves (`acquire.processes.worker`). A nursery that has died is replaced, and its workers are not touched.
+The nursery only imports modules: it has one thread, no device, no file. Anything that must not be forked,
+such as a GenTL producer or a library's threads, is loaded by the worker. The nursery ends with its owner,
+since the kernel closes the owner's end of the socket; workers detect their owner's end themselves
+(`acquire.processes.worker`). A nursery that has died is replaced, and its workers are not affected.
 
 multiprocessing's own forkserver is not used: when it is killed, it reports its living children as dead (exit
-code 255), and a successor would write to the ring beside the recorder that it replaces. Here the owner has a
-pidfd of every worker, which tells the truth whoever else has died.
+code 255), and a successor would write to the ring at the same time as the recorder that it replaces. Here the
+owner has a pidfd of every worker, which is reliable whichever process has died.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 _MOST_FDS = 250
-"""Descriptors in one message; the kernel takes 253."""
+"""Descriptors in one message; the kernel's limit is 253."""
 _REAP_S = 1.0
-"""For the nursery to say how a worker ended."""
-UNTOLD = 255
-"""Exit code of a worker whose nursery has died: nobody is left who could know it."""
+"""Time for the nursery to report how a worker ended."""
+UNKNOWN = 255
+"""Exit code of a worker whose nursery has died, so that its real one is unknown."""
 _START = "import sys; from acquire.processes import nursery; nursery.main(int(sys.argv[1]), sys.argv[2:])"
 
 
 class Child:
-    """The owner's view of one worker process. It may not be born yet; then its number is not known."""
+    """The owner's view of one worker process, which may not be forked yet; then its number is unknown."""
 
     def __init__(self, status: socket.socket) -> None:
         self._status = status
@@ -61,56 +61,56 @@ class Child:
         self._dead_since_s: float | None = None
 
     def pid(self, timeout_s: float = 0.0) -> int | None:
-        """Its process number, once it is born."""
+        """Return its process number, or None if it is not forked within ``timeout_s``."""
         deadline = time.monotonic() + timeout_s
-        while self._pid is None and self._exit_code is None and self._hear(deadline):
+        while self._pid is None and self._exit_code is None and self._wait(deadline):
             continue
         return self._pid
 
     def exit_code(self, timeout_s: float = 0.0) -> int | None:
-        """How it ended (below 0: by which signal), or None when it still lives after ``timeout_s``.
+        """Return its exit code (negative: a signal), or None if it is still alive after ``timeout_s``.
 
-        `UNTOLD` where the nursery cannot say any more.
+        `UNKNOWN` if the nursery cannot report it any more.
         """
         deadline = time.monotonic() + timeout_s
-        while self._exit_code is None and self._hear(deadline):
+        while self._exit_code is None and self._wait(deadline):
             continue
         return self._exit_code
 
     def kill(self) -> None:
-        """End it by force."""
-        # By pidfd and not by number: the number may be another process's by now.
+        """Kill it."""
+        # With the pidfd, not the number, which may belong to another process by now.
         if self._pidfd >= 0:
             with contextlib.suppress(ProcessLookupError):
                 signal.pidfd_send_signal(self._pidfd, signal.SIGKILL)
 
     def close(self) -> None:
-        """Forget it. Idempotent."""
+        """Release its descriptors. Idempotent."""
         self._status.close()
         if self._pidfd >= 0:
             os.close(self._pidfd)
             self._pidfd = -1
 
-    def _hear(self, deadline: float) -> bool:
-        """Wait for the nursery's next word, or the process's end; False where nothing is new by then."""
+    def _wait(self, deadline: float) -> bool:
+        """Wait for the nursery's next message, or the process's end; return False if neither came in time."""
         sources = [fd for fd in (self._status.fileno(), self._pidfd) if fd >= 0]
         while sources:
             ready = _readable(sources, deadline - time.monotonic())
             if self._status.fileno() in ready:
-                self._listen()
+                self._receive()
                 return True
             if self._pidfd in ready:
-                # The process has ended; a nursery that is dead, or stopped, will not say how.
+                # The process has ended; a nursery that is dead, or stopped, will not report how.
                 self._dead_since_s = self._dead_since_s or time.monotonic()
                 if self._status.fileno() < 0 or time.monotonic() - self._dead_since_s > _REAP_S:
-                    self._exit_code = UNTOLD
+                    self._exit_code = UNKNOWN
                     return True
             if not ready or time.monotonic() >= deadline:
                 return False
-            time.sleep(_REAP_S / 100)  # it has ended: the nursery will say how
+            time.sleep(_REAP_S / 100)  # it has ended: the nursery will report how
         return False
 
-    def _listen(self) -> None:
+    def _receive(self) -> None:
         try:
             word, fds, _, _ = socket.recv_fds(self._status, 64, 1, socket.MSG_CMSG_CLOEXEC)
         except OSError:
@@ -122,20 +122,20 @@ class Child:
         if word:
             self._exit_code = int(word)
         elif self._pidfd < 0:
-            self._exit_code = UNTOLD  # the nursery died before this process was born
+            self._exit_code = UNKNOWN  # the nursery died before this process was forked
 
 
 class Nursery:
-    """The owner's side: one process, which forks a worker for every `bear`."""
+    """The owner's side of the nursery: one process, which forks a worker for every `fork`."""
 
     def __init__(self, modules: tuple[str, ...] = ()) -> None:
-        """Start it; it imports ``modules`` meanwhile, those that are there."""
+        """Start the process, which then imports those of ``modules`` that exist."""
         self.modules = modules
-        # Sequential packets: a message stays whole, with the descriptors that were sent with it.
+        # Sequential packets keep a message together with its descriptors.
         self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         path = os.pathsep.join(entry for entry in sys.path if entry)
         with theirs:
-            self._process = subprocess.Popen(  # noqa: S603 - ourselves
+            self._process = subprocess.Popen(  # noqa: S603 - this package
                 [sys.executable, "-c", _START, str(theirs.fileno()), *modules],
                 stdin=subprocess.DEVNULL,
                 pass_fds=(theirs.fileno(),),
@@ -151,12 +151,12 @@ class Nursery:
     def pid(self) -> int:
         return self._process.pid
 
-    def bear(self, name: str, target: Callable[..., None], *args: Any) -> Child:
-        """A process that calls ``target(*args)``. Raises what pickling raises, and OSError."""
+    def fork(self, name: str, target: Callable[..., None], *args: Any) -> Child:
+        """Fork a process that calls ``target(*args)``. Raises errors of pickling, and OSError."""
         parcel = _Parcel()
         job = _pack(parcel, name, target, args)
-        # The job goes as an anonymous file, since a packet is limited by the socket's buffer, and a plan with
-        # its arrays may be larger.
+        # The job is sent as an anonymous file, since a plan with its arrays may be larger than a packet,
+        # which is limited by the socket's buffer.
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         page = os.memfd_create("acquire-job")
         try:
@@ -172,15 +172,15 @@ class Nursery:
         return Child(ours)
 
     def close(self) -> None:
-        """End it; workers go on. Idempotent."""
+        """End the process; workers continue. Idempotent."""
         self._channel.close()
         if self.owner == os.getpid():
-            self._process.kill()  # it has nothing that could be lost
+            self._process.kill()  # it has no state that could be lost
             self._process.wait()
 
 
 class Own:
-    """The nursery of one owner, made when it is first needed."""
+    """The nursery of one owner, created when it is first needed."""
 
     def __init__(self) -> None:
         self._nursery: Nursery | None = None
@@ -207,12 +207,12 @@ _own = Own()
 
 
 def nursery() -> Nursery:
-    """This process's own; another one where it has died."""
+    """Return the nursery of this process, replaced if it has died."""
     return _own.get()
 
 
 def warm_up(*modules: str) -> None:
-    """Let the nursery of this process import ``modules`` from now on, so that workers begin at once."""
+    """Have the nursery of this process import ``modules`` now, so that workers start at once."""
     _own.replace(lambda: Nursery(modules))
 
 
@@ -222,11 +222,11 @@ def end() -> None:
     _own.replace(lambda: None)
 
 
-# ---- the way of a job
+# ---- sending a job
 
 
 class _Parcel:
-    """Collects the descriptors of what is pickled: all that multiprocessing asks a ``popen`` object for."""
+    """Collects descriptors of pickled objects; the part of a ``popen`` object that multiprocessing uses."""
 
     def __init__(self) -> None:
         self.fds: list[int] = []
@@ -253,14 +253,14 @@ _received: list[int] = []
 
 
 def is_worker() -> bool:
-    """This process is a nursery's worker, whose cores are for the capture path."""
+    """Return whether this process is a nursery's worker, whose cores are for the capture path."""
     return bool(_received)
 
 
 def _pack(parcel: _Parcel, name: str, target: Callable[..., None], args: tuple[Any, ...]) -> bytes:
     buffer = io.BytesIO()
-    # multiprocessing pickles a pipe or a lock only while it believes to be spawning: `parcel` is what it then
-    # hands descriptors to.
+    # multiprocessing pickles a pipe or a lock only while it is spawning a process: it then passes descriptors
+    # to `parcel`.
     set_spawning_popen(parcel)  # type: ignore[arg-type]
     try:
         ForkingPickler(buffer, pickle.HIGHEST_PROTOCOL).dump((name, target, args))
@@ -286,13 +286,13 @@ def _readable(sources: list[int], timeout_s: float) -> set[int]:
 
 
 def main(fd: int, modules: list[str]) -> None:
-    """Life of the nursery, and of every worker."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # of a terminal's foreground group: left to the owner
+    """Main function of the nursery, and of every worker."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # sent to a terminal's foreground group: left to the owner
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     for module in modules:
-        with contextlib.suppress(ImportError):  # of a driver that is not installed: its worker says so
+        with contextlib.suppress(ImportError):  # a driver that is not installed: its worker reports it
             importlib.import_module(module)
-    # A collection in a worker would write to the head of every object, and so copy the pages that are shared.
+    # A collection in a worker would write to every object's header, and so copy the shared pages.
     gc.collect()
     gc.freeze()
     page = _keep(socket.socket(fileno=fd))
@@ -300,19 +300,19 @@ def main(fd: int, modules: list[str]) -> None:
         return
     with open(page, "rb") as file:  # noqa: PTH123 - a descriptor
         file.seek(0)
-        place, environment, job = pickle.load(file)  # noqa: S301 - from the owner
-    # The owner's as of now: the nursery has the environment of the moment when it was started.
+        place, environment, job = pickle.load(file)  # noqa: S301 - from the owner, through a private socket
+    # The owner's current environment: that of the nursery is as of its start.
     os.environ.clear()
     os.environ.update(environment)
     spawn.prepare(place)
-    name, target, args = pickle.loads(job)  # noqa: S301
+    name, target, args = pickle.loads(job)  # noqa: S301 - as above
     with contextlib.suppress(OSError), open("/proc/self/comm", "w", encoding="utf-8") as comm:  # noqa: PTH123
         comm.write(f"acquire {name}"[:15])
     target(*args)
 
 
 def _keep(channel: socket.socket) -> int | None:
-    """Fork workers until the owner is gone. In a worker: the descriptor of its job."""
+    """Fork workers until the owner is gone, then return None. In a worker, return its job's descriptor."""
     waiting = select.poll()
     waiting.register(channel, select.POLLIN)
     children: dict[int, tuple[int, socket.socket]] = {}
@@ -323,7 +323,7 @@ def _keep(channel: socket.socket) -> int | None:
                 pid, status = children.pop(ready)
                 _, ended = os.waitpid(pid, 0)
                 os.close(ready)
-                with status, contextlib.suppress(OSError):  # an owner that has gone does not ask
+                with status, contextlib.suppress(OSError):  # the owner may be gone
                     status.send(str(os.waitstatus_to_exitcode(ended)).encode())
                 continue
             _, fds, _, _ = socket.recv_fds(channel, 16, _MOST_FDS, socket.MSG_CMSG_CLOEXEC)
@@ -343,10 +343,11 @@ def _keep(channel: socket.socket) -> int | None:
 
 
 def _begin(channel: socket.socket, children: dict[int, tuple[int, socket.socket]], fds: list[int]) -> int:
-    """First steps of a worker: close all that is the nursery's."""
+    """Close everything that belongs to the nursery, in a new worker; return its job's descriptor."""
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     channel.close()
-    # Of other workers: the owner takes the end of such a socket for the nursery's, which a copy would hide.
+    # Also other workers' sockets: the owner detects the nursery's death by their end, which a copy would
+    # hide.
     for pidfd, (_, status) in children.items():
         status.close()
         os.close(pidfd)

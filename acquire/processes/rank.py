@@ -1,4 +1,4 @@
-"""Who stands back for the capture: with the processors, and where memory ends."""
+"""Lower rank of other processes than the capture's, for processors and when memory runs out."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ import os
 from pathlib import Path
 
 FIRST, EARLY = 1000, 500
-"""Whom the kernel kills first where memory ends, and whom next: see proc(5), oom_score_adj."""
+"""Scores of processes that the kernel kills first, and next, when memory runs out: see proc(5),
+oom_score_adj.
+"""
 
 
 def stand_back(nice: int, oom_score: int) -> None:
-    """From now on, with all that this process starts. What it does can be done again; lines come once."""
+    """Lower the rank of this process and all that it starts: its work can be repeated, lines cannot."""
     os.nice(nice)
     with contextlib.suppress(OSError):  # a kernel without it, or a service that may not
         Path("/proc/self/oom_score_adj").write_text(str(oom_score), encoding="ascii")

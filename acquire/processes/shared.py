@@ -1,7 +1,7 @@
-"""Memory that the processes of one run share: anonymous files, passed to spawned children by descriptor.
+"""Shared memory of the processes of one run: anonymous files, passed to child processes by descriptor.
 
-An anonymous file (memfd) has no name that could outlive a process killed without warning: the kernel
-frees it with the last descriptor and mapping. No resource tracker takes part.
+An anonymous file (memfd) has no name that could outlive a killed process: the kernel frees it with the last
+descriptor and mapping. No resource tracker is involved.
 """
 
 from __future__ import annotations
@@ -18,26 +18,26 @@ WORD_BYTES = 8
 
 
 class SharedBytes:
-    """``size`` bytes, zero at first; every process that holds them has them mapped and touched.
+    """``size`` bytes, initially 0; mapped and touched in every process that has them.
 
-    Pickled only while a child is being spawned; the child gets the same bytes.
+    They can be pickled only while a child is being started; the child gets the same bytes.
     """
 
     def __init__(self, name: str, size: int, fd: int | None = None) -> None:
         self.name = name
         self.size = size
         self._fd = _allocate(name, size) if fd is None else fd
-        # Populated now: a first touch during capture would cost more than the copy itself.
+        # Populate now: a page's first touch during capture would cost more than the copy itself.
         self.map = mmap.mmap(self._fd, size, flags=mmap.MAP_SHARED | mmap.MAP_POPULATE)
 
     def words(self, first: int, count: int) -> memoryview:
-        """``count`` signed 64-bit words from word ``first``; a store of one word is never torn."""
+        """Return ``count`` signed 64-bit words from word ``first``; a store of one word is never torn."""
         start = first * WORD_BYTES
         return memoryview(self.map)[start : start + count * WORD_BYTES].cast("q")
 
     @property
     def path(self) -> str:
-        """A path to the bytes for programs that are not spawned from here; good while this process lives."""
+        """A path to the bytes for processes not started from here; valid while this process lives."""
         return f"/proc/{os.getpid()}/fd/{self._fd}"
 
     def close(self) -> None:
@@ -78,7 +78,7 @@ class Counters:
 
 
 def available_bytes() -> int:
-    """Memory that can be had without another program losing any, as the kernel estimates it."""
+    """Return the memory that is available without swapping, by the kernel's estimate."""
     with Path("/proc/meminfo").open(encoding="ascii") as lines:
         sizes = dict(line.split(":") for line in lines)
     return int(sizes["MemAvailable"].split()[0]) * 1024
@@ -93,7 +93,7 @@ def _allocate(name: str, size: int) -> int:
         )
     fd = os.memfd_create(f"acquire-{name}")
     try:
-        # An error now, in place of a SIGBUS at some later store into a page that cannot be had.
+        # Fail now, rather than with SIGBUS at a later store into a page that cannot be allocated.
         os.posix_fallocate(fd, 0, size)
     except OSError as error:
         os.close(fd)

@@ -154,7 +154,7 @@ class SimulatedCamera:
     def next_block(self, timeout_s: float) -> CameraBlock | None:
         """The next ``block_lines`` lines; fewer only for the last of a train that was stopped."""
         if self._train is None:
-            raise CameraError("a block was asked of a camera that is not armed", hint="arm it")
+            raise CameraError("a block was requested of a camera that is not armed", hint="arm it")
         if self._ready:
             return self._ready.popleft()
         reading = self._wire.read()

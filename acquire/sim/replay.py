@@ -124,7 +124,7 @@ class ReplayCamera:
     def next_block(self, timeout_s: float) -> CameraBlock | None:
         """The next lines that are due; at the end, and when all of a block were missing, none."""
         if self._run is None:
-            raise CameraError("a block was asked of a camera that is not armed", hint="arm it")
+            raise CameraError("a block was requested of a camera that is not armed", hint="arm it")
         if self._ready:
             return self._ready.popleft()
         deadline_ns = self._wire.clock.monotonic_ns() + int(timeout_s * 1e9)

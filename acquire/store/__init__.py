@@ -1,4 +1,4 @@
-"""Recordings and videos on disk: Zarr v3 that zarr-python, xarray and tensorstore open without us.
+"""Recordings and videos on disk: Zarr v3 that zarr-python, xarray and tensorstore open without this package.
 
 ::
 
@@ -12,9 +12,9 @@
     what is written    terms, spec (attributes), layout and shape (metadata), codecs (bytes)
     where              files (disk), pages, host  source → disk | remote (URLs)
 
-An `Outline` is a recording without its lines: it and all below it need no library of arrays. What is asked
-for here is imported when it is asked for, so a list of recordings comes at once. No module may have the name
-of a function: importing it would put it in the function's place.
+An `Outline` is a recording without its lines: it and everything that it uses need no array library. Names are
+imported from here lazily, so that a list of recordings comes at once. No module may have the name of a
+function: importing it would replace the function.
 """
 
 from __future__ import annotations
@@ -126,6 +126,6 @@ _HOMES = {
     "verify": "verification",
     "write_video": "video",
 }
-"""What is asked for here, and the module that has it."""
+"""Public name → the module that defines it."""
 
 __getattr__, __dir__ = lazily(__name__, _HOMES, __all__)

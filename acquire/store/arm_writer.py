@@ -54,12 +54,12 @@ class ArmWriter:
 
     @property
     def written_rows(self) -> int:
-        """Rows that are on disk in every array, in whole chunks."""
+        """Rows on disk in every array, in whole chunks."""
         return min(array.written_rows for array in self._arrays.values())
 
     @property
     def whole_rows(self) -> int:
-        """Of these, what is in the indices of all their shards."""
+        """Rows that are also in the indices of all their shards."""
         return min(array.whole_rows for array in self._arrays.values())
 
     @property
@@ -68,7 +68,7 @@ class ArmWriter:
 
     @property
     def direct(self) -> bool:
-        """Lines are written past the page cache."""
+        """Whether lines are written past the page cache."""
         return any(array.direct for array in self._arrays.values())
 
     def create(self) -> None:
@@ -76,17 +76,17 @@ class ArmWriter:
             self._disk.make_directory(array.directory, parents=True)
 
     def begin(self, first_line: int) -> None:
-        """Row 0 is line ``first_line``; before the first `append`."""
+        """Set the line of row 0; before the first `append`."""
         self._first_line = first_line
 
     def append(self, block: TaggedBlock, behind: ThreadPoolExecutor | None) -> None:
-        """With ``behind``, a thread that writes, the block is lent until `give_back`."""
+        """Append the block. With ``behind``, a thread that writes, it is lent until `give_back`."""
         self._check(block)
-        for column, array in reversed(self._arrays.items()):  # pixels last: what they have, all have
+        for column, array in reversed(self._arrays.items()):  # pixels last: rows that they have, all have
             array.append(getattr(block, column.source), behind)
 
     def give_back(self) -> None:
-        """Wait until what the last `append` was given may be reused."""
+        """Wait until the block of the last `append` may be reused."""
         self._pixels.give_back()
 
     def pad(self) -> None:
@@ -94,15 +94,15 @@ class ArmWriter:
             array.pad()
 
     def settle(self) -> None:
-        """Wait for what is being encoded, write it, and put all that is written into the indices."""
+        """Wait for the chunks being encoded, write them, and put all written chunks into the indices."""
         for array in self._arrays.values():
             array.settle()
 
     def publish_chunks(self) -> None:
-        """Put what is written into the indices, as far as the disk lets it."""
+        """Put the written chunks into the indices, as far as the disk allows."""
         for array in self._arrays.values():
             with contextlib.suppress(OSError):
-                array.finish()  # once it has failed, there is nothing left to wait for
+                array.finish()  # a write that has failed leaves nothing to wait for in `publish`
             with contextlib.suppress(OSError):
                 array.publish()
 
@@ -115,8 +115,9 @@ class ArmWriter:
             array.close()
 
     def publish(self, publisher: Publisher, rows: int, *, own: bool) -> dict[str, layout.Document]:
-        """Metadata of ``rows`` rows, by path below the recording; ``own``: what lies in the arm's directory
-        is replaced by it, too.
+        """Return the metadata of ``rows`` rows, by path below the recording.
+
+        ``own``: also replace the metadata files in the arm's directory.
         """
         documents = {
             column.name: layout.line_array(column, array.shape, rows)

@@ -1,4 +1,4 @@
-"""The files of a recording's arrays, as metadata and indices tell of them: no sample is read here."""
+"""The files of a recording's arrays, as described by metadata and indices: no sample is read here."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ class ArrayFiles:
 
     @property
     def most_bytes(self) -> int:
-        """Of a chunk as it lies in its file, however badly it was packed."""
+        """Largest possible size of a chunk in its file, however badly it was packed."""
         return 2 * self.shape.chunk_bytes + PAGE
 
     @property
     def chunks(self) -> int:
-        """Chunks that the rows are in."""
+        """Number of chunks that hold the rows."""
         return -(-self.rows // self.shape.chunk_rows)
 
     def file_bytes(self, shard: int) -> int:
-        """Size of a shard's file; 0 where there is none. Raises OSError."""
+        """Return the size of a shard's file; 0 if there is none. Raises OSError."""
         try:
             return self._source.size(self.shard_file(shard))
         except FileNotFoundError:
             return 0
 
     def index(self, shard: int) -> tuple[list[tuple[int, int]], bool]:
-        """Offset and size of a shard's chunks, ABSENT where there is none; whether they are intact."""
+        """Return offset and size of a shard's chunks (ABSENT if missing), and whether the index is intact."""
         chunks = self.shape.shard_chunks
         try:
             data = self._source.read_range(self.shard_file(shard), 0, index_bytes(chunks))
@@ -56,11 +56,11 @@ class ArrayFiles:
         return unpack_index(data, chunks)
 
     def file(self, chunk: int) -> str:
-        """Key of the file that has a chunk."""
+        """Return the key of the file that holds a chunk."""
         return self.shard_file(chunk // self.shape.shard_chunks)
 
     def shard_file(self, shard: int) -> str:
-        """Key of a shard."""
+        """Return the key of a shard's file."""
         return f"{self.key}/{shard_key(shard, len(self.shape.chunk_shape))}"
 
 
@@ -81,14 +81,14 @@ class ArmFiles:
 
     @property
     def data_type(self) -> str:
-        """Of a sample."""
+        """Zarr data type of a sample."""
         return self.files("lines").shape.data_type
 
     @property
     def pixels(self) -> int:
-        """Samples of a line."""
+        """Number of samples in a line."""
         return self.files("lines").shape.row_shape[0]
 
     def files(self, name: str) -> ArrayFiles:
-        """Those of the array ``name``."""
+        """Return the files of the array ``name``."""
         return self._files[name]

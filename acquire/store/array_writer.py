@@ -32,17 +32,16 @@ if TYPE_CHECKING:
     from acquire.store.shard import Piece
 
 ENCODED_AHEAD = 4
-"""Chunks of an array that are encoded while others are filled and written."""
+"""Number of chunks of an array that may be encoded while others are filled and written."""
 
 
 class ArrayWriter:
     """Appends rows to one array; whole chunks go to disk at once, the rest waits in one buffer.
 
-    Buffers are allocated once. Rows that make whole chunks by themselves are written without a copy, in one
-    piece; with a ``pool`` they are encoded there while others are written, always in order: as they are if
-    they are lent, else copied into up to ``ahead`` buffers. ``once`` is shared by arrays of equal rows.
-    ``durable`` forces each file to the medium before it is left for the next. What fills up the last chunk is
-    ``padding``.
+    Buffers are allocated once. Rows that form whole chunks are written without a copy, in one piece. With a
+    ``pool`` they are encoded there while others are written, always in order: in place if they are lent,
+    otherwise copied into up to ``ahead`` buffers. ``once`` is shared by arrays of equal rows. ``durable``
+    forces each file to the medium before the next one is begun. The last chunk is filled up with ``padding``.
     """
 
     def __init__(
@@ -73,7 +72,7 @@ class ArrayWriter:
         self._buffer = self._free.popleft()
         self._filled = 0
         self._encoding: deque[tuple[Future[NDArray[np.uint8]], NDArray[Any] | None]] = deque()
-        """In order; the buffer that a chunk is in, or None: it is lent."""
+        """Chunks being encoded, in order, each with its buffer, or None if its rows are lent."""
         self._writing: tuple[Future[None], Piece] | None = None
         self._chunks = 0
         self._published = 0
@@ -83,24 +82,24 @@ class ArrayWriter:
 
     @property
     def written_rows(self) -> int:
-        """Rows in chunks that are on disk, without what pads the last."""
+        """Rows in chunks that are on disk, without padding."""
         return min(self._chunks * self.shape.chunk_rows, self.rows)
 
     @property
     def whole_rows(self) -> int:
-        """Rows in chunks that are on disk and in their shard's index, without what pads the last."""
+        """Rows in chunks that are on disk and in their shard's index, without padding."""
         return min(self._published * self.shape.chunk_rows, self.rows)
 
     @property
     def direct(self) -> bool:
-        """Chunks go past the page cache."""
+        """Whether chunks are written past the page cache."""
         return self._shard is not None and self._shard.direct
 
     def append(self, rows: NDArray[Any], behind: ThreadPoolExecutor | None = None) -> None:
         """Append rows of this array's dtype and row shape, any number of them.
 
-        With ``behind``, a thread, they are lent until `give_back`: large chunks may be on their way to disk,
-        or being encoded.
+        With ``behind``, a thread, they are lent until `give_back`: large chunks may still be on their way to
+        disk, or being encoded.
         """
         self._behind = behind if self._is_large else None
         start = 0
@@ -110,13 +109,13 @@ class ArrayWriter:
             self.rows += taken
 
     def give_back(self) -> None:
-        """Wait until the rows of the last `append` may be reused: for the disk, or for what encodes them."""
+        """Wait until the rows of the last `append` are written or encoded, and may be reused."""
         if self._pool is None:
             self.finish()
         wait([payload for payload, buffer in self._encoding if buffer is None])
 
     def finish(self) -> None:
-        """Wait for the piece that is on its way to the disk; raises what the disk says."""
+        """Wait for the piece that is on its way to the disk. Raises the disk's OSError."""
         if self._writing is not None:
             (written, piece), self._writing = self._writing, None
             written.result()
@@ -135,27 +134,27 @@ class ArrayWriter:
         self.publish()
 
     def publish(self) -> None:
-        """Put what is written into the index of its shard."""
+        """Put the written chunks into the index of their shard."""
         self.finish()
         if self._shard is not None:
             self._shard.publish()
             self._published = self._chunks
 
     def sync(self) -> None:
-        """Force what was written since the last call to the medium."""
+        """Force everything written since the last call to the medium."""
         if self._shard is not None and self._unsynced:
             self._shard.sync()
             self._unsynced = False
 
     def close(self) -> None:
-        """Close the file; rows that wait are dropped. Idempotent; no piece is on its way any more."""
+        """Close the file; rows that wait are dropped. No piece may be on its way. Idempotent."""
         if self._shard is not None:
             self._shard.close()
 
     def _take(self, rows: NDArray[Any]) -> int:
         size = self.shape.chunk_rows
         if self._pool is None and self._filled == 0:
-            self.finish()  # it may be the buffer
+            self.finish()  # the piece on its way may be in the buffer
         if self._filled == 0 and len(rows) >= size and rows.flags.c_contiguous:
             if self._pool is None:
                 return self._write_whole(rows)
@@ -169,14 +168,14 @@ class ArrayWriter:
         return count
 
     def _write_whole(self, rows: NDArray[Any]) -> int:
-        """Write the whole chunks at the beginning of ``rows`` that the file has room for; so many rows."""
+        """Write the whole chunks at the start of ``rows`` that the file has room for; return their rows."""
         size = self.shape.chunk_rows
         count = min(len(rows) // size, self._with_room().room)
         self._write([self._encode(rows[k * size : (k + 1) * size], self._chunks + k) for k in range(count)])
         return count * size
 
     def _encode_whole(self, rows: NDArray[Any], pool: ThreadPoolExecutor) -> int:
-        """Have the whole chunks at the beginning of ``rows`` encoded where they are; so many rows."""
+        """Have the whole chunks at the start of ``rows`` encoded in place; return their number of rows."""
         self._write_encoded()
         size = self.shape.chunk_rows
         whole = len(rows) // size
@@ -201,21 +200,21 @@ class ArrayWriter:
         return self._once(chunk, rows, self.shape.codec)
 
     def _write_encoded(self) -> None:
-        """Wait for all that is being encoded, and write it in as few pieces as can be."""
+        """Wait for all chunks being encoded, and write them in as few pieces as possible."""
         while self._encoding:
             self.finish()
             count = min(self._with_room().room, len(self._encoding))
             self._write([self._encoded() for _ in range(count)])
 
     def _encoded(self) -> NDArray[np.uint8]:
-        """The oldest chunk that is being encoded."""
+        """Wait for the oldest chunk being encoded, and return it."""
         payload, buffer = self._encoding.popleft()
         if buffer is not None:
-            self._free.append(buffer)  # nobody but this thread takes it, and not before the result is here
+            self._free.append(buffer)  # only this thread takes it again, after the result below
         return payload.result()
 
     def _write(self, payloads: Sequence[NDArray[np.uint8]]) -> None:
-        self.finish()  # its last pages are those that the next piece needs
+        self.finish()  # `_pages` holds parts of the piece on its way, and is about to be reused
         shard = self._with_room()
         piece = self._pages.piece(payloads) if self._is_large else small_piece(payloads)
         self._unsynced = True
@@ -241,10 +240,10 @@ class ArrayWriter:
         self._shard = None
         key = shard_key(self._chunks // self.shape.shard_chunks, len(self.shape.chunk_shape))
         path = self.directory / key
-        self.directory.stat()  # one that was taken away is a failure, and not made again
+        self.directory.stat()  # raises if the directory was removed: it must not be created again
         self._disk.make_directory(path.parent, parents=True)
         self._shard = ShardWriter(self._disk, path, self.shape.shard_chunks, direct=self._is_large)
-        # A file that is on the medium can still have no name there: each directory above it is forced, too.
+        # A file whose bytes are on the medium may still have no name there: force each directory above it.
         directory = path.parent
         while self._durable and directory != self.directory.parent:
             self._disk.sync_directory(directory)
@@ -253,6 +252,6 @@ class ArrayWriter:
 
 
 def _buffer(shape: ArrayShape) -> NDArray[Any]:
-    """A chunk in page-aligned memory."""
+    """Return a chunk in page-aligned memory."""
     samples = aligned_bytes(shape.chunk_bytes)[: shape.chunk_bytes]
     return samples.view(shape.dtype).reshape(shape.chunk_shape)

@@ -1,9 +1,9 @@
-"""What a recording's root must say for a reader to believe it: checked once, when it is opened.
+"""Validation of the attributes of a recording's root, once, when it is opened.
 
-Whatever wrote the attributes, readers may rely on their kinds and limits afterwards; facts that no reader
-takes apart (the configuration, the scene) are only demanded to be of the right kind. Recordings of all
-versions of this format pass. A list of recordings is read by this, too: a library of models would take
-longer to load than all of them.
+Afterwards readers may rely on the attributes' types and limits, whatever wrote them; for facts that no reader
+interprets (the configuration, the scene) only the type is checked. Recordings of all versions of this format
+pass. This is plain Python because lists of recordings are read with it: importing a modelling library would
+take longer than reading all of them.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     Check = Callable[[Any], None]
-    """Raises `_WrongError` for what a value must not be."""
+    """Raises `_WrongError` for a value that is not valid."""
 
 MOST_LINES = 2**62
 
 
 class _WrongError(ValueError):
-    """``where`` in the attributes something is wrong, and what."""
+    """``what`` is wrong, and ``where`` in the attributes."""
 
     def __init__(self, what: str, *where: str) -> None:
         super().__init__(f"{'.'.join(where)}: {what}" if where else what)
@@ -48,7 +48,7 @@ def _object(value: Any) -> None:
 
 
 def _anything(value: Any) -> None:
-    """What is only asked for where it is shown."""
+    """Accept any value: it is only shown."""
 
 
 def _whole(low: int, high: int) -> Check:
@@ -58,7 +58,7 @@ def _whole(low: int, high: int) -> Check:
 
 
 def _number(low: float = -math.inf, *, above: bool = False) -> Check:
-    """A finite number of at least ``low``, or ``above`` it."""
+    """Return a check for a finite number of at least ``low``, or ``above`` it."""
     limit = "" if low == -math.inf else f" above {low:g}" if above else f" from {low:g} on"
 
     def check(value: Any) -> None:
@@ -73,7 +73,7 @@ def _maybe(of: Check) -> Check:
 
 
 def _each(of: Check) -> Check:
-    """A list of such values."""
+    """Return a check for a list of such values."""
 
     def check(value: Any) -> None:
         _check(isinstance(value, list), value, "a list")
@@ -84,7 +84,7 @@ def _each(of: Check) -> Check:
 
 
 def _table(of: Check) -> Check:
-    """A JSON object, all values of which are such."""
+    """Return a check for a JSON object with such values only."""
 
     def check(value: Any) -> None:
         _object(value)
@@ -95,7 +95,7 @@ def _table(of: Check) -> Check:
 
 
 def _record(required: dict[str, Check], optional: dict[str, Check] | None = None) -> Check:
-    """A JSON object with these values, and perhaps others."""
+    """Return a check for a JSON object with these values, and perhaps others."""
 
     def check(value: Any) -> None:
         _object(value)
@@ -118,31 +118,31 @@ def _at(key: str, of: Check, value: Any) -> None:
 
 
 def _name(value: Any) -> None:
-    """Of something in the same directory."""
+    """Check a name in the same directory."""
     odd = not isinstance(value, str) or value in ("", ".", "..") or "/" in value or "\0" in value
     _check(not odd, value, "a name")
 
 
 def _stretch(value: Any) -> None:
-    """First line and count."""
+    """Check a first line and a count."""
     _each(_COUNT)(value)
     _check(len(value) == 2, value, "a first line and a count")
 
 
 def _hold(value: Any) -> None:
-    """First line, count, and why."""
+    """Check a first line, a count and a reason."""
     fits = isinstance(value, list) and [type(one) for one in value] == [int, int, str] and min(value[:2]) >= 0
     _check(fits, value, "a first line, a count and a reason")
 
 
 def _book(value: Any) -> None:
-    """Of an arm: lines stored, and missing by cause; a ledger may tell something else instead."""
+    """Check an arm's ledger: lines stored, and missing by cause. Anything but an object passes."""
     if isinstance(value, dict):
         _record({}, {"stored": _maybe(_COUNT), "missing": _table(_COUNT)})(value)
 
 
 def _durability(value: Any) -> None:
-    """Nothing, or what can be lost."""
+    """Check the durability: empty, or the lines that can be lost."""
     if value != {}:
         _record({"fsync": _text, "kill_lines": _COUNT, "power_lines": _maybe(_COUNT)})(value)
 
@@ -200,7 +200,7 @@ _ROOT = _record(
 
 
 def segment_of(attributes: dict[str, Any]) -> tuple[str, int] | None:
-    """Name of the first recording that this one continues, and its number; None where it continues none."""
+    """Return the name of the recording that this segment continues, and its number; None if it is none."""
     segment: Any = attributes.get("segment")
     try:
         _SEGMENT(segment)
@@ -210,7 +210,7 @@ def segment_of(attributes: dict[str, Any]) -> tuple[str, int] | None:
 
 
 def upload_target(attributes: dict[str, Any]) -> str | None:
-    """Where the rig that recorded it copies its recordings, as far as it says so."""
+    """Return the URL to which the rig copies its recordings, according to its configuration, or None."""
     found: Any = attributes
     for key in ("config", "recording", "upload_to"):
         found = found.get(key) if isinstance(found, dict) else None
@@ -218,5 +218,5 @@ def upload_target(attributes: dict[str, Any]) -> str | None:
 
 
 def check_attributes(attributes: dict[str, Any]) -> None:
-    """Raise ValueError, with the first thing that is wrong, unless they are a recording's."""
+    """Raise ValueError, stating the first fault, unless these are valid attributes of a recording."""
     _ROOT(attributes)

@@ -1,4 +1,4 @@
-"""One arm of a recording, read by slices; what is not intact on disk raises instead of giving zeros."""
+"""One arm of a recording, read by slices; rows that are not intact on disk raise and never read as zeros."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 class CameraStream(ArmFiles):
     """One arm: arrays that are read when they are sliced; row i of each is line ``first_line + i``.
 
-    ``documents`` are the metadata of its arrays by name, ``group`` opens it in zarr-python.
+    ``documents``: metadata of its arrays by name; ``group`` opens the recording in zarr-python.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class CameraStream(ArmFiles):
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Of a sample."""
+        """Type of a sample."""
         return self._readers["lines"].shape.dtype
 
     @property
@@ -84,24 +84,24 @@ class CameraStream(ArmFiles):
         return self.array("flags")
 
     def array(self, name: str) -> zarr.Array[Any]:
-        """The Zarr array ``name`` of this arm."""
+        """Return the Zarr array ``name`` of this arm."""
         return child_array(self._group(), f"{self.arm}/{name}")
 
     def reader(self, name: str) -> ChunkReader:
-        """The chunks of the array ``name``."""
+        """Return the reader of the chunks of the array ``name``."""
         return self._readers[name]
 
     def stretch(self, name: str, start: int, stop: int) -> Stretch:
-        """Rows ``start .. stop - 1`` of one array, to be read."""
+        """Return rows ``start .. stop - 1`` of one array, to be read."""
         return Stretch(self._readers[name], start, stop, self.first_line)
 
     def read(self, name: str, start: int, stop: int) -> NDArray[Any]:
-        """Rows ``start .. stop - 1`` of one array; DataError when they are not intact on disk."""
+        """Read rows ``start .. stop - 1`` of one array. Raises DataError if they are not intact on disk."""
         return self.stretch(name, start, stop).read()
 
 
 def child_array(group: zarr.Group, name: str) -> zarr.Array[Any]:
-    """The array ``name`` inside ``group``; TypeError when it is something else."""
+    """Return the array ``name`` inside ``group``. Raises TypeError if it is something else."""
     import zarr
 
     node = group[name]

@@ -1,4 +1,4 @@
-"""Reader of one sharded array: a chunk is given whole and intact, or it is said what is wrong with it."""
+"""Reader of one sharded array: a chunk is returned whole and intact, or an error states what is wrong."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 READ_ATTEMPTS = 3
-"""An index may be met in the instant of its replacement; its checksum tells, and it is read again."""
+"""An index may be read in the instant of its replacement; its checksum reveals that, and it is read again."""
 
 
 class AbsentChunkError(LookupError):
@@ -27,15 +27,15 @@ class ChunkReader(ArrayFiles):
     """The chunks of one array of an arm."""
 
     def expect_index(self, shard: int) -> None:
-        """The index of a shard will be read soon: it is fetched meanwhile. Raises OSError."""
+        """Start fetching the index of a shard, which will be read soon. Raises OSError."""
         self._source.expect(self.shard_file(shard), 0, index_bytes(self.shape.shard_chunks))
 
     def expect(self, number: int, offset: int, size: int) -> None:
-        """The same of a chunk itself: a disk does best when it knows all that is wanted at once."""
+        """Start fetching a chunk: a disk is fastest if it knows all requests at once. Raises OSError."""
         self._source.expect(self.file(number), offset, size)
 
     def places(self, numbers: range) -> dict[int, tuple[int, int]]:
-        """Offset and size of these chunks, as far as they are on disk and their indices intact.
+        """Return offset and size of those chunks that are on disk, and whose indices are intact.
 
         Each index is read once. Raises OSError.
         """
@@ -45,11 +45,11 @@ class ChunkReader(ArrayFiles):
             for number in numbers if intact else ():
                 offset, size = entries[number % per_shard]
                 if number // per_shard == shard and size <= self.most_bytes and offset < 2**62:
-                    found[number] = offset, size  # of what is absent, both are larger
+                    found[number] = offset, size  # both are larger for an absent chunk
         return found
 
     def chunk(self, number: int, place: tuple[int, int] | None = None) -> NDArray[Any]:
-        """All rows of one chunk, with what pads it; ``place`` is its offset and size, if known.
+        """Return all rows of one chunk, with padding; ``place`` is its offset and size, if known.
 
         Raises `AbsentChunkError`, `DamagedChunkError`, OSError.
         """
@@ -61,7 +61,10 @@ class ChunkReader(ArrayFiles):
         return samples.view(self.shape.dtype).reshape(self.shape.chunk_shape)
 
     def payload(self, number: int, offset: int, size: int) -> memoryview:
-        """Bytes of chunk ``number`` at ``offset`` of its file; their length and checksum are right."""
+        """Return the bytes of chunk ``number`` at ``offset`` of its file, with length and checksum verified.
+
+        Raises DamagedChunkError and OSError.
+        """
         data = self._source.read_range(self.file(number), offset, size)
         if len(data) < size or size <= CRC_BYTES:
             raise DamagedChunkError(f"{size - len(data)} of {size} bytes are not there")
@@ -75,7 +78,7 @@ class ChunkReader(ArrayFiles):
         return payload
 
     def size_at(self, number: int, offset: int) -> int:
-        """Size that a chunk at ``offset`` would have by its own account; 0 where there cannot be one."""
+        """Return the size that a chunk at ``offset`` has by its own header; 0 if there cannot be one."""
         try:
             header = self._source.read_range(self.file(number), offset, BLOSC_HEADER)
         except OSError:
@@ -83,7 +86,7 @@ class ChunkReader(ArrayFiles):
         return stored_size(header, self.shape.chunk_bytes, self.shape.codec)
 
     def trouble(self, number: int) -> str | None:
-        """What is wrong with a chunk, in words; None: it is there, of the right length and checksum."""
+        """Return what is wrong with a chunk, in words; None if it has the right length and checksum."""
         try:
             self.payload(number, *self.entry(number))
         except (AbsentChunkError, DamagedChunkError) as error:
@@ -93,7 +96,7 @@ class ChunkReader(ArrayFiles):
         return None
 
     def entry(self, number: int) -> tuple[int, int]:
-        """Offset and size of a chunk. Raises `AbsentChunkError`; `DamagedChunkError` for a broken index."""
+        """Return offset and size of a chunk. Raises `AbsentChunkError`, or `DamagedChunkError` (index)."""
         for _ in range(READ_ATTEMPTS):
             entries, intact = self.index(number // self.shape.shard_chunks)
             if intact:

@@ -1,6 +1,6 @@
-"""How the bytes of a chunk are packed: as they are, or by blosc with bit shuffle; and how fast that is here.
+"""Codecs of chunks (none, or blosc with bit shuffle), and measurement of their speed on this host.
 
-What is packed here, plain Zarr unpacks. Every chunk carries a crc32c, since blosc notices no flipped bit.
+Plain Zarr can unpack the chunks. Every chunk carries a crc32c, since blosc does not detect flipped bits.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ _MOST_KEPT = 4
 BLOSC_HEADER = 16
 """Bytes; the second word is the unpacked size, the fourth the packed one."""
 
-blosc.use_threads = False  # its own threads serve one caller at a time; ours are the writer's
+blosc.use_threads = False  # its own threads serve one caller at a time; the writer has a pool instead
 
 
 @dataclass(frozen=True, slots=True)
 class CodecSpeed:
-    """What one thread makes of sample lines: MB of lines per second, and how many times smaller they get."""
+    """Speed of one thread on sample lines, in MB of lines per second, and compression ratio."""
 
     codec: Codec
     megabytes_per_s: float
@@ -41,7 +41,7 @@ class CodecSpeed:
 
 @dataclass(frozen=True, slots=True)
 class CodecChoice:
-    """The codec for a rate of lines, and the numbers that it was chosen by; JSON by `to_attrs`."""
+    """The codec chosen for a line rate, and the measurements behind the choice; JSON by `to_attrs`."""
 
     codec: Codec
     reason: str
@@ -53,23 +53,23 @@ class CodecChoice:
 
 
 def encode(rows: NDArray[Any], codec: Codec) -> NDArray[np.uint8]:
-    """Bytes of one chunk before its checksum; ``rows`` is C-contiguous and little-endian."""
+    """Return the bytes of one chunk, without checksum; ``rows`` is C-contiguous and little-endian."""
     if codec == "none":
         return rows.reshape(-1).view(np.uint8)
-    # Bit shuffle lays bits of one weight together: the upper ones hardly change along a line, though the
+    # Bit shuffle puts bits of equal weight together: the upper ones hardly change along a line, although the
     # lowest are noise.
     return np.frombuffer(blosc.compress(rows, codec.encode(), 1, blosc.BITSHUFFLE), np.uint8)
 
 
 class EncodeOnce:
-    """Packs chunks that come twice, once from either arm, a single time: code and ticks are alike."""
+    """Packs chunks only once that come from both arms with the same content, such as code and ticks."""
 
     def __init__(self) -> None:
         self._packed: dict[tuple[int, bytes], NDArray[np.uint8]] = {}
 
     def __call__(self, chunk: int, rows: NDArray[Any], codec: Codec) -> NDArray[np.uint8]:
-        """`encode` of the rows of chunk number ``chunk``."""
-        # By checksum as well: arms that lost different lines do not have the same rows.
+        """Return `encode` of the rows of chunk number ``chunk``."""
+        # The checksum is part of the key: arms that lost different lines do not have the same rows.
         key = chunk, crc32c(rows.data)
         packed = self._packed.pop(key, None)
         if packed is None:
@@ -80,7 +80,7 @@ class EncodeOnce:
 
 
 def decode(payload: Buffer, codec: Codec) -> NDArray[np.uint8]:
-    """The bytes that were packed; `check_size` has agreed with their number."""
+    """Return the unpacked bytes; `check_size` must have passed."""
     samples: NDArray[np.uint8] = np.frombuffer(
         memoryview(payload) if codec == "none" else blosc.decompress(payload), np.uint8
     )
@@ -88,8 +88,8 @@ def decode(payload: Buffer, codec: Codec) -> NDArray[np.uint8]:
 
 
 def check_size(payload: memoryview, size: int, codec: Codec) -> None:
-    """Raise ValueError unless ``payload`` is of the length that it says, and unpacks to ``size`` bytes."""
-    # Before it is unpacked: a header that lies would have us ask the system for whatever it says.
+    """Raise ValueError unless ``payload`` has the length that its header states, and unpacks to ``size``."""
+    # To be called before unpacking, which allocates whatever size a damaged header states.
     have, stored = len(payload), len(payload)
     if codec != "none" and have >= BLOSC_HEADER:
         have, stored = struct.unpack_from("<4xI4xI", payload)
@@ -98,7 +98,7 @@ def check_size(payload: memoryview, size: int, codec: Codec) -> None:
 
 
 def stored_size(header: bytes, size: int, codec: Codec) -> int:
-    """Bytes on disk, with checksum, of a chunk of ``size`` bytes that begins so; 0: none does."""
+    """Return the size on disk, with checksum, of a chunk of ``size`` bytes by its header; 0 without one."""
     if len(header) < BLOSC_HEADER:
         return size + CRC_BYTES if codec == "none" else 0
     stored = size if codec == "none" else int(struct.unpack_from("<12xI", header)[0])
@@ -106,7 +106,7 @@ def stored_size(header: bytes, size: int, codec: Codec) -> int:
 
 
 def crc32c(data: Buffer) -> bytes:
-    """Checksum as Zarr stores it: 4 bytes, little-endian."""
+    """Return the checksum as Zarr stores it: 4 bytes, little-endian."""
     value: int = checksums.crc32c(data)
     return value.to_bytes(CRC_BYTES, "little")
 
@@ -119,11 +119,11 @@ def choose_codec(
     threads: int = 1,
     margin: float = 1.5,
 ) -> CodecChoice:
-    """The codec that records ``bytes_per_s`` here with ``margin`` to spare; takes some tenths of a second.
+    """Choose the codec that records ``bytes_per_s`` here with ``margin``; takes some tenths of a second.
 
-    ``lines`` (line, pixel) are like those to come, some MB of them; ``disk_bytes_per_s`` is what the disk
-    sustains; ``threads`` pack beside each other. The smallest recording wins among the codecs that hold the
-    rate with ``margin``; where none does, the one that comes nearest.
+    ``lines`` (line, pixel) are like those to come, some MB of them; ``disk_bytes_per_s`` is the rate that the
+    disk sustains; ``threads`` pack in parallel. Among the codecs that sustain the rate with ``margin`` the
+    one with the smallest recording is chosen; if none does, the fastest.
     """
     if not lines.size or bytes_per_s <= 0 or disk_bytes_per_s <= 0:
         raise UsageError(
@@ -133,7 +133,7 @@ def choose_codec(
         )
     measured = tuple(measure_codec(lines, codec) for codec in CODECS)
     needed = bytes_per_s * margin
-    # Packing and writing go on beside each other: the slower one counts.
+    # Packing and writing run in parallel: the slower one counts.
     held = {
         speed.codec: min(speed.megabytes_per_s * 1e6 * threads, disk_bytes_per_s * speed.ratio)
         for speed in measured
@@ -149,10 +149,10 @@ def choose_codec(
 
 
 def measure_codec(lines: NDArray[Any], codec: Codec, seconds: float = 0.1) -> CodecSpeed:
-    """How fast one thread packs ``lines`` with checksum: the best of the rounds that fit ``seconds``.
+    """Measure how fast one thread packs ``lines`` with checksum: the best of the rounds within ``seconds``.
 
     Lines that fit into the processor's caches stay there from round to round. That flatters ``none``, of
-    which nothing but the checksum is left; what it can sustain is the disk's rate anyway, never this one.
+    which only the checksum is measured; but its rate is limited by the disk anyway, never by this one.
     """
     rows = np.ascontiguousarray(lines)
     best, until = float("inf"), time.perf_counter() + seconds

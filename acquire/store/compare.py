@@ -1,18 +1,18 @@
-"""Two recordings of the same lines, array by array: where they first differ, and in how many rows.
+"""Comparison of two recordings of the same lines, array by array: the first difference, and their number.
 
-A recording that was made from another one numbers its lines anew, from 0 on, and has a clock of its own. So
-what is compared is what the lines themselves determine:
+A recording made from another one numbers its lines from 0 again, and has a clock of its own. So the following
+is compared, which the lines themselves determine:
 
 =============  ==========================================================================================
 lines, code    equal
 flags          equal; both missing is equal, whatever else is flagged
-code_index     equal once either is counted from the recording's line 0
+code_index     equal if each is counted from its recording's line 0
 tick           equal up to one offset, the same for all rows of both arms
-time           as far off the recording's own clock at its tick, to the nanosecond, in both
+time           equal offset from the recording's own clock at its tick, to the nanosecond
 gaps           the same rows of the same arm; their causes may differ
 =============  ==========================================================================================
 
-Rows that are missing in either are compared by their flags and gaps alone.
+Rows that are missing in either are compared only by their flags and gaps.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ Block = dict[str, "NDArray[Any]"]
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """Where an array of the second recording first differs from the first one's, and in how many rows."""
+    """First difference between an array of both recordings, and the number of rows that differ."""
 
     array: str
     rows: int
@@ -63,9 +63,9 @@ class Difference:
 def compare(
     first: Recording, second: Recording, progress: Callable[[int, int], object] | None = None
 ) -> list[Difference]:
-    """Every array of ``second`` against that of ``first``, whose row ``second.first_line`` is its row 0.
+    """Compare every array of ``second`` with ``first``; row 0 of ``second`` is line ``second.first_line``.
 
-    Raises DataError where one of them cannot be read.
+    Raises DataError if one of them cannot be read.
     """
     shift = second.first_line
     asked, have = first.lines - shift, second.lines
@@ -87,7 +87,7 @@ def compare(
 
 
 class _Offset:
-    """Between the two clocks: found at the first row that both have, and the same from there on."""
+    """Offset between the two clocks: found at the first row that both have, and constant from there on."""
 
     def __init__(self) -> None:
         self.ticks: int | None = None
@@ -100,10 +100,10 @@ def _read(recording: Recording, arm: str, start: int, stop: int) -> Block:
 
 
 def _count_from_zero(first: Recording, second: Recording, old: Block, new: Block, offset: _Offset) -> None:
-    """Bring numbers and clocks of both to the same beginning, where rows are there in both."""
+    """Refer numbers and clocks of both to the same origin; set rows that either lacks to 0."""
     both = ((old["flags"] | new["flags"]) & MISSING) == 0
     for recording, block in ((first, old), (second, new)):
-        # int64 throughout: differences of recorded numbers may be negative where something is wrong
+        # int64 throughout: differences of recorded numbers may be negative if something is wrong
         block["time"] = block["time"] - recording.clock.time_ns(block["tick"])
         begin = 0 if recording is second else first.substeps * first.first_line
         block["code_index"] = block["code_index"].astype(np.int64) - begin
@@ -135,7 +135,7 @@ def _of_block(arm: str, start: int, old: Block, new: Block) -> Iterator[Differen
 
 
 def _shown(value: Any) -> str:
-    """A value; of a line, its first pixels."""
+    """Return a value as text; of a line, its first pixels."""
     if np.ndim(value) == 0:
         return str(value)
     return f"[{' '.join(map(str, value[:4]))}{' …' if len(value) > 4 else ''}]"
@@ -152,7 +152,7 @@ def _add(found: dict[str, Difference], new: Difference) -> None:
 
 
 def _of_gaps(first: Recording, second: Recording, shift: int, rows: int) -> Iterator[Difference]:
-    """Listed gaps; those that found no room in the table are in the flags alone."""
+    """Compare the listed gaps; if a table was full, the flags alone have the gaps that it lacks."""
     if first.gaps_not_listed or second.gaps_not_listed:
         return
     for arm in ARMS:
@@ -167,7 +167,7 @@ def _of_gaps(first: Recording, second: Recording, shift: int, rows: int) -> Iter
 
 
 def _edges(stretches: list[range], shift: int, rows: int) -> NDArray[np.int64]:
-    """Where stretches of lost rows begin and end, in turn; those that touch or overlap are one."""
+    """Return first and end row of the ranges in turn; ranges that touch or overlap are joined."""
     edges: list[int] = []
     for lost in sorted(stretches, key=lambda lost: lost.start):
         begin, end = (min(max(0, row - shift), rows) for row in (lost.start, lost.stop))

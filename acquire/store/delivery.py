@@ -1,4 +1,4 @@
-"""A Zarr group that is made in private and appears at its place whole, on a disk or at a URL.
+"""Delivery of a Zarr group that is prepared in private and appears complete, on a disk or at a URL.
 
 ::
 
@@ -6,8 +6,8 @@
     URL    a temporary directory   ─▶ its arrays are put ─▶ its root metadata, as the last
     file   .NAME.partial beside it ─▶ forced to the medium ─▶ linked (`whole_file`)
 
-Who opens a group asks for its ``zarr.json`` first: as long as there is none, nothing is there. What an upload
-leaves that failed is therefore no group, and is replaced when it is tried again.
+Readers open a group's ``zarr.json`` first: until it exists, there is no group. The remains of a failed upload
+are therefore no group, and are replaced by the next attempt.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ ROOT = "zarr.json"
 
 
 class Delivery(Protocol):
-    """What is made in ``partial``, until it is delivered or given up."""
+    """A group being prepared in ``partial``, until it is delivered or given up."""
 
     partial: Path
 
     def deliver(self) -> None:
-        """It appears at its place. UsageError where something is by now, StoreError when that fails."""
+        """Make it appear at its place. Raises UsageError if that is taken by now, StoreError if it fails."""
 
     def clear(self) -> None:
-        """Nothing of it stays here; what was delivered does."""
+        """Remove the preparations; a delivered group stays."""
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """An empty file to be filled, which appears at ``path`` when the block ends without an error.
+    """Yield an empty file to be filled, which appears at ``path`` when the block ends without an error.
 
-    Raises UsageError where somebody else has made ``path`` meanwhile, which is left as it is, and what
-    `refused` makes of a disk that refuses; then nothing is left.
+    Raises UsageError if ``path`` was created in the meantime, which is left alone, and the errors of
+    `refused` if the disk refuses; then nothing is left behind.
     """
     part = path.with_name(f".{path.name}.{os.getpid()}.partial")
     with refused(path, "written"):
@@ -61,19 +61,19 @@ def whole_file(path: Path) -> Iterator[Path]:
                 os.link(part, path)  # refuses where a rename would replace
             except FileExistsError as error:
                 raise UsageError(
-                    f"{path} was made by somebody else meanwhile", hint="another name"
+                    f"{path} was created by another program in the meantime", hint="another name"
                 ) from error
     finally:
         part.unlink(missing_ok=True)
 
 
 def delivery_to(place: Path | str) -> Delivery:
-    """UsageError where nothing new can be created at a place; StoreError for a store that does not answer."""
+    """Begin a delivery. Raises UsageError if the place is taken, StoreError if a store does not answer."""
     return _FarDelivery(str(place)) if is_url(place) else _LocalDelivery(Path(place))
 
 
 def check_new_place(place: Path | str) -> None:
-    """`check_new_path` of a path or a URL."""
+    """Do as `check_new_path`, for a path or a URL."""
     if is_url(place):
         _check_free(RemoteSource(str(place)))
     else:
@@ -107,7 +107,7 @@ class _FarDelivery:
     def deliver(self) -> None:
         _check_free(self._target)
         files = [file for file in self.partial.rglob("*") if file.is_file()]
-        # First what arrays are, by which `_check_free` knows what a failed upload has left; the root last.
+        # Metadata of arrays first, by which `_check_free` recognises a failed upload; the root last.
         files.sort(key=lambda file: (file == self.partial / ROOT, file.name != ROOT))
         with refused(self._target, "written"):
             for file in files:
@@ -121,7 +121,7 @@ class _FarDelivery:
 
 
 def _check_free(target: RemoteSource) -> None:
-    """Where an upload has failed, there are arrays without a root; anything else is not ours to replace."""
+    """Raise UsageError unless the target is empty, or holds arrays without a root: a failed upload."""
     with refused(target, "read"):
         there = target.sizes()
     if ROOT in there:

@@ -1,4 +1,4 @@
-"""How long a recording claims to be, against what lies on disk: nobody counts to a number out of a text."""
+"""Check of a recording's claimed length against its files: no loop may run over an unchecked number."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ if TYPE_CHECKING:
     from acquire.store.outline import Outline
 
 MOST_ABSENT_CHUNKS = 2**17
-"""Of an array, that a recording may claim and that are not on disk: terabytes of an accident, and seconds of
-a scan. Only a recording that claims more than these has its files counted when it is opened.
+"""Number of chunks of an array that may be claimed without being on disk: terabytes lost by an accident, and
+seconds of a scan. The files are counted at opening only if a recording claims more chunks than this.
 """
 
 
 def check_lengths(recording: Outline) -> None:
-    """Raise ValueError where a recording cannot be as long as its root says."""
+    """Raise ValueError if a recording cannot be as long as its root states."""
     arrays = {f"{arm}/{name}": files.files(name) for arm, files in recording.arms.items() for name in COLUMNS}
     first = arrays[f"{ARMS[0]}/lines"]
     for key, array in arrays.items():
@@ -26,7 +26,7 @@ def check_lengths(recording: Outline) -> None:
             raise ValueError(f"files of {key} have other rows than those of {ARMS[0]}/lines")
         if array.rows > MOST_LINES:
             raise ValueError(f"{key} claims {array.rows} lines")
-    # Dropped stretches are parts of the recording, one after the other.
+    # Dropped ranges are parts of the recording, one after the other.
     end = 0
     for rows in sorted(recording.dropped_rows(), key=lambda rows: rows.start):
         if not end <= rows.start < rows.stop <= recording.lines:
@@ -43,6 +43,6 @@ def check_lengths(recording: Outline) -> None:
 
 
 def kept_shards(recording: Outline) -> int:
-    """Files of each array that hold lines which retention has not dropped, as the root says."""
+    """Return the number of files of each array with lines that retention has not dropped, by the root."""
     size = recording.arms[ARMS[0]].files("lines").shape.shard_rows
     return sum((rows.stop - 1) // size - rows.start // size + 1 for rows in recording.kept_rows())

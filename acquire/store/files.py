@@ -1,7 +1,7 @@
-"""What the store asks of a file system: whole writes, atomic replacement, forcing to the medium.
+"""The store's file system operations: complete writes, atomic replacement, forcing to the medium.
 
 Every change that the store makes on a disk is a method of `Disk` or of the `ShardFile` that it opens, so that
-tests can put a disk in its place that fails, that is slow, or that loses its power between any two of them.
+tests can substitute a disk that fails, is slow, or loses power between any two of them.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ if TYPE_CHECKING:
     from typing_extensions import Buffer
 
 SCRATCH = ".next"
-"""Where new metadata of a recording is prepared, beside the shards of its first array."""
+"""Name under which a recording's new metadata is prepared, next to the shards of its first array."""
 
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 _WRITABLE = stat.S_IWUSR | stat.S_IWGRP | stat.S_IWOTH
 
 NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS)
-"""What a file system without locks answers; some network disks are such."""
+"""Errors of a file system without locks, as some network disks are."""
 
 
 def check_new_path(path: Path) -> None:
@@ -58,7 +58,7 @@ def _is_taken(path: Path) -> bool:
 
 
 def write_all(fd: int, parts: Sequence[Buffer], offset: int) -> None:
-    """Write all of ``parts`` from ``offset`` on; a short write goes on until the disk says why."""
+    """Write all of ``parts`` from ``offset`` on; continue short writes until the disk raises an error."""
     views = [memoryview(part).cast("B") for part in parts]
     left = sum(map(len, views))
     while (written := os.pwritev(fd, views, offset)) < left:
@@ -70,7 +70,7 @@ def write_all(fd: int, parts: Sequence[Buffer], offset: int) -> None:
 
 
 def _without(views: Sequence[memoryview], count: int) -> list[memoryview]:
-    """``views`` after their first ``count`` bytes."""
+    """Return ``views`` without their first ``count`` bytes."""
     rest = []
     for view in views:
         rest.append(view[count:])
@@ -79,16 +79,17 @@ def _without(views: Sequence[memoryview], count: int) -> list[memoryview]:
 
 
 class ShardFile:
-    """A new file of chunks: an index in its first page, which is replaced in place, and pages that follow.
+    """A new file of chunks: an index in its first page, which is replaced in place, and pages after it.
 
-    With ``direct`` the pages go past the page cache where the file system allows it: the memory that they
-    come from is read by the disk itself. Elsewhere they go through it, and are dropped from it once they are
-    written, since a cache that fills up stalls whoever writes.
+    With ``direct`` the pages bypass the page cache if the file system allows it: the disk reads their memory
+    itself. Otherwise they go through the cache, and are dropped from it once they are written, since a full
+    cache stalls the writer.
     """
 
     def __init__(self, path: Path, *, direct: bool, fd: int = -1) -> None:
-        """``fd``: the file is there already, open under this descriptor, which is taken over; ``path`` may
-        then be a link, as /proc has one for every descriptor.
+        """Create the file, or take over ``fd``, which is open already.
+
+        ``path`` may then be a link, as in /proc.
         """
         self._fd = os.open(path, _NEW, 0o666) if fd < 0 else fd
         self._direct = open_direct(path, follow=fd >= 0) if direct else -1
@@ -96,7 +97,7 @@ class ShardFile:
 
     @property
     def direct(self) -> bool:
-        """Pages go past the page cache."""
+        """Whether pages bypass the page cache."""
         return self._direct >= 0
 
     def write_pages(self, parts: Sequence[Buffer], offset: int) -> None:
@@ -104,12 +105,12 @@ class ShardFile:
         if self.direct and self._write_direct(parts, offset):
             return
         self.write(parts, offset)
-        # What was written before these: the kernel keeps pages that are not on the disk yet.
+        # Drop the pages of the previous write: the kernel keeps pages that are not on the disk yet.
         os.posix_fadvise(self._fd, *self._cached, os.POSIX_FADV_DONTNEED)
         self._cached = offset, sum(memoryview(part).nbytes for part in parts)
 
     def _write_direct(self, parts: Sequence[Buffer], offset: int) -> bool:
-        """False once the file system refuses this way: it wants larger pages, or took part of one."""
+        """Return False once the file system refuses direct writes: it wants larger pages, or took a part."""
         try:
             write_all(self._direct, parts, offset)
         except OSError as error:
@@ -124,11 +125,11 @@ class ShardFile:
         write_all(self._fd, parts, offset)
 
     def sync(self) -> None:
-        """Force the file's bytes to the medium, by whichever way they were written."""
+        """Force the file's bytes to the medium, direct or not."""
         os.fdatasync(self._fd)
 
     def close(self) -> None:
-        """Idempotent."""
+        """Close the file. Idempotent."""
         fds, self._fd, self._direct = (self._fd, self._direct), -1, -1
         for fd in fds:
             if fd >= 0:
@@ -136,20 +137,20 @@ class ShardFile:
 
 
 class Disk:
-    """The local file system. Raises OSError as the system gives it."""
+    """The local file system. Raises the system's OSError."""
 
     def make_directory(self, path: Path, *, parents: bool = False) -> None:
-        """Make one; with ``parents``, also those above, and none of them need be new."""
+        """Create a directory; with ``parents``, also those above, and none of them need be new."""
         path.mkdir(parents=parents, exist_ok=parents)
 
     def create(self, path: Path, *, direct: bool) -> ShardFile:
-        """A new file of chunks."""
+        """Create a new file of chunks."""
         return ShardFile(path, direct=direct)
 
     def write_file(self, path: Path, data: Buffer, *, durable: bool) -> None:
-        """Write a whole small file in the place of what was there; ``durable`` forces it to the medium.
+        """Write a whole small file, replacing an existing one; ``durable`` forces it to the medium.
 
-        What was there is unlinked and not written over: under another name it may be somebody's file.
+        An existing file is unlinked and not overwritten: under another name it may be somebody's file.
         """
         self.remove(path)
         fd = os.open(path, _NEW, 0o666)
@@ -161,9 +162,9 @@ class Disk:
             os.close(fd)
 
     def patch(self, path: Path, data: Buffer, offset: int) -> None:
-        """Replace bytes of a file that exists, or add some behind its end.
+        """Replace bytes of an existing file, or add some after its end.
 
-        A file that has another name as well, or that nobody may write to, is somebody's copy: OSError.
+        Raises OSError for a file that has another name as well, or is read-only: it is somebody's copy.
         """
         fd = open_regular(path, os.O_WRONLY, follow=False)
         try:
@@ -176,7 +177,7 @@ class Disk:
             os.close(fd)
 
     def reserve(self, path: Path, size: int) -> None:
-        """A file that keeps ``size`` bytes of the disk for later; remove it to have them."""
+        """Create a file that reserves ``size`` bytes of the disk; remove it to use them."""
         self.remove(path)
         fd = os.open(path, _NEW, 0o666)
         try:
@@ -189,15 +190,15 @@ class Disk:
         source.replace(target)
 
     def remove(self, path: Path) -> None:
-        """Remove a file; no matter if there is none."""
+        """Remove a file, if it exists."""
         path.unlink(missing_ok=True)
 
     def remove_tree(self, path: Path) -> None:
-        """Remove a directory with all below it, as far as that can be done."""
+        """Remove a directory with everything below it, as far as possible."""
         shutil.rmtree(path, ignore_errors=True)
 
     def remove_directory(self, path: Path) -> None:
-        """Remove a directory; one that holds something stays, and no matter if there is none."""
+        """Remove a directory, if it exists and is empty."""
         with suppress(FileNotFoundError):
             try:
                 path.rmdir()
@@ -212,7 +213,7 @@ class Disk:
     def sync_tree(self, path: Path) -> None:
         """Force every file and directory below ``path``, and ``path`` itself, to the medium.
 
-        What somebody else removes meanwhile, as a copier its hold, is not there to be forced.
+        Files that another process removes in the meantime, as a copier its hold, are skipped.
         """
         for directory, files in _walk(path):
             for file in files:
@@ -226,27 +227,28 @@ class Disk:
                     raise
 
     def free_bytes(self, path: Path) -> int:
-        """What the file system of ``path`` can still take from us."""
+        """Return how many bytes the file system of ``path`` can still take from this user."""
         room = os.statvfs(path)
         return room.f_bavail * room.f_frsize
 
 
 DISK = Disk()
-"""The one that is used unless told otherwise."""
+"""The default disk."""
 
 
 _MEASURED = ".acquire-{}.measure"
 
 
 def measure_disk(directory: Path, size: int = 2**27) -> float:
-    """Bytes per second that the disk of ``directory`` takes, past the page cache where that can be.
+    """Measure the bytes per second that the disk of ``directory`` takes, without the page cache if possible.
 
     Writes ``size`` bytes to a file that loses its name first, so that a kill leaves nothing. Raises OSError.
     """
-    for path in directory.glob(_MEASURED.format("*")):  # where a file cannot be made without a name
+    # Files of killed measurements, on file systems that cannot create a file without a name.
+    for path in directory.glob(_MEASURED.format("*")):
         if not Path("/proc", path.stem.removeprefix(".acquire-")).exists():
             path.unlink(missing_ok=True)
-    block = aligned_bytes(2**22)  # as large as a write of the recorder's, which hides each write's own cost
+    block = aligned_bytes(2**22)  # as large as the recorder's writes: the cost per write is negligible
     file = _nameless(directory)
     try:
         begun = time.perf_counter()
@@ -259,11 +261,11 @@ def measure_disk(directory: Path, size: int = 2**27) -> float:
 
 
 def _nameless(directory: Path) -> ShardFile:
-    """A new file that has no name, or, where the file system makes none, one that has lost it."""
+    """Create a file without a name, or, if the file system cannot, one whose name is removed."""
     try:
         fd = os.open(directory, os.O_TMPFILE | os.O_RDWR | os.O_CLOEXEC, 0o600)
     except OSError as error:
-        # EISDIR: a kernel that does not know the flag takes it for a directory that is to be written to.
+        # EISDIR: a kernel that does not know the flag sees an attempt to write to a directory.
         if error.errno not in (errno.EOPNOTSUPP, errno.EISDIR, errno.EINVAL):
             raise
         path = directory / _MEASURED.format(os.getpid())
@@ -275,15 +277,15 @@ def _nameless(directory: Path) -> ShardFile:
 
 
 def tree_bytes(path: Path) -> int:
-    """Bytes of all files below ``path``."""
+    """Return the bytes of all files below ``path``."""
     return sum(file.stat().st_size for _, files in _walk(path) for file in files if file.is_file())
 
 
 @contextmanager
 def locked(path: Path, doing: str, *, surely: bool = False) -> Iterator[None]:
-    """Hold the directory ``path`` for ourselves; StateError while another process does. Ends with us.
+    """Lock the directory ``path``. Raises StateError while another process has it. Ends with this process.
 
-    On a file system without locks it is taken for free, unless it must be so ``surely``: StateError then.
+    A file system without locks counts as unlocked; with ``surely`` it raises StateError instead.
     """
     fd = lock(path, doing, surely=surely)
     try:
@@ -293,15 +295,15 @@ def locked(path: Path, doing: str, *, surely: bool = False) -> Iterator[None]:
 
 
 def lock(path: Path, doing: str, *, surely: bool = False) -> int:
-    """A descriptor that holds the directory ``path`` until it is closed; see `locked`."""
-    # On the directory itself: a file for it could be left behind, and its name be somebody's array.
+    """Return a descriptor that locks the directory ``path`` until it is closed; see `locked`."""
+    # Lock the directory itself: a lock file could be left behind, or have the name of an array.
     fd = os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW)
     try:
         fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
         os.close(fd)
         raise StateError(
-            f"{doing} {path}: another process is writing it", hint="when its recording has ended"
+            f"{doing} {path}: another process is writing it", hint="try again when its recording has ended"
         ) from error
     except OSError as error:
         if error.errno not in NO_LOCKS:
@@ -310,7 +312,7 @@ def lock(path: Path, doing: str, *, surely: bool = False) -> int:
         if surely:
             os.close(fd)
             raise StateError(
-                f"{doing} {path}: its file system has no locks that would tell whether somebody writes it"
+                f"{doing} {path}: its file system has no locks, which would show whether it is being written"
             ) from error
     return fd
 
@@ -322,7 +324,7 @@ def _walk(path: Path) -> Iterator[tuple[Path, list[Path]]]:
 
 
 def _sync(path: Path, flags: int = 0) -> None:
-    # Neither a link out of the recording nor a pipe that somebody has put there may hold the writer up.
+    # A link out of the recording, or a pipe in it, must not hold the writer up.
     fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK | flags)
     try:
         os.fsync(fd)
@@ -332,18 +334,18 @@ def _sync(path: Path, flags: int = 0) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Publisher:
-    """Replaces files so that a reader meets the old bytes or the new ones, nothing between.
+    """Replaces files so that a reader finds either the old or the new bytes.
 
-    ``scratch`` is where the new bytes are prepared: on the same file system, and where no Zarr reader
-    lists names, since a writer that is killed leaves it behind. One thread at a time.
+    ``scratch`` is the file in which new bytes are prepared: on the same file system, and where no Zarr reader
+    lists names, since a killed writer leaves it behind. One thread at a time.
     """
 
     scratch: Path
     disk: Disk = DISK
 
     def replace(self, path: Path, data: Buffer, *, durable: bool = False) -> None:
-        """Replace ``path``; ``durable`` forces bytes and name to the medium before it returns."""
-        # The bytes first: after a power failure a name may otherwise lead to an empty file.
+        """Replace ``path``; ``durable`` forces bytes and name to the medium before returning."""
+        # Bytes first: otherwise a name might lead to an empty file after a power failure.
         self.disk.write_file(self.scratch, data, durable=durable)
         self.disk.rename(self.scratch, path)
         if durable:

@@ -1,6 +1,6 @@
-"""Which machine writes a recording, since which start of it: who finds it open knows what can have happened.
+"""The machine that writes a recording, and its boot: from these, recovery knows what can have been lost.
 
-A machine that has run on has kept everything that was written, also what was never forced to the medium.
+A machine that has kept running has everything that was written, even what was never forced to the medium.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 @cache
 def this_host() -> dict[str, str]:
-    """For a recording's root: the machine's name, and a number that is another after every start."""
+    """Return the machine's name, and a number that is different after every boot, for a recording's root."""
     try:
         boot_id = _BOOT_ID.read_text(encoding="ascii").strip()
     except FileNotFoundError:
@@ -27,13 +27,13 @@ def this_host() -> dict[str, str]:
 
 
 def is_here(attributes: Mapping[str, Any]) -> bool:
-    """The recording was written on this machine."""
+    """Return whether the recording was written on this machine."""
     name = _host(attributes).get("name")
     return bool(name) and name == this_host()["name"]
 
 
 def has_run_on(attributes: Mapping[str, Any]) -> bool:
-    """This machine wrote the recording, and has not stopped since."""
+    """Return whether this machine wrote the recording, and has not restarted since."""
     boot_id = _host(attributes).get("boot_id")
     return bool(boot_id) and boot_id == this_host()["boot_id"] and is_here(attributes)
 

@@ -1,4 +1,4 @@
-"""The recording format as Zarr v3 metadata: pure functions from what is known to JSON documents.
+"""The recording format as Zarr v3 metadata: pure functions that return JSON documents.
 
 ::
 
@@ -28,33 +28,33 @@ Document = dict[str, Any]
 """The content of one zarr.json."""
 
 FORMAT = "acquire-recording/2"
-"""Of what is written. In format 1 the code's ``seed`` is the register's state, and the number that the user
-gave is not there; lines that contradict their code have the flag of lines without a tag.
+"""Format of new recordings. In format 1 the code's ``seed`` is the register's state, and the user's seed is
+not stored; lines that contradict their code have the flag of lines without a tag.
 """
 READABLE = ("acquire-recording/1", FORMAT)
 
 DAMAGE = (OSError, ValueError, RuntimeError, LookupError, TypeError, AttributeError, ArithmeticError)
-"""What zarr and arithmetic raise for metadata or chunks that are not what they should be."""
+"""Exceptions that zarr and arithmetic raise for wrong metadata or chunks."""
 PARSE_ERRORS = (LookupError, TypeError, ValueError, AttributeError)
-"""What a document that is not what it should be raises when it is taken apart."""
+"""Exceptions raised when a wrong document is parsed."""
 
 MAX_READ_BYTES = 2**31
-"""Of one chunk that a reader takes into memory; those that are written are much smaller."""
+"""Largest chunk that a reader takes into memory; chunks that are written are much smaller."""
 MAX_READ_CHUNKS = 1024
-"""Of one file, for a reader."""
+"""Largest number of chunks per file that a reader accepts."""
 
 BYTES = {"name": "bytes", "configuration": {"endian": "little"}}
 CRC32C = {"name": "crc32c"}
 VLEN_UTF8 = {"name": "vlen-utf8", "configuration": {}}
 NO_LINE = 2**64 - 1
-"""Code index of a row that never was a line: it fills up a last chunk, or is not on disk."""
+"""Code index of a row that is not a line: padding of a last chunk, or not on disk."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Column:
-    """One array of an arm: its name in the recording, where a TaggedBlock has it, and its attributes.
+    """One array of an arm: its name in the recording, its name in a TaggedBlock, and its attributes.
 
-    ``fill`` is what a reader meets where there is nothing on disk, and what fills up the last chunk.
+    ``fill`` is the value that a reader finds where nothing is on disk, and the padding of the last chunk.
     """
 
     name: str
@@ -65,7 +65,7 @@ class Column:
 
 
 def line_columns(dtype: str) -> tuple[Column, ...]:
-    """The arrays of an arm; ``lines`` is (line, pixel) of ``dtype``, the others are (line)."""
+    """Return the arrays of an arm; ``lines`` is (line, pixel) of ``dtype``, the others are (line)."""
     return (Column("lines", "pixels", dtype, LINES_ATTRIBUTES), *TAG_COLUMNS)
 
 
@@ -134,13 +134,13 @@ TAG_COLUMNS = (
 
 
 SAME_IN_BOTH_ARMS = ("code_index", "code", "tick", "time")
-"""Arrays whose rows follow from the line's number."""
+"""Arrays whose values follow from the line's number."""
 
 
 def column_shape(column: Column, spec: RecordingSpec) -> ArrayShape:
-    """How ``column`` is cut into pieces; a file of any of them has the same rows.
+    """Return how ``column`` is chunked; a file of any array has the same rows.
 
-    Tags are few bytes, and predictable: they come in longer chunks, packed even where pixels are not.
+    Tags are few bytes, and predictable: their chunks are longer, and packed even if pixels are not.
     """
     pixels = column.name == "lines"
     codec: Codec = spec.codec if pixels or spec.codec != "none" else "lz4"
@@ -155,7 +155,7 @@ def column_shape(column: Column, spec: RecordingSpec) -> ArrayShape:
 
 
 def line_array(column: Column, shape: ArrayShape, rows: int) -> Document:
-    """Metadata of an arm's array of ``rows`` lines."""
+    """Return the metadata of an arm's array of ``rows`` lines."""
     sharding = {
         "chunk_shape": list(shape.chunk_shape),
         "codecs": [BYTES, *packing(shape), CRC32C],
@@ -174,7 +174,7 @@ def line_array(column: Column, shape: ArrayShape, rows: int) -> Document:
 
 
 def parse_line_array(document: Document) -> tuple[ArrayShape, int]:
-    """How an array of `line_array` is cut into pieces, and its rows; one of `PARSE_ERRORS` for any other."""
+    """Return chunking and rows of an array made by `line_array`. Raises one of `PARSE_ERRORS` for others."""
     (sharding,) = document["codecs"]
     inner = sharding["configuration"]
     rows, *row_shape = map(int, document["shape"])
@@ -203,7 +203,7 @@ def array_document(
     attributes: Mapping[str, Any],
     fill: int = 0,
 ) -> Document:
-    """Metadata of any array; a text's fill value is empty."""
+    """Return the metadata of any array; the fill value of strings is empty."""
     return {
         "zarr_format": 3,
         "node_type": "array",
@@ -220,7 +220,7 @@ def array_document(
 
 
 def group_document(attributes: Mapping[str, Any], nodes: Mapping[str, Document]) -> Document:
-    """Metadata of a group, with those of ``nodes`` (path below the group → document) consolidated."""
+    """Return the metadata of a group, with ``nodes`` (path below the group → document) consolidated."""
     return {
         "zarr_format": 3,
         "node_type": "group",
@@ -234,19 +234,19 @@ def group_document(attributes: Mapping[str, Any], nodes: Mapping[str, Document])
 
 
 def to_json(document: Document) -> bytes:
-    """One zarr.json; compact, since it is rewritten at every commit."""
+    """Return the bytes of a zarr.json; compact, since it is rewritten at every commit."""
     return json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
 
 
 def inner(document: Document) -> Document:
-    """A node inside consolidated metadata: zarr keeps that flat, inner groups carry none of their own."""
+    """Return a node for consolidated metadata, which zarr keeps flat: inner groups have none of their own."""
     if document["node_type"] == "array":
         return document
     return group_document(document["attributes"], {})
 
 
 def packing(shape: ArrayShape) -> list[Document]:
-    """What packs the bytes of a chunk, if anything does."""
+    """Return the Zarr codec that packs the bytes of a chunk, if any."""
     if shape.codec == "none":
         return []
     blosc = {

@@ -1,7 +1,7 @@
-"""Links in recordings: a reader follows them; who repairs, copies, holds or deletes refuses them.
+"""Links in recordings: readers follow them; repair, copy, hold and deletion refuse them.
 
-Through a link it would reach what does not belong to the recording: the originals of an archive that keeps
-its files elsewhere (git-annex), another recording, or any file of the system.
+Through a link these would reach files that do not belong to the recording: the originals of an archive that
+keeps its files elsewhere (git-annex), another recording, or any file of the system.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 
 
 def refuse_links(root: Path) -> None:
-    """Raise DataError unless ``root`` and all below it are directories and regular files.
+    """Raise DataError unless ``root`` and everything below it are directories and regular files.
 
-    A directory without any part of a recording is passed over: whoever opens it says that it is none. Raises
-    as `refusals.refusal` where the entries cannot be read.
+    A directory without any part of a recording passes: opening it reports that it is none. Raises the error
+    of `refusals.refusal` if the entries cannot be read.
     """
     refuse_link(root, root)
     if not any(os.path.lexists(root / part) for part in ("zarr.json", *ARMS)):
@@ -39,13 +39,13 @@ def refuse_links(root: Path) -> None:
                     elif (kind := kind_of(entry.stat(follow_symlinks=False).st_mode)) is not None:
                         raise _odd(root, entry.path, kind)
         except FileNotFoundError:
-            continue  # retention, or a commit, has removed it meanwhile
+            continue  # retention or a commit has removed it in the meantime
         except OSError as error:
             raise refusal(root, error, "read") from error
 
 
 def refuse_link(root: Path, path: Path) -> None:
-    """Raise DataError where ``root``, ``path`` or a directory between them is a link, or something odder."""
+    """Raise DataError if ``root``, ``path`` or a directory between them is a link or a special file."""
     below = path.relative_to(root)
     for part in (*reversed(below.parents), below):
         with refused(root, "read"), suppress(FileNotFoundError, NotADirectoryError):
@@ -60,5 +60,5 @@ def _odd(root: Path, path: str, kind: str) -> DataError:
     return DataError(
         f"{root} {what}",
         possible="directories and regular files",
-        hint="where a link leads to, or a copy with files in the place of links: cp -rL, git annex unlock",
+        hint="the target of the link, or a copy with files in place of links: cp -rL, git annex unlock",
     )

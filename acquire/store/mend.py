@@ -1,6 +1,6 @@
-"""Repairs inside the files of a recording that nobody writes: torn indices, chunks that are lost.
+"""Repairs inside the files of a recording that nobody writes: torn indices, lost chunks.
 
-They are forced to the medium by whoever tells of them in the recording's root.
+The caller forces them to the medium before it rewrites the recording's root.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 
 
 def mend_index(disk: Disk, path: Path, reader: ChunkReader, shard: int, *, grow: bool) -> bool:
-    """Rewrite the index of a shard when its checksum is wrong; says whether it was changed.
+    """Rewrite the index of a shard if its checksum is wrong; return whether it was changed.
 
-    Replacing an index adds entries and leaves the others: each entry of a torn one is either right, which
-    its chunk's own checksum tells, or it is none. With ``grow``, chunks that were written behind the last
-    one are added, too: a commit would have put them into the index.
+    Replacing an index adds entries and leaves the others: each entry of a torn one is either right, as its
+    chunk's own checksum shows, or invalid. With ``grow``, chunks that were written after the last one are
+    added, too: the next commit would have put them into the index.
     """
     entries, intact = reader.index(shard)
     first = shard * len(entries)
@@ -43,7 +43,7 @@ def mend_index(disk: Disk, path: Path, reader: ChunkReader, shard: int, *, grow:
 
 
 def _grow(reader: ChunkReader, first: int, entries: list[tuple[int, int]]) -> None:
-    """Add what lies behind the last chunk that ``entries`` know; chunk ``first`` is in slot 0."""
+    """Add the chunks that follow the last one in ``entries``; chunk ``first`` is in slot 0."""
     slot = max((slot + 1 for slot, (offset, _) in enumerate(entries) if offset != ABSENT), default=0)
     offset = page_up(sum(entries[slot - 1])) if slot else PAGE
     while slot < len(entries):
@@ -55,9 +55,9 @@ def _grow(reader: ChunkReader, first: int, entries: list[tuple[int, int]]) -> No
 
 
 def rewrite_chunk(disk: Disk, path: Path, reader: ChunkReader, chunk: int, rows: NDArray[Any]) -> None:
-    """Put ``rows`` in the place of a chunk: at the end of its file, which is made where there is none."""
-    # The chunk, then its entry: whoever reads meanwhile finds the old one or the new one, and a recovery that
-    # is interrupted has lost nothing. What the old one took stays unused.
+    """Replace a chunk by ``rows``, at the end of its file, which is created if there is none."""
+    # First the chunk, then its entry: a concurrent reader finds the old or the new one, and an interrupted
+    # recovery loses nothing. The old chunk's bytes stay unused.
     file = path / reader.file(chunk)
     entries, _ = reader.index(chunk // reader.shape.shard_chunks)
     payload = encode(rows, reader.shape.codec).tobytes()
@@ -74,7 +74,7 @@ def rewrite_chunk(disk: Disk, path: Path, reader: ChunkReader, chunk: int, rows:
 
 
 def _holds(reader: ChunkReader, chunk: int, offset: int, size: int) -> bool:
-    """There is a whole chunk at this place; what an index did not say, or could not, is not asked for."""
+    """Return whether there is an intact chunk at this place; impossible entries are not read."""
     if not 0 < size <= reader.most_bytes or offset % PAGE or offset < PAGE:
         return False
     try:

@@ -4,10 +4,10 @@
 
     writer ─▶ run.zarr (local) ─▶ whole shards ─▶ tables ─▶ metadata of arrays ─▶ root ─▶ s3://…/run.zarr
 
-The order is the writer's: the root is last, and says only what has come before it. A copy that was
-interrupted goes on where it was. What is not copied yet is held, so that retention can bound the spool and
-no line is lost: a store that is too slow ends the recording in good order, when the disk gets full.
-A recording is copied by one process at a time.
+The order is the writer's: the root comes last, and describes only files that are there already. An
+interrupted copy continues where it stopped. Lines that are not copied yet are held, so that retention can
+bound the spool without losing lines: if the store is too slow, the recording ends in good order when the disk
+is full. One process at a time copies a recording.
 """
 
 from __future__ import annotations
@@ -44,24 +44,24 @@ if TYPE_CHECKING:
     from acquire.store.reader import Recording
 
 LOOK_S = 0.5
-"""How often a growing recording is looked at."""
+"""How often a growing recording is checked."""
 MARK = "a/lines/.copy-of"
-"""Says at the target whose copy it is, as long as no root does."""
+"""File at the target that identifies the recording until there is a root."""
 _OURS = (*ARMS, "gaps", "events", overview.NAME, ROOT, SCRATCH)
-"""What the keys of a recording begin with."""
+"""First parts of a recording's keys."""
 _ELSEWHERE = "another name there: acquire upload RECORDING URL"
-_HINT = "what is there already stays: the same command goes on with it"
+_HINT = "repeat the command, which continues with what is there already"
 
 
 @dataclass(frozen=True, slots=True)
 class Mirrored:
-    """How far a copy has come.
+    """Progress of a copy.
 
     Attributes
     ----------
-    lines, waiting_lines : that are there; that a reader finds here, and not there yet
-    shards, bytes : copied since the copy was begun or gone on with
-    sealed : it is whole, and says so
+    lines, waiting_lines : lines at the target; lines that a reader finds here, but not there yet
+    shards, bytes : copied since the copy was begun or continued
+    sealed : the copy is complete and sealed
     """
 
     url: str
@@ -86,12 +86,12 @@ def mirror(
 ) -> Mirrored:
     """Copy the recording at ``path`` to ``url``; with ``follow`` until it is sealed.
 
-    Raises UsageError where ``url`` holds something else, StateError while another process copies it,
-    StoreError and PlaceError when the store fails or refuses, and DataError when a recording that is followed
+    Raises UsageError if ``url`` holds something else, StateError while another process copies it,
+    StoreError and PlaceError if the store fails or refuses, and DataError if a recording that is followed
     has not grown for ``idle_s``: its writer is gone.
     """
     refuse_link(path, path)
-    open_recording(path)  # which says what else it may be
+    open_recording(path)  # raises if it is no recording
     with only_copy(path):
         copying = _Steps(Mirror(path, url), progress)
         done = copying.step()
@@ -114,14 +114,14 @@ def mirror(
 
 
 class _Steps:
-    """A copy, file by file: after each, ``progress`` is told lines that are there, and how many there are."""
+    """A copy, shard by shard; after each, ``progress`` gets the lines copied, and their total."""
 
     def __init__(self, copying: Mirror, progress: Callable[[int, int], object]) -> None:
         self._copying, self._progress = copying, progress
         self.target = copying.target
 
     def step(self) -> Mirrored:
-        """All that is new; see `Mirror.step`."""
+        """Copy everything new; see `Mirror.step`."""
         done = self._copying.step(most_shards=1)
         before = -1
         while not done.sealed and done.shards != before:
@@ -132,10 +132,10 @@ class _Steps:
 
 @contextmanager
 def only_copy(path: Path) -> Iterator[None]:
-    """Keep other processes from copying the recording at ``path``; StateError while one does."""
+    """Keep other processes from copying the recording at ``path``. Raises StateError while one does."""
     with ExitStack() as held:
         try:
-            # An arm's directory: the lock of the recording's own is its writer's.
+            # Lock an arm's directory: the lock of the recording's directory belongs to the writer.
             held.enter_context(locked(path / ARMS[0], "copying"))
         except StateError as error:
             raise StateError(f"{path} is being copied by another process", hint="acquire status") from error
@@ -145,14 +145,14 @@ def only_copy(path: Path) -> Iterator[None]:
 
 
 def _identity(attributes: dict[str, Any]) -> tuple[str, int]:
-    """Run, and which of its segments."""
+    """Return the run's ID, and the number of the segment."""
     segment = segment_of(attributes)
     number = attributes.get("segment_number", 1) if segment is None else segment[1]
     return str(attributes.get("run_id")), number
 
 
 def _identity_in(data: bytes) -> tuple[str, int] | None:
-    """Of the recording whose root this is; None where it is none that could be read."""
+    """Return the `_identity` of the recording with this root; None if it cannot be read."""
     try:
         attributes = parse_object(data)["attributes"]
     except PARSE_ERRORS:
@@ -163,7 +163,7 @@ def _identity_in(data: bytes) -> tuple[str, int] | None:
 class Mirror:
     """One copy; `step` brings it up to date.
 
-    ``pause`` is called before anything is put; what it raises ends the copy, and another goes on with it.
+    ``pause`` is called before anything is written; it may raise to end the copy, to be continued later.
     """
 
     def __init__(
@@ -185,11 +185,11 @@ class Mirror:
         self._shards = 0
         self._directories: set[str] = set()
         self._sent: dict[str, bytes] = {}
-        """Metadata and tables → as they are there."""
+        """Key of metadata and tables → bytes at the target."""
         self._root = b""
         self._sealed = False
         self._next = 0
-        """The first shard that may not be there."""
+        """The first shard that may not be at the target yet."""
         self._kept_from = -1
         try:
             self._there = self.target.sizes()
@@ -199,19 +199,22 @@ class Mirror:
 
     @property
     def grows(self) -> bool:
-        """The recording was not sealed yet at the latest step."""
+        """Whether the recording was not sealed yet at the latest step."""
         return not self._sealed
 
     def step(self, most_shards: int | None = None) -> Mirrored:
-        """Copy what is new and whole, or the next ``most_shards`` of it; what is new of a sealed recording
-        readers there see once it is complete. Raises StoreError when the store fails and
-        PlaceError when it refuses; a later step goes on.
+        """Copy new whole shards, at most ``most_shards`` of them, and update the copy's root.
+
+        The root of a sealed recording is copied once all shards are. Raises StoreError if the store fails and
+        PlaceError if it refuses; a later step continues.
         """
         recording = open_recording(self.path)
         if _identity(recording.attrs) != self._identity:
-            raise DataError(f"{self.path} is another recording than it was: run {recording.attrs['run_id']}")
+            raise DataError(
+                f"{self.path} is not the same recording any more: run {recording.attrs['run_id']}"
+            )
         sealed = recording.state == "sealed"
-        if sealed and not self._sealed:  # who recovered it may have mended what was copied
+        if sealed and not self._sealed:  # a recovery may have mended files that are copied already
             refuse_links(self.path)
             self._refuse_shortfall(recording, None)
             self._sealed, self._next = True, 0
@@ -224,11 +227,11 @@ class Mirror:
             if whole or not sealed:
                 self._publish(recording, lines)
         except OSError as error:
-            # A copy fails for what is read here, or for what is written there; the error's file tells.
+            # Reading here or writing there may have failed: the error's file name tells which.
             here = error.filename is not None and str(error.filename).startswith(str(self.path))
             what = (self.path, error, "read") if here else (self.target, error, "written", _HINT)
             raise refusal(*what) from error
-        # Retention may have what is copied: lines before this one; all of a recording that is sealed.
+        # Retention may delete copied lines: those before this one, or all of a sealed recording.
         line = None if sealed else recording.first_line + lines
         if line is None:
             release(self.path, self._disk)
@@ -249,20 +252,20 @@ class Mirror:
         before = self._shards
         size = recording.arms[ARMS[0]].reader("lines").shape.shard_rows
         if self._next < end and not self._root and MARK not in self._there:
-            # Say whose copy this is, before its root can.
+            # Identify the copy until there is a root.
             run_id, number = self._identity
             facts = {"run_id": run_id} | ({"segment_number": number} if number > 1 else {})
             self._put(MARK, to_json({"attributes": facts}))
             self._there[MARK] = 0
         while self._next < end and (most is None or self._shards - before < most):
-            # What retention has dropped is passed over in one go: of an endless recording that is very much.
+            # Skip shards that retention has dropped in one go: an endless recording has very many.
             dropped = (rows for rows in recording.dropped_rows() if self._next * size in rows)
             if (kept := max((rows.stop // size for rows in dropped), default=self._next)) != self._next:
                 self._next = kept
                 continue
             if not self._sealed:
                 self._refuse_shortfall(recording, range(self._next, self._next + 1))
-            # What is there of the right size is the same: a shard that is whole is never written again.
+            # A file of the right size is the same one: a whole shard is never written again.
             copied = False
             for file in shard_files(self.path, self._next):
                 key = file.relative_to(self.path).as_posix()
@@ -277,35 +280,35 @@ class Mirror:
             self._next += 1
 
     def _refuse_shortfall(self, recording: Recording, shards: range | None) -> None:
-        """What is said to be here, and is not, must not be said there."""
+        """Raise DataError if lines claimed here are not on disk, since the copy must not claim them."""
         if (found := first_shortfall(recording, shards)) is not None:
             raise DataError(
                 f"{self.path} is not copied: {found}",
-                possible="a recording of which all lines are on disk, or flagged as missing",
+                possible="a recording whose lines are all on disk or flagged as missing",
                 hint=f"acquire verify {self.path}; acquire recover flags what is lost, then copy again",
             )
 
     def _check_target(self) -> None:
-        """Only a copy of the same recording may be there, or one that was begun and never published."""
+        """Raise UsageError unless the target is empty or has a copy of this recording, maybe unpublished."""
         foreign = [key for key in self._there if key.split("/")[0] not in _OURS]
         root = self.target.read(ROOT) if ROOT in self._there else b""
-        said = _identity_in(root)
-        if said is None and (foreign or (root and len(self._there) == 1)):
+        found = _identity_in(root)
+        if found is None and (foreign or (root and len(self._there) == 1)):
             what = "something damaged" if root else "something that is no recording"
             raise UsageError(f"{self.target} holds {what}", hint=_ELSEWHERE)
-        if said is not None:
+        if found is not None:
             self._root = root
         elif MARK in self._there:
-            said = _identity_in(self.target.read(MARK))
-        if said is not None and said != self._identity:
+            found = _identity_in(self.target.read(MARK))
+        if found is not None and found != self._identity:
             raise UsageError(
-                f"{self.target} holds another recording: run {said[0]}, segment {said[1]}", hint=_ELSEWHERE
+                f"{self.target} holds another recording: run {found[0]}, segment {found[1]}", hint=_ELSEWHERE
             )
-        if said is None:  # nothing there says whose it is: nothing there is relied on
+        if found is None:  # files of an unknown recording are not relied on, but replaced
             self._there = {}
 
     def _publish(self, recording: Recording, lines: int) -> None:
-        """Tables and metadata of what is copied; nothing where the root would be the same."""
+        """Write tables and metadata of the copied lines, unless the root would stay the same."""
         document = copy.deepcopy(recording.document)
         nodes: dict[str, Document] = document["consolidated_metadata"]["metadata"]
         for arm in ARMS:
@@ -325,11 +328,11 @@ class Mirror:
             inner = {name.partition("/")[2]: n for name, n in nodes.items() if name.startswith(f"{key}/")}
             own = group_document(node["attributes"], inner) if node["node_type"] == "group" else node
             self._put(f"{key}/zarr.json", to_json(own))
-        self._put("zarr.json", root)  # last: readers there begin with it
+        self._put("zarr.json", root)  # last, since readers begin with it
         self._root = root
 
     def _dropped(self, recording: Recording, lines: int) -> list[list[int]]:
-        """Lines that retention deleted here before they could be copied."""
+        """Return the ranges of lines that retention deleted here before they could be copied."""
         size = recording.arms[ARMS[0]].reader("lines").shape.shard_rows
         start = "a/tick/c/"
         names = (key[len(start) :] for key in self._there if key.startswith(start))
@@ -344,7 +347,7 @@ class Mirror:
         return found
 
     def _put(self, key: str, data: bytes) -> None:
-        """Most of it is the same from one time to the next, and a store takes its time for each part."""
+        # Most of these files are the same from one step to the next, and each takes a store some time.
         if self._sent.get(key) == data:
             return
         self._make_way(key)

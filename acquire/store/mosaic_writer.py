@@ -1,4 +1,4 @@
-"""Writes a video that comes in tiles, each in the order of its frames: no more than one is in memory."""
+"""Writer of a video that comes in tiles, each in the order of its frames: one tile at a time is in memory."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 NOT_THERE = float("nan")
-"""Voxels of tiles that nobody wrote."""
+"""Value of voxels in tiles that were not written."""
 
 
 class MosaicWriter(VideoWriter):
@@ -37,7 +37,7 @@ class MosaicWriter(VideoWriter):
         *,
         regions: int = 1,
     ) -> None:
-        """``regions``: along rows and columns of a tile, that the error is given of."""
+        """``regions``: number of regions with an error, along rows and columns of a tile."""
         shape = (tiles[0] * side, tiles[1] * side)
         super().__init__(
             place,
@@ -63,10 +63,10 @@ class MosaicWriter(VideoWriter):
         quality: NDArray[np.float32],
         error: NDArray[np.float32],
     ) -> None:
-        """Frames (t, side, side) of one tile from frame ``first`` on; ``tile``: its row and column of tiles.
-        ``quality`` (t,) and ``error`` (t, regions, regions) are of these.
+        """Write frames (t, side, side) of one tile from frame ``first`` on.
 
-        StoreError when the disk refuses.
+        ``tile``: its row and column; ``quality`` (t,) and ``error`` (t, regions, regions) of these frames.
+        Raises StoreError if the disk refuses.
         """
         row, column = (each * self._side for each in tile)
         end = first + len(video)
@@ -80,7 +80,7 @@ class MosaicWriter(VideoWriter):
         self._squares[:, first:end] += np.where(known, np.square(quality, dtype=np.float64), 0), known
 
     def finish(self, provenance: Mapping[str, Any]) -> None:
-        """The video appears under its name; a frame's quality is the RMS of its tiles'."""
+        """Make the video appear under its name; a frame's quality is the RMS of its tiles'."""
         if not self.frames:
             raise UsageError(f"{self._place}: a video without a frame cannot be written")
         check_provenance(provenance)

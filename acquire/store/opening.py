@@ -1,4 +1,4 @@
-"""Opening recordings, here or far away: what is not one, or is damaged, is told before anything is read."""
+"""Opening recordings, local or remote: a place without one, or damage, is reported before lines are read."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ Kind = TypeVar("Kind", bound="Outline")
 
 
 def opened(source: Source, kind: type[Kind]) -> Kind:
-    """What lies in a source as a `Recording`, or as an `Outline`, which has no lines.
+    """Open a source as a `Recording`, or as an `Outline`, which has no lines.
 
-    Raises PlaceError where there is no recording, DataError for a damaged one, and StoreError where that
-    cannot be found out.
+    Raises PlaceError if there is no recording, DataError if it is damaged, and StoreError if that cannot be
+    found out.
     """
-    # The format before the rest: what is no recording is a wrong path, and not damage.
+    # The format comes first: something that is no recording is a wrong path, not damage.
     document = read_root(source)
     _check_format(source, _format(document))
     try:
@@ -49,15 +49,15 @@ def opened(source: Source, kind: type[Kind]) -> Kind:
 
 
 def format_of(place: Path | str) -> str | None:
-    """The format that a Zarr group names, if any. Raises as `read_root` does."""
+    """Return the format that a Zarr group states, if any. Raises as `read_root` does."""
     return _format(read_root(source_of(place)))
 
 
 def read_root(source: Source) -> Document:
-    """The root's zarr.json, with attributes.
+    """Return the root's zarr.json, with attributes.
 
-    Raises PlaceError where there is no Zarr group, DataError where its metadata is damaged or was removed,
-    and StoreError where a disk or a store does not say.
+    Raises PlaceError if there is no Zarr group, DataError if its metadata is damaged or was removed, and
+    StoreError if the disk or the store fails.
     """
     try:
         document: Document = parse_object(source.read("zarr.json"))
@@ -76,7 +76,7 @@ def read_root(source: Source) -> Document:
 
 
 def _no_root(source: Source) -> AcquireError:
-    """Why there is no root metadata at a place: nothing, something else, or a recording that lost it."""
+    """Return the error for missing root metadata: nothing there, something else, or a damaged recording."""
     hint = "the path or URL of a directory NAME.zarr; `acquire ls DIR` lists those of a directory"
     with refused(source, "read"):
         if not source.exists():
@@ -99,7 +99,7 @@ def _has(source: Source, key: str) -> bool:
 
 def _check_object(attributes: Any) -> None:
     if not isinstance(attributes, dict):
-        raise TypeError("its attributes are no JSON object")
+        raise TypeError("its attributes are not a JSON object")
 
 
 def _format(document: Document) -> str | None:
@@ -125,12 +125,12 @@ def _check_format(source: Source, name: str | None) -> None:
 
 
 def _check_complete(recording: Outline) -> None:
-    """Touch everything that a recording needs; what is absent or impossible raises DAMAGE or UsageError."""
+    """Check everything that a recording needs; raise DAMAGE or UsageError for missing or impossible parts."""
     code_from_attrs(recording.attrs["code"])
     recording.geometry_for(1)
     for path, node in recording.document["consolidated_metadata"]["metadata"].items():
         if not all(part and part not in (".", "..") and "\0" not in part for part in path.split("/")):
-            raise ValueError(f"{path!r} is no path of an array or a group")
+            raise ValueError(f"{path!r} is not the path of an array or a group")
         _check_object(node["attributes"])
         node["node_type"]
     for table in ("gaps", "events"):

@@ -1,7 +1,7 @@
-"""What a recording says of itself, from its metadata and its small tables: no line is read.
+"""A recording's description, from its metadata and its small tables: no line is read.
 
-This is all that lists and summaries need, so it needs no library beyond the standard one and a checksum:
-`acquire ls` answers at once. `acquire.store.reader.Recording` is the same, with the lines.
+Lists and summaries need no more. It imports only the standard library and a checksum, so that `acquire ls`
+answers at once. `acquire.store.reader.Recording` is the same, with the lines.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ if TYPE_CHECKING:
 
 
 def open_outline(place: Path | str) -> Outline:
-    """What `acquire.store.open_recording` opens, without its lines; raises as it does."""
+    """Open a recording without its lines; raises as `acquire.store.open_recording` does."""
     return opened(source_of(place), Outline)
 
 
 class Outline:
-    """One recording, as far as its metadata tell; `open_outline` makes it.
+    """One recording, as far as its metadata describe it; `open_outline` returns it.
 
-    A snapshot: of one that is still growing it shows what was committed when it was opened; `refreshed` shows
-    more.
+    It is a snapshot: of a growing recording it shows the lines committed when it was opened. `refreshed`
+    shows more.
     """
 
     arms: Mapping[str, ArmFiles]
 
     def __init__(self, source: Source, document: Document) -> None:
-        """``document`` is the root's zarr.json. Raises one of `layout.DAMAGE` where it is damaged."""
+        """``document`` is the root's zarr.json. Raises one of `layout.DAMAGE` if it is damaged."""
         self.source = source
         self.document = document
         self.attrs: dict[str, Any] = document["attributes"]
@@ -60,11 +60,11 @@ class Outline:
 
     @property
     def is_here(self) -> bool:
-        """It lies on a disk of this machine."""
+        """Whether it is on a disk of this machine."""
         return isinstance(self.source, LocalSource)
 
     def refreshed(self) -> Self:
-        """The recording as it is now: of one that is growing, what was committed since."""
+        """Return the recording as it is now, with the lines committed since."""
         return opened(self.source, type(self))
 
     @property
@@ -92,14 +92,14 @@ class Outline:
 
     @property
     def substeps(self) -> int:
-        """S."""
+        """S, sub-steps per line."""
         return int(self.attrs["geometry"]["substeps"])
 
     @cached_property
     def fibre(self) -> Fibre | None:
-        """Which column sees what; None where a line's pixels see one scene, in order.
+        """The fibre's assignment of columns to tiles; None if a line's pixels see one scene, in order.
 
-        Raises DataError for a table that contradicts itself.
+        Raises DataError for an inconsistent table.
         """
         try:
             return Fibre.of(self.attrs["geometry"])
@@ -108,19 +108,19 @@ class Outline:
 
     @property
     def dropped(self) -> tuple[tuple[int, int], ...]:
-        """Lines that retention has deleted: first line and count of every stretch."""
+        """Lines that retention has deleted: first line and count of every range."""
         return tuple((int(first), int(count)) for first, count in self.attrs.get("dropped", ()))
 
     @property
     def first_available_line(self) -> int:
-        """The first line that retention has left."""
+        """The first line that retention has not deleted."""
         line = self.first_line
         for first, count in sorted(self.dropped):
             line = first + count if first == line else line
         return line
 
     def dropped_rows(self) -> list[range]:
-        """The same, in rows."""
+        """Return `dropped` as ranges of rows."""
         return [range(first - self.first_line, first - self.first_line + n) for first, n in self.dropped]
 
     @cached_property
@@ -129,11 +129,11 @@ class Outline:
         return tuple(self.beside(name) for name in self.attrs.get("segments", ()))
 
     def beside(self, name: str) -> Self:
-        """The recording of this name in the same place. Raises DataError."""
+        """Return the recording of this name in the same place. Raises DataError."""
         return opened(self.source.beside(name), type(self))
 
     def kept_rows(self) -> list[range]:
-        """Rows that have not been deleted; retention deletes whole files."""
+        """Return the rows that have not been deleted; retention deletes whole files."""
         kept, start = [], 0
         for dropped in sorted(self.dropped_rows(), key=lambda rows: rows.start):
             kept.append(range(start, dropped.start))
@@ -141,7 +141,7 @@ class Outline:
         return [rows for rows in [*kept, range(start, self.lines)] if rows]
 
     def lost_rows(self, arm: str, lines: int | None = None) -> list[range]:
-        """Rows of one arm that are listed in gaps; of the first ``lines`` rows, or of all that there are."""
+        """Return the rows of one arm that are listed in gaps, of the first ``lines`` rows or of all."""
         start, end = self.first_line, self.lines if lines is None else lines
         gaps = [
             range(gap.first_line - start, min(end, gap.first_line - start + gap.count))
@@ -152,26 +152,26 @@ class Outline:
 
     @cached_property
     def gaps_not_listed(self) -> int:
-        """Gaps for which the table had no room."""
+        """Number of gaps for which the table had no room."""
         return int(self._nodes["gaps"]["attributes"]["not_listed"])
 
     def geometry_for(self, lines: int) -> Geometry:
-        """Geometry of a segment of ``lines`` lines."""
+        """Return the geometry of a cut of ``lines`` lines."""
         sizes = self.attrs["geometry"]
         return Geometry(int(sizes["stages"]), int(sizes["substeps"]), lines)
 
     @cached_property
     def gaps(self) -> tuple[Gap, ...]:
-        """Lost lines in the order in which they were noticed."""
+        """Lost lines in the order of their detection."""
         return read_gaps(self.source, self._nodes)
 
     @cached_property
     def events(self) -> tuple[Event, ...]:
-        """What happened, in the order in which it was noted."""
+        """Events in the order in which they were noted."""
         return read_events(self.source, self._nodes)
 
     def info(self) -> dict[str, Any]:
-        """What one wants to know of a recording at a glance; everything is JSON."""
+        """Return a summary of the recording, as JSON."""
         period_ns, lines = self.line_period_ns, self.lines
         keys = ("run_id", "state", "run_condition", "end_reason", "layout", "geometry", "code", "clock")
         return {
@@ -204,7 +204,7 @@ class Outline:
         }
 
     def _disk_facts(self) -> dict[str, float] | None:
-        """While it grows here: bytes free, bytes per second that it takes, seconds until the disk is full."""
+        """Return, of a local growing recording, bytes free, bytes per second, and seconds to a full disk."""
         if self.state == "sealed" or not isinstance(self.source, LocalSource) or not self.lines:
             return None
         free = DISK.free_bytes(self.source.path)
@@ -212,7 +212,7 @@ class Outline:
         return {"free_bytes": free, "bytes_per_s": rate, "seconds_to_full": free / rate}
 
     def _start_ns(self) -> int | None:
-        """When the first line that there is was read out: its number and the clock tell."""
+        """Return when the first available line was read out, from its number and the clock."""
         line = self.first_available_line
         if line >= self.first_line + self.lines:
             return None

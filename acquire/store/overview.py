@@ -1,13 +1,13 @@
-"""A coarse picture of a whole recording, beside its lines: hours at a glance, in any viewer of Zarr.
+"""A coarse picture of a whole recording, stored with its lines: hours at a glance, in any Zarr viewer.
 
 ::
 
     overview/  a  b   (line, pixel)   row i: the mean of rows T·i … T·i + 7 of the arm that are not missing
                line   (line)          the trigger's number of the line in row T·i
 
-The first lines of every T are added up while they pass; T doubles, and every second row goes, whenever there
-are too many rows: memory and time are bounded, however long a recording gets. It is written when the
-recording is sealed, and never a reason for a recording to fail.
+The first lines of every T are added up as they pass; whenever there are too many rows, T doubles and every
+second row is dropped, so that memory and time are bounded however long a recording gets. The overview is
+written when the recording is sealed, and its failure never makes a recording fail.
 """
 
 from __future__ import annotations
@@ -39,33 +39,33 @@ if TYPE_CHECKING:
 NAME = "overview"
 KEYS = (NAME, *(f"{NAME}/{name}" for name in (*ARMS, "line")))
 CHUNKS = (*(f"{NAME}/{arm}/c/0/0" for arm in ARMS), f"{NAME}/line/c/0")
-"""The files that hold it; everything else is metadata."""
+"""Keys of its data; everything else is metadata."""
 AVERAGED = 8
-"""Lines that become one row."""
+"""Number of lines averaged into one row."""
 FIRST_STEP = 64
 """T of a short recording."""
 MOST_ROWS = 1024
 MOST_SAMPLES = 2**22
-"""Of an arm: lines of very many pixels have fewer rows."""
+"""Limit per arm: very wide lines have fewer rows."""
 SPARE_BYTES = 2**22
-"""Of the disk, that are left to whatever else ends a recording."""
+"""Bytes of the disk that are left for the rest of a recording's end."""
 MISSING = np.uint16(LineFlag.MISSING)
 ROWS = {"long_name": "mean of some lines", "units": "DN"}
 NUMBERS = {"long_name": "the trigger's number of the row's first line", "units": "1"}
 
 
 class Passing:
-    """What becomes of one arm's overview while its lines pass; rows are counted from ``first_line``."""
+    """One arm's overview while its lines pass; rows are counted from ``first_line``."""
 
     def __init__(self, pixels: int) -> None:
         self.step = FIRST_STEP
         rows = max(2, min(MOST_ROWS, MOST_SAMPLES // pixels) // 2 * 2)
-        # Sums of AVERAGED samples of 16 bits fit; the system gives the memory page by page.
+        # Sums of AVERAGED 16-bit samples fit; the system allocates the memory page by page, on first use.
         self._sums = np.zeros((rows, pixels), np.uint32)
         self._counts = np.zeros(rows, np.uint32)
 
     def add(self, block: TaggedBlock, first_line: int) -> None:
-        """Take note of the next lines; a missing one is filled with 0."""
+        """Add the next lines; missing ones are filled with 0."""
         start, count = block.first_line - first_line, len(block.flags)
         while (start + count - 1) // self.step >= len(self._counts):
             self.widen(2 * self.step)
@@ -78,17 +78,17 @@ class Passing:
             self._counts[rows] += (block.flags[skipped :: self.step] & MISSING) == 0
 
     def widen(self, step: int) -> None:
-        """Keep the rows for a larger T."""
+        """Increase T to ``step``, keeping the rows that remain."""
         while self.step < step:
             for values in (self._sums, self._counts):
                 half = len(values) // 2
-                for row in range(half):  # in its place: no memory that could be refused
+                for row in range(half):  # in place, since an allocation could fail
                     values[row] = values[2 * row]
                 values[half:] = 0
             self.step *= 2
 
     def rows(self, lines: int, data_type: str) -> NDArray[Any]:
-        """Rows of so many lines, without one whose lines were not all due; 0 where none of them is there."""
+        """Return the rows of ``lines`` lines, without an incomplete last one; 0 if all lines are missing."""
         count = max(0, (lines - AVERAGED) // self.step + 1)
         means = self._sums[:count] / np.maximum(self._counts[:count], 1)[:, None]
         return np.rint(means).astype(np.dtype(data_type).newbyteorder("<"))
@@ -97,7 +97,7 @@ class Passing:
 def write_overview(
     publisher: Publisher, path: Path, passing: Mapping[str, Passing], spec: RecordingSpec, lines: int
 ) -> dict[str, layout.Document]:
-    """Write it for a recording of so many lines; metadata by path below the recording. Raises OSError."""
+    """Write it for a recording of ``lines`` lines; return the metadata by path. Raises OSError."""
     step = max(arm.step for arm in passing.values())
     for arm in passing.values():
         arm.widen(step)
@@ -108,7 +108,7 @@ def write_overview(
     documents = {name: _document(rows, ("line", "pixel"), ROWS) for name, rows in arrays.items()}
     arrays["line"] = (spec.first_line + step * np.arange(count)).astype("<u8")
     documents["line"] = _document(arrays["line"], ("line",), NUMBERS)
-    # Twice: what does not pack well, and metadata. A full disk must still take the end of the recording.
+    # Twice the size, for data that do not pack well and for metadata: the recording's end must still fit.
     spare = publisher.disk.free_bytes(path) - 2 * sum(rows.nbytes for rows in arrays.values())
     if spare < SPARE_BYTES:
         raise OSError(errno.ENOSPC, "the disk has room for the recording's end alone")
@@ -129,7 +129,7 @@ def write_overview(
 
 
 def withdraw_overview(disk: Disk, path: Path) -> None:
-    """Give back the room of one that could not be written; a recording's end needs it."""
+    """Remove one that could not be written; the recording's end needs its room."""
     for key in (*CHUNKS, *(f"{key}/zarr.json" for key in KEYS)):
         with suppress(OSError):
             disk.remove(path / key)
@@ -157,7 +157,7 @@ class Overview:
 
 
 def read_overview(recording: Recording, arm: str) -> Overview | None:
-    """The one that was written; None where there is none. Raises DataError for a damaged one."""
+    """Return the overview of an arm; None if there is none. Raises DataError if it is damaged."""
     nodes = recording.document["consolidated_metadata"]["metadata"]
     if NAME not in nodes:
         return None
@@ -181,12 +181,12 @@ def read_overview(recording: Recording, arm: str) -> Overview | None:
     except layout.DAMAGE as error:
         raise DataError(
             f"{recording}: its overview cannot be read: {error}",
-            hint="the lines themselves, which it is made of",
+            hint="the lines themselves, from which it was made",
         ) from error
 
 
 def contradictions(recording: Recording, arm: str) -> Iterator[str]:
-    """Where an arm's overview is not what its lines are, as far as these are there and intact."""
+    """Yield the faults of an arm's overview, compared with those of its lines that are there and intact."""
     try:
         found = read_overview(recording, arm)
     except DataError as error:
@@ -199,7 +199,7 @@ def contradictions(recording: Recording, arm: str) -> Iterator[str]:
 
 
 def _groups(recording: Recording, found: Overview) -> Iterator[range]:
-    """Rows of lines that are read at once: a chunk at a time, without what retention has dropped."""
+    """Yield the rows whose lines are read at once: a chunk at a time, without dropped lines."""
     step, size = found.lines_per_row, recording.arms[ARMS[0]].reader("lines").shape.chunk_rows
     together = max(1, size // step)
     there = min(len(found.rows), max(0, recording.lines - AVERAGED) // step + 1)
@@ -211,13 +211,13 @@ def _groups(recording: Recording, found: Overview) -> Iterator[range]:
 
 
 def _differ(recording: Recording, arm: str, found: Overview, rows: range) -> int:
-    """How many of the rows are not the mean of their lines; those that miss a line are not compared."""
+    """Return how many of the rows are not the mean of their lines; rows with a missing line are skipped."""
     step, stream = found.lines_per_row, recording.arms[arm]
     start, stop = rows.start * step, rows[-1] * step + AVERAGED
     try:
         missing = (stream.read("flags", start, stop) & MISSING) != 0
         lines = stream.read("lines", start, stop)
-    except DataError:  # which is told as damage
+    except DataError:  # reported as damage elsewhere
         return 0
     wrong = 0
     for number in rows:

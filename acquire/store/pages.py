@@ -1,4 +1,4 @@
-"""Memory and files in whole pages, as direct I/O wants them: aligned, allocated once, touched before use."""
+"""Memory and files in whole pages, as direct I/O requires: aligned, allocated once, touched before use."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ PAGE = 4096
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
 """Options of glibc's mallopt."""
 KEPT_BYTES = 2**25
-"""Pieces up to this size are kept: the most that glibc allows."""
+"""Largest allocation that is kept: the limit of glibc."""
 
 
 def page_up(size: int) -> int:
-    """``size`` rounded up to whole pages."""
+    """Return ``size`` rounded up to whole pages."""
     return -(-size // PAGE) * PAGE
 
 
 def aligned_bytes(size: int) -> NDArray[np.uint8]:
-    """At least ``size`` bytes of zeros from a page's beginning on, in whole pages.
+    """Return at least ``size`` bytes of zeros in whole pages.
 
     They are written once here: the first touch of a page costs more than all later ones together.
     """
-    import numpy as np  # for those who write: lists of recordings need files and pages, too
+    import numpy as np  # here, since lists of recordings import this module, and do without numpy
 
     memory = np.frombuffer(mmap.mmap(-1, max(PAGE, page_up(size))), np.uint8)
     memory.fill(0)
@@ -42,12 +42,12 @@ def aligned_bytes(size: int) -> NDArray[np.uint8]:
 
 @cache
 def keep_freed_memory() -> bool:
-    """Let the C library keep what it is given back, for the rest of this process; False where it cannot.
+    """Have the C library keep freed memory for the rest of this process; return False if it cannot.
 
-    Each packed chunk is some MB that are allocated anew: taken from the system and returned every time, their
-    first touch costs a third of the packing.
+    Each packed chunk is a new allocation of some MB: if it were taken from the system and returned every
+    time, the first touch of its pages would cost a third of the packing.
     """
-    import ctypes  # as numpy above: for those who write
+    import ctypes  # here for the same reason as numpy above
 
     library = ctypes.CDLL(None)
     if not hasattr(library, "mallopt"):  # not glibc
@@ -56,13 +56,14 @@ def keep_freed_memory() -> bool:
 
 
 def is_aligned(array: NDArray[Any]) -> bool:
-    """The array's memory begins with a page."""
+    """Return whether the array's memory begins at a page boundary."""
     return int(array.__array_interface__["data"][0]) % PAGE == 0
 
 
 def open_direct(path: Path, *, follow: bool = False) -> int:
-    """A descriptor that writes ``path`` past the page cache; -1 where the file system has no such thing, or
-    where ``path`` is a link that is not to be followed.
+    """Return a descriptor that writes ``path`` past the page cache.
+
+    Return -1 if the file system cannot do that, or if ``path`` is a link that is not to be followed.
     """
     flags = os.O_WRONLY | os.O_CLOEXEC | os.O_DIRECT
     try:

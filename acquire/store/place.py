@@ -1,6 +1,6 @@
-"""Parts put below a directory of this machine whole: who is killed meanwhile leaves the old bytes or the new.
+"""Atomic writes below a local directory: a process killed in between leaves either the old or the new bytes.
 
-A part is prepared under one name beside its own, `files.SCRATCH`, forced to the medium, and renamed.
+A file is prepared under the name `files.SCRATCH` in the same directory, forced to the medium, and renamed.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Rows of one arm without those that are not there: what is missing or was dropped is never read."""
+"""Reading rows of one arm of which some are missing or dropped; these are never read."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ MISSING = np.uint16(LineFlag.MISSING)
 
 
 def flags_of(recording: Recording, arm: str, start: int, stop: int) -> NDArray[np.uint16]:
-    """Flags of rows ``start .. stop - 1``; a row that retention has dropped is flagged as missing."""
+    """Return the flags of rows ``start .. stop - 1``; dropped rows are flagged as missing."""
     flags = np.full(stop - start, MISSING, np.uint16)
     for rows in recording.kept_rows():
         first, end = max(rows.start, start), min(rows.stop, stop)
@@ -30,10 +30,10 @@ def flags_of(recording: Recording, arm: str, start: int, stop: int) -> NDArray[n
 def present_values(
     recording: Recording, arm: str, name: str, start: int, flags: NDArray[np.uint16]
 ) -> NDArray[Any]:
-    """An array's values from row ``start`` on, one for each of ``flags``; 0 where a row is missing.
+    """Return an array's values from row ``start`` on, one for each of ``flags``; 0 for missing rows.
 
-    A recording that was recovered flags as missing what is not intact on disk. Raises DataError where a row
-    that is not flagged cannot be read.
+    In a recovered recording, rows that are not intact on disk are flagged as missing. Raises DataError if a
+    row that is not flagged cannot be read.
     """
     stream = recording.camera(arm)
     present = (flags & MISSING) == 0

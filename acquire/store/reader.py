@@ -1,6 +1,6 @@
-"""Reading recordings: what they say about themselves, and segments cut out of them for reconstruction.
+"""Reading recordings: their description, and segments cut out of them for reconstruction.
 
-Nothing is read before it is asked for.
+Everything is read lazily.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from acquire.store.stretch import Stretch
 
 CUT_COLUMNS = ("lines", "flags", "code", "code_index", "time")
-"""Arrays that a segment is made of."""
+"""Arrays from which a segment is cut."""
 
 NOISE_KEYS = ("dn_per_electron", "read_noise_e")
 UNUSABLE = LineFlag.MISSING | LineFlag.INCOMPLETE
@@ -47,19 +47,19 @@ UNUSABLE = LineFlag.MISSING | LineFlag.INCOMPLETE
 def open_recording(place: Path | str) -> Recording:
     """Open a recording, growing or sealed.
 
-    Raises PlaceError where there is none, DataError for a damaged one, and StoreError where that cannot be
-    found out.
+    Raises PlaceError if there is none, DataError if it is damaged, and StoreError if that cannot be found
+    out.
     """
     return open_source(source_of(place))
 
 
 def open_source(source: Source) -> Recording:
-    """`open_recording` of what lies in a source."""
+    """Do as `open_recording`, with a source."""
     return opened(source, Recording)
 
 
 class Recording(Outline):
-    """One recording, opened for reading; `open_recording` makes it."""
+    """One recording, opened for reading; `open_recording` returns it."""
 
     arms: Mapping[str, CameraStream]
 
@@ -77,7 +77,7 @@ class Recording(Outline):
         )
 
     def _picture(self) -> str:
-        """Both arms side by side, where there is an overview that can be read."""
+        """Return both arms side by side, if there is a readable overview."""
         try:
             overviews = [found.rows for arm in ARMS if (found := self.overview(arm)) is not None]
         except DataError:
@@ -89,7 +89,7 @@ class Recording(Outline):
         return as_picture(both[::rows, ::columns], "both arms, time downwards")
 
     def _holds(self) -> dict[str, str]:
-        """What it holds, in words; nothing is read for it."""
+        """Return a description in words, without reading any lines."""
         first, count, sizes = self.first_line, self.lines, self.attrs["geometry"]
         period_ns = self.line_period_ns
         return {
@@ -102,12 +102,12 @@ class Recording(Outline):
 
     @property
     def path(self) -> Path:
-        """Where it lies; of a remote recording only the name means something."""
+        """Its path; of a remote recording only the name is meaningful."""
         return Path(str(self.source))
 
     @cached_property
     def group(self) -> zarr.Group:
-        """The recording in zarr-python, which is imported when somebody asks for it."""
+        """The recording as a zarr-python group; zarr is imported only here."""
         import zarr
 
         return zarr.open_group(self.source.zarr_store(), mode="r", zarr_format=3)
@@ -116,25 +116,25 @@ class Recording(Outline):
         return self.group
 
     def end_ns(self) -> int | None:
-        """UTC at which the line after the last is read out; None without lines."""
+        """Return the UTC at which the line after the last one is read out; None without lines."""
         if not self.lines:
             return None
         last = int(self.arms[ARMS[0]].read("time", self.lines - 1, self.lines)[0])
         return last + round(self.line_period_ns)
 
     def camera(self, arm: str) -> CameraStream:
-        """The arrays of arm ``"a"`` or ``"b"``."""
+        """Return the arrays of arm ``"a"`` or ``"b"``."""
         if arm not in self.arms:
             raise UsageError(f"{self} has no arm {arm!r}", possible=", ".join(self.arms))
         return self.arms[arm]
 
     def cut(self, first_line: int, lines: int, tile: Tile | None = None) -> Segment:
-        """The segment of ``lines`` lines from the trigger's line ``first_line`` on; behind a fibre, of a
-        ``tile`` of the scene.
+        """Return the segment of ``lines`` lines from the trigger's line ``first_line`` on.
 
-        A sample is masked when its line is missing or incomplete, or when it stands at the top of the range.
-        Raises UsageError for lines and tiles that are not there, and DataError when the file is damaged or
-        the code that the attributes describe is not the one recorded with the lines.
+        Behind a fibre, ``tile`` is the tile of the scene. A sample is masked if its line is missing or
+        incomplete, or if it is at the top of the range. Raises UsageError for lines and tiles that are not
+        there, and DataError if the file is damaged or the code recorded with the lines is not the one that
+        the attributes describe.
         """
         if (segment := self._segment_with(first_line)) is not None:
             return segment.cut(first_line, lines, tile)
@@ -160,8 +160,9 @@ class Recording(Outline):
         )
 
     def whole_lines(self, first_line: int, lines: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-        """Samples (arm, line, pixel) of ``lines`` lines from ``first_line`` on and which can be used,
-        whatever they see: for what is a matter of columns. Raises as `cut` does.
+        """Return samples (arm, line, pixel) of ``lines`` lines from ``first_line`` on, and which are usable.
+
+        All columns are included, whatever they see: for calibrations per column. Raises as `cut` does.
         """
         if (segment := self._segment_with(first_line)) is not None:
             return segment.whole_lines(first_line, lines)
@@ -172,7 +173,7 @@ class Recording(Outline):
         return samples, self._usable(samples, flags)
 
     def _columns(self, tile: Tile | None) -> tuple[slice, slice]:
-        """Of the lines of arms A and B: those that see a tile, or all."""
+        """Return the columns of arms A and B that see a tile, or all of them."""
         if self.fibre is not None:
             if tile is None:
                 raise UsageError(
@@ -191,21 +192,21 @@ class Recording(Outline):
         return slice(0, pixels), slice(0, pixels)
 
     def overview(self, arm: str) -> Overview | None:
-        """All of an arm in at most a thousand rows; None where it was written without, or still grows.
+        """Return a whole arm in at most a thousand rows; None if there is no overview, or not yet.
 
-        Raises DataError for a damaged one.
+        Raises DataError if it is damaged.
         """
         return read_overview(self, self.camera(arm).arm)
 
     def _fetched(self, start: int, stop: int) -> dict[str, dict[str, Stretch]]:
-        """Arm → array → its rows ``start .. stop - 1``, all on their way from the disk at once."""
+        """Return, per arm and array, rows ``start .. stop - 1``, all being fetched at once."""
         found = {
             arm: {name: stream.stretch(name, start, stop) for name in CUT_COLUMNS}
             for arm, stream in self.arms.items()
         }
         stretches = [stretch for arm in found.values() for stretch in arm.values()]
-        # All indices first, then all chunks: a disk does best, and a store far away answers soonest, when it
-        # has been asked for everything before anything is waited for.
+        # All indices first, then all chunks: disks and remote stores are fastest if everything is requested
+        # before anything is waited for.
         for stretch in stretches:
             stretch.expect_index()
         for stretch in stretches:
@@ -213,7 +214,7 @@ class Recording(Outline):
         return found
 
     def _segment_with(self, line: int) -> Recording | None:
-        """The further segment that has a line which is not here."""
+        """Return the further segment that holds the line, if it is not in this one."""
         if line < self.first_line + self.lines:
             return None
         return next((s for s in self.segments if s.first_line <= line < s.first_line + s.lines), None)
@@ -240,7 +241,7 @@ class Recording(Outline):
         return [float(self.attrs["cameras"][arm][key]) for arm in ARMS]
 
     def _noise(self) -> Noise | None:
-        """What the rig said of the cameras' noise; None where it said nothing."""
+        """Return the cameras' noise from the rig's configuration; None if it is not given."""
         cameras = [self.attrs["cameras"][arm] for arm in ARMS]
         if any(camera.get(key) is None for camera in cameras for key in NOISE_KEYS):
             return None
@@ -254,7 +255,7 @@ class Recording(Outline):
     def _usable(self, samples: NDArray[Any], flags: NDArray[np.uint16]) -> NDArray[np.bool_]:
         usable = np.empty(samples.shape, np.bool_)
         for arm, white in enumerate(self._camera_numbers("white_dn")):
-            np.less(samples[arm], math.ceil(white), out=usable[arm])  # whole numbers: many times faster
+            np.less(samples[arm], math.ceil(white), out=usable[arm])  # integer comparison: many times faster
         usable[(flags & UNUSABLE) != 0] = False
         return usable
 
@@ -265,7 +266,7 @@ class Recording(Outline):
         flags: NDArray[np.uint16],
         stretches: dict[str, dict[str, Stretch]],
     ) -> NDArray[np.uint8]:
-        """E of the segment from the attributes, compared with what stands beside each line of either arm."""
+        """Return E of the segment from the attributes, after comparing it with the code stored per line."""
         S, lines = geometry.substeps, geometry.lines
         bits = code_from_attrs(self.attrs["code"]).bits(S * first_line, geometry.span)
         index = S * np.arange(first_line, first_line + lines, dtype=np.uint64)

@@ -1,13 +1,13 @@
-"""The root of a recording anew, where its zarr.json is lost: from what the parts below it say.
+"""Rebuilding a lost root zarr.json of a recording from the metadata of the parts below it.
 
 ::
 
-    a/lines/.attributes          the root's attributes, once more ─┐
+    a/lines/.attributes          copy of the root's attributes ────┐
     a/*, b/*, gaps/*, events/*   each array's own zarr.json ───────┴▶ zarr.json
 
-The copy of the attributes is written before the first line, and again when retention has lines dropped and
-when the recording is sealed. Arrays know their lengths to within a second: what is on disk beyond that is
-found by `recover`. Recordings of versions that kept no copy cannot be rebuilt: their arms can be read.
+The copy of the attributes is written before the first line, and again when retention drops lines and when the
+recording is sealed. Arrays state their lengths to within a second: `recover` finds lines on disk beyond that.
+Recordings of versions that kept no copy cannot be rebuilt, but their arms can be read.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ if TYPE_CHECKING:
     from acquire.store.files import Disk
 
 LOST_FACTS = "run_id, first_line, geometry, code, clock, cameras, trigger, config"
-"""What only the root and its copy say."""
+"""Facts that are stored only in the root and its copy."""
 DAMAGED_ROOT = "zarr.json.damaged"
-"""What a root that cannot be read is renamed to."""
+"""New name of a root that cannot be read."""
 
 
 def root_is_lost(path: Path) -> bool:
-    """There are the arms of a recording, and no root, or one that is no JSON object with attributes."""
+    """Return whether a recording's arms are there, but not a root that is a JSON object with attributes."""
     if not any((path / arm).is_dir() for arm in ARMS):
         return False
     try:
@@ -43,11 +43,11 @@ def root_is_lost(path: Path) -> bool:
     except (FileNotFoundError, ValueError):
         return True
     except OSError:
-        return False  # it may be intact: whoever opens it says what is wrong
+        return False  # it may be intact: opening it reports the error
 
 
 def known_attributes(path: Path) -> dict[str, Any] | None:
-    """The root's attributes, or else their copy; None where there is neither."""
+    """Return the root's attributes, or else their copy; None if there is neither."""
     for file in (path / ROOT, path / ARMS[0] / "lines" / COPY):
         with suppress(OSError, ValueError):
             if isinstance(attributes := read_object(file, follow=False).get("attributes"), dict):
@@ -56,15 +56,15 @@ def known_attributes(path: Path) -> dict[str, Any] | None:
 
 
 def write_copy(publisher: Publisher, path: Path, attributes: dict[str, Any], *, durable: bool) -> None:
-    """Keep the root's attributes a second time. Raises OSError."""
+    """Write the copy of the root's attributes. Raises OSError."""
     text = layout.to_json({"attributes": attributes})
     publisher.replace(path / ARMS[0] / "lines" / COPY, text, durable=durable)
 
 
 def rebuild_root(path: Path, disk: Disk) -> None:
-    """Write the root of the recording at ``path`` anew; one that cannot be read is kept under another name.
+    """Rebuild the root of the recording at ``path``; one that cannot be read is kept under another name.
 
-    Raises DataError, and touches nothing, where too much is lost.
+    Raises DataError, and changes nothing, if too much is lost.
     """
     attributes = known_attributes(path)
     if attributes is None:
@@ -81,14 +81,14 @@ def rebuild_root(path: Path, disk: Disk) -> None:
         publisher = Publisher(path / ARMS[0] / "lines" / SCRATCH, disk)
         publisher.replace(path / ROOT, layout.to_json(layout.group_document(attributes, nodes)), durable=True)
     except OSError as error:
-        raise DataError(f"{path}: its root cannot be written anew: {error.strerror or error}") from error
+        raise DataError(f"{path}: its root cannot be rebuilt: {error.strerror or error}") from error
 
 
 def _arms(path: Path, attributes: dict[str, Any]) -> dict[str, layout.Document]:
-    """Metadata of both arms, of the rows that all arrays have; of an open recording, of whole chunks."""
+    """Return the metadata of both arms, with the rows that all arrays have; whole chunks unless sealed."""
     nodes: dict[str, layout.Document] = {}
     for column in layout.line_columns("any"):
-        # Arrays of one column are alike in both arms: either may speak for the other.
+        # Arrays of one column are alike in both arms: either may stand in for the other.
         found = [_own(path / arm / column.name) for arm in ARMS]
         known = next(filter(None, found), None)
         if known is None:
@@ -104,7 +104,7 @@ def _arms(path: Path, attributes: dict[str, Any]) -> dict[str, layout.Document]:
         rows = min(rows for _, rows in shapes.values())
         if attributes.get("state") != "sealed":
             rows -= rows % max(shape.chunk_rows for shape, _ in shapes.values())
-            # Whatever retention had dropped was committed, though an array may not say so yet.
+            # Lines that retention dropped were committed, although an array may not state them yet.
             first_line = int(attributes["first_line"])
             dropped = (int(first) + int(count) for first, count in attributes.get("dropped", ()))
             rows = max([rows, *(end - first_line for end in dropped)])
@@ -115,7 +115,7 @@ def _arms(path: Path, attributes: dict[str, Any]) -> dict[str, layout.Document]:
         raise DataError(
             f"{path}: its root zarr.json is lost, and its arrays are damaged: {error!r}"
         ) from error
-    ordered: dict[str, layout.Document] = {}  # a group, and what is in it: zarr relies on that
+    ordered: dict[str, layout.Document] = {}  # zarr relies on a group being followed by its members
     for arm in ARMS:
         ordered[arm] = layout.group_document({"arm": arm, **group}, {})
         ordered |= {key: node for key, node in nodes.items() if key.startswith(f"{arm}/")}
@@ -123,7 +123,7 @@ def _arms(path: Path, attributes: dict[str, Any]) -> dict[str, layout.Document]:
 
 
 def _tables(path: Path) -> dict[str, layout.Document]:
-    """Metadata of tables and overview, as far as it is there: what they say is not needed for the lines."""
+    """Return the metadata of tables and overview, as far as it exists: the lines do not depend on it."""
     nodes: dict[str, layout.Document] = {}
     for keys in (gap_table(path).nodes(), event_table(path).nodes(), overview.KEYS):
         own = {key: _own(path / key) for key in keys}
@@ -133,7 +133,7 @@ def _tables(path: Path) -> dict[str, layout.Document]:
 
 
 def _own(directory: Path) -> layout.Document | None:
-    """What an array or a group says of itself, if it does."""
+    """Return the own metadata of an array or a group, if it can be read."""
     try:
         document = read_object(directory / ROOT, follow=False)
     except (OSError, ValueError):

@@ -1,16 +1,16 @@
-"""Makes a recording whole again whose writer did not end it: what is on disk is kept, the end is told.
+"""Recovery of a recording whose writer did not end it: everything on disk is kept, and the end is sealed.
 
 ::
 
-    scan every chunk ─▶ mend indices ─▶ flag what is lost ─▶ tables ─▶ lengths ─▶ root: sealed, INTERRUPTED
+    mend indices ─▶ scan every chunk ─▶ flag lost rows ─▶ tables ─▶ lengths ─▶ root: sealed, INTERRUPTED
 
-Nothing that was committed is cut off: lines of which a part is not on disk stay, flagged as missing and
-listed in gaps. Whole chunks that were written after the last commit are added; pixels without tags are no
-lines, and are left where they are, behind the last. A second run finds nothing to do; one that is interrupted
-is simply run again, since the root is written last.
+No committed line is cut off: lines of which a part is not on disk stay, flagged as missing and listed in
+gaps. Whole chunks that were written after the last commit are added; pixels without tags are no lines, and
+stay where they are, after the last line. A second run finds nothing to do; an interrupted one is simply
+repeated, since the root is written last.
 
-Where the machine has run on since, what was committed is where it was written: then only what came after the
-last commit is looked at, and it takes a moment however long the recording is.
+If the machine has kept running, committed lines are certainly on disk: then only the chunks after the last
+commit are checked, which takes a moment however long the recording is.
 """
 
 from __future__ import annotations
@@ -68,34 +68,34 @@ class Circumstances:
 
     Attributes
     ----------
-    reason : of the recording's end
-    committed_intact : the machine has run on since, and nothing else is to be feared for what was committed
-    alone : nobody else can be writing it, also where the file system has no locks that would tell
-    told : line, kind and text of events that the writer was told of and may not have listed
+    reason : why the recording ended
+    committed_intact : the machine has kept running, and committed lines are certainly intact
+    alone : nobody else can be writing it, even if the file system has no locks to prove it
+    notes : line, kind and text of events that were sent to the writer, which may not have listed them
     """
 
     reason: str = REASON
     committed_intact: bool = False
     alone: bool = True
-    told: tuple[tuple[int, str, str], ...] = ()
+    notes: tuple[tuple[int, str, str], ...] = ()
 
 
 UNKNOWN = Circumstances()
-"""An operator says that it is over; all of the recording is looked at."""
+"""An operator says that the recording is over; all of it is checked."""
 
 
 @dataclass(frozen=True, slots=True)
 class Recovery:
-    """What was done.
+    """Result of a recovery.
 
     Attributes
     ----------
-    changed : anything at all
-    lines, lines_before : rows of each arm that a reader finds
-    indices_mended : files whose index was torn, or did not know all chunks yet
-    damage : lines that are lost, of which array and why
-    root_rebuilt : the root's zarr.json was lost, and written anew from what the parts below it say
-    not_listed : why the segments of the run could not be listed in its first recording, if so
+    changed : whether anything was changed
+    lines, lines_before : rows of each arm that a reader finds, after and before
+    indices_mended : number of files whose index was torn, or lacked chunks
+    damage : lost lines, of which array and why
+    root_rebuilt : the root's zarr.json was lost, and rebuilt from the metadata of the parts below it
+    not_listed : why the segments of the run could not be listed in its first recording; "" if they could
     """
 
     path: str
@@ -117,23 +117,23 @@ def recover(
     progress: Callable[[int, int], None] | None = None,
     known: Circumstances = UNKNOWN,
 ) -> Recovery:
-    """Recover the recording at ``path``, and list it where it goes on in segments; idempotent.
+    """Recover the recording at ``path``, and list the segments of its run; idempotent.
 
-    ``progress`` is told chunks looked at, and how many there are; what it raises ends the recovery, which
-    can begin anew at any time. Raises PlaceError where there is no recording, DataError where one holds
-    links, StoreError where the disk refuses, StateError while somebody writes it.
+    ``progress`` gets the chunks checked and their total; it may raise to end the recovery, which can be
+    repeated at any time. Raises PlaceError if there is no recording, DataError if it holds links, StoreError
+    if the disk refuses, StateError while it is being written.
     """
     refuse_links(path)
     if not root_is_lost(path):
-        open_recording(path)  # what is no recording is refused before it is locked
+        open_recording(path)  # refuse anything but a recording before it is locked
     with refused(path, "recovered"), locked(path, "recovering", surely=not known.alone):
         if lost := root_is_lost(path):
             rebuild_root(path, disk)
-        recording = open_recording(path)  # as it is now that nobody writes it
+        recording = open_recording(path)  # once more, now that nobody writes it
         done = _Recoverer(recording, path, disk, known).run(progress)
     not_listed = ""
     try:
-        with contextlib.suppress(StateError):  # who recovers the first recording meanwhile lists them all
+        with contextlib.suppress(StateError):  # another recovery has the first recording, and lists them
             list_segments(path, disk)
     except (AcquireError, OSError) as error:
         not_listed = str(error)
@@ -141,14 +141,14 @@ def recover(
 
 
 class _Recoverer:
-    """One recovery, with the recording held."""
+    """One recovery, with the recording locked."""
 
     def __init__(self, recording: Recording, path: Path, disk: Disk, known: Circumstances) -> None:
         self.recording = recording
         self.path = path
         self.disk = disk
         self.reason = known.reason
-        self.told = known.told
+        self.notes = known.notes
         self.sealed = recording.state == "sealed"
         self.rows = recording.lines
         self.flags_changed = 0
@@ -156,14 +156,14 @@ class _Recoverer:
         self.tag_rows = tag_rows(recording)
         trusted = known.committed_intact and not self.sealed
         self.first_row = recording.lines // self.tag_rows * self.tag_rows if trusted else 0
-        """Those before it are known to be as they were written."""
+        """Rows before this one are known to be intact."""
         kept = [range(max(rows.start, self.first_row), rows.stop) for rows in recording.kept_rows()]
         self.kept = [rows for rows in kept if rows]
 
     def run(self, progress: Callable[[int, int], None] | None) -> Recovery:
         recording = self.recording
-        # Indices first: chunks are found by them. Then what was committed, and only then what lies beyond
-        # it, since rows count only where every array of both arms has them.
+        # Indices first, since chunks are found by them. Then committed rows, and only then the rows after
+        # them, which count only if every array of both arms has them.
         mended = sum(self._mend(arm) for arm in ARMS)
         scans = scan(recording, self.kept, progress)
         if not self.sealed:
@@ -184,7 +184,7 @@ class _Recoverer:
         )
 
     def _mend(self, arm: str) -> int:
-        """Torn indices of an arm, mended."""
+        """Mend the torn indices of an arm; return their number."""
         stream = self.recording.arms[arm]
         first_shard = self.first_row // self.shape.shard_rows
         mended = 0
@@ -198,8 +198,8 @@ class _Recoverer:
         return mended
 
     def _grown(self) -> int:
-        """Rows with those that are whole on disk in every array, though no commit lists them."""
-        # Chunk after chunk of the arrays of tags: the first that is not whole, in any array of either arm, is
+        """Return the number of rows, including uncommitted ones that are whole on disk in every array."""
+        # Chunk after chunk of the tag arrays: the first one that is not whole, in any array of either arm, is
         # where the writer was.
         rows, grown = self.recording.lines, self.tag_rows
         while rows % self.tag_rows == 0 and grown:
@@ -209,7 +209,7 @@ class _Recoverer:
         return rows
 
     def _flag(self, found: ArmScan) -> list[tuple[int, int, str]]:
-        """Flag what is lost of one arm; gaps to be listed: first line, count, cause."""
+        """Flag the lost rows of one arm; return the gaps to be listed: first line, count, cause."""
         size = self.tag_rows
         listed = sorted(self.recording.lost_rows(found.stream.arm, self.rows), key=lambda rows: rows.start)
         gaps: dict[str, list[tuple[int, int, str]]] = {"damaged": [], "unlisted": []}
@@ -224,7 +224,7 @@ class _Recoverer:
         return sorted(gap for of_cause in gaps.values() for gap in of_cause)
 
     def _flag_chunk(self, found: ArmScan, chunk: int, lost: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Which rows of a chunk are missing; those that are ``lost`` are, and so it stands on disk then."""
+        """Return which rows of a chunk are missing, after flagging the ``lost`` ones on disk."""
         reader = found.stream.reader("flags")
         damaged = chunk in found.troubles["flags"]
         flags = np.zeros(len(lost), reader.shape.dtype) if damaged else reader.chunk(chunk).copy()
@@ -242,24 +242,24 @@ class _Recoverer:
         nodes |= self._tables(publisher, new_gaps)
         self._resize(publisher, nodes)
         document["attributes"] = self._attributes(new_gaps)
-        self.disk.sync_tree(self.path)  # all that the root is going to tell of
+        self.disk.sync_tree(self.path)  # everything that the root is going to describe
         write_copy(publisher, self.path, document["attributes"], durable=True)
         publisher.replace(self.path / "zarr.json", layout.to_json(document), durable=True)
         for leftover in (SCRATCH, RESERVE):
             self.disk.remove(hidden / leftover)
         release(self.path, self.disk)
-        # Shards that retention had told of, and may have had no time to delete.
+        # Shards that the root lists as dropped, and that retention may have had no time to delete.
         size = self.shape.shard_rows
-        told = [range(-(-rows.start // size), rows.stop // size) for rows in self.recording.dropped_rows()]
+        listed = [range(-(-rows.start // size), rows.stop // size) for rows in self.recording.dropped_rows()]
         for shard in shards_on_disk(self.path):
-            if any(shard in shards for shards in told):
-                remove(self.disk, self.path, Dropped(shard, told))
+            if any(shard in shards for shards in listed):
+                remove(self.disk, self.path, Dropped(shard, listed))
         self.disk.sync_directory(self.path.parent)
 
     def _tables(
         self, publisher: Publisher, new_gaps: dict[str, list[tuple[int, int, str]]]
     ) -> dict[str, layout.Document]:
-        """Gaps and events as they were, with what is new."""
+        """Write gaps and events as they were, with the new ones; return their metadata."""
         recording = self.recording
         gaps, events = gap_table(self.path), event_table(self.path)
         end = recording.first_line + self.rows
@@ -274,10 +274,10 @@ class _Recoverer:
             events.add({"tick": event.tick, "line": event.line, "kind": event.kind, "text": event.text})
         # A writer that dies between a line's commit and that of its event leaves a line without its mark.
         listed = {(event.line, event.kind, event.text) for event in recording.events}
-        for line, kind, said in self.told:
-            if recording.first_line <= line < end and (line, kind, said) not in listed:
-                events.add({"tick": self._tick(line), "line": line, "kind": kind, "text": said})
-                listed.add((line, kind, said))
+        for line, kind, note in self.notes:
+            if recording.first_line <= line < end and (line, kind, note) not in listed:
+                events.add({"tick": self._tick(line), "line": line, "kind": kind, "text": note})
+                listed.add((line, kind, note))
         text = f"{self.rows} lines, {recording.lines} of them were committed"
         events.add({"tick": 0, "line": end, "kind": "recovered", "text": text})
         for table in (gaps, events):
@@ -285,7 +285,7 @@ class _Recoverer:
         return gaps.nodes() | events.nodes()
 
     def _tick(self, line: int) -> int:
-        """Of the trigger, at a line; 0 where that is damaged."""
+        """Return the trigger's tick at a line; 0 if it cannot be read."""
         chunk, row = divmod(line - self.recording.first_line, self.tag_rows)
         for arm in ARMS:
             with contextlib.suppress(AbsentChunkError, DamagedChunkError, OSError):
@@ -293,7 +293,7 @@ class _Recoverer:
         return 0
 
     def _resize(self, publisher: Publisher, nodes: dict[str, layout.Document]) -> None:
-        """Make the rows visible to readers that begin below the root."""
+        """Write the lengths into the arms' own metadata, for readers that begin below the root."""
         for arm in ARMS:
             arrays = {name: nodes[f"{arm}/{name}"] for name in COLUMNS}
             for name, array in arrays.items():
@@ -324,7 +324,7 @@ class _Recoverer:
         }
 
     def _book(self, arm: str, new_gaps: list[tuple[int, int, str]]) -> dict[str, Any]:
-        """Lines of an arm = stored + missing by cause, from what the recording lists."""
+        """Return an arm's ledger, lines = stored + missing by cause, from the listed gaps."""
         missing: dict[str, int] = {}
         end = self.recording.first_line + self.rows
         listed = [(g.first_line, g.count, g.cause) for g in self.recording.gaps if g.arm == arm]
@@ -339,14 +339,14 @@ class _Recoverer:
 def _joined(
     gaps: list[tuple[int, int, str]], first: int, count: int, cause: str
 ) -> list[tuple[int, int, str]]:
-    """``gaps`` with one more, which may continue the last."""
+    """Return ``gaps`` with one more, joined with the last one if it continues it."""
     if gaps and gaps[-1][0] + gaps[-1][1] == first and gaps[-1][2] == cause:
         return [*gaps[:-1], (gaps[-1][0], gaps[-1][1] + count, cause)]
     return [*gaps, (first, count, cause)]
 
 
 def _with_lost(ledger: dict[str, Any], lost: dict[str, int]) -> dict[str, Any]:
-    """The ledger of a sealed recording of which lines were lost since."""
+    """Return the ledger of a sealed recording that lost lines afterwards."""
     changed = copy.deepcopy(ledger)
     for arm, count in lost.items():
         book = changed.get(arm)

@@ -1,10 +1,10 @@
-"""What a disk or a remote store refuses, as the error that the user meets.
+"""Errors for the user when a disk or a remote store refuses an operation.
 
 ::
 
-    no such path or bucket, no permission, no credentials   PlaceError, 2   another place, or other rights
+    no such path or bucket, no permission, no credentials   PlaceError, 2   another place or permissions
     the disk is full, the store or its network is away      StoreError, 5   later, or on another disk
-    the medium cannot give back what it holds               DataError, 6    a copy of the recording
+    the medium cannot be read                               DataError, 6    a copy of the recording
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ NOT_A_PLACE = (
     errno.EPERM,
     errno.EROFS,
 )
-"""What is wrong with a path, or with this user's rights there; all other reasons are the disk's."""
+"""Errors of a path, or of this user's permissions there; all other errors are the disk's."""
 
 _RIGHTS = "the credentials in the environment (for S3: AWS_ACCESS_KEY_ID, AWS_SECRET_ACCESS_KEY, AWS_REGION)"
 _NETWORK = "the network and the store's address (for S3: AWS_ENDPOINT, and AWS_ALLOW_HTTP=true for http://)"
@@ -41,7 +41,7 @@ _NETWORK = "the network and the store's address (for S3: AWS_ENDPOINT, and AWS_A
 
 @contextmanager
 def refused(place: object, doing: str, hint: str = "") -> Iterator[None]:
-    """Turn an OSError of the block into the error that the user meets; see `refusal`."""
+    """Turn an OSError of the block into an error for the user; see `refusal`."""
     try:
         yield
     except OSError as error:
@@ -49,9 +49,9 @@ def refused(place: object, doing: str, hint: str = "") -> Iterator[None]:
 
 
 def refusal(place: object, error: OSError, doing: str, hint: str = "") -> AcquireError:
-    """The error for a place, a path or a URL, that cannot be ``doing``: read, written, copied.
+    """Return the error for a place (path or URL) that cannot be read, written, copied: ``doing``.
 
-    ``hint`` is added to what there is to try.
+    ``hint`` is added to the advice.
     """
     text = f"{place} cannot be {doing}: {error.strerror or error}"
     if is_url(str(place)):

@@ -1,8 +1,8 @@
-"""Recordings far away: anything that fsspec reaches, with obstore for object stores (S3, Google, Azure).
+"""Remote recordings: anything that fsspec reaches, with obstore for object stores (S3, Google, Azure).
 
 Credentials and endpoints come from the environment, as those stores document it (AWS_ENDPOINT and the like);
-none of them is ever written anywhere. Where there are none, a store is refused at once: obstore would ask the
-metadata service of the cloud's machines, which no other machine can reach, and wait for it.
+they are never written anywhere. Without any, a store is refused at once: obstore would query the metadata
+service of cloud machines, which no other machine can reach, and wait for it.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 OBJECT_STORES = ("s3", "s3a", "gs", "gcs", "az", "abfs", "abfss")
 RETRY = {"max_retries": 4, "retry_timeout": timedelta(seconds=30)}
-"""For how long a store that does not answer is asked again."""
+"""For how long requests are repeated if a store does not answer."""
 _ATTEMPTS = re.compile(r" in [\d.]+\w+, after \d+ retries, max_retries: \d+, retry_timeout: \w+ ?")
-"""What obstore tells of that is another text each time."""
+"""obstore's account of the retries, which is different each time and is removed from messages."""
 _STATUS = re.compile(r"status code: (\d+)")
 _STATUS_ERRORS: dict[str, type[OSError]] = {
     "401": PermissionError,
@@ -69,20 +69,20 @@ WAYS_IN = {
         ("IDENTITY_ENDPOINT",),
     ),
 }
-"""Variables of the environment, any of these groups of which gives access to a kind of object store."""
+"""Kind of object store → groups of environment variables, each of which gives access."""
 _FAMILIES = {"s3a": "s3", "gcs": "gs", "abfs": "az", "abfss": "az"}
 _GOOGLE_FILE = ".config/gcloud/application_default_credentials.json"
 
 PATIENCE = "120s"
 PROOF = ".acquire"
-"""A part beside the recordings, put to see whether one can be."""
+"""Key of a small file next to the recordings, written to test whether that is possible."""
 
 
 def be_patient() -> None:
-    """Give each request of this process the time that a slow store needs; what the environment says is kept.
+    """Give each request of this process the time that a slow store needs, unless the environment sets it.
 
-    An upload has a dozen parts of 5 MB under way at once: with `PATIENCE` for each a store that takes
-    0.5 MB/s will do. obstore's own 30 s ask for 2 MB/s, and one that is slower never gets a large part.
+    An upload has a dozen parts of 5 MB under way at once: with `PATIENCE` for each, a store that takes
+    0.5 MB/s suffices. obstore's default of 30 s requires 2 MB/s: a slower store never gets a large part.
     """
     for store in ("AWS", "GOOGLE", "AZURE"):
         os.environ.setdefault(f"{store}_TIMEOUT", PATIENCE)
@@ -94,7 +94,7 @@ def is_url(place: Path | str) -> bool:
 
 
 def url_below(target: str, path: Path) -> str:
-    """Where below ``target`` the copy of the recording at ``path`` is."""
+    """Return the URL below ``target`` of the copy of the recording at ``path``."""
     return f"{target}/{path.name}"
 
 
@@ -102,15 +102,17 @@ class RemoteSource:
     """Bytes below a URL; see `source.Source`. Every failure is an OSError."""
 
     def __init__(self, url: str) -> None:
-        """Raises UsageError for a URL that cannot be one, or whose packages are not installed, and PlaceError
-        for an object store without credentials in the environment.
+        """Open the URL.
+
+        Raises UsageError for an invalid URL or one whose packages are not installed, and PlaceError for an
+        object store without credentials in the environment.
         """
         self.url = url.rstrip("/")
         check_url(self.url)
         _check_credentials(self.url)
         import fsspec
 
-        with _told(self.url):
+        with _url_errors(self.url):
             self._fs, self._root = fsspec.core.url_to_fs(self.url, **_options(self.url))
 
     def __str__(self) -> str:
@@ -127,7 +129,7 @@ class RemoteSource:
             return data
 
     def expect(self, key: str, start: int, size: int) -> None:
-        """Nothing is fetched ahead."""
+        """Do nothing: remote data are not fetched ahead."""
 
     def size(self, key: str) -> int:
         with _as_os_errors():
@@ -149,7 +151,7 @@ class RemoteSource:
         return sum(self.sizes().values())
 
     def sizes(self) -> dict[str, int]:
-        """Keys of all parts → their bytes."""
+        """Return the keys of all parts, with their sizes in bytes."""
         with _as_os_errors():
             found = self._fs.find(self._root, detail=True)
         start = len(self._root.rstrip("/")) + 1
@@ -180,23 +182,23 @@ class RemoteSource:
             self._fs.put_file(str(file), self._path(key))
 
     def prove(self) -> None:
-        """Find out whether parts can be put here, by a small one that stays: `PROOF`.
+        """Test whether the store can be written, with a small file that stays: `PROOF`.
 
-        Raises PermissionError and FileNotFoundError (no such bucket) where the store says no, and OSError
-        where it cannot be asked.
+        Raises PermissionError or FileNotFoundError (no such bucket) if the store refuses, and OSError if it
+        cannot be reached.
         """
         if self.has_directories:
             self.make_directory_of(PROOF)
         self.put(PROOF, b"acquire copies recordings to this place\n")
 
     def make_directory_of(self, key: str) -> None:
-        """What a file system needs before a part can be put; an object store needs nothing."""
+        """Create the directory for a part, as a file system requires; an object store does not."""
         with _as_os_errors():
             self._fs.makedirs(self._path(key).rpartition("/")[0], exist_ok=True)
 
     @property
     def path(self) -> Path | None:
-        """Where it is on a disk of this machine, if it is."""
+        """Its path, if it is on a disk of this machine."""
         return Path(self._root) if self.url.partition("://")[0] in ("file", "local") else None
 
     @property
@@ -208,19 +210,19 @@ class RemoteSource:
 
 
 def check_url(url: str) -> None:
-    """Raise UsageError for a URL that cannot be one, or whose packages are not installed; asks nobody."""
+    """Raise UsageError for an invalid URL, or if its packages are not installed. Connects to nothing."""
     if importlib.util.find_spec("fsspec") is None:
         raise UsageError(f"{url}: fsspec is not installed", hint="pip install 'tdi-acquire[remote]'")
     import fsspec
 
     protocol = url.partition("://")[0]
     _register(protocol)
-    with _told(url):
+    with _url_errors(url):
         fsspec.get_filesystem_class(protocol)
 
 
 def _check_credentials(url: str) -> None:
-    """Raise PlaceError for an object store to which nothing in the environment gives access; asks nobody."""
+    """Raise PlaceError for an object store without credentials in the environment. Connects to nothing."""
     protocol = url.partition("://")[0]
     family = _FAMILIES.get(protocol, protocol)
     if family not in WAYS_IN or not _has_obstore():
@@ -239,8 +241,8 @@ def _check_credentials(url: str) -> None:
 
 
 @contextmanager
-def _told(url: str) -> Iterator[None]:
-    """What fsspec says of a URL, in words."""
+def _url_errors(url: str) -> Iterator[None]:
+    """Turn fsspec's errors about a URL into UsageError."""
     try:
         yield
     except (ValueError, ImportError) as error:
@@ -258,7 +260,7 @@ def _options(url: str) -> dict[str, Any]:
 
 @cache
 def _register(protocol: str) -> None:
-    """Object stores go through obstore: faster, and no event loop of their own."""
+    """Have fsspec use obstore for object stores: it is faster, and has no event loop of its own."""
     if protocol in OBJECT_STORES and _has_obstore():
         from obstore.fsspec import register
 
@@ -272,7 +274,7 @@ def _has_obstore() -> bool:
 
 @contextmanager
 def _as_os_errors() -> Iterator[None]:
-    """obstore has an exception tree of its own."""
+    """Turn obstore's exceptions into OSError."""
     try:
         yield
     except tuple(_store_errors()) as error:
@@ -281,7 +283,7 @@ def _as_os_errors() -> Iterator[None]:
 
 
 def _kind_of(error: Exception, text: str) -> type[OSError]:
-    """obstore names the reason of most refusals; of a listing it gives the server's status alone."""
+    """Return the OSError class: obstore's exception gives most reasons, a listing only the HTTP status."""
     status = _STATUS.search(text)
     if status is not None and status[1] in _STATUS_ERRORS:
         return _STATUS_ERRORS[status[1]]
@@ -290,7 +292,7 @@ def _kind_of(error: Exception, text: str) -> type[OSError]:
 
 @cache
 def _store_errors() -> dict[type[Exception], type[OSError]]:
-    """What obstore raises, the particular first → what that is here."""
+    """Return obstore's exceptions, the most specific first, each with its OSError class."""
     if not _has_obstore():
         return {}
     from obstore.exceptions import BaseError, NotFoundError, PermissionDeniedError, UnauthenticatedError

@@ -1,4 +1,4 @@
-"""The one way in which anything of a recording is deleted: with a proof that no line is lost by it."""
+"""The only way to delete parts of a recording: with a proof that no line is lost by it."""
 
 from __future__ import annotations
 
@@ -21,40 +21,40 @@ if TYPE_CHECKING:
 
 ROOT = "zarr.json"
 RESERVE = ".reserve"
-"""Of a recording that is being written, beside the shards of the first array: room for its end."""
+"""File that keeps room for a recording's end while it is written, next to the shards of the first array."""
 COPY = ".attributes"
-"""The root's attributes once more, beside the shards of the first array; see `acquire.store.rebuild`."""
+"""Copy of the root's attributes, next to the shards of the first array; see `acquire.store.rebuild`."""
 _MADE_FIRST = {ROOT, SCRATCH, RESERVE, COPY}
-"""Files that are there before the first line; everything else holds lines, or is somebody else's."""
+"""Files that exist before the first line; all others hold lines, or belong to somebody else."""
 
 
 @dataclass(frozen=True, slots=True)
 class Unborn:
-    """Proof for a whole directory: nobody has ever counted a line of it as committed."""
+    """Proof for a whole directory: no line of it was ever committed."""
 
     committed_lines: int
 
 
 @dataclass(frozen=True, slots=True)
 class Dropped:
-    """Proof for one shard: retention has told, in the recording's root, that these shards are dropped."""
+    """Proof for one shard: the recording's root lists these shards as dropped by retention."""
 
     shard: int
-    told: Sequence[range]
+    listed: Sequence[range]
 
 
 def remove(disk: Disk, path: Path, proof: Unborn | Dropped) -> None:
-    """Delete what the proof is for, of the recording at ``path``; no matter if parts of it are gone.
+    """Delete the proof's object from the recording at ``path``; parts of it may be gone already.
 
-    Raises DataError, and deletes nothing, where the proof does not hold, or a link leads elsewhere.
+    Raises DataError, and deletes nothing, if the proof does not hold, or a link leads elsewhere.
     """
     match proof:
         case Unborn(committed_lines):
             _check_unborn(path, committed_lines)
             disk.remove_tree(path)
-        case Dropped(shard, told):
-            if not any(shard in shards for shards in told):
-                raise DataError(f"{path}: shard {shard} is not deleted: retention has not told of it")
+        case Dropped(shard, listed):
+            if not any(shard in shards for shards in listed):
+                raise DataError(f"{path}: shard {shard} is not deleted: it is not listed as dropped")
             files = shard_files(path, shard)
             for file in files:
                 refuse_link(path, file)
@@ -65,7 +65,7 @@ def remove(disk: Disk, path: Path, proof: Unborn | Dropped) -> None:
 
 
 def shard_files(path: Path, shard: int) -> list[Path]:
-    """The files of a shard in all arrays of both arms, that there are."""
+    """Return the existing files of a shard in all arrays of both arms."""
     files = [
         path / arm / column.name / shard_key(shard, 2 if column.name == "lines" else 1)
         for arm in ARMS
@@ -75,7 +75,7 @@ def shard_files(path: Path, shard: int) -> list[Path]:
 
 
 def shards_on_disk(path: Path) -> list[int]:
-    """Numbers of the shards of which any array has something, in order."""
+    """Return the numbers of the shards of which any array has a file, in order."""
     found: set[int] = set()
     for arm in ARMS:
         for column in line_columns("any"):
@@ -84,13 +84,13 @@ def shards_on_disk(path: Path) -> list[int]:
 
 
 def shard_numbers(array: Path) -> list[int]:
-    """Numbers of the shards in the directory of one array, in order; other names are passed over."""
+    """Return the numbers of the shards in the directory of one array, in order; other names are skipped."""
     try:
         names = [entry.name for entry in (array / "c").iterdir()]
     except (FileNotFoundError, NotADirectoryError):
         return []
     except OSError as error:
-        raise DataError(f"{array} cannot be looked through: {error.strerror}") from error
+        raise DataError(f"{array} cannot be listed: {error.strerror}") from error
     short = (name for name in names if name.isascii() and name.isdecimal() and len(name) < 19)
     return sorted(int(name) for name in short if str(int(name)) == name)
 

@@ -1,12 +1,14 @@
-"""A recording goes on after an outage: as a segment of its own, listed in the first, which is not reopened.
+"""Continuing a recording after an outage, as a separate segment that is listed in the first one.
+
+The first recording is not reopened.
 
 ::
 
     run.zarr  (sealed, or recovered) ──outage──▶ run-2.zarr ──outage──▶ run-3.zarr
        └ segments: run-2.zarr, run-3.zarr        └ segment: number, of, outage (lines, from, to)
 
-All of them have one run_id. Where the trigger went on counting, lines keep their numbers through all of them,
-and the outage is that many lines long; where it began anew, the outage is known by time only.
+All segments have the same run_id. If the trigger kept counting, line numbers continue through all of them,
+which gives the length of the outage in lines; if it restarted, the outage is known by time only.
 """
 
 from __future__ import annotations
@@ -35,10 +37,10 @@ if TYPE_CHECKING:
 
 
 def next_segment(path: Path, spec: RecordingSpec, cause: str = "interrupted") -> tuple[Path, RecordingSpec]:
-    """Path and specification of the segment that continues the recording at ``path``, to be prepared and
-    begun as any other; it is listed in the first once it has begun.
+    """Return path and specification of the segment that continues the recording at ``path``.
 
-    Raises UsageError unless the recording is sealed, and ``spec`` describes lines and a code like its own.
+    It is prepared and begun like any other recording, and listed in the first one once it has begun. Raises
+    UsageError unless the recording is sealed, and ``spec`` describes the same kind of lines and code.
     """
     first = open_recording(path)
     if "segment" in first.attrs:
@@ -58,16 +60,17 @@ def next_segment(path: Path, spec: RecordingSpec, cause: str = "interrupted") ->
 
 
 def list_segment(segment: Path, follows: Continuation, disk: Disk = DISK) -> None:
-    """Name a segment that has begun in the first recording. Raises OSError, DataError and StateError."""
+    """List a segment that has begun in the first recording. Raises OSError, DataError and StateError."""
     first = segment.with_name(follows.first)
     with locked(first, "listing a segment of"):
         _name(first, [segment.name], disk)
 
 
 def list_segments(path: Path, disk: Disk = DISK) -> None:
-    """Name in the first recording of the one at ``path`` every segment that lies beside it; idempotent.
+    """List all segments of the run of the recording at ``path`` in its first recording; idempotent.
 
-    Raises OSError, DataError, and StateError while somebody else writes the first recording.
+    Segments are looked for in the same directory. Raises OSError, DataError, and StateError while another
+    process writes the first recording.
     """
     segment = segment_of(read_root(LocalSource(path))["attributes"])
     first = path if segment is None else path.with_name(segment[0])
@@ -78,7 +81,7 @@ def list_segments(path: Path, disk: Disk = DISK) -> None:
 
 
 def _name(first: Path, segments: list[str], disk: Disk) -> None:
-    """List what is not listed yet; the recording is held."""
+    """List the segments that are not listed yet; the caller holds the lock of ``first``."""
     refuse_link(first, first / ARMS[0] / "lines")
     refuse_link(first, first / "zarr.json")
     document = read_root(LocalSource(first))
@@ -86,22 +89,22 @@ def _name(first: Path, segments: list[str], disk: Disk) -> None:
     if not isinstance(listed, list):
         raise DataError(f"{first}: segments is {listed!r:.50}, not a list of names")
     if new := [name for name in segments if name not in listed]:
-        # One that had to be recovered may be listed after those that went on from it: NAME-2 before NAME-10.
+        # A recovered segment may be listed after its successors. By length first: NAME-2 before NAME-10.
         document["attributes"]["segments"] = sorted([*listed, *new], key=lambda name: (len(name), name))
         publisher = Publisher(first / ARMS[0] / "lines" / SCRATCH, disk)
         publisher.replace(first / "zarr.json", to_json(document), durable=True)
 
 
 def _segments_beside(first: Path) -> list[str]:
-    """Names of recordings that say they are segments of this one, in order."""
+    """Return the names of recordings whose attributes name this one as their first, in order."""
     run_id = read_root(LocalSource(first))["attributes"].get("run_id")
     found = []
     for path in first.parent.glob(f"{escape(first.stem)}-*{escape(first.suffix)}"):
         try:
             attributes = read_root(LocalSource(path))["attributes"]
         except (DataError, PlaceError):
-            continue  # no recording, or none that could say what it is
-        # A name alone proves nothing: somebody may have called another recording NAME-2.
+            continue  # no recording, or a damaged one
+        # The file name proves nothing: a user may have called another recording NAME-2.
         segment = segment_of(attributes)
         if segment and (segment[0], attributes.get("run_id")) == (first.name, run_id):
             found.append((segment[1], path.name))

@@ -1,13 +1,13 @@
-"""Endless recordings: the oldest shards go, by size, age and when the disk gets full, unless they are held.
+"""Endless recordings: the oldest shards are dropped by size, age and when the disk is full, unless held.
 
 ::
 
     ├ dropped ┤├ held ┤├ dropped ┤├────────── kept: max_bytes, max_age_lines ──────────┤├ margin ┤ newest line
 
-A shard goes from all arrays of both arms at once. That is first told in the recording's root and then done,
-so that nobody meets lines that are said to be there and are not. Lines are held by an event, by the writer's
-owner, or by anybody with `hold`, from any process: a small file that the writer looks for before it deletes.
-What is held is widened by a margin on both sides, which reconstruction needs to cut a segment there.
+A shard is dropped from all arrays of both arms at once. It is first listed in the recording's root and then
+deleted, so that the root never claims lines that are gone. Lines are held by an event, by the writer's owner,
+or by any process with `hold`: a small file that the writer checks before it deletes. A held range is widened
+by a margin on both sides, which reconstruction needs to cut a segment there.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 _NOT_COPIED = "not copied yet"
 
 HOLDS = ".holds"
-"""Directory of the files of `hold`, where no Zarr reader lists names."""
+"""Directory of the files of `hold`, placed where no Zarr reader lists names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,15 +57,15 @@ class Hold:
 def hold(path: Path, first_line: int, count: int, why: str = "", disk: Disk = DISK) -> Hold:
     """Keep lines of the recording at ``path``, which may be growing in another process, from being deleted.
 
-    Lines that are still to come can be held, too. Raises DataError when some of them are gone already, and
-    UsageError for a range that cannot be one.
+    Future lines can be held, too. Raises DataError if some of the lines are gone already, and UsageError for
+    an impossible range.
     """
     if first_line < 0 or count < 1:
         raise UsageError(f"{count} lines from line {first_line} on cannot be held", possible="1 line or more")
     recording = open_recording(path)
     if recording.state == "sealed":
         raise UsageError(
-            f"{path} is sealed: no line of it need be held", possible="nothing of it is deleted any more"
+            f"{path} is sealed: its lines need not be held", possible="nothing of it is deleted any more"
         )
     if first_line + count <= recording.first_line:
         raise UsageError(
@@ -82,7 +82,8 @@ def hold(path: Path, first_line: int, count: int, why: str = "", disk: Disk = DI
         Publisher(directory / f".{name}", disk).replace(directory / name, text, durable=True)
     except OSError as error:
         raise refusal(f"{path}: lines {first_line} to {first_line + count - 1}", error, "held") from error
-    # Only now: the writer looks for holds before it drops a shard, and once more before it deletes it.
+    # Checked after writing the hold: the writer reads holds before it drops a shard, and again before it
+    # deletes the shard.
     for first, gone in open_recording(path).dropped:
         if first < first_line + count and first_line < first + gone:
             last = min(first + gone, first_line + count) - 1
@@ -94,8 +95,9 @@ def hold(path: Path, first_line: int, count: int, why: str = "", disk: Disk = DI
 
 
 def keep_from(path: Path, line: int, url: str, disk: Disk = DISK) -> None:
-    """Hold every line from ``line`` on, those to come included, for a copy to ``url``; a later call for the
-    same place replaces an earlier one.
+    """Hold every line from ``line`` on, including future ones, for a copy to ``url``.
+
+    A later call for the same URL replaces an earlier one.
     """
     text = json.dumps({"first_line": line, "count": ALL_LINES, "why": _NOT_COPIED}).encode()
     refuse_link(path, _holds(path))
@@ -107,32 +109,32 @@ def keep_from(path: Path, line: int, url: str, disk: Disk = DISK) -> None:
 
 
 def holds_of(path: Path) -> list[Hold]:
-    """What `hold` was asked for, of a recording that is being written.
+    """Return the holds of a recording that is being written.
 
-    A file that cannot be understood may have meant any lines: it holds all of them until it is removed.
+    A file that cannot be parsed may stand for any lines: it holds all of them until it is removed.
     """
     found = []
     for file in sorted(_holds(path).glob("[0-9]*.json")):
         try:
-            said = read_object(file, follow=False)
-            found.append(Hold(int(said["first_line"]), int(said["count"]), str(said["why"])))
+            facts = read_object(file, follow=False)
+            found.append(Hold(int(facts["first_line"]), int(facts["count"]), str(facts["why"])))
         except FileNotFoundError:
-            continue  # replaced by a wider one, or released, meanwhile
+            continue  # replaced by a wider one, or released, in the meantime
         except (*PARSE_ERRORS, OSError) as error:
             found.append(Hold(0, ALL_LINES, f"{file.name} is no hold, remove it: {error}"))
     return found
 
 
 def release(path: Path, disk: Disk = DISK) -> None:
-    """Forget all holds of a recording that is sealed: nothing of it is deleted any more."""
+    """Remove all holds of a sealed recording: nothing of it is deleted any more."""
     disk.remove_tree(_holds(path))
 
 
 @dataclass(slots=True)
 class Keeper:
-    """What was dropped of one recording that is being written, and what goes next.
+    """Chooses and deletes the shards to be dropped of one recording that is being written.
 
-    ``shard_rows`` are the lines of a shard; ``first_line`` is that of row 0.
+    ``shard_rows``: lines per shard; ``first_line``: the line of row 0.
     """
 
     path: Path
@@ -141,41 +143,42 @@ class Keeper:
     first_line: int
     disk: Disk
     holds: list[Hold] = field(default_factory=list)
-    """By events."""
+    """Holds by events."""
     marked: list[Hold] = field(default_factory=list)
-    """By `hold`, as found at the latest commit."""
+    """Holds by `hold`, as found at the latest commit."""
     gone: list[range] = field(default_factory=list)
-    """Shards that were dropped, as stretches."""
+    """Dropped shards, as ranges."""
     sizes: dict[int, int] = field(default_factory=dict)
-    """Whole shards that are there → bytes in all their arrays."""
+    """Existing whole shard → bytes in all its arrays."""
     odd: set[int] = field(default_factory=set)
-    """Shards that a link leads to by now: they are not deleted, and count as kept."""
+    """Shards that have become links: they are not deleted, and count as kept."""
 
     def note(self, kind: str, line: int) -> None:
-        """An event happened at ``line``."""
+        """Hold the lines around an event at ``line``, if the policy asks for it."""
         if kind in self.policy.hold_events:
             before, after = self.policy.hold_lines
             first, end = max(self.first_line, line - before), line + after + 1
             last = self.holds[-1] if self.holds else None
-            # One hold for events that follow each other closely: all of them are in the recording's root.
+            # One hold for events in close succession, since all holds are listed in the recording's root.
             if last and last.why == kind and last.first_line <= first <= last.lines.stop:
                 self.holds.pop()
                 first, end = last.first_line, max(end, last.lines.stop)
             self.holds.append(Hold(first, end - first, kind))
 
     def choose(self, rows: int, missing_bytes: int = 0) -> list[int]:
-        """Shards to be dropped now that ``rows`` rows are committed, the oldest first; they count as dropped.
+        """Return the shards to be dropped now that ``rows`` rows are committed, the oldest first.
 
-        ``missing_bytes`` more than the limits ask for, where the disk is nearly full.
+        They count as dropped from now on. If the disk is nearly full, at least ``missing_bytes`` are dropped
+        whatever the limits.
         """
-        # A whole shard does not change any more: each is measured once.
+        # A whole shard does not change any more, so each is measured once.
         known = max([-1, *self.sizes, *(stretch.stop - 1 for stretch in self.gone)])
         for shard in range(known + 1, rows // self.shard_rows):
             self.sizes[shard] = shard_bytes(self.path, shard)
         self.marked = self._marks()
         held = [hold.lines for hold in (*self.holds, *self.marked)]
         newest = self.first_line + rows
-        # Of the shard that is being written, only the end tells the size: it is taken for the largest.
+        # The size of the shard being written is known at its end only: assume the largest so far.
         partly = max(self.sizes.values(), default=0)
         excess = missing_bytes
         if self.policy.max_bytes is not None:
@@ -194,11 +197,11 @@ class Keeper:
         return going
 
     def delete(self, shards: list[int]) -> list[int]:
-        """Delete the files of shards that the root calls dropped; those that somebody holds meanwhile stay.
+        """Delete the files of shards that the root lists as dropped, except those held in the meantime.
 
-        Returns the latter: they count as kept again.
+        Return the latter, which count as kept again.
         """
-        # Asked once more: somebody may have held them since they were chosen.
+        # Read the holds again: shards may have been held since they were chosen.
         held = [hold.lines for hold in self._marks()]
         saved = [shard for shard in shards if self._held(shard, held) or not self._delete(shard)]
         for shard in saved:
@@ -207,7 +210,7 @@ class Keeper:
         return saved
 
     def _delete(self, shard: int) -> bool:
-        """Says whether it was; what is not the recording's own any more stays."""
+        """Delete a shard; return False if its files are links by now, which stay."""
         try:
             remove(self.disk, self.path, Dropped(shard, self.gone))
         except DataError:
@@ -216,7 +219,7 @@ class Keeper:
         return True
 
     def attributes(self) -> dict[str, Any]:
-        """For the recording's root."""
+        """Return the attributes ``dropped`` and ``holds`` for the recording's root."""
         stretches = [
             [self.first_line + rows.start * self.shard_rows, len(rows) * self.shard_rows]
             for rows in self.gone
@@ -225,7 +228,7 @@ class Keeper:
         return {"dropped": stretches, "holds": holds}
 
     def _marks(self) -> list[Hold]:
-        """By `hold`, and by a copy that is to come and has not begun."""
+        """Return the holds by `hold`, and one for all lines if a copy is configured and has not begun."""
         marks = holds_of(self.path)
         target = self.policy.copied_to
         if target is not None and not _copy_hold(self.path, url_below(target, self.path)).exists():
@@ -242,7 +245,7 @@ class Keeper:
 
 
 def shard_bytes(path: Path, shard: int) -> int:
-    """Bytes of a shard in all arrays of both arms."""
+    """Return the bytes of a shard in all arrays of both arms."""
     return sum(file.stat().st_size for file in shard_files(path, shard))
 
 
@@ -251,12 +254,12 @@ def _holds(path: Path) -> Path:
 
 
 def _copy_hold(path: Path, url: str) -> Path:
-    """The file that says how far a copy has come."""
+    """Return the path of the hold for the lines that a copy has not reached yet."""
     return _holds(path) / f"0-copy-{crc32(url.encode()):08x}.json"
 
 
 def _with(stretches: list[range], number: int) -> list[range]:
-    """Stretches in order, with one more number."""
+    """Return the ranges, in order, with one more number."""
     before = [r for r in stretches if r.stop < number]
     after = [r for r in stretches if r.start > number + 1]
     touching = [r for r in stretches if r.stop >= number and r.start <= number + 1]
@@ -266,7 +269,7 @@ def _with(stretches: list[range], number: int) -> list[range]:
 
 
 def _without(stretches: list[range], number: int) -> list[range]:
-    """Stretches in order, without a number."""
+    """Return the ranges, in order, without a number."""
     below = [range(r.start, min(r.stop, number)) for r in stretches]
     above = [range(max(r.start, number + 1), r.stop) for r in stretches]
     return sorted((part for part in (*below, *above) if part), key=lambda r: r.start)

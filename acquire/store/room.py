@@ -1,4 +1,4 @@
-"""How much the disk can still take, and how long that lasts."""
+"""Free space of the disk, and how long it lasts."""
 
 from __future__ import annotations
 
@@ -12,32 +12,32 @@ if TYPE_CHECKING:
     from acquire.store.files import Disk
 
 LOOK_S = 0.5
-"""How often the disk is asked."""
+"""Interval of the queries."""
 
 MEMORY_S = 20.0
-"""Over which the rate is averaged."""
+"""Time over which the rate is averaged."""
 
 
 @dataclass(frozen=True, slots=True)
 class Room:
-    """A disk at one moment: what is free above the reserve, and what is written per second."""
+    """A disk at one moment: bytes free above the reserve, and bytes written per second."""
 
     free_bytes: int
     bytes_per_s: float
 
     @property
     def seconds_to_full(self) -> float:
-        """Infinite while nothing is written."""
+        """Seconds until the disk is full; infinite while nothing is written."""
         return max(0, self.free_bytes) / self.bytes_per_s if self.bytes_per_s > 0 else float("inf")
 
     @property
     def full(self) -> bool:
-        """Nothing is left but the reserve."""
+        """Whether nothing is left but the reserve."""
         return self.free_bytes <= 0
 
 
 class RoomWatch:
-    """Looks at the disk of ``path`` now and then; ``reserve_bytes`` of it are not ours."""
+    """Queries the disk of ``path`` now and then; ``reserve_bytes`` of it are to stay free."""
 
     def __init__(self, disk: Disk, path: Path, reserve_bytes: int) -> None:
         self._disk = disk
@@ -49,11 +49,11 @@ class RoomWatch:
         self.room = Room(2**63, 0.0)
 
     def look(self, bytes_written: int) -> Room:
-        """The disk after so many bytes in all; asked again only once in `LOOK_S`. Raises OSError."""
+        """Return the disk's room after ``bytes_written``; queried once per `LOOK_S`. Raises OSError."""
         now = time.monotonic()
         if now >= self._due_s:
             elapsed = max(1e-3, now - self._begun_s)
-            # An exponential mean; the first look has no rate before it, and is believed.
+            # An exponential mean, beginning with the first value.
             share = min(1.0, max(LOOK_S, elapsed) / MEMORY_S) if self._bytes else 1.0
             self._rate += share * ((bytes_written - self._bytes) / elapsed - self._rate)
             self._bytes, self._begun_s, self._due_s = bytes_written, now, now + LOOK_S

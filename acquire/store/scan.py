@@ -1,4 +1,4 @@
-"""What of a recording is on disk: chunk by chunk, which are intact, and what is wrong with the others."""
+"""Scan of a recording's chunks on disk: which are intact, and what is wrong with the others."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class ArmScan:
-    """One arm: array → chunk of it → what is wrong with it; chunks that are not listed are intact."""
+    """Scan of one arm. ``troubles``: array → chunk → what is wrong; chunks not listed are intact."""
 
     stream: CameraStream
     troubles: dict[str, dict[int, str]]
 
     def chunks(self, array: str, rows: Iterable[range]) -> Iterator[int]:
-        """Chunks of an array that hold any of ``rows``."""
+        """Yield the chunks of an array that hold any of ``rows``."""
         return chunks_of(self.stream.reader(array).shape.chunk_rows, rows)
 
     def check(self, array: str, chunk: int) -> None:
-        """Note what is wrong with a chunk, if anything is."""
+        """Check a chunk, and note what is wrong with it."""
         trouble = self.stream.reader(array).trouble(chunk)
         if trouble is not None:
             self.troubles[array][chunk] = trouble
 
     def lost(self, rows: range) -> NDArray[np.bool_]:
-        """Which of ``rows`` lie in a chunk, of any array, that is not intact."""
+        """Return which of ``rows`` are in a chunk, of any array, that is not intact."""
         lost = np.zeros(len(rows), bool)
         for array, troubles in self.troubles.items():
             size = self.stream.reader(array).shape.chunk_rows
@@ -50,7 +50,7 @@ class ArmScan:
         return lost
 
     def damages(self, rows: int) -> Iterator[Damage]:
-        """Neighbouring chunks with the same trouble as one; only the first ``rows`` rows count."""
+        """Yield the damage within the first ``rows`` rows; joins adjacent chunks with the same trouble."""
         for array, troubles in self.troubles.items():
             size = self.stream.reader(array).shape.chunk_rows
             for chunks, what in _stretches(troubles):
@@ -60,7 +60,7 @@ class ArmScan:
 
 
 def chunks_of(size: int, rows: Iterable[range]) -> Iterator[int]:
-    """Chunks of ``size`` rows that hold any of ``rows``, which are in order."""
+    """Yield the chunks of ``size`` rows that hold any of ``rows``, which are in order."""
     unseen = 0
     for part in filter(None, rows):
         stop = -(-part.stop // size)
@@ -71,7 +71,7 @@ def chunks_of(size: int, rows: Iterable[range]) -> Iterator[int]:
 def scan(
     recording: Recording, rows: Sequence[range], progress: Callable[[int, int], None] | None = None
 ) -> dict[str, ArmScan]:
-    """Look at the chunks that hold these rows, of every array of both arms."""
+    """Check the chunks that hold these rows, of every array of both arms."""
     found = {arm: ArmScan(stream, {name: {} for name in COLUMNS}) for arm, stream in recording.arms.items()}
     arrays = [(arm, name) for arm in found for name in COLUMNS]
     total = sum(1 for arm, name in arrays for _ in found[arm].chunks(name, rows))
@@ -86,28 +86,28 @@ def scan(
 
 
 def tag_rows(recording: Recording) -> int:
-    """Rows of a chunk of tags: the longest chunk that there is."""
+    """Return the rows of a chunk of tags, the longest chunks of a recording."""
     return next(iter(recording.arms.values())).reader("flags").shape.chunk_rows
 
 
 def grown_rows(found: ArmScan, rows: range) -> int:
-    """How many of ``rows``, one chunk of tags, are lines from its beginning on, whole in every array."""
+    """Return how many of ``rows`` (one chunk of tags), from the first on, are lines, whole in every array."""
     lost = found.lost(rows)
     whole = int(lost.argmax()) if lost.any() else len(rows)
     if not whole:
         return 0
     tags = found.stream.reader("code_index").chunk(rows.start // len(rows))
-    return min(whole, int(np.count_nonzero(tags != NO_LINE)))  # the others fill it up
+    return min(whole, int(np.count_nonzero(tags != NO_LINE)))  # NO_LINE is padding
 
 
 def missing_rows(flags: NDArray[np.uint16]) -> NDArray[np.bool_]:
-    """Which rows are flagged as missing."""
+    """Return which rows are flagged as missing."""
     missing: NDArray[np.bool_] = (flags & LineFlag.MISSING) != 0
     return missing
 
 
 def covered(ranges: list[range], rows: range) -> NDArray[np.bool_]:
-    """Which of ``rows`` are in one of ``ranges``, which are in order and do not overlap."""
+    """Return which of ``rows`` are in one of ``ranges``, which are in order and do not overlap."""
     inside = np.zeros(len(rows), bool)
     for other in ranges[max(0, bisect_right(ranges, rows.start, key=lambda r: r.start) - 1) :]:
         if other.start >= rows.stop:
@@ -117,7 +117,7 @@ def covered(ranges: list[range], rows: range) -> NDArray[np.bool_]:
 
 
 def runs(rows: NDArray[np.bool_], start: int) -> list[tuple[int, int]]:
-    """Stretches of True as (first, count), counted from ``start``."""
+    """Return the runs of True as (first, count), counted from ``start``."""
     edges = np.flatnonzero(np.diff(np.concatenate(([0], rows.view(np.int8), [0]))))
     return [(start + int(low), int(high - low)) for low, high in edges.reshape(-1, 2)]
 

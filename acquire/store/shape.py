@@ -1,7 +1,7 @@
-"""How an array is cut into chunks and files, how its bytes are packed, and where a file says that they lie.
+"""Division of an array into chunks and files, its codec, and the index of a file.
 
-Plain numbers: nothing here needs a library of arrays or codecs, which take half a second to load. Who only
-asks what a recording holds (`acquire.store.outline`) does not wait for them.
+Nothing here needs a library of arrays or codecs, which take half a second to load, so that
+`acquire.store.outline` does not wait for them.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ CODECS: tuple[Codec, ...] = ("none", "lz4", "zstd")
 CRC_BYTES = 4
 
 ITEM_BYTES = {"uint8": 1, "uint16": 2, "uint64": 8, "int64": 8}
-"""Of a sample, by the Zarr data types that there are."""
+"""Zarr data type → bytes per sample."""
 
 ABSENT = 2**64 - 1
-"""Offset and size of a chunk that is not there."""
+"""Offset and size of a missing chunk."""
 
 
 @dataclass(frozen=True, slots=True)
 class ArrayShape:
-    """How an array is cut into pieces: rows of ``row_shape`` samples, rows per chunk, chunks per file."""
+    """Division of an array: rows of ``row_shape`` samples, rows per chunk, chunks per file."""
 
     data_type: str
     row_shape: tuple[int, ...]
@@ -42,7 +42,7 @@ class ArrayShape:
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Of a sample, as it lies on disk."""
+        """Type of a sample on disk."""
         import numpy as np
 
         return np.dtype(self.data_type).newbyteorder("<")
@@ -66,36 +66,36 @@ class ArrayShape:
 
 
 def shard_key(shard: int, dimensions: int) -> str:
-    """Where shard number ``shard`` lies below an array with ``dimensions`` axes, cut along the first only."""
+    """Return the key of shard number ``shard`` of an array with ``dimensions`` axes, cut along the first."""
     return "/".join(["c", str(shard), *["0"] * (dimensions - 1)])
 
 
 def index_bytes(chunks: int) -> int:
-    """Size of the index of ``chunks`` chunks."""
+    """Return the size of the index of ``chunks`` chunks."""
     return 16 * chunks + CRC_BYTES
 
 
 def small_crc32c(data: bytes) -> bytes:
-    """Checksum of an index or a table as Zarr stores it; of chunks, `codecs.crc32c` is the faster one."""
+    """Return the checksum of an index or a table as Zarr stores it; for chunks, `codecs.crc32c` is faster."""
     value: int = google_crc32c.value(data)
     return value.to_bytes(CRC_BYTES, "little")
 
 
 def pack_index(entries: Sequence[tuple[int, int]]) -> bytes:
-    """Offset and size of every chunk as they stand in the file."""
+    """Return an index, offset and size of every chunk, as stored in the file."""
     data = struct.pack(f"<{2 * len(entries)}Q", *chain.from_iterable(entries))
     return data + small_crc32c(data)
 
 
 def unpack_index(data: bytes, chunks: int) -> tuple[list[tuple[int, int]], bool]:
-    """Offset and size of every chunk, and whether their checksum agrees; what is not there is ABSENT."""
+    """Return offset and size of every chunk (ABSENT if missing), and whether the checksum agrees."""
     page = data[: index_bytes(chunks)].ljust(index_bytes(chunks), b"\xff")
     entries, checksum = page[:-CRC_BYTES], page[-CRC_BYTES:]
     return list(struct.iter_unpack("<QQ", entries)), small_crc32c(entries) == checksum
 
 
 def codec_of(codecs: Sequence[dict[str, Any]]) -> Codec:
-    """The codec of a Zarr codec chain of ours: `bytes`, perhaps `blosc`, `crc32c`. ValueError for others."""
+    """Return the codec of a chain `bytes`, optionally `blosc`, `crc32c`. Raises ValueError for others."""
     names = [codec["name"] for codec in codecs]
     if names == ["bytes", "crc32c"]:
         return "none"

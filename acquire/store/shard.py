@@ -1,4 +1,4 @@
-"""One shard: a file of chunks of a Zarr v3 array, written whole, one after the other.
+"""One shard: a file of chunks of a Zarr v3 array, each written whole, one after the other.
 
 The index has one page, so chunks are published by one small write in place::
 
@@ -6,10 +6,10 @@ The index has one page, so chunks are published by one small write in place::
     ├ index ┤  ├ chunk 0 │ crc ┤  ├ chunk 1 │ crc ┤ ...
       offset and size of every chunk (uint64, all ones: absent), crc32c of these
 
-A chunk's bytes come first, then its entry (at a commit, those of all new chunks at once): an index never
-points at bytes that are not there, and what is not in it does not exist for a reader. Offsets are multiples
-of the page, for direct I/O; the gaps are legal Zarr. zarr-python's own sharding codec rewrites the shard per
-chunk.
+A chunk's bytes are written first, then its entry (at a commit, the entries of all new chunks at once): an
+index never points at bytes that are not there, and chunks that are not in it do not exist for a reader.
+Offsets are multiples of the page, for direct I/O; the gaps are legal Zarr. zarr-python's own sharding codec
+would rewrite the shard for each chunk.
 """
 
 from __future__ import annotations
@@ -34,16 +34,17 @@ if TYPE_CHECKING:
     from acquire.store.files import Disk
 
 MAX_SHARD_CHUNKS = 255
-"""Chunks whose index (16 bytes each, and a checksum) fits one page."""
+"""Number of chunks whose index (16 bytes each, and a checksum) fits one page."""
 MAX_CHUNK_BYTES = 2**26
-"""Each array holds one chunk in memory while it fills, lost if the process is killed; blosc takes 2 GiB."""
+"""Limit because each array holds one chunk in memory while it fills, lost if the process is killed. blosc
+could take 2 GiB."""
 DIRECT_BYTES = 2**16
-"""Chunks of at least so many bytes are written past the page cache; smaller ones are quicker through it."""
+"""Chunks of at least this size are written past the page cache; smaller ones are faster through it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """Chunks that follow each other in a shard: their bytes and checksums as they will lie in the file.
+    """Consecutive chunks of a shard: their bytes and checksums as they will be in the file.
 
     ``parts`` are whole pages; ``sizes`` are the bytes of each chunk, with its checksum.
     """
@@ -53,37 +54,37 @@ class Piece:
 
 
 class ShardWriter:
-    """One shard being written, piece after piece. Raises OSError as the disk gives it."""
+    """One shard being written, piece after piece. Raises the disk's OSError."""
 
     def __init__(self, disk: Disk, path: Path, chunks: int, *, direct: bool) -> None:
         self._file = disk.create(path, direct=direct)
         self._in_pages = direct
         self._index = [(ABSENT, ABSENT)] * chunks
         try:
-            # An empty index first: who reads before the first chunk finds a shard without chunks, not a
-            # broken one.
+            # An empty index first, so that readers find a shard without chunks, and not a broken one, until
+            # the first chunk is there.
             self._file.write([pack_index(self._index)], 0)
         except OSError:
-            self._file.close()  # a full disk still makes names
+            self._file.close()  # a full disk still creates the file
             raise
         self._end = PAGE
         self.chunks = 0
-        """Written."""
+        """Chunks written."""
         self.published = 0
-        """Of these, in the index: all that exists for a reader."""
+        """Chunks in the index, and so visible to readers."""
 
     @property
     def room(self) -> int:
-        """Chunks that it can still take."""
+        """Number of chunks that it can still take."""
         return len(self._index) - self.chunks
 
     @property
     def direct(self) -> bool:
-        """Chunks go past the page cache."""
+        """Whether chunks bypass the page cache."""
         return self._file.direct
 
     def append(self, piece: Piece) -> None:
-        """Write chunks, to be published; all at once, since a disk takes large writes sooner than many."""
+        """Write chunks, to be published later; all at once, since one large write is faster than many."""
         write = self._file.write_pages if self._in_pages else self._file.write
         write(piece.parts, self._end)
         ends = list(accumulate(map(page_up, piece.sizes), initial=self._end))
@@ -93,8 +94,8 @@ class ShardWriter:
         self._end = ends[-1]
 
     def publish(self) -> None:
-        """Put the chunks that are written into the index; several at once cost as much as one."""
-        # After the chunks, never before: what an index names is in the file by then.
+        """Put the written chunks into the index; several at once cost as much as one."""
+        # After the chunks, never before: the index must only name chunks that are in the file.
         if self.published < self.chunks:
             self._file.write([pack_index(self._index)], 0)
             self.published = self.chunks
@@ -104,24 +105,24 @@ class ShardWriter:
         self._file.sync()
 
     def close(self) -> None:
-        """Idempotent."""
+        """Close the file. Idempotent."""
         self._file.close()
 
 
 class Pages:
-    """Memory in which what is not aligned is laid out in pages; allocated once, as large as it has to be."""
+    """Memory in which unaligned data are laid out in pages; allocated once, and grown as necessary."""
 
     def __init__(self) -> None:
         self._memory = aligned_bytes(2 * PAGE)
 
     def piece(self, payloads: Sequence[NDArray[np.uint8]]) -> Piece:
-        """Encoded chunks with their checksums, each filled up with 0; valid until the next call.
+        """Return encoded chunks with their checksums, each padded with 0; valid until the next call.
 
-        Page-aligned memory stays where it is, but for its last page.
+        Page-aligned chunks are not copied, except for their last page.
         """
         wholes = [len(payload) // PAGE * PAGE if is_aligned(payload) else 0 for payload in payloads]
         rests = [payload[whole:] for payload, whole in zip(payloads, wholes, strict=True)]
-        # A quarter more, so that pieces that grow a little do not ask for memory each time.
+        # A quarter more, so that slightly larger pieces do not cause an allocation each time.
         size = sum(page_up(len(rest) + CRC_BYTES) for rest in rests)
         if size > len(self._memory):
             self._memory = aligned_bytes(size + size // 4)
@@ -138,7 +139,7 @@ class Pages:
 
 
 def small_piece(payloads: Sequence[NDArray[np.uint8]]) -> Piece:
-    """Small encoded chunks with their checksums, each filled up with 0: a copy is all that they cost."""
+    """Return small encoded chunks with their checksums, each padded with 0, at the cost of a copy."""
     chunks = [payload.tobytes() + crc32c(payload.data) for payload in payloads]
     whole = b"".join(chunk.ljust(page_up(len(chunk)), b"\0") for chunk in chunks)
     return Piece([whole], [len(chunk) for chunk in chunks])

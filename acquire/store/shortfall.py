@@ -1,8 +1,8 @@
-"""Lines that are recorded and not on disk, found by lengths alone: in a moment, however long a recording is.
+"""Recorded lines that are not on disk, found by lengths alone: in a moment, however long a recording is.
 
-`verify` reads every byte. Here only the indices of the files are read and compared with the files' sizes:
-a file that is gone or cut short shows, a flipped bit does not. What is flagged as missing is no shortfall:
-its loss is told already.
+`verify` reads every byte. Here only the indices of the files are read and compared with the files' sizes: a
+file that is gone or cut short is detected, a flipped bit is not. Lines flagged as missing are no shortfall:
+their loss is recorded already.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Damage:
 
 
 def shortfalls(recording: Outline, shards: range | None = None) -> Iterator[Damage]:
-    """Of all files of a recording, or of those of some shards. Raises DataError where gaps cannot be read."""
+    """Yield the shortfalls of a recording, or of some shards. Raises DataError if gaps cannot be read."""
     whole = cache(partial(_with_lines, recording))
     for arm, files in recording.arms.items():
         lost = sorted(recording.lost_rows(arm), key=lambda rows: rows.start)
@@ -56,7 +56,7 @@ def shortfalls(recording: Outline, shards: range | None = None) -> Iterator[Dama
 
 
 def first_shortfall(recording: Outline, shards: range | None = None) -> Damage | None:
-    """The first one, if any; what retention has deleted meanwhile is none."""
+    """Return the first shortfall, or None; lines that retention has deleted in the meantime do not count."""
     found = next(shortfalls(recording, shards), None)
     if found is not None and recording.state != "sealed":
         recording = recording.refreshed()
@@ -65,7 +65,7 @@ def first_shortfall(recording: Outline, shards: range | None = None) -> Damage |
 
 
 def missing_segments(recording: Outline) -> Iterator[str]:
-    """What is wrong with the segments that a recording lists, in words."""
+    """Yield what is wrong with the segments that a recording lists, in words."""
     for name in recording.attrs.get("segments", ()):
         try:
             segment = recording.beside(name)
@@ -77,7 +77,7 @@ def missing_segments(recording: Outline) -> Iterator[str]:
 
 
 def _by_shard(recording: Outline, size: int, shards: range | None) -> Iterator[range]:
-    """Rows that should be there, one shard after the other."""
+    """Yield the rows that should be there, one shard after the other."""
     for kept in recording.kept_rows():
         for shard in range(kept.start // size, -(-kept.stop // size)):
             if shards is None or shard in shards:
@@ -85,7 +85,7 @@ def _by_shard(recording: Outline, size: int, shards: range | None) -> Iterator[r
 
 
 def _absent(array: ArrayFiles, rows: range) -> Iterator[range]:
-    """Those of the rows, all of one shard, that lie in chunks which the file is too short for."""
+    """Yield those of the rows, all of one shard, that are in chunks beyond the end of the file."""
     shard, size = rows.start // array.shape.shard_rows, array.shape.chunk_rows
     try:
         entries, intact = array.index(shard)
@@ -106,7 +106,7 @@ def _absent(array: ArrayFiles, rows: range) -> Iterator[range]:
 
 
 def _outside(lost: list[range], stretches: Iterable[range]) -> Iterator[range]:
-    """What of the stretches is not in ``lost``, which is in order."""
+    """Yield the parts of ``stretches`` that are not in ``lost``, which is in order."""
     for rows in stretches:
         start = rows.start
         for gone in lost:
@@ -120,15 +120,14 @@ def _outside(lost: list[range], stretches: Iterable[range]) -> Iterator[range]:
 
 
 def _with_lines(recording: Outline) -> Recording:
-    from acquire.store.reader import (
-        open_source,  # libraries of arrays, which nobody needs where nothing is gone
-    )
+    # Imported here, since array libraries are slow to load, and needed only if something is gone.
+    from acquire.store.reader import open_source
 
     return open_source(recording.source)
 
 
 def _unflagged(whole: Callable[[], Recording], arm: str, rows: range) -> Iterator[range]:
-    """Which of the rows are not flagged as missing; all of them where their flags cannot be read."""
+    """Yield those of the rows that are not flagged as missing; all of them if the flags cannot be read."""
     from acquire.store.present import flags_of
     from acquire.store.scan import missing_rows, runs
 

@@ -1,4 +1,4 @@
-"""Where a recording is read from: named parts of bytes below one place, on a local disk or far away."""
+"""Sources of recordings: keys and bytes below one place, on a local disk or remote."""
 
 from __future__ import annotations
 
@@ -15,37 +15,37 @@ if TYPE_CHECKING:
 
 
 class Source(Protocol):
-    """Bytes by key, as ``a/lines/c/0/0``. Methods raise OSError; FileNotFoundError for what is not there."""
+    """Bytes by key, such as ``a/lines/c/0/0``. Methods raise OSError; FileNotFoundError for a missing key."""
 
     def __str__(self) -> str:
-        """How the place is named to the user."""
+        """Return the place's name for the user."""
 
     def read(self, key: str) -> bytes:
-        """All bytes of one part."""
+        """Return all bytes of a key."""
 
     def read_range(self, key: str, start: int, size: int) -> bytes:
-        """Bytes ``start .. start + size - 1`` of one part, fewer where it ends earlier."""
+        """Return bytes ``start .. start + size - 1`` of a key, fewer if it ends earlier."""
 
     def expect(self, key: str, start: int, size: int) -> None:
-        """These bytes will be read soon: a hint, which may begin to fetch them."""
+        """Announce that these bytes will be read soon: a hint, which may start fetching them."""
 
     def size(self, key: str) -> int:
-        """Bytes of one part."""
+        """Return the size of a key in bytes."""
 
     def names(self, key: str) -> list[str]:
-        """Names of what lies directly below ``key``; none where there is nothing."""
+        """Return the names directly below ``key``; none if there is nothing."""
 
     def exists(self) -> bool:
-        """There is something at this place."""
+        """Return whether there is anything at this place."""
 
     def total_bytes(self) -> int:
-        """Bytes of all parts."""
+        """Return the bytes of all keys."""
 
     def beside(self, name: str) -> Source:
-        """The place ``name`` in the directory that holds this one."""
+        """Return the place ``name`` in the same directory."""
 
     def zarr_store(self) -> Path | Store:
-        """The same place for zarr-python."""
+        """Return the same place for zarr-python."""
 
 
 class LocalSource:
@@ -80,7 +80,7 @@ class LocalSource:
 
     def names(self, key: str) -> list[str]:
         try:
-            return os.listdir(f"{self._root}/{key}")  # noqa: PTH208
+            return os.listdir(f"{self._root}/{key}")  # noqa: PTH208 - names only, without a Path for each
         except (FileNotFoundError, NotADirectoryError):
             return []
 
@@ -98,7 +98,7 @@ class LocalSource:
 
 
 def source_of(place: Path | str) -> Source:
-    """The source for a path, or for a URL. Raises UsageError for a URL that cannot be one."""
+    """Return the source for a path or a URL. Raises UsageError for an invalid URL."""
     if not is_url(place):
         return LocalSource(Path(place))
     remote = RemoteSource(str(place))

@@ -1,4 +1,4 @@
-"""What a recording is told about itself when it is created, and what its end adds."""
+"""The description of a recording at its creation, and the facts added at its end."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ if TYPE_CHECKING:
     from acquire.store.terms import Continuation, Retention
 
 CAMERA_KEYS = ("white_dn", "black_level_dn", "responsivity_dn")
-"""What a reader needs of each camera to turn DN into samples of Eq. (1)."""
+"""Camera facts that a reader needs to convert DN into samples of Eq. (1)."""
 
 State = Literal["recording", "sealed"]
 
 
 class RunCondition(StrEnum):
-    """What the recorded lines are worth."""
+    """Condition of the recorded lines."""
 
     GOOD = "GOOD"
     """Every line is there, and tags confirm the code."""
@@ -42,21 +42,21 @@ class RunCondition(StrEnum):
     INCOMPLETE = "INCOMPLETE"
     """Lines are missing; they are flagged and listed."""
     INTERRUPTED = "INTERRUPTED"
-    """Ended before its end by an operator's or the system's wish."""
+    """Ended early by an operator or the system."""
     ABORTED = "ABORTED"
     """Ended by a fault."""
 
 
 @dataclass(frozen=True, slots=True)
 class Durability:
-    """What is lost at worst, in lines of either arm that both had delivered to the writer.
+    """Largest possible loss, in lines of either arm that both had delivered to the writer.
 
     Attributes
     ----------
     fsync : when bytes are forced to the medium
-    kill_lines : when the writer's process is killed and the recording recovered: the chunk that fills, and
-        those that are being packed
-    power_lines : when the machine loses power; None: as many as the system had not written back
+    kill_lines : loss if the writer's process is killed and the recording recovered: the chunk being filled,
+        and those being packed
+    power_lines : loss if the machine loses power; None: all lines that the system had not written back
     """
 
     fsync: str
@@ -66,7 +66,7 @@ class Durability:
 
 @dataclass(frozen=True, slots=True)
 class RecordingSpec:
-    """Everything that is known when a recording begins; refuses with UsageError what cannot be recorded.
+    """Everything that is known when a recording begins. Raises UsageError for impossible settings.
 
     Attributes
     ----------
@@ -79,16 +79,16 @@ class RecordingSpec:
     cameras : per arm the settings as read back, with ``white_dn``, ``black_level_dn``, ``responsivity_dn``
     extra : further attributes (``scene``, ``effects``, ``simulated`` ...)
     chunk_lines, shard_chunks : lines per chunk; chunks per file
-    tag_chunks : chunks of pixels whose tags (code, times, flags) share one chunk; a part of ``shard_chunks``
-    codec : of the pixels
-    encoders : threads that pack chunks, where there is a codec
+    tag_chunks : chunks of pixels whose tags (code, times, flags) share one chunk; divides ``shard_chunks``
+    codec : codec of the pixels
+    encoders : threads that pack chunks, if there is a codec
     fsync : force bytes to the medium at every ``"commit"``, or only at the ``"seal"``
     commit_lines : lines on disk that may wait for their commit; a whole number of chunks is best
-    retention : what of an endless recording is kept; None: everything
-    reserve_bytes : of the disk that are left free: the recording should end when nothing else is left
-    continues : what this recording is a further segment of, if it is one
-    layout : of the instrument: ``dual``, ``compact``, ``emulated``, ``interline``, ``fibre``
-    fibre : which column sees what; of layout ``fibre``, and of no other
+    retention : which lines of an endless recording are kept; None: all
+    reserve_bytes : bytes of the disk that are left free: the recording should end when only these are left
+    continues : the recording that this one continues, if it is a further segment
+    layout : layout of the instrument: ``dual``, ``compact``, ``emulated``, ``interline``, ``fibre``
+    fibre : assignment of columns to tiles; for layout ``fibre`` only
     """
 
     run_id: str
@@ -129,13 +129,13 @@ class RecordingSpec:
 
     @property
     def geometry(self) -> dict[str, Any]:
-        """As it stands in the attributes."""
+        """The attribute ``geometry``."""
         sizes = {"stages": self.stages, "substeps": self.substeps, "pixels": self.pixels}
         return sizes if self.fibre is None else {**sizes, "fibre": self.fibre.to_attrs()}
 
     @property
     def durability(self) -> Durability:
-        """What this recording can lose."""
+        """The largest possible loss of this recording."""
         held = self.chunk_lines * max(self.tag_chunks, 1 if self.codec == "none" else 1 + ENCODED_AHEAD)
         committed = self.commit_lines + held if self.fsync == "commit" else None
         return Durability(self.fsync, held, committed)
@@ -157,15 +157,15 @@ class RecordingSpec:
         if (self.layout == "fibre") != (self.fibre is not None):
             raise UsageError(
                 f"layout {self.layout!r} does not go with {'no' if self.fibre is None else 'a'} fibre",
-                possible="layout 'fibre', and what its columns see",
+                possible="layout 'fibre' with a fibre, or another layout without",
             )
         if self.fibre is None:
             return
-        told = (self.fibre.stages, self.fibre.substeps, self.fibre.sensor_pixels)
-        if told != (self.stages, self.substeps, self.pixels):
+        fibre = (self.fibre.stages, self.fibre.substeps, self.fibre.sensor_pixels)
+        if fibre != (self.stages, self.substeps, self.pixels):
             raise UsageError(
                 f"a recording of M = {self.stages}, S = {self.substeps}, {self.pixels} pixels has a fibre of "
-                f"M = {told[0]}, S = {told[1]}, {told[2]} pixels",
+                f"M = {fibre[0]}, S = {fibre[1]}, {fibre[2]} pixels",
                 possible="the same",
             )
 
@@ -214,7 +214,7 @@ class RecordingSpec:
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """What is known only at the end."""
+    """Facts that are known only at the end."""
 
     condition: RunCondition
     reason: str
@@ -222,16 +222,16 @@ class Ending:
 
 
 def root_attributes(spec: RecordingSpec, ending: Ending | None = None) -> dict[str, Any]:
-    """Attributes of the recording's root group; ``ending`` makes it sealed."""
+    """Return the attributes of the recording's root group; ``ending`` makes it sealed."""
     segment: dict[str, Any] = {}
-    if spec.continues:  # how long the outage was is known only now, with the first line
+    if spec.continues:  # the length of the outage is known only now, with the first line
         readout = readout_ns(spec, spec.first_line)
         segment = {"segment": spec.continues.to_attrs(spec.first_line, readout)}
     return {**spec.extra, **segment, **_own_attributes(spec, ending)}
 
 
 def readout_ns(spec: RecordingSpec, line: int) -> int:
-    """UTC at which the read-out of a line begins."""
+    """Return the UTC in ns at which the read-out of a line begins."""
     readout = Geometry(spec.stages, spec.substeps, 1).readout_substep
     return spec.clock.instant_ns((spec.substeps * line + readout) * spec.substep_ticks)
 

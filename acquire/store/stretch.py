@@ -1,10 +1,10 @@
-"""Some rows of one array, read in steps, so that a disk can take the same step of many arrays at once.
+"""A range of rows of one array, read in steps, so that the same step of many arrays can be requested at once.
 
 ::
 
-    expect_index ─▶ indices are on their way ─▶ expect ─▶ chunks are on their way ─▶ read
+    expect_index ─▶ indices are being fetched ─▶ expect ─▶ chunks are being fetched ─▶ read
 
-The first two are hints: `read` does all that is left to do.
+The first two are hints: `read` does everything that is left to do.
 """
 
 from __future__ import annotations
@@ -33,23 +33,23 @@ class Stretch:
         self._places: dict[int, tuple[int, int]] = {}
 
     def expect_index(self) -> None:
-        """The indices of the files will be read soon."""
+        """Start fetching the indices of the files."""
         per_shard = self._reader.shape.shard_chunks
         for shard in range(self._chunks.start // per_shard, -(-self._chunks.stop // per_shard)):
-            with suppress(OSError):  # reading it says what is wrong
+            with suppress(OSError):  # `read` reports it
                 self._reader.expect_index(shard)
 
     def expect(self) -> None:
-        """The chunks will be read soon."""
+        """Start fetching the chunks."""
         with suppress(OSError):
             self._places = self._reader.places(self._chunks)
             for chunk, place in self._places.items():
                 self._reader.expect(chunk, *place)
 
     def read(self, out: NDArray[Any] | None = None, columns: slice | None = None) -> NDArray[Any]:
-        """The rows, into ``out`` if given, which takes only ``columns`` of them if these are.
+        """Return the rows, in ``out`` if given, and only their ``columns`` if given.
 
-        Raises DataError when they are not intact on disk.
+        Raises DataError if they are not intact on disk.
         """
         shape = self._reader.shape
         rows = np.empty((self._stop - self._start, *shape.row_shape), shape.dtype) if out is None else out
@@ -67,11 +67,11 @@ class Stretch:
             absent = max(self._start, chunk * self._reader.shape.chunk_rows)
             raise DataError(
                 f"{self._reader}: line {self._first_line + absent} is recorded, but not on disk",
-                hint="`acquire verify` says which lines are left; a file was lost or cut short",
+                hint="`acquire verify` lists the lines that are left; a file was lost or cut short",
             ) from error
         except (DamagedChunkError, OSError) as error:
             first, last = self._first_line + self._start, self._first_line + self._stop - 1
             raise DataError(
                 f"{self._reader}: lines {first} to {last} cannot be read: {error}",
-                hint="`acquire verify` says which lines are intact, `acquire recover` masks the others",
+                hint="`acquire verify` lists the intact lines, `acquire recover` masks the others",
             ) from error

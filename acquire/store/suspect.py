@@ -1,7 +1,7 @@
-"""Lines that are there and do not follow the light's code, as far as the check while recording could tell.
+"""Recorded lines that do not follow the light's code, according to the checks during the recording.
 
-A check takes some tenths of a second of lines, and its verdict comes after them: lines that were written
-before it carry no flag. So the recording's events say from which line on the code is in doubt, and from which
+A check takes some tenths of a second of lines, and its verdict comes after them: lines written before it are
+not flagged. So the recording's events state from which line on the code is in doubt, and from which line on
 it is verified again, for each arm::
 
        check: verified                check: doubtful          check: verified
@@ -9,7 +9,8 @@ it is verified again, for each arm::
        ▲ code_doubtful                                           code_verified ▲
        └──── the light slipped somewhere here ───────┘
 
-No bad line comes before the first suspect one: a check may not notice what happens near its own end.
+No bad line comes before the first suspect one, which is that of the last verified check: a check may not
+notice a slip near its own end.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ CODE_EVENTS = frozenset((*DOUBTFUL.values(), *VERIFIED.values()))
 
 @dataclass(frozen=True, slots=True)
 class Suspect:
-    """Lines of one arm that do not follow the recorded code, and what the check said of them."""
+    """Lines of one arm that do not follow the recorded code, and the check's verdict."""
 
     arm: str
     first_line: int
@@ -47,7 +48,7 @@ class Suspect:
 
 
 def suspect_lines(recording: Outline) -> tuple[Suspect, ...]:
-    """Of both arms, in their order. Raises DataError where the events cannot be read."""
+    """Return the suspect lines of both arms, in order. Raises DataError if the events cannot be read."""
     return tuple(found for arm in ARMS for found in _of_arm(recording, arm))
 
 

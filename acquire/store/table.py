@@ -1,7 +1,7 @@
 """Small tables of a recording: one 1-D array per column, one chunk each, replaced whole at a commit.
 
-Rows are only ever added, so a reader that knows an older length still reads what it knew. A table has a
-capacity; rows beyond it are counted in the group's attribute ``not_listed``.
+Rows are only ever added, so a reader with an older length still reads the same rows. A table has a capacity;
+rows beyond it are counted in the group's attribute ``not_listed``.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ GAP_ROWS = 16384
 EVENT_ROWS = 4096
 
 EVENT_KINDS = ("armed", "started", "stopped", "loss", "tag_mismatch", "fault", "mark")
-"""Kinds that every recording's vocabulary begins with; others are added at their first use."""
+"""First kinds of every recording's vocabulary; others are added at their first use."""
 
 MAX_TEXT = 500
 """Longest text of a cell; a longer one ends in an ellipsis."""
 
 
 class Vocabulary:
-    """Names ↔ uint8 values that can grow; names beyond ``limit`` become the first, ``other``."""
+    """Growing list of names ↔ uint8 values; names beyond ``limit`` become the first, ``other``."""
 
     def __init__(self, *names: str, limit: int = 64) -> None:
         self._names = ["other", *names]
         self._limit = limit
 
     def value(self, name: str) -> int:
-        """The value of ``name``, given to it at its first use."""
+        """Return the value of ``name``, which is assigned at its first use."""
         word = "_".join(name.split()) or "other"
         if word not in self._names:
             if len(self._names) >= self._limit:
@@ -83,7 +83,7 @@ class Table:
         return len(self._cells[self._columns[0].name])
 
     def add(self, row: Mapping[str, Any]) -> None:
-        """Add one row (column name → value), or count it when the table is full."""
+        """Add one row (column name → value), or count it if the table is full."""
         self.dirty = True
         if len(self) >= self.capacity:
             self.not_listed += 1
@@ -96,9 +96,9 @@ class Table:
             disk.make_directory(self.directory / column.name / "c", parents=True)
 
     def publish(self, publisher: Publisher, *, durable: bool = False) -> None:
-        """Replace chunks, then arrays' metadata, then the group's. Raises OSError as the disk gives it.
+        """Replace chunks, then arrays' metadata, then the group's. Raises the disk's OSError.
 
-        ``durable`` forces the chunks to the medium: what a recording's root says of them is what counts.
+        ``durable`` forces the chunks to the medium, but not the metadata: readers use the root's.
         """
         if not self.dirty:
             return
@@ -111,7 +111,7 @@ class Table:
         self.dirty = False
 
     def nodes(self) -> dict[str, layout.Document]:
-        """Metadata of the group and its arrays, by path below the recording."""
+        """Return the metadata of the group and its arrays, by path below the recording."""
         name = self.directory.name
         return {name: self._group()} | {f"{name}/{c.name}": self._array(c) for c in self._columns}
 
@@ -142,7 +142,7 @@ class Table:
 
 
 def gap_table(path: Path) -> Table:
-    """Lost lines: first line, count, cause, arm."""
+    """Return the table of lost lines: first line, count, cause, arm."""
     columns = (
         TableColumn("first_line", "uint64", {"long_name": "the trigger's number of the first lost line"}),
         TableColumn("count", "uint64", {"long_name": "lost lines", "units": "1"}),
@@ -157,7 +157,7 @@ def gap_table(path: Path) -> Table:
 
 
 def event_table(path: Path) -> Table:
-    """What happened when: tick, line, kind, text."""
+    """Return the table of events: tick, line, kind, text."""
     columns = (
         TableColumn("tick", "uint64", {"long_name": "trigger clock", "units": "1"}),
         TableColumn("line", "uint64", {"long_name": "the trigger's line number"}),

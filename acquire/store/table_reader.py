@@ -1,4 +1,4 @@
-"""Reader of a recording's small tables: what happened, and which lines were lost."""
+"""Reader of a recording's small tables: events and lost lines."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 NUMBERS = {"uint8": "B", "uint64": "Q"}
-"""Data types of cells, and what `struct` calls them."""
+"""Data type of cells → format character of `struct`."""
 MOST_ROWS = 2**20
 
 
@@ -32,7 +32,7 @@ class Gap:
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """What happened when, on the trigger's clock."""
+    """An event, and when it happened on the trigger's clock."""
 
     kind: str
     tick: int
@@ -41,14 +41,14 @@ class Event:
 
 
 def read_gaps(source: Source, nodes: dict[str, Document]) -> tuple[Gap, ...]:
-    """Lost lines in the order in which they were noticed; ``nodes`` are the root's. Raises DataError."""
+    """Return lost lines in the order of their detection; ``nodes`` are the root's. Raises DataError."""
     table = _Table(source, "gaps", nodes)
     first, count = table.numbers("first_line"), table.numbers("count")
     return tuple(map(Gap, table.words("arm"), first, count, table.words("cause")))
 
 
 def read_events(source: Source, nodes: dict[str, Document]) -> tuple[Event, ...]:
-    """What happened, in the order in which it was noted; ``nodes`` are the root's. Raises DataError."""
+    """Return events in the order in which they were noted; ``nodes`` are the root's. Raises DataError."""
     table = _Table(source, "events", nodes)
     texts = table.cells("text", text=True)
     return tuple(map(Event, table.words("kind"), table.numbers("tick"), table.numbers("line"), texts))
@@ -61,7 +61,7 @@ class _Table:
     nodes: dict[str, Document]
 
     def cells(self, column: str, *, text: bool = False) -> list[Any]:
-        """The cells of one column, numbers or texts."""
+        """Return the cells of one column, numbers or texts."""
         try:
             document = self.nodes[f"{self.name}/{column}"]
             (rows,), data_type = document["shape"], document["data_type"]
@@ -72,7 +72,7 @@ class _Table:
             data = self._chunk(column)
             if data_type == "string":
                 return _texts(data, rows)
-            # By struct: whoever lists recordings need not wait for numpy.
+            # With struct, since listing recordings should not wait for numpy to load.
             return list(struct.unpack_from(f"<{rows}{NUMBERS[data_type]}", data))
         except (*PARSE_ERRORS, struct.error, OSError) as error:
             raise DataError(f"{self.source}: table {self.name}/{column} cannot be read: {error!r}") from error
@@ -81,7 +81,7 @@ class _Table:
         return self.cells(column)
 
     def words(self, column: str) -> list[str]:
-        """A column of CF flag values as their meanings."""
+        """Return a column of CF flag values as their meanings."""
         values = self.numbers(column)
         try:
             attributes = self.nodes[f"{self.name}/{column}"]["attributes"]
@@ -92,7 +92,7 @@ class _Table:
             raise DataError(f"{self.source}: table {self.name}/{column} cannot be read: {error!r}") from error
 
     def _chunk(self, column: str) -> bytes:
-        """The column's one chunk; it may have more rows than the root knows."""
+        """Return the column's only chunk, which may have more rows than the root states."""
         data = self.source.read(f"{self.name}/{column}/c/0")
         payload, checksum = data[:-CRC_BYTES], data[-CRC_BYTES:]
         if small_crc32c(payload) != checksum:
@@ -101,7 +101,7 @@ class _Table:
 
 
 def _texts(data: bytes, rows: int) -> list[str]:
-    """The first texts of a chunk of Zarr's ``vlen-utf8``: how many there are, and each after its length."""
+    """Return the first texts of a ``vlen-utf8`` chunk: a count, then each text after its length."""
     (there,) = struct.unpack_from("<I", data)
     if there < rows:
         raise ValueError(f"it has {there} texts, not {rows}")
@@ -110,6 +110,6 @@ def _texts(data: bytes, rows: int) -> list[str]:
         (size,) = struct.unpack_from("<I", data, at)
         at += 4 + size
         if at > len(data):
-            raise ValueError("a text goes on behind the end")
+            raise ValueError("a text goes beyond the end")
         texts.append(data[at - size : at].decode())
     return texts

@@ -1,4 +1,4 @@
-"""What is agreed before a recording begins: what of it is kept, and what it continues."""
+"""Terms of a recording that are fixed before it begins: which lines are kept, and what it continues."""
 
 from __future__ import annotations
 
@@ -13,17 +13,18 @@ ALL_LINES = 2**62
 
 @dataclass(frozen=True, slots=True)
 class Retention:
-    """What of an endless recording is kept; refuses with UsageError what cannot be.
+    """Which lines of an endless recording are kept. Raises UsageError for impossible terms.
 
     Attributes
     ----------
-    max_bytes : that the recording may take of the disk; None: as many as there are
-    max_age_lines : lines behind the newest; None: all
-    margin_lines : on either side of what is held, and behind the newest line whatever the limits: M + L_R
+    max_bytes : bytes of the disk that the recording may take; None: no limit
+    max_age_lines : number of newest lines that are kept; None: all
+    margin_lines : lines kept on either side of a held range, and before the newest line, whatever the limits:
+        M + L_R
     hold_events : kinds of events that hold lines
-    hold_lines : before and after such an event
-    copied_to : URL below which the recording is copied while it grows: nothing goes before it is there, nor
-        while the copy has not begun
+    hold_lines : lines held before and after such an event
+    copied_to : URL below which the recording is copied while it grows: no line is dropped before it is
+        there, or before the copy has begun
     """
 
     max_bytes: int | None = None
@@ -41,16 +42,16 @@ class Retention:
 
 @dataclass(frozen=True, slots=True)
 class Continuation:
-    """What a segment follows.
+    """What a segment continues.
 
     Attributes
     ----------
     first : name of the run's first recording, in the same directory
-    number : of the segment; the first recording is 1
+    number : number of the segment; the first recording is 1
     end_line, end_ns : line after the last one before the outage, and when that was read out
     cause : why there was an outage
-    listed : in the first recording as soon as the segment has begun; if not, whoever recovers the first
-        recording does it
+    listed : list the segment in the first recording as soon as it has begun; otherwise the recovery of the
+        first recording does that
     """
 
     first: str
@@ -61,7 +62,7 @@ class Continuation:
     listed: bool = True
 
     def to_attrs(self, first_line: int, start_ns: int) -> dict[str, Any]:
-        """For the segment's root, once its first line is known."""
+        """Return the attribute ``segment`` of the root, once its first line is known."""
         lost = first_line - self.end_line
         outage = {
             "after_line": self.end_line - 1,

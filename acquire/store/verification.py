@@ -1,4 +1,4 @@
-"""Is a recording whole? Every chunk is read, and everything that is said twice has to agree."""
+"""Verification of a recording: every chunk is read, and all redundant facts have to agree."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Verification:
-    """What was found.
+    """Result of a verification.
 
     Attributes
     ----------
-    path, state, lines : of the recording
-    bytes : that all of it takes
+    path, state, lines : path, state and lines of the recording
+    bytes : its size
     damage : lines that are not intact on disk
-    contradictions : what is said twice and differs, in words
-    notes : what is no damage, but good to know
+    contradictions : redundant facts that disagree, in words
+    notes : remarks that are no damage
     """
 
     path: str
@@ -67,16 +67,18 @@ class Verification:
 
 
 def verify(place: Path | str, progress: Callable[[int, int], None] | None = None) -> Verification:
-    """Read all of a recording, here or far away: presence, length and checksum of every chunk, and that
-    numbering, gaps, flags and ledger agree, and segments are where they are listed. Raises as
-    `open_recording` does, and DataError for a recording that holds links.
+    """Read all of a recording, local or remote, and verify it.
+
+    Checks are presence, length and checksum of every chunk, that numbering, gaps, flags and ledger agree, and
+    that listed segments exist. Raises as `open_recording` does, and DataError for a recording that holds
+    links.
     """
     source = source_of(place)
     if isinstance(source, LocalSource):
         refuse_links(source.path)
     recording = open_source(source)
     scans = scan(recording, recording.kept_rows(), progress)
-    gone = open_source(source).dropped  # what retention may have deleted meanwhile is no damage
+    gone = open_source(source).dropped  # lines that retention deleted during the scan are no damage
     damage = tuple(
         found
         for arm in scans.values()
@@ -100,7 +102,7 @@ def _contradictions(recording: Recording, scans: dict[str, ArmScan]) -> Iterator
     try:
         listed = {arm: _listed(recording, arm) for arm in ARMS}
         complete = recording.gaps_not_listed == 0
-        recording.events  # noqa: B018  (reads the table)
+        recording.events  # noqa: B018 - reads the table
     except DataError as error:
         yield error.message
         return
@@ -119,7 +121,7 @@ def _contradictions(recording: Recording, scans: dict[str, ArmScan]) -> Iterator
 
 
 def _listed(recording: Recording, arm: str) -> tuple[int, int]:
-    """Lines that are listed as lost, and those of them that retention has not dropped."""
+    """Return the number of lines listed as lost, and of those that retention has not dropped."""
     lost = recording.lost_rows(arm)
     every = sum(len(rows) for rows in lost)
     gone = sum(
@@ -131,7 +133,7 @@ def _listed(recording: Recording, arm: str) -> tuple[int, int]:
 
 
 def _read_tags(recording: Recording, found: ArmScan) -> tuple[int | None, int]:
-    """Lines flagged as missing, None where flags are damaged; lines with an impossible code index."""
+    """Return the number of lines flagged as missing (None if flags are damaged), and of misnumbered lines."""
     flagged, misnumbered = 0, 0
     size = found.stream.reader("flags").shape.chunk_rows
     for chunk in chunks_of(size, recording.kept_rows()):
@@ -149,7 +151,7 @@ def _read_tags(recording: Recording, found: ArmScan) -> tuple[int | None, int]:
 
 
 def _unbalanced(recording: Recording, arm: str, listed: int | None) -> Iterator[str]:
-    """Lines = stored + missing, by the ledger of a sealed recording, and the gaps say so too."""
+    """Check lines = stored + missing by the ledger of a sealed recording, and missing by the gaps."""
     ledger = recording.attrs["ledger"]
     book = ledger.get(arm)
     if recording.state != "sealed" or not isinstance(book, dict) or "stored" not in book:
@@ -165,8 +167,8 @@ def _unbalanced(recording: Recording, arm: str, listed: int | None) -> Iterator[
 
 
 def _metadata(recording: Recording) -> Iterator[str]:
-    """Arrays' own metadata, which readers meet that do not begin at the root."""
-    if recording.state != "sealed":  # while it grows, they are renewed once a second only
+    """Check the arrays' own metadata, which readers use that do not begin at the root."""
+    if recording.state != "sealed":  # in a growing recording they are rewritten only once a second
         return
     nodes = recording.document["consolidated_metadata"]["metadata"]
     for path, document in nodes.items():
@@ -176,12 +178,11 @@ def _metadata(recording: Recording) -> Iterator[str]:
             yield f"{path}/zarr.json cannot be read: {error}"
             continue
         if any(own.get(key) != value for key, value in document.items() if key != "consolidated_metadata"):
-            yield f"{path}/zarr.json differs from what the root says of it"
+            yield f"{path}/zarr.json differs from its copy in the root"
 
 
 def _notes(recording: Recording) -> Iterator[str]:
-    """Never an error: where the events cannot be read, that is a contradiction, and told as one."""
-    with contextlib.suppress(DataError):
+    with contextlib.suppress(DataError):  # unreadable events are reported by `_contradictions`
         yield from map(str, suspect_lines(recording))
     for first, count in recording.dropped:
         yield f"lines {first} to {first + count - 1} were dropped by retention"

@@ -1,19 +1,19 @@
-"""Reconstructed videos as OME-Zarr 0.5 images, which viewers open without us.
+"""Reconstructed videos as OME-Zarr 0.5 images, which viewers open without this package.
 
 ::
 
     NAME.zarr/   attributes: ome (axes t, y, x with units, scale, translation; omero), provenance
       0          (t, y, x)
-      1, 2, …    the same in half the rows and columns, for large ones
+      1, 2, …    the same with half the rows and columns, of large videos
       t, y, x    their coordinates: seconds after the recording's first line, centres of pixels
       time       (t) int64, UTC of each frame
-      quality    (t) float32, where it is known: relative residual of each frame's lines
-      error      (t, region_y, region_x) float32, where it is known: estimated RMS error of parts of the frame
-      trusted    (t) bool, where it is known: sampled in full, and solved to its end
+      quality    (t) float32, if known: relative residual of each frame's lines
+      error      (t, region_y, region_x) float32, if known: estimated RMS error of parts of the frame
+      trusted    (t) bool, if known: sampled in full, and solved to its end
 
-The consolidated metadata, which viewers follow, lists the image alone: ``xarray.open_zarr(…,
-consolidated=False)`` finds the coordinates. `VideoWriter` takes the frames as they come, for videos longer
-than memory; `write_video` writes one at once. A place is a path, or a URL as recordings have.
+The consolidated metadata, which viewers use, lists the image only: ``xarray.open_zarr(…,
+consolidated=False)`` finds the coordinates. `VideoWriter` takes frames as they come, for videos longer than
+memory; `write_video` writes a whole one. A place is a path or a URL, as for recordings.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ DTYPES = ("uint8", "uint16", "float32")
 class VideoFile:
     """A video on disk: ``video`` (t, y, x) is read when it is sliced, ``time_ns`` (t,) int64 UTC.
 
-    ``quality`` (t,) float32 where it was written; 0 is best. ``error`` (t, region_y, region_x) likewise, the
+    ``quality`` (t,) float32, if it was written; 0 is best. ``error`` (t, region_y, region_x) likewise is the
     estimated RMS error in the video's unit, read when it is sliced.
     """
 
@@ -64,17 +64,17 @@ class VideoFile:
         return in_words("VideoFile", **self._holds())
 
     def _repr_html_(self) -> str:
-        """With the frame in the middle of those that are trusted."""
+        """Return a table with the middle one of the trusted frames."""
         shown = self.trusted or range(len(self.time_ns))
         number = shown[len(shown) // 2]
         try:
             picture = as_picture(np.asarray(self.video[number]), f"frame {number}")
-        except DAMAGE:  # said when the frame is asked for
+        except DAMAGE:  # reported when the frame is read
             picture = ""
         return as_table("Video", self._holds(), picture)
 
     def _holds(self) -> dict[str, str]:
-        """What it holds, in words."""
+        """Return a description in words."""
         count, rows, columns = self.video.shape
         trusted = self.trusted
         span = trusted and f"frames {trusted.start} to {trusted.stop - 1}"
@@ -87,7 +87,7 @@ class VideoFile:
 
     @property
     def interval_ns(self) -> float:
-        """Duration of a frame."""
+        """Duration of a frame in ns."""
         return self.scale[0] * 1e9
 
     @property
@@ -97,18 +97,18 @@ class VideoFile:
 
     @property
     def origin(self) -> tuple[float, float, float]:
-        """Where the first frame begins, in seconds, and where the centre of the first pixel lies."""
+        """Start of the first frame in seconds, and the centre of the first pixel (y, x)."""
         return self._transformed("translation", 0.0)
 
     @property
     def pixel_unit(self) -> str | None:
-        """UDUNITS-2 name of a length; None where only ratios are known."""
+        """UDUNITS-2 name of a length; None if only ratios are known."""
         unit = self.attrs["ome"]["multiscales"][0]["axes"][-1].get("unit")
         return None if unit is None else str(unit)
 
     @property
     def trusted(self) -> range | None:
-        """Frames that are sampled in full; None for a video that does not say."""
+        """Frames that are sampled in full; None if the video does not state them."""
         found = (self.attrs.get("provenance") or {}).get("trusted")
         if found is None:
             return None
@@ -135,11 +135,11 @@ def write_video(
 ) -> None:
     """Write ``video`` (t, y, x) float32, uint16 or uint8 as a new OME-Zarr 0.5 image.
 
-    ``pixel_size`` is the side of a pixel in ``pixel_unit``, a UDUNITS-2 name of a length, or None where only
-    ratios are known. ``origin`` is where the first frame begins, in seconds, and where the centre of the
-    first pixel lies (y, x). ``provenance["trusted"]``, first frame and the one after the last, marks them.
-    The image appears whole or not at all. UsageError for what cannot be written, before
-    anything is touched; StoreError when the disk refuses.
+    ``pixel_size`` is the side of a pixel in ``pixel_unit``, a UDUNITS-2 name of a length, or None if only
+    ratios are known. ``origin`` is the start of the first frame in seconds, and the centre of the first pixel
+    (y, x). ``provenance["trusted"]``, first frame and the one after the last, marks the trusted frames. The
+    image appears whole or not at all. Raises UsageError for an impossible video, before anything is changed,
+    and StoreError if the disk refuses.
     """
     _check(video, time_ns, pixel_size, frame_interval_ns, provenance)
     rows, columns = video.shape[1:]
@@ -150,10 +150,10 @@ def write_video(
 
 
 def open_video(place: Path | str) -> VideoFile:
-    """Open a video that `write_video` wrote.
+    """Open a video written by `write_video`.
 
-    Raises PlaceError where there is none, DataError for a damaged one, and StoreError where that cannot be
-    found out.
+    Raises PlaceError if there is none, DataError if it is damaged, and StoreError if that cannot be found
+    out.
     """
     import zarr
     from zarr.errors import GroupNotFoundError
@@ -164,13 +164,15 @@ def open_video(place: Path | str) -> VideoFile:
             there = source.exists()
         if not there:
             raise PlaceError(f"{source} does not exist", hint=_VIDEO)
-        with suppress(PlaceError):  # said below, in a video's words
-            read_root(source)  # zarr would wait for a pipe, and read a device for ever
+        # Refuses a pipe, for which zarr would wait, and a device, which it would read for ever. PlaceError is
+        # raised below, with a text about videos.
+        with suppress(PlaceError):
+            read_root(source)
         group = zarr.open_group(source.zarr_store(), mode="r", zarr_format=3, use_consolidated=False)
         attributes = dict(group.attrs)
         if attributes.get("format") != FORMAT:
             raise PlaceError(
-                f"{source} is not a video of ours: format {attributes.get('format')!r}",
+                f"{source} is not a video of acquire: format {attributes.get('format')!r}",
                 possible=f"{FORMAT!r}",
                 hint="acquire reconstruct, which makes videos of recordings",
             )
@@ -179,7 +181,7 @@ def open_video(place: Path | str) -> VideoFile:
         error = child_array(group, "error") if "error" in group else None
         return VideoFile(child_array(group, "0"), time_ns, attributes, quality, error)
     except (GroupNotFoundError, NotADirectoryError) as error:
-        raise PlaceError(f"{source} is not a video: it is no Zarr group", hint=_VIDEO) from error
+        raise PlaceError(f"{source} is not a video: it is not a Zarr group", hint=_VIDEO) from error
     except DAMAGE as error:
         raise DataError(f"{source} is not a video, or is damaged: {error}") from error
 

@@ -1,7 +1,7 @@
-"""A video as OME-Zarr 0.5 metadata: pure functions from what is known to JSON documents and numbers.
+"""A video as OME-Zarr 0.5 metadata: pure functions that return JSON documents and numbers.
 
-What viewers follow, the root's consolidated metadata, lists the image alone: those that take every array of a
-group for a part of the picture would stumble over the columns that lie beside it.
+The root's consolidated metadata, which viewers use, lists the image only: some viewers take every array of a
+group for part of the picture, and would stumble over the columns next to it.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 
 FORMAT = "acquire-video/1"
 LARGE = 1024
-"""Rows or columns of a level that get another one of half the size."""
+"""A level with more rows or columns than this gets another level of half the size."""
 LOW, HIGH = 0.001, 0.999
-"""Quantiles of the voxels that a viewer shows as black and as white."""
+"""Quantiles of the voxels that a viewer shows as black and white."""
 KEPT = 2**16
-"""Voxels of all frames that are kept to find them."""
+"""Number of voxels of all frames that are kept to estimate the quantiles."""
 
 TIME_ATTRIBUTES: dict[str, Any] = {
     "standard_name": "time",
@@ -51,10 +51,10 @@ TRUSTED_ATTRIBUTES: dict[str, Any] = {
 
 @dataclass(frozen=True, slots=True)
 class VideoGrid:
-    """Where the voxels of a video lie: steps along t (seconds), y and x, and where the first one does.
+    """Grid of a video's voxels: steps along t (seconds), y and x, and the position of the first one.
 
-    ``origin`` is when the first frame begins, and the centre of the first pixel. ``pixel_unit`` is a
-    UDUNITS-2 name of a length, or None where only ratios are known.
+    ``origin`` is the start of the first frame, and the centre of the first pixel. ``pixel_unit`` is a
+    UDUNITS-2 name of a length, or None if only ratios are known.
     """
 
     step: tuple[float, float, float]
@@ -62,7 +62,7 @@ class VideoGrid:
     pixel_unit: str | None = "micrometer"
 
     def level(self, number: int) -> VideoGrid:
-        """The grid of a level whose pixels are 2^number wide."""
+        """Return the grid of a level whose pixels are 2^number wide."""
         factor = 2**number
         (t, height, width), (begin, y, x) = self.step, self.origin
         origin = (begin, y + (factor - 1) * height / 2, x + (factor - 1) * width / 2)
@@ -70,7 +70,7 @@ class VideoGrid:
 
 
 def level_shapes(shape: tuple[int, int]) -> list[tuple[int, int]]:
-    """Rows and columns of the image and of its smaller copies."""
+    """Return the rows and columns of the image and of its smaller copies."""
     found = [shape]
     while max(found[-1]) > LARGE:
         rows, columns = found[-1]
@@ -79,7 +79,7 @@ def level_shapes(shape: tuple[int, int]) -> list[tuple[int, int]]:
 
 
 def halved(frames: NDArray[Any]) -> NDArray[Any]:
-    """Frames (t, y, x) of half the size, means of 2 x 2 pixels; an odd edge counts twice."""
+    """Return frames (t, y, x) of half the size, means of 2 x 2 pixels; an odd edge counts twice."""
     even = np.pad(frames, [(0, 0), *((0, size % 2) for size in frames.shape[1:])], mode="edge")
     count, rows, columns = even.shape
     mean = even.reshape(count, rows // 2, 2, columns // 2, 2).mean(axis=(2, 4), dtype=np.float64)
@@ -89,7 +89,7 @@ def halved(frames: NDArray[Any]) -> NDArray[Any]:
 
 @dataclass(slots=True)
 class Window:
-    """What a viewer shows as black and white, from some voxels of every stretch of frames."""
+    """Black and white levels for viewers, from some voxels of every range of frames."""
 
     low: float = math.inf
     high: float = -math.inf
@@ -97,7 +97,7 @@ class Window:
     _every: int = 1
 
     def add(self, frames: NDArray[Any]) -> None:
-        """Look at frames; memory stays bounded, however many come."""
+        """Take frames into account; memory stays bounded, however many come."""
         finite = frames[np.isfinite(frames)] if frames.dtype.kind == "f" else frames.reshape(-1)
         if not finite.size:
             return
@@ -108,7 +108,7 @@ class Window:
             self._kept = [np.concatenate(self._kept)[::2]]
 
     def to_omero(self, name: str, first_frame: int) -> dict[str, Any]:
-        """For the attribute ``omero``; ``first_frame`` is what is shown first."""
+        """Return the attribute ``omero``; ``first_frame`` is shown first."""
         values = np.concatenate(self._kept) if self._kept else np.zeros(1)
         start, end = (float(each) for each in np.quantile(values, (LOW, HIGH)))
         low, high = (self.low, self.high) if self._kept else (0.0, 1.0)
@@ -128,26 +128,23 @@ class Window:
 def ome_attributes(
     name: str, grid: VideoGrid, levels: int, window: Window, first_frame: int
 ) -> dict[str, Any]:
-    """The attribute ``ome``."""
+    """Return the attribute ``ome``."""
     space = {"type": "space"} | ({"unit": grid.pixel_unit} if grid.pixel_unit else {})
     axes = [{"name": "t", "type": "time", "unit": "second"}, {"name": "y", **space}, {"name": "x", **space}]
-    datasets = [
-        {"path": str(number), "coordinateTransformations": _transformations(grid.level(number))}
-        for number in range(levels)
-    ]
+    datasets = []
+    for number in range(levels):
+        level = grid.level(number)
+        transformations = [
+            {"type": "scale", "scale": list(level.step)},
+            {"type": "translation", "translation": list(level.origin)},
+        ]
+        datasets.append({"path": str(number), "coordinateTransformations": transformations})
     multiscale = {"name": name, "axes": axes, "datasets": datasets} | ({"type": "mean"} if levels > 1 else {})
     return {"version": "0.5", "multiscales": [multiscale], "omero": window.to_omero(name, first_frame)}
 
 
-def _transformations(grid: VideoGrid) -> list[dict[str, Any]]:
-    return [
-        {"type": "scale", "scale": list(grid.step)},
-        {"type": "translation", "translation": list(grid.origin)},
-    ]
-
-
 def coordinate_attributes(axis: str, grid: VideoGrid) -> dict[str, Any]:
-    """Of the coordinates of an axis t, y or x."""
+    """Return the attributes of the coordinates of an axis t, y or x."""
     if axis == "t":
         return {"long_name": "begin of the frame, since the recording's first line", "units": "s"}
     unit = {"units": grid.pixel_unit} if grid.pixel_unit else {}
@@ -155,11 +152,11 @@ def coordinate_attributes(axis: str, grid: VideoGrid) -> dict[str, Any]:
 
 
 def along(axis: str, grid: VideoGrid, count: int) -> NDArray[np.float64]:
-    """Coordinates of pixels along y or x."""
+    """Return the coordinates of pixels along y or x."""
     number = "tyx".index(axis)
     return np.float64(grid.origin[number]) + grid.step[number] * np.arange(count, dtype=np.float64)
 
 
 def coordinates_of(columns: Sequence[str]) -> str:
-    """What xarray takes as coordinates of the image, beside those of its axes."""
+    """Return the names that xarray takes as coordinates of the image, in addition to its axes."""
     return " ".join(name for name in columns if name not in {"t", "y", "x", "error"})

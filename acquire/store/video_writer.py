@@ -1,4 +1,4 @@
-"""Writes a video as its frames come, for videos longer than memory."""
+"""Writer of a video whose frames come one after the other, for videos longer than memory."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ if TYPE_CHECKING:
 CHUNK_BYTES = 4 * 2**20
 
 COLUMN_CHUNK = 65536
-"""Values of a column in a chunk."""
+"""Number of values in a column's chunk."""
 
 
 class VideoWriter:
-    """A video that grows: beside its name until `finish`, and then whole at its name.
+    """A growing video: under a temporary name until `finish`, then whole under its own.
 
-    Leaving the ``with`` block without `finish` leaves nothing. One thread at a time.
+    Leaving the ``with`` block without `finish` leaves nothing behind. One thread at a time.
     """
 
     def __init__(
@@ -46,8 +46,11 @@ class VideoWriter:
         tile_side: int | None = None,
         fill_value: float = 0,
     ) -> None:
-        """``regions``: along rows and columns, whose estimated error comes with ``quality``. ``tile_side``:
-        rows and columns of a chunk; absent: those of a frame. ``fill_value``: of voxels that are not written.
+        """Create the video.
+
+        ``regions``: number of regions with an estimated error along rows and columns; requires ``quality``.
+        ``tile_side``: rows and columns of a chunk; None: those of a frame. ``fill_value``: value of voxels
+        that are not written.
         """
         import zarr
 
@@ -91,9 +94,9 @@ class VideoWriter:
         quality: NDArray[np.float32] | None = None,
         error: NDArray[np.float32] | None = None,
     ) -> None:
-        """The next frames (t, y, x), with quality (t,) and error (t, region_y, region_x) where it has these.
+        """Append frames (t, y, x), with quality (t,) and error (t, region_y, region_x) if the video has them.
 
-        Whole chunks go to the disk; StoreError when it refuses.
+        Whole chunks go to the disk. Raises StoreError if it refuses.
         """
         if not self.frames and len(time_ns):
             self._begin_ns = int(time_ns[0])
@@ -106,9 +109,9 @@ class VideoWriter:
             self._flush(whole_chunks=True)
 
     def finish(self, provenance: Mapping[str, Any]) -> None:
-        """The video appears under its name. UsageError for one without frames.
+        """Make the video appear under its name. Raises UsageError if it has no frame.
 
-        ``provenance["trusted"]``, first frame and the one after the last, marks the frames.
+        ``provenance["trusted"]``, first frame and the one after the last, marks the trusted frames.
         """
         if not self.frames:
             raise UsageError(f"{self._place}: the video has no frame")
@@ -117,7 +120,7 @@ class VideoWriter:
         self._end(provenance)
 
     def _end(self, provenance: Mapping[str, Any]) -> None:
-        """All frames are there: mark them, say what the video is, and show it."""
+        """Mark the trusted frames, write the metadata, and deliver the video."""
         first, end = provenance.get("trusted") or (0, 0)
         with refused(self._place, "written"):
             if "trusted" in provenance:
@@ -130,7 +133,7 @@ class VideoWriter:
         self._delivery.deliver()
 
     def _publish(self, provenance: Mapping[str, Any], first_frame: int) -> None:
-        """Consolidated by hand: the columns are not listed, and zarr-python would warn."""
+        # Consolidated by hand, since the columns are not to be listed, and zarr-python would warn.
         self._levels[0].update_attributes({"coordinates": layout.coordinates_of(tuple(self._columns))})
         count = len(self._levels)
         ome = layout.ome_attributes(self._name, self._grid, count, self._window, first_frame)
@@ -162,7 +165,7 @@ class VideoWriter:
 
 
 def check_provenance(provenance: Mapping[str, Any]) -> None:
-    """UsageError for what is not JSON."""
+    """Raise UsageError unless the provenance is JSON."""
     try:
         json.dumps(dict(provenance), allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -197,7 +200,7 @@ def _image(
     dtype: np.dtype[Any],
     fill_value: float,
 ) -> zarr.Array[Any]:
-    """A level of frames of a shape; all levels have as many frames in a chunk."""
+    """Create a level with frames of a shape; chunks of all levels have equally many frames."""
     return group.create_array(
         name,
         shape=(0, *shape),
@@ -235,7 +238,7 @@ def _of_regions(group: zarr.Group, regions: tuple[int, int]) -> zarr.Array[Any]:
 
 
 def _whole(group: zarr.Group, name: str, values: NDArray[Any], axis: str, grid: layout.VideoGrid) -> None:
-    """Coordinates of an axis, all at once."""
+    """Create the coordinates of an axis, all at once."""
     array = group.create_array(
         name,
         shape=values.shape,

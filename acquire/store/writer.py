@@ -1,4 +1,4 @@
-"""The writer of a recording. What it has acknowledged can be read, whatever happens to its process.
+"""The writer of a recording. Lines that it has acknowledged can be read, whatever happens to its process.
 
 The order of a commit, each step complete before the next begins::
 
@@ -6,8 +6,8 @@ The order of a commit, each step complete before the next begins::
            → root zarr.json with the metadata of everything: the commit record
 
 A reader that starts at the root therefore sees one consistent, slightly older recording; no length ever
-covers a line that is not on disk, in both arms. What arrays and groups of lines say of themselves, for those
-who open one by itself, is renewed once a second only: at ten commits a second it cost more than the lines.
+covers a line that is not on disk, in both arms. The metadata of arrays and groups, for readers that open one
+of them directly, are rewritten only once a second: at ten commits a second they cost more than the lines.
 """
 
 from __future__ import annotations
@@ -48,27 +48,27 @@ if TYPE_CHECKING:
     from acquire.store.spec import RecordingSpec
 
 OWN_INTERVAL_S = 1.0
-"""How much older than the root the metadata of a group or an array opened by itself may be."""
+"""How much older than the root the own metadata of a group or an array may be."""
 
 RESERVE_BYTES = 2**20
-"""Kept free for the metadata of the end: more than the tables and the root take."""
+"""Bytes kept free for the metadata of the end: more than the tables and the root take."""
 
 
 class RecordingWriter:
     """Writes one recording; one thread at a time.
 
-    Lines go to disk in whole chunks of ``spec.chunk_lines``. Lines of the last chunk that is not whole yet
-    are held in memory and become readable at `seal` only: ``kill -9`` can lose them, but nothing that
-    `committed_lines` has acknowledged. (With ``fsync="seal"`` a power failure can; with ``"commit"`` it
-    cannot, for a reader that starts at the root.) What can be lost is bounded, see `spec.Durability`: the
-    writer commits on its own when as many lines wait for it as the specification allows.
+    Lines go to disk in whole chunks of ``spec.chunk_lines``. Lines of the last, incomplete chunk are held in
+    memory and become readable at `seal` only: ``kill -9`` can lose them, but no line acknowledged by
+    `committed_lines`. (With ``fsync="seal"`` a power failure can; with ``"commit"`` it cannot, for a reader
+    that starts at the root.) The possible loss is bounded, see `spec.Durability`: the writer commits on its
+    own when as many lines wait for a commit as the specification allows.
 
-    A row is committed when both arms have it. An arm that runs ahead is written but not visible; how far
-    it may run is the caller's to bound.
+    A row is committed when both arms have it. Lines of an arm that is ahead are written but not visible; the
+    caller limits how far it may be ahead.
 
     After a disk error the writer takes no more lines; `seal` then ends the recording with the whole chunks
-    that are on disk (a little room is kept for that on a disk that is full), and `close` leaves it as the
-    last commit made it.
+    that are on disk (a little room is reserved for that, should the disk be full), and `close` leaves it as
+    of the last commit.
     """
 
     def __init__(self, path: Path, spec: RecordingSpec, disk: Disk) -> None:
@@ -81,14 +81,14 @@ class RecordingWriter:
         if threads:
             keep_freed_memory()
         self._pool = ThreadPoolExecutor(threads, "encoder") if threads else None
-        # One thread for both arms: a disk takes one large write after the other as fast as two at once.
+        # One thread for both arms: a disk takes large writes one after the other as fast as two at once.
         self._behind = ThreadPoolExecutor(1, "disk")
         once = {name: EncodeOnce() for name in layout.SAME_IN_BOTH_ARMS}
         self._arms = {arm: ArmWriter(path / arm, spec, disk, self._pool, once) for arm in ARMS}
         self._gaps = gap_table(path)
         self._events = event_table(path)
         self._tables = (self._gaps, self._events)
-        # No Zarr reader lists what is inside an array's directory.
+        # Zarr readers do not list the contents of an array's directory.
         hidden = path / ARMS[0] / "lines"
         self._publisher = Publisher(hidden / SCRATCH, disk)
         self._reserve = hidden / RESERVE
@@ -105,20 +105,20 @@ class RecordingWriter:
 
     @classmethod
     def create(cls, path: Path, spec: RecordingSpec, disk: Disk = DISK) -> RecordingWriter:
-        """A new, empty recording at ``path``, from line ``spec.first_line`` on: `prepare`, then `begin`."""
+        """Create an empty recording at ``path`` from line ``spec.first_line`` on: `prepare`, then `begin`."""
         writer = cls.prepare(path, spec, disk)
         writer.begin(spec.first_line)
         return writer
 
     @classmethod
     def prepare(cls, path: Path, spec: RecordingSpec, disk: Disk = DISK) -> RecordingWriter:
-        """Do all that takes time; ``path`` becomes a recording, and takes lines, once `begin` was called.
+        """Do everything that takes time; `begin` then makes ``path`` a recording that takes lines.
 
-        Raises UsageError when ``path`` exists or cannot be created, before anything is touched, and
-        StoreError when the disk refuses; then nothing is left behind.
+        Raises UsageError if ``path`` exists or cannot be created, before anything is changed, and StoreError
+        if the disk refuses; then nothing is left behind.
         """
         check_new_path(path)
-        # Made by us, or refused: of two recorders that are given one name, one is.
+        # Created here or refused, so that of two recorders with the same path one is refused.
         try:
             disk.make_directory(path)
         except FileExistsError as error:  # somebody was faster
@@ -139,7 +139,7 @@ class RecordingWriter:
     def begin(self, first_line: int) -> None:
         """Make it a recording whose row 0 is line ``first_line``; takes as long as a commit.
 
-        Raises StoreError when the disk refuses; then nothing is left behind.
+        Raises StoreError if the disk refuses; then nothing is left behind.
         """
         self.spec = replace(self.spec, first_line=first_line)
         for arm in self._arms.values():
@@ -150,7 +150,7 @@ class RecordingWriter:
         try:
             with self._failing("creating the recording", StoreError):
                 self._publish_copy()
-                self._publish_root(0, self._publish_parts(0, own=False))  # `prepare` did all that takes time
+                self._publish_root(0, self._publish_parts(0, own=False))  # `prepare` did the slow part
                 if self.spec.continues is not None and self.spec.continues.listed:
                     list_segment(self.path, self.spec.continues, self._disk)
         except AcquireError:
@@ -158,7 +158,7 @@ class RecordingWriter:
             raise
 
     def abandon(self) -> None:
-        """Give up what was prepared, before `begin`: nothing is left behind."""
+        """Give up the preparations, before `begin`: nothing is left behind."""
         self.close()
         remove(self._disk, self.path, Unborn(self._committed))
 
@@ -182,7 +182,7 @@ class RecordingWriter:
         self.close()
 
     def next_line(self, arm: str) -> int:
-        """Number of the line that the next block of ``arm`` must begin with."""
+        """Return the line with which the next block of ``arm`` must begin."""
         return self._arms[arm].next_line
 
     @property
@@ -198,15 +198,15 @@ class RecordingWriter:
     def append(self, block: TaggedBlock) -> None:
         """Take the next lines of one arm; its arrays may be reused afterwards.
 
-        Raises DataError unless the block begins with the next line of its arm, and when the disk fails.
+        Raises DataError if the block does not begin with the next line of its arm, or the disk fails.
         """
         self._append(block, None)
 
     def lend(self, block: TaggedBlock) -> None:
-        """`append` that goes on while the lines are on their way to the disk: it can be the other arm's turn.
+        """Append while the lines are still on their way to the disk, so that the other arm can be served.
 
-        The block's arrays stay as they are until `give_back`, which may be told that the disk failed; until
-        then ``kill -9`` loses its lines as well.
+        The block's arrays must not change until `give_back`, which raises an error of the disk; until then
+        ``kill -9`` loses its lines as well.
         """
         self._append(block, self._behind)
 
@@ -221,11 +221,11 @@ class RecordingWriter:
 
     @property
     def packs(self) -> bool:
-        """Lines are packed, by threads beside the caller: what is lent to them need not be copied."""
+        """Whether lines are packed, in other threads: lent lines need not be copied."""
         return self._pool is not None
 
     def give_back(self, arm: str) -> None:
-        """Wait until the arrays that the arm has lent may be reused. DataError: the disk failed."""
+        """Wait until the arrays that the arm has lent may be reused. Raises DataError if the disk failed."""
         with self._failing(f"writing lines of arm {arm}"):
             self._arms[arm].give_back()
 
@@ -242,7 +242,7 @@ class RecordingWriter:
         self._gaps.add({"first_line": first_line, "count": count, "cause": cause, "arm": ARMS.index(arm)})
 
     def add_event(self, kind: str, tick: int, line: int, text: str = "") -> None:
-        """Note what happened when, on the trigger's clock; visible at the next commit."""
+        """List an event on the trigger's clock; visible at the next commit."""
         if tick < 0 or line < 0:
             raise UsageError(f"event {kind!r} cannot be at tick {tick}, line {line}", possible="0 or more")
         self._events.add({"tick": tick, "line": line, "kind": kind, "text": text})
@@ -252,16 +252,16 @@ class RecordingWriter:
     def commit(self) -> None:
         """Make every row that both arms have in whole chunks visible, and all gaps and events.
 
-        Cheap when there is nothing new. Raises DataError when the disk fails: `committed_lines` is then
-        what it was.
+        Cheap if there is nothing new. Raises DataError if the disk fails; `committed_lines` is then
+        unchanged.
         """
         self._check_alive()
         with self._failing("committing"):
             for arm in self._arms.values():
-                # Rows count once they are on disk, so what is on its way is waited for.
+                # Rows count once they are on disk, so wait for those on their way.
                 arm.settle()
             rows = self._whole_rows()
-            room = self._watch.look(self.bytes_written)  # others fill the disk, too, while nothing comes
+            room = self._watch.look(self.bytes_written)  # always: others may fill the disk in the meantime
             if rows == self._committed and not any(table.dirty for table in self._tables):
                 return
             if self._durable:
@@ -273,24 +273,24 @@ class RecordingWriter:
 
     @property
     def room(self) -> Room:
-        """What the disk could still take at the latest commit, and for how long."""
+        """The disk's room at the latest commit, and for how long it lasts."""
         return self._watch.room
 
     @property
     def nearly_full(self) -> str | None:
-        """Why the recording should be sealed now, while there is room for that; None: it need not.
+        """Reason to seal the recording now, while there is room for that, or None.
 
-        With retention the oldest lines go first, and this is said only when nothing is left that may go.
+        With retention the oldest lines are dropped first: there is a reason only when none are left to drop.
         """
         if not self._stuck:
             return None
         return f"disk nearly full: {self.spec.reserve_bytes} bytes are kept free"
 
     def seal(self, condition: RunCondition, end_reason: str, ledger: dict[str, Any]) -> None:
-        """Write the lines that wait, pad their chunk with 0, end the recording, and force it to the medium.
+        """Write the waiting lines, pad their chunk with 0, end the recording, and force it to the medium.
 
-        The recording ends with the last line that both arms have; what else was appended is counted in
-        ``ledger["store"]``. Raises DataError when the disk fails; a second call then seals what is there.
+        The recording ends with the last line that both arms have; further lines are counted in
+        ``ledger["store"]``. Raises DataError if the disk fails; a second call then seals what is on disk.
         """
         self._check_open()
         try:
@@ -298,11 +298,16 @@ class RecordingWriter:
         except (TypeError, ValueError) as error:
             raise UsageError(f"the ledger of a recording is not JSON: {error}") from error
         with self._failing("sealing"):
-            rows = self._rescue() if self._failure else self._pad()
+            if self._failure:
+                rows = self._rescue()
+            else:
+                rows = min(arm.next_line for arm in self._arms.values()) - self.spec.first_line
+                for arm in self._arms.values():
+                    arm.pad()
             self._disk.remove(self._reserve)
-            self._disk.sync_tree(self.path)  # the lines, before what tells of them
+            self._disk.sync_tree(self.path)  # lines before their metadata
             nodes = self._publish_parts(rows, own=True) | self._publish_overview(rows)
-            self._disk.sync_tree(self.path)  # and that, before the root
+            self._disk.sync_tree(self.path)  # metadata before the root
             ending = Ending(condition, end_reason, {**ledger, "store": self._ledger(rows)})
             self._publish_copy(ending)
             self._publish_root(rows, nodes, ending)
@@ -312,9 +317,9 @@ class RecordingWriter:
         self.close()
 
     def rescue(self) -> int:
-        """Rows that `seal` will end with: all that both arms have, or, after a disk error, what is on disk.
+        """Return the rows that `seal` will keep: those of both arms, or, after a disk error, those on disk.
 
-        Raises DataError when the disk fails once more.
+        Raises DataError if the disk fails once more.
         """
         self._check_open()
         if not self._failure:
@@ -323,7 +328,7 @@ class RecordingWriter:
             return self._rescue()
 
     def close(self) -> None:
-        """Close all files; what was not committed is dropped. Idempotent."""
+        """Close all files; uncommitted lines are dropped. Idempotent."""
         self._closed = True
         for threads in (self._pool, self._behind):
             if threads is not None:
@@ -331,7 +336,7 @@ class RecordingWriter:
         with self._failing("closing files"):
             for arm in self._arms.values():
                 arm.close()
-            # The lock last: whoever gets it may recover the recording, which nobody may write any more then.
+            # The lock last: whoever gets it may recover the recording, which must not be written any more.
             if self._lock >= 0:
                 held, self._lock = self._lock, -1
                 os.close(held)
@@ -344,21 +349,15 @@ class RecordingWriter:
         return min(arm.whole_rows for arm in self._arms.values())
 
     def _rescue(self) -> int:
-        """After a failure: the rows that are whole."""
+        """Return the rows that are whole on disk, after a failure."""
         for arm in self._arms.values():
             arm.publish_chunks()
         return self._whole_rows()
 
-    def _pad(self) -> int:
-        rows = min(arm.next_line for arm in self._arms.values()) - self.spec.first_line
-        for arm in self._arms.values():
-            arm.pad()
-        return rows
-
     def _publish_parts(self, rows: int, *, own: bool) -> dict[str, layout.Document]:
-        """Replace all metadata but the root's; returns it by path below the recording.
+        """Replace all metadata except the root's; return it by path below the recording.
 
-        Without ``own``, that of the arms is returned only.
+        Without ``own``, the arms' metadata are returned only, and not written.
         """
         nodes: dict[str, layout.Document] = {}
         for arm in self._arms.values():
@@ -369,7 +368,7 @@ class RecordingWriter:
         return nodes
 
     def _publish_overview(self, rows: int) -> dict[str, layout.Document]:
-        """Write the overview; a recording is whole without one."""
+        """Write the overview, if possible: a recording is complete without one."""
         try:
             return write_overview(self._publisher, self.path, self._overview, self.spec, rows)
         except (OSError, MemoryError) as error:
@@ -378,7 +377,7 @@ class RecordingWriter:
             return {}
 
     def _publish_kept(self, rows: int, nodes: dict[str, layout.Document], room: Room) -> None:
-        """The commit, without the lines that retention drops; their files are deleted once it is told."""
+        """Commit without the lines that retention drops, then delete their files."""
         looked, self._looked = self._looked is not room, room
         going = self._keeper.choose(rows, -room.free_bytes if looked else 0) if self._keeper else []
         if looked:
@@ -386,21 +385,21 @@ class RecordingWriter:
         if going:
             self._publish_copy()
         self._publish_root(rows, nodes)
-        # What could not be deleted, or was claimed by a hold in the meantime, is told of again.
+        # Shards that could not be deleted, or were held in the meantime, are listed again.
         if self._keeper and self._keeper.delete(going):
             self._publish_root(rows, nodes)
 
     def _publish_root(
         self, rows: int, nodes: dict[str, layout.Document], ending: Ending | None = None
     ) -> None:
-        """The commit itself."""
+        """Replace the root, which is the commit itself."""
         root = layout.group_document(self._attributes(ending), nodes)
         durable = self._durable or ending is not None
         self._publisher.replace(self.path / "zarr.json", layout.to_json(root), durable=durable)
         self._committed = rows
 
     def _publish_copy(self, ending: Ending | None = None) -> None:
-        """What the root says, for the case that it is lost; always before the root itself."""
+        """Write the copy of the root's attributes, in case the root is lost; always before the root."""
         durable = self._durable or ending is not None
         write_copy(self._publisher, self.path, self._attributes(ending), durable=durable)
 
@@ -437,9 +436,9 @@ class RecordingWriter:
 
     @contextmanager
     def _failing(self, doing: str, kind: type[AcquireError] = DataError) -> Iterator[None]:
-        """Turn what the disk refuses into a ``kind``, and remember it: nothing after it is acknowledged.
+        """Turn an OSError into a ``kind``, and remember it: nothing after it is acknowledged.
 
-        As long as there is no line that could be lost, that is a StoreError.
+        ``kind`` is StoreError as long as there is no line that could be lost.
         """
         try:
             yield

@@ -9,12 +9,13 @@
                     └── events ─────────────┘     (check of the code, thresholds)
 
 Grabbers, recorder and watcher are processes, the supervisor is a thread; `Capture` owns them all. Rings are
-shared memory: nothing between a camera's buffer and the recorder's is sent, and no camera waits for a reader.
+shared memory: no pixel is sent between a camera's buffer and the recorder, and no camera waits for a reader.
 
-`losses` causes · `ring` · `observer` of a ring · `messages` · `grabber` · `tagger` · `window` of lines around
-an event · `session` one recording · `recorder` and its `recorder_states` · `lightcheck`, `threshold`,
-`watcher` · `external_counts` of trigger, cameras and watcher · `ledger` of every pulse · `plan` ·
-`succession` of what was killed · `lifecycle` of a recording · `supervisor` · `capture`
+`losses` and their causes · `ring` · `observer` of a ring · `messages` between the processes · `grabber` ·
+`tagger` · `window` of lines around an event · `session` (one recording) · `recorder` and its
+`recorder_states` · `lightcheck`, `threshold`, `watcher` · `external_counts` of trigger, cameras and watcher ·
+`ledger` of every pulse · `plan` · `succession` of killed processes · `lifecycle` of a recording ·
+`supervisor` · `capture`
 """
 
 from acquire.stream.capture import Capture

@@ -1,11 +1,11 @@
-"""The owner of one armed run: its processes, one thread, and the order in which they begin and end.
+"""The owner of one armed run: its processes, its thread, and the order in which they start and end.
 
 ::
 
     arm     memory → recorder, grabbers → cameras armed → trigger → tags flow
     close   recording → tags → trigger → grabbers → recorder → memory
 
-Whatever fails first is what is told. A capture is used once: armed, and closed.
+The first failure is the one reported. A capture is used once: armed, then closed.
 """
 
 from __future__ import annotations
@@ -43,18 +43,18 @@ if TYPE_CHECKING:
     from acquire.trigger.base import Trigger
 
 _TAG_RING = RingShape(slots=64, rows=256, width=3, dtype="uint64")
-TOLD_S = 1.0
-"""What is waited for longer than this is told."""
+REPORTED_S = 1.0
+"""Waits longer than this are reported in the status."""
 _UNDO_S = 5.0
 _LEAST_END_S = 5.0
-"""For the processes, even when the time is up: one that is killed leaves its camera running."""
+"""Least time for the processes to end, even when time is up: a killed grabber leaves its camera running."""
 
 
 class Capture:
     """One armed run of the capture path.
 
     `start`, `stop` and `close` are for one thread at a time; `poll` may be called by any and never waits.
-    The trigger stays its giver's: it is started and stopped here, not closed.
+    The caller keeps ownership of the trigger, which is started and stopped here, but not closed.
 
     Attributes
     ----------
@@ -81,7 +81,7 @@ class Capture:
         self._used = self._closed = self._emptied = False
 
     def arm(self, timeout_s: float = 120.0, tell: Callable[[str], object] = lambda _: None) -> None:
-        """Start everything; lines flow and are discarded. ``tell`` is called with what is being waited for.
+        """Start everything; lines flow and are discarded. ``tell`` is called with each step being waited for.
 
         On failure everything is undone and the first error raised: the camera's or trigger's own, or
         DeviceError for a process that dies, or does not answer within ``timeout_s`` of the one before it.
@@ -99,10 +99,10 @@ class Capture:
             raise
 
     def start(self, begin: Begin) -> None:
-        """Record; returns once the recording exists.
+        """Begin a recording; return once it exists.
 
-        Raises UsageError or DataError when it cannot be made, or when the rings do not hold what the window
-        asks for; nothing has changed then.
+        Raises UsageError or DataError if it cannot be created, or if the rings do not hold the window's
+        lines; nothing has changed then.
         """
         supervisor = self._running("start")
         if supervisor.fault:
@@ -112,50 +112,50 @@ class Capture:
         supervisor.begin(begin)
 
     def note(self, kind: str, text: str, line: int | None = None) -> int:
-        """Something happens at ``line``, or at the newest: listed in every recording that holds the line.
+        """List an event at ``line``, or at the newest one, in every recording that holds the line.
 
-        Returns the line. A recording that begins later can still hold it: see `Window`.
+        Return the line. A recording that begins later can still hold it: see `Window`.
         """
         supervisor = self._running("note")
         if line is None:
             line = max(ring.newest_line for ring in self._rings.values())
-        supervisor.tell(Note(line, kind, text))
+        supervisor.send(Note(line, kind, text))
         return line
 
     def take_events(self) -> list[Note]:
-        """What the trigger's inputs and the lines have told since the last call; marks are not among it."""
+        """Return the events of the trigger's inputs and of the lines since the last call, without marks."""
         return self._running("take_events").take_events()
 
     def extend(self, line: int) -> None:
-        """Let the recording under way not end before ``line``, unless it is ending already."""
+        """Do not let the current recording end before ``line``, unless it is ending already."""
         self._running("extend").extend(line)
 
     def stop(self, reason: str = "stopped") -> None:
-        """End the recording at the newest line; `poll` tells when it is sealed. Idempotent."""
+        """End the recording at the newest line; `poll` reports when it is sealed. Idempotent."""
         newest_line = max((ring.newest_line for ring in self._rings.values()), default=0)
         self._running("stop").end_recording(reason, newest_line)
 
     def poll(self) -> CaptureStatus:
-        """What is seen at this moment; after `close`, what was seen last."""
+        """Return the current status; after `close`, the final one."""
         with self._memory:
             if self._final is not None:
                 return self._final
-            return self._look(self._supervisor) if self._supervisor else CaptureStatus()
+            return self._status(self._supervisor) if self._supervisor else CaptureStatus()
 
     def ring_places(self) -> dict[str, tuple[str, RingShape]]:
-        """Arm → path and shape of its ring, for observers that nobody starts from here; empty once closed."""
+        """Return, per arm, its ring's path and shape, for observers in other processes; empty once closed."""
         return {} if self._closed else {arm: (ring.path, ring.shape) for arm, ring in self._rings.items()}
 
     @property
     def pids(self) -> dict[str, int | None]:
-        """Process numbers: of the recorder, and of each grabber."""
+        """Process numbers of the recorder and of each grabber."""
         return {name: worker.pid for name, worker in self._workers.items()}
 
     def close(self, timeout_s: float = END_S) -> None:
-        """End everything, in the module's order; a recording under way is sealed as interrupted. Idempotent.
+        """End everything, in the module's order; a current recording is sealed as interrupted. Idempotent.
 
-        What has not ended in ``timeout_s`` is killed; a recorder that still writes what the rings hold is
-        given that, or the plan's ``seal_timeout_s``, again from its latest commit on. Raises the first error.
+        Processes that have not ended in ``timeout_s`` are killed. Sealing may take that time, or the plan's
+        ``seal_timeout_s`` if shorter, again after each commit. Raises the first error.
         """
         if self._closed:
             return
@@ -175,7 +175,7 @@ class Capture:
     def _begin(self, timeout_s: float, tell: Callable[[str], object]) -> None:
         tell("memory for the rings")
         self._make_memory()
-        # None is waited for before all are on their way: a camera takes seconds to open.
+        # Start all before waiting for any: a camera takes seconds to open.
         self._workers[RECORDER] = self._new_recorder()
         if self._plan.watch is not None:
             self._workers[WATCHER] = self._new_watcher()
@@ -188,8 +188,8 @@ class Capture:
             facts |= dict.fromkeys(cameras, worker.expect(Ready, time.monotonic() + timeout_s).facts)
         self.cameras = facts
         tell("trigger")
-        self._trigger_used = True  # from now on it has to be stopped, whatever `prepare` comes to
-        # The trigger is last: both cameras wait for it by now, and count from its first pulse.
+        self._trigger_used = True  # from now on it has to be stopped, even if `prepare` fails
+        # The trigger starts last: both cameras wait for it by now, and count from its first pulse.
         self._trigger.prepare(self._plan.run)
         self.clock = self._trigger.start()
         self._workers[RECORDER].post(RunStarted(self.clock))
@@ -241,7 +241,7 @@ class Capture:
 
     def _new_watcher(self) -> Worker:
         counters = self._counters[WATCHER]
-        # A successor finds the counters as its forerunner left them, and has not judged anything yet.
+        # A successor finds its predecessor's counters, and has not judged anything yet.
         for arm in ARMS:
             counters[f"verdict_{arm}"] = 0
         return Worker(WATCHER, watcher.watch, self._plan.watch, self._rings, counters)
@@ -265,10 +265,10 @@ class Capture:
         return Worker(f"grabber {name}", grabber.grab, *tasks)
 
     def _next_recorder(self) -> Worker:
-        """What the one before had released and not counted was stored: see `Session.take`."""
+        """Return a successor. Lines that the dead recorder had released, but not counted, count as stored."""
         counters = self._counters[RECORDER]
-        # The ring's own count is exact at any instant. The dead recorder may have counted a block that it did
-        # not live to release: this one takes it, and counts it, again.
+        # The ring's own count is exact at any instant. A block that the dead recorder counted, but did not
+        # live to release, is taken and counted again by its successor.
         for arm, ring in self._rings.items():
             others = counters[f"discarded_{arm}"] + counters[f"unsaved_{arm}"]
             counters[f"stored_{arm}"] = ring.released_lines - others
@@ -279,7 +279,7 @@ class Capture:
         return worker
 
     def _next_grabber(self, name: str) -> Worker | None:
-        """Only a camera that tells time can be numbered again."""
+        """Return a successor, or None: without time stamps, a camera's lines cannot be numbered again."""
         arms = self._plan.grabbers[name]
         self._settle_books(arms)
         if not all(self._counters[arm]["stamp_ns"] for arm in arms):
@@ -291,9 +291,9 @@ class Capture:
             raise StateError(f"{command}: this capture is not armed", possible="arm, once")
         return self._supervisor
 
-    # ---- watch
+    # ---- status
 
-    def _look(self, supervisor: Supervisor) -> CaptureStatus:
+    def _status(self, supervisor: Supervisor) -> CaptureStatus:
         began, sealed, counters = supervisor.life.began, supervisor.life.sealed, self._counters[RECORDER]
         status = CaptureStatus(
             accounts={arm: self._account(arm, supervisor) for arm in ARMS},
@@ -327,13 +327,13 @@ class Capture:
         )
 
     def _waiting(self, supervisor: Supervisor) -> str:
-        """What takes longer than it should, and how long that can be borne."""
-        if supervisor.silent_s > TOLD_S:
+        """Return what takes longer than it should, and for how long the rings can make up for it."""
+        if supervisor.silent_s > REPORTED_S:
             who = "disk has not answered" if supervisor.waits_for_disk else "recorder has shown no life"
             room = f"; {self._room()}" if supervisor.recording else ""
             return f"the {who} for {supervisor.silent_s:.0f} s{room}"
         since_ns = self._counters[RECORDER]["store_since_ns"]
-        if since_ns and (store_s := time.monotonic() - since_ns / 1e9) > TOLD_S:
+        if since_ns and (store_s := time.monotonic() - since_ns / 1e9) > REPORTED_S:
             doing = recorder_states.MEANINGS[recorder_states.STATES[self._counters[RECORDER]["state"]]]
             return f"the disk has been at work for {store_s:.0f} s: {doing}"
         if why := supervisor.life.resumption.why:
@@ -341,12 +341,13 @@ class Capture:
         return ""
 
     def _room(self) -> str:
-        """How long the rings can still take what comes."""
+        """Return for how long the rings can still take lines."""
         rings, period_ns = self._rings.values(), self._plan.line_period_ns
         if any(ring.fill == ring.shape.slots for ring in rings):
-            return "the rings are full: what comes now belongs to no recording"
+            return "the rings are full: lines that come now belong to no recording"
         lines = min(ring.room_lines for ring in rings)
-        return f"the rings hold {lines * period_ns / 1e9:.0f} s more" if period_ns else f"{lines} lines more"
+        more = f"{lines * period_ns / 1e9:.0f} s" if period_ns else f"{lines} lines"
+        return f"the rings hold {more} more"
 
     def _ring_counts(self, arm: str) -> dict[str, int]:
         counts = asdict(self._rings[arm].statistics())
@@ -368,21 +369,22 @@ class Capture:
         }
 
     def _discarded(self, arm: str) -> int:
-        """Lines of no recording: a line that finds its ring full ends the recording before it."""
+        """Return the arm's lines in no recording."""
+        # A recording ends before lines that found their ring full, unless they are a gap in it.
         recorded = self._counters[RECORDER]
         dropped = self._rings[arm].statistics().dropped_lines - recorded[f"overrun_{arm}"]
         return recorded[f"discarded_{arm}"] + self._left_over[arm] + dropped
 
     def _account(self, arm: str, supervisor: Supervisor) -> ArmLedger:
-        """Counts are read against the way of the lines (recorder, ring, grabber): they go on being counted
-        meanwhile, and read in this order a line can seem to wait, but never to come from nowhere.
-        """
+        """Return the arm's ledger."""
+        # The counts advance while they are read. They are read against the flow of the lines (recorder, ring,
+        # grabber), so that a line may appear to be waiting, but never to come from nowhere.
         recorded, ring, began = self._counters[RECORDER], self._rings[arm], supervisor.life.began
         stored, discarded = recorded[f"stored_{arm}"], self._discarded(arm)
         lost = self._lost(arm)
         next_line = max(self._counters[arm]["next_line"], ring.newest_line)
         depth = self._plan.depth_lines
-        # Before the first line, the counter's 0 is the number of none.
+        # Before the first line, the counter's 0 is no line number.
         next_line = next_line if self._counters[arm]["delivered"] else -depth
         known = max(supervisor.pulses, self._counters[TRIGGER]["pulses"], next_line + depth)
         counted = Counted(
@@ -425,8 +427,8 @@ class Capture:
         if supervisor is None or not supervisor.recording:
             return
         supervisor.interrupt_recording("the capture was closed")
-        # A recorder may have seconds of lines in the rings to write yet: it is given up only when a whole
-        # timeout has passed without a commit.
+        # The recorder may still have to write seconds of lines from the rings: it is given up only when a
+        # whole timeout has passed without a commit.
         committed = self._counters[RECORDER]["committed"]
         while not supervisor.wait_sealed(time.monotonic() + timeout_s):
             if committed == (committed := self._counters[RECORDER]["committed"]):
@@ -447,7 +449,7 @@ class Capture:
             deadlines[RECORDER] = least  # it has had its time to seal
         for worker in self._workers.values():
             worker.post(Quit())
-        # All are told first and then waited for, so that they end side by side. The recorder comes last: it
+        # All get Quit before any is waited for, so that they end in parallel. The recorder comes last: it
         # empties the rings that the grabbers fill.
         order = sorted(self._workers, key=RECORDER.__eq__)
         _run_all(*(partial(self._workers[name].end, deadlines[name]) for name in order))
@@ -457,9 +459,7 @@ class Capture:
             grabber.settle_books(self._rings[arm], self._counters[arm])
 
     def _empty_rings(self) -> None:
-        """Nobody will take what the last of the grabbers left, or what a recording was to begin with: that
-        may be in another one.
-        """
+        """Account for the blocks that no recorder will take; another recording may have some of them."""
         for name in self._supervisor.dead if self._supervisor else ():
             self._settle_books(self._plan.grabbers.get(name, ()))
         for arm, ring in self._rings.items():
@@ -473,9 +473,9 @@ class Capture:
     def _end_memory(self) -> None:
         if self._supervisor is not None:
             self._supervisor.mark_unsealed()
-        # Under the lock that `poll` takes, from another thread: it must not read memory that is unmapped.
+        # Under the lock of `poll`, which must not read unmapped memory from another thread.
         with self._memory:
-            self._final = self._look(self._supervisor) if self._supervisor else CaptureStatus()
+            self._final = self._status(self._supervisor) if self._supervisor else CaptureStatus()
             for counters in self._counters.values():
                 counters.close()
             for lines in self._rings.values():
@@ -486,7 +486,7 @@ class Capture:
 
 
 def _run_all(*steps: Callable[[], None]) -> None:
-    """Take every step, whatever the ones before did; then raise the first error."""
+    """Take every step, even if earlier ones fail; then raise the first error."""
     first: AcquireError | OSError | None = None
     for step in steps:
         try:

@@ -1,6 +1,6 @@
-"""What others know about the lines of a recording: the trigger's and cameras' counts, the watcher's verdicts.
+"""Other parties' counts for a recording: the trigger's and cameras' counts, and the watcher's verdicts.
 
-Both are read from shared memory where they are needed; where there is no trigger to ask, or no watcher, there
+They are read from shared memory when they are needed; without a trigger to query, or without a watcher, there
 is nothing to doubt.
 """
 
@@ -23,14 +23,14 @@ TRIGGER_COUNTERS = (
     *("pulses", "tags", "tags_missing", "tags_repeated", "tags_wrong", "tag_lost"),
     *("strobe_a_missed", "strobe_a_unexpected", "strobe_b_missed", "strobe_b_unexpected"),
 )
-"""Of a trigger's statistics, those that the ledger needs: pulses issued; tags received, made but not
-received, dropped, lost in the device; strobes by which cameras answer pulses, missed or in excess."""
+"""The trigger's statistics that the ledger needs: pulses issued; tags received, missing, repeated, wrong, and
+lost in the device; the cameras' strobes in answer to pulses, missed or unexpected."""
 
 CAMERA_COUNTS = ("delivered", "preroll", "next_line", "reopened", *CAMERA_CAUSES)
 
 
 class ExternalCounts:
-    """See the module; ``others`` maps `TRIGGER`, `WATCHER` and the arms to what they count."""
+    """See the module; ``others`` maps `TRIGGER`, `WATCHER` and the arms to their counters."""
 
     def __init__(self, others: Mapping[str, Counters]) -> None:
         self._trigger = others.get(TRIGGER)
@@ -39,20 +39,21 @@ class ExternalCounts:
         self._begun: dict[str, int] = {}
 
     def begin(self) -> None:
-        """A recording begins: the trigger's counts of before are not its."""
+        """Begin a recording: the trigger's earlier counts do not belong to it."""
         self._begun = self._counts()
 
     def trigger(self) -> dict[str, int]:
-        """What the trigger counted since `begin`; of strobes, since arm: a line behind is behind for good."""
+        """Return the trigger's counts since `begin`; of strobes, since arm: a camera behind stays behind."""
         return {
             name: count if name.startswith("strobe") else count - self._begun.get(name, 0)
             for name, count in self._counts().items()
         }
 
     def cameras(self) -> dict[str, dict[str, int]]:
-        """Arm → what its camera gave and lost since it was armed.
+        """Return, per arm, the lines that its camera delivered and lost since it was armed.
 
-        A block that is being taken just now is ``delivered`` already, and ``next_line`` is still its first.
+        A block that is just being taken counts as ``delivered`` already, while ``next_line`` is still its
+        first line.
         """
         return {
             arm: {str(name): counted[name] for name in CAMERA_COUNTS if counted[name]}
@@ -60,19 +61,19 @@ class ExternalCounts:
         }
 
     def doubted(self) -> set[str]:
-        """Arms whose lines contradict the code."""
+        """Return the arms whose lines contradict the code."""
         watcher = self._watcher
         if watcher is None:
             return set()
         return {arm for arm in ARMS if VERDICTS[watcher[f"verdict_{arm}"]].doubtful}
 
     def verified(self) -> dict[str, int]:
-        """Arm → the line up to which the code is known to be followed; empty where nobody checks."""
+        """Return, per arm, the line up to which the light follows the code; empty without a watcher."""
         watcher = self._watcher
         return {} if watcher is None else {arm: watcher[f"verified_line_{arm}"] for arm in ARMS}
 
     def doubt(self) -> str:
-        """What is wrong with them, in words; "" where nothing is."""
+        """Return the doubtful verdicts in words; "" if there are none."""
         watcher = self._watcher
         if watcher is None:
             return ""

@@ -1,11 +1,11 @@
 """One process per camera: it takes blocks from the camera and copies them, once, into the arm's ring.
 
 The camera counts lines since it was armed; line ``k`` of that count is the trigger's line
-``k - depth_lines``, and what comes before the trigger's line 0 (preroll) is discarded. Lines that do not
-come, or find the ring full, are located and told with the next slot that is committed.
+``k - depth_lines``, and lines before the trigger's line 0 (preroll) are discarded. Lines that do not come,
+or find the ring full, are located and reported with the next committed slot.
 
-A camera that is gone is opened again, for a bounded time. It then counts from 0: its time stamps say which
-line that is, and what the trigger issued meanwhile is a loss like any other.
+A camera that is gone is opened again, within a time limit. It then counts from 0: its time stamps give the
+number of that line, and the lines that the trigger issued in the meantime are a loss like any other.
 """
 
 from __future__ import annotations
@@ -38,28 +38,28 @@ COUNTERS = (
     "delivered", "preroll", *CAMERA_CAUSES, Cause.GRABBER_LOST,
     "next_line", "reopened", "stamp_line", "stamp_ns", "drift_ppb", "saturated",
 )  # fmt: skip
-"""Lines since arm: delivered by the camera (preroll included), discarded as preroll, lost by cause; the line
-that comes next. How often the camera was opened again; a line and its time by the camera's clock, and how
-much faster that runs than the trigger's. Lines with a saturated pixel.
+"""Lines since arm: delivered by the camera (preroll included), discarded as preroll, lost by cause; the next
+line. How often the camera was opened again; a line and its time by the camera's clock, and how much faster
+that clock runs than the trigger's. Lines with a saturated pixel.
 """
 
-# A driver that waits does not hear us: an end, and an owner that is gone, are noticed so late.
+# A waiting driver cannot be interrupted: Quit, and the owner's death, are noticed this much later at most.
 _BLOCK_WAIT_S = 0.05
-# A camera takes seconds to come back; to look for it ten times a second costs nobody anything.
+# A camera takes seconds to come back; looking for it ten times a second costs next to nothing.
 _REOPEN_PAUSE_S = 0.1
-# Blocks may come every 2 ms: a look at the mailbox for each would be a system call that nobody needs.
+# Blocks may come every 2 ms: checking the mailbox for each would be a needless system call.
 _MAIL_INTERVAL_S = 0.02
 
 
 @dataclass(frozen=True, slots=True)
 class GrabberPlan:
-    """What one grabber needs to know. Picklable.
+    """Settings of one grabber, for one arm. Picklable.
 
     A jump of the camera's count by more than ``max_jump_lines`` is a broken count, not a loss. A camera that
-    is gone is waited for as long as ``reopen_timeout_s``; ``line_period_ns`` is the trigger's. ``columns``
-    are the arm's on a camera that has both arms, None on one of its own. ``realtime``: it runs before
-    everything else on the host, where that is allowed. ``successor``: of a grabber that died; its ring and
-    counters are as that one left them.
+    is gone is waited for during ``reopen_timeout_s``; ``line_period_ns`` is the trigger's. ``columns`` are
+    the arm's columns on a camera that serves both arms; None if the arm has a camera of its own.
+    ``realtime``: run ahead of everything else on the host, where that is allowed. ``successor``: take over
+    the ring and counters of a grabber that died, as it left them.
     """
 
     arm: str
@@ -75,46 +75,47 @@ class GrabberPlan:
 
 
 def grab(mailbox: Mailbox, *arms: tuple[GrabberPlan, Ring, Counters]) -> None:
-    """Life of a grabber: open and arm the camera, say so, fill the rings until told to end.
+    """Main function of a grabber: open and arm the camera, report Ready, fill the rings until Quit.
 
-    Several ``arms`` fall on one camera, each on columns of its own.
+    Several ``arms`` share one camera, each with its own columns.
     """
     plan = arms[0][0]  # the first arm's opener opens the camera that they share
-    urgent = plan.realtime and become_urgent()  # first: threads of a driver are as urgent as who starts them
+    urgent = plan.realtime and become_urgent()  # first, since a driver's threads inherit the priority
     camera = _open_again(mailbox, plan, "its grabber died") if plan.successor else plan.opener()
     intakes = [Intake(*arm) for arm in arms]
     try:
         facts = {**camera.settings(), "identity": asdict(camera.identify()), "realtime": urgent}
-        if not plan.successor:  # `_open_again` has armed it: a camera is there again once it can be armed
+        if not plan.successor:  # `_open_again` has armed it already
             camera.arm()
         mailbox.post(Ready(facts))
         while True:
             try:
                 _pump(mailbox, camera, intakes)
             except CameraLostError as lost:
-                # Closed first, as far as it can be: most devices are opened by one handle at a time.
+                # Close it first, as far as possible: most devices can be opened by one handle at a time.
                 with contextlib.suppress(AcquireError):
-                    _let_go(camera)
+                    _shut_down(camera)
                 camera = _open_again(mailbox, plan, lost.message)
                 for intake in intakes:
                     intake.realign()
-    except BaseException as error:  # the only way out
+    except BaseException as error:  # the only way out: `Mailbox.take` raises on Quit as well
         try:
-            _let_go(camera)
+            _shut_down(camera)
         except AcquireError as second:
-            error.add_note(f"while letting go: {second}")
+            error.add_note(f"while closing the camera: {second}")
         raise
 
 
 def _open_again(mailbox: Mailbox, plan: GrabberPlan, why: str) -> Camera:
-    """The camera, open and armed; CameraLostError when that does not succeed in time."""
+    """Return the camera, open and armed. Raises CameraLostError if that does not succeed in time."""
     deadline = time.monotonic() + plan.reopen_timeout_s
     while (camera := _try_open(plan)) is None:
         if time.monotonic() >= deadline:
             raise CameraLostError(
-                f"camera {plan.arm} is gone: {why}", hint=f"it was waited for {plan.reopen_timeout_s:g} s"
+                f"camera {plan.arm} is gone: {why}",
+                hint=f"it did not come back within {plan.reopen_timeout_s:g} s",
             )
-        mailbox.take()  # raises OwnerGone once nobody wants the camera any more
+        mailbox.take()  # raises OwnerGone once the run is over
         time.sleep(_REOPEN_PAUSE_S)
     return camera
 
@@ -128,12 +129,12 @@ def _try_open(plan: GrabberPlan) -> Camera | None:
         camera.arm()
     except CameraError:
         with contextlib.suppress(AcquireError):
-            _let_go(camera)
+            _shut_down(camera)
         return None
     return camera
 
 
-def _let_go(camera: Camera) -> None:
+def _shut_down(camera: Camera) -> None:
     try:
         camera.disarm()
     finally:
@@ -155,13 +156,13 @@ def _pump(mailbox: Mailbox, camera: Camera, intakes: list[Intake]) -> None:
 
 
 def settle_books(ring: Ring, counters: Counters) -> None:
-    """For a grabber that died: lines that it had counted, and did not commit, were not delivered."""
-    # `take` counts a block before it puts it: killed in between, the block is in the count and nowhere else.
+    """Correct the count of a grabber that died: lines that it did not commit were not delivered."""
+    # `Intake.take` counts a block before it puts it into the ring; a kill in between leaves it counted only.
     counters["delivered"] = counters["preroll"] + ring.statistics().dropped_lines + ring.committed_lines
 
 
 class Intake:
-    """From camera blocks to ring slots: numbering, preroll, losses, saturation. Single copy, no I/O."""
+    """Moves camera blocks to ring slots: numbering, preroll, losses, saturation. One copy, no I/O."""
 
     def __init__(self, plan: GrabberPlan, ring: Ring, counters: Counters) -> None:
         self._plan = plan
@@ -177,23 +178,24 @@ class Intake:
             self._take_over()
 
     def _take_over(self) -> None:
-        """Go on for a grabber that died: what comes after its last slot is lost."""
+        """Continue for a grabber that died: lines after its last slot are lost."""
         ring, counters = self._ring, self._counters
         self._next = ring.newest_line
-        counted = sum(counters[cause] for cause in (*CAMERA_CAUSES, Cause.GRABBER_LOST))
-        told = ring.committed_lines + ring.statistics().dropped_lines + counted - self._next
-        counters.add(Cause.GRABBER_LOST, -max(0, told))  # lost before the death, and located after it
+        lost = sum(counters[cause] for cause in (*CAMERA_CAUSES, Cause.GRABBER_LOST))
+        # Losses that the dead grabber had counted and not committed yet are located, and counted, once more.
+        excess = ring.committed_lines + ring.statistics().dropped_lines + lost - self._next
+        counters.add(Cause.GRABBER_LOST, -max(0, excess))
         self._clock.take_over(counters["stamp_line"], counters["stamp_ns"], counters["drift_ppb"])
         self._away_for = Cause.GRABBER_LOST
         self.realign()
 
     def realign(self) -> None:
-        """The camera was opened again: it counts from 0, and its next time stamp says from which line."""
+        """Note that the camera was opened again and counts from 0; its next time stamp gives the line."""
         self._away = True
         self._counters.add("reopened", 1)
 
     def take(self, block: CameraBlock) -> None:
-        """Put the block's lines into the ring. Raises CameraError for a block that cannot be right."""
+        """Put the block's lines into the ring. Raises CameraError for an impossible block."""
         if self._plan.columns is not None:
             block = replace(block, pixels=block.pixels[:, slice(*self._plan.columns)])
         shape = self._ring.shape
@@ -206,11 +208,11 @@ class Intake:
         if self._away:
             if block.time_ns is None and block.flags.all():
                 return  # an incomplete frame has no time, and the next one may have
-            self._come_back(block)
-            block = replace(block, losses=())  # these are among what it missed
+            self._renumber(block)
+            block = replace(block, losses=())  # they are part of the loss that `_renumber` noted
         first = block.first_line + self._shift
         self._note_jump(first, block.losses)
-        # Before the lines are put: whoever sees them, and a successor, finds a stamp that is not older.
+        # Before the lines are put: readers of the lines, and a successor, must not find an older stamp.
         if block.time_ns is not None:
             self._clock.note(first, block.time_ns)
             stamp = {"stamp_line": first, "stamp_ns": block.time_ns, "drift_ppb": self._clock.drift_ppb}
@@ -220,24 +222,24 @@ class Intake:
         preroll = min(max(-first, 0), count)
         self._counters.add("delivered", count)
         self._counters.add("preroll", preroll)
-        # A frame may have more lines than a slot: its height is the camera's, the slot's is the rig's.
+        # A frame may have more lines than a slot: the camera sets its height, the rig the slot's.
         for at in range(preroll, count, self._ring.shape.rows):
             part = slice(at, at + self._ring.shape.rows)
             self._put(first + at, block.pixels[part], block.flags[part])
         self._next = first + count
         self._counters["next_line"] = self._next
 
-    def _come_back(self, block: CameraBlock) -> None:
-        """Number a camera that was away by its time stamps; what it missed is lost."""
+    def _renumber(self, block: CameraBlock) -> None:
+        """Number the lines of a camera that was away by its time stamps; the lines in between are lost."""
         line = None if block.time_ns is None else self._clock.line_at(block.time_ns)
         if line is None:
             raise CameraError(
-                f"camera {self._plan.arm} is there again, but its time stamps do not say at which line",
+                f"camera {self._plan.arm} is back, but its time stamps do not tell at which line",
                 hint="arm again",
             )
         self._away = False
         self._shift = line - block.first_line
-        # A line further off than that is left for `_note_jump` to refuse.
+        # A jump outside these limits is left for `_note_jump` to refuse.
         if 0 <= line - self._next <= self._plan.max_jump_lines:
             self._lose(self._next, line - self._next, self._away_for)
             self._next = line
@@ -247,12 +249,12 @@ class Intake:
         jump = first - self._next
         if not 0 <= jump <= self._plan.max_jump_lines:
             raise CameraError(
-                f"camera {self._plan.arm}: its count of lines went from "
+                f"camera {self._plan.arm}: its line count went from "
                 f"{self._next - self._shift} to {first - self._shift}",
                 possible=f"the next line, or up to {self._plan.max_jump_lines} lost ones",
             )
-        # Where the camera told fewer losses than its count jumped by, the rest has no reason of its own; the
-        # sum of the causes must be the jump, or the ledger would not balance.
+        # If the camera reported fewer losses than its count jumped by, the rest has no specific cause; the
+        # losses must add up to the jump, or the ledger would not balance.
         unexplained = jump - sum(loss.count for loss in losses)
         self._lose(self._next, unexplained, Cause.CAMERA)
         at = self._next + max(unexplained, 0)
@@ -262,8 +264,7 @@ class Intake:
             at += count
 
     def _lose(self, first: int, count: int, cause: Cause) -> None:
-        """Note lines that did not come, but for the preroll's."""
-        # Lines before the trigger's line 0 are nobody's: no ledger has them.
+        """Note lines that did not come, except in the preroll, which is in no ledger."""
         count += min(first, 0)
         if count > 0:
             self._counters.add(cause, count)
@@ -273,14 +274,14 @@ class Intake:
         count = len(flags)
         slot = self._ring.claim()
         if slot is None:
-            # Nobody waits for a slot: what is dropped here has a number and a cause. Cameras that run out of
-            # buffers do not always say how many lines that was.
+            # Do not wait for a slot: lines dropped here have numbers and a cause, whereas a camera that runs
+            # out of buffers does not always report how many lines it lost.
             self._ring.drop(first_line, count)
             self._losses.add(Loss(first_line, count, Cause.RING_FULL))
             return
         slot.pixels[:count] = pixels
         slot.flags[:count] = flags
-        # One look at the whole block is several times cheaper than one per line, and mostly enough.
+        # The maximum of the whole block is several times cheaper than one per line, and mostly enough.
         if pixels.max() >= self._plan.white_dn:
             white = pixels.max(axis=1) >= self._plan.white_dn
             slot.flags[:count][white] |= np.uint16(LineFlag.SATURATED)

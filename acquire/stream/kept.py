@@ -1,7 +1,7 @@
-"""Which lines of one arm recordings hold already, so that a line which two of them hold is counted once.
+"""Which lines of one arm are in recordings already, so that a line that is in two of them is counted once.
 
-A recording may begin with lines from the ring's history that another has stored. What is remembered of a
-recording is a range: a line inside it that was lost never comes from the ring again.
+A recording may begin with lines from the ring's history that another one has stored. One range per recording
+suffices: a line inside it that was lost never comes from the ring again.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ class Kept:
         self._ranges = list(ranges)
 
     def begin(self, oldest_line: int) -> None:
-        """A recording begins; what is older than ``oldest_line`` cannot be asked for any more."""
+        """Begin a recording; lines before ``oldest_line`` cannot be recorded any more."""
         self._ranges = [(first, end) for first, end in self._ranges if end > oldest_line]
         self._ranges.append((oldest_line, oldest_line))
 
     def add(self, first: int, end: int) -> None:
-        """The recording holds ``first .. end - 1`` as well; calls come in the order of the lines."""
+        """Add ``first .. end - 1`` to the recording; calls come in the order of the lines."""
         begun, reached = self._ranges[-1]
         self._ranges[-1] = (begun if reached > begun else first), end
 
     def end_at(self, line: int) -> None:
-        """The recording ended before ``line``, whatever was added."""
+        """End the recording before ``line``, whatever was added."""
         begun, reached = self._ranges[-1]
         if reached > begun:
             self._ranges[-1] = begun, max(begun, line)
 
     def count(self, first: int, end: int) -> int:
-        """How many of the lines ``first .. end - 1`` recordings hold."""
+        """Return how many of the lines ``first .. end - 1`` are in recordings."""
         held = 0
         for start, stop in sorted(self._ranges):
             lines = range(max(start, first), min(stop, end))

@@ -1,11 +1,11 @@
-"""Every pulse of the trigger has a place: what became of the lines of one arm since it was armed.
+"""The account of every trigger pulse: what became of the lines of one arm since it was armed.
 
 ::
 
     issued = preroll + stored + discarded + Σ lost + waiting + pending
 
 ``issued``, ``lost`` and ``waiting`` are counted by different parties (trigger, camera and grabber, ring and
-recorder), so that a line which none of them knows of shows.
+recorder), so that a line unaccounted for by all of them shows up as an imbalance.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
 UNDELIVERED = "undelivered"
-"""Loss at the end of a run: pulses whose lines a recording wanted, and the camera never gave."""
+"""Loss at the end of a run: pulses whose lines belonged to a recording and were never delivered."""
 
 
 @dataclass(frozen=True, slots=True)
 class Counted:
-    """What was counted of one arm, in lines.
+    """Counts of one arm, in lines.
 
     Attributes
     ----------
-    pulses : that the trigger is known to have issued
-    next_line : after the last line that came out of the camera, or was lost before it
-    depth : lines that come before the trigger's line 0
-    stored, discarded : what the recorder took from the ring: in recordings, in none
+    pulses : pulses that the trigger is known to have issued
+    next_line : line after the last one that the camera delivered or lost
+    depth : lines before the trigger's line 0
+    stored, discarded : lines that the recorder took from the ring: into recordings, into none
     lost : cause → lines
-    recorded_to : line after the last row of the latest recording, there or missing
-    room, block : lines that the ring and one of its slots hold at most
+    recorded_to : line after the last row of the latest recording, stored or missing
+    room, block : capacity of the ring, and of one of its slots
     """
 
     pulses: int
@@ -48,7 +48,7 @@ class Counted:
 
 @dataclass(frozen=True, slots=True)
 class ArmLedger:
-    """The account; see the module. ``balanced``: no place holds less than nothing, or more than it can."""
+    """The account; see the module. ``balanced``: no term is negative, or more than its place can hold."""
 
     issued: int
     preroll: int
@@ -64,11 +64,11 @@ class ArmLedger:
 
 
 def account(counted: Counted, *, closed: bool) -> ArmLedger:
-    """The account of a running arm, whose counts are up to a block apart, or of a ``closed`` one: exact.
+    """Return the account of an arm: exact once ``closed``; while running, counts are up to a block apart.
 
-    A line that came proves its pulse, whatever tags have told so far. Once closed, nothing waits, and what
-    is pending will not come: it is lost as far as a recording has rows for it. The rest was under way when
-    the trigger stopped, as a block that did not fill, and belongs to no recording.
+    A line that came proves its pulse, even before a tag reports it. Once closed, nothing waits, and pending
+    lines will not come: they are lost if a recording has rows for them. The others were in a block that had
+    not filled when the trigger stopped, and belong to no recording.
     """
     read = max(0, counted.next_line + counted.depth)
     issued = counted.pulses if closed else max(counted.pulses, read)

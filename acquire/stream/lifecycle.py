@@ -1,4 +1,4 @@
-"""What became of the latest recording, as its recorder's owner knows: a table of (stage, event) → stage.
+"""The life of the latest recording, as seen by the recorder's owner: a table of (stage, event) → stage.
 
 ::
 
@@ -9,8 +9,8 @@
                     cancelled     DISK_END ▼  │ lost            │
                                   replaced, paused ─────────────┘ (paused only)
 
-It has no thread and no clock, and speaks to no process: times are passed in, and what the recorder is to be
-told is returned. An event that cannot happen, or a command that makes no sense, has no row.
+It has no thread and no clock, and sends no messages: times are passed in, and messages for the recorder are
+returned. An event that cannot happen, or a command that makes no sense, has no row.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ if TYPE_CHECKING:
 
     from acquire.stream.messages import Began, Begin, Note, Sealed
 
-_MOST_TOLD = 1024
+_MOST_NOTES = 1024
 _MOST_KEPT = 256
-"""Recordings whose lines are remembered; those that a ring still holds lines of are fewer."""
+"""Number of recordings whose line ranges are remembered: more than a ring can hold lines of."""
 
 
 class Stage(StrEnum):
-    """Where the latest recording is in its life."""
+    """Stage of the latest recording's life."""
 
     NONE = "none"
     ASKED = "asked"
@@ -52,21 +52,21 @@ class Stage(StrEnum):
 MEANINGS = {
     Stage.NONE: "nothing has been recorded",
     Stage.ASKED: "a recording is being created",
-    Stage.CANCELLED: "the disk took too long to create the recording, and nobody wants it any more",
+    Stage.CANCELLED: "the recording was cancelled because the disk took too long to create it",
     Stage.RECORDING: "a recording is being written",
-    Stage.REPLACED: "the recorder was killed; another one goes on with the recording beside it",
-    Stage.PAUSED: "the recording goes on in a further segment when the disk lets it",
+    Stage.REPLACED: "the recorder was killed; another one continues the recording in a new segment",
+    Stage.PAUSED: "the recording will continue in a further segment once the disk allows it",
     Stage.SEALED: "the recording is closed",
     Stage.LOST: "the recorder ended without sealing the recording, which can be recovered",
 }
-"""For refusals and for the status."""
+"""Texts for refusals and for the status."""
 
 UNDER_WAY = frozenset({Stage.RECORDING, Stage.REPLACED, Stage.PAUSED})
-"""A recording is open, as far as the living can tell."""
+"""Stages in which a recording is open, or will be continued."""
 
 
 class Event(StrEnum):
-    """What can happen to a recording. BEGIN and END are commands."""
+    """Events in a recording's life. BEGIN and END are commands."""
 
     BEGIN = "start"
     END = "stop"
@@ -75,14 +75,14 @@ class Event(StrEnum):
     OVERDUE = "overdue"
     """The recorder has not answered in time."""
     KILLED = "killed"
-    """The recorder was, and another process took its place."""
+    """The recorder was killed, and another process took its place."""
     DIED = "died"
-    """The recorder did, and nobody takes its place."""
+    """The recorder died, and has no successor."""
     DISK_END = "ended by the disk"
-    """The recorder sealed what it had, and goes on as soon as the disk allows."""
+    """The recorder sealed what it had, and continues as soon as the disk allows."""
     SEALED = "sealed"
     FAULT = "fault"
-    """The capture has failed, or is closed: what has not begun is not wanted any more."""
+    """The capture has failed, or is closed: a recording that has not begun is cancelled."""
 
 
 TABLE: dict[tuple[Stage, Event], Stage] = {
@@ -96,7 +96,7 @@ TABLE: dict[tuple[Stage, Event], Stage] = {
     (Stage.ASKED, Event.KILLED): Stage.NONE,
     (Stage.ASKED, Event.DIED): Stage.NONE,
     (Stage.ASKED, Event.FAULT): Stage.CANCELLED,
-    # The recorder is silent about what was cancelled, unless its answer was on the way already.
+    # The recorder does not answer for a cancelled recording, unless its answer was on the way already.
     (Stage.CANCELLED, Event.BEGIN): Stage.ASKED,
     (Stage.CANCELLED, Event.BEGAN): Stage.RECORDING,
     (Stage.CANCELLED, Event.REFUSED): Stage.NONE,
@@ -104,7 +104,7 @@ TABLE: dict[tuple[Stage, Event], Stage] = {
     (Stage.CANCELLED, Event.DIED): Stage.NONE,
     (Stage.CANCELLED, Event.FAULT): Stage.CANCELLED,
     (Stage.RECORDING, Event.END): Stage.RECORDING,
-    (Stage.RECORDING, Event.REFUSED): Stage.RECORDING,  # the answer to a start that was given up
+    (Stage.RECORDING, Event.REFUSED): Stage.RECORDING,  # the late answer to a start that was given up
     (Stage.RECORDING, Event.KILLED): Stage.REPLACED,
     (Stage.RECORDING, Event.DIED): Stage.LOST,
     (Stage.RECORDING, Event.DISK_END): Stage.PAUSED,
@@ -138,7 +138,7 @@ TABLE: dict[tuple[Stage, Event], Stage] = {
 
 
 def after(stage: Stage, event: Event) -> Stage:
-    """The stage that ``event`` leads to; StateError where the table has no row for it."""
+    """Return the stage that ``event`` leads to. Raises StateError if the table has no row for it."""
     try:
         return TABLE[stage, event]
     except KeyError:
@@ -153,12 +153,12 @@ class Lifecycle:
     Attributes
     ----------
     stage : where it is in its life
-    began : the recorder's answer to the latest beginning, unless that was refused
-    sealed : how it ended
+    began : the recorder's answer to the latest `Begin`, unless that was refused
+    sealed : how the recording ended
     refused : why it was not begun
-    path : where ``began`` is: not where it was first begun, if it goes on in another segment
-    resumption : when a recording that the disk has ended goes on, and why it has not yet
-    told : what the recorder was told of lately: it may die before that is written
+    path : path of ``began``: the latest segment's if the recording continued in another one
+    resumption : when a recording that the disk has ended continues, and why it has not yet
+    notes : recent notes sent to the recorder, which may die before it has written them
     """
 
     def __init__(self, *, goes_on: bool) -> None:
@@ -168,7 +168,7 @@ class Lifecycle:
         self.refused: Refused | None = None
         self.path: Path | None = None
         self.resumption = Resumption()
-        self.told: deque[Note] = deque(maxlen=_MOST_TOLD)
+        self.notes: deque[Note] = deque(maxlen=_MOST_NOTES)
         self._goes_on = goes_on
         self._begin: Begin | None = None
         self._end_reason: str | None = None
@@ -179,11 +179,12 @@ class Lifecycle:
 
     @property
     def orphans(self) -> tuple[Orphan, ...]:
-        """Recordings that were not sealed; not while another recorder only begins, which has more to do."""
+        """Recordings that were not sealed."""
+        # None while a successor is only starting: recovering them would compete with it for the disk.
         return () if self.stage is Stage.REPLACED else tuple(self._orphans)
 
     def kept(self, arm: str, released_line: int) -> list[tuple[int, int]]:
-        """Ranges of the arm's lines that recordings hold, the one under way up to ``released_line``."""
+        """Return the ranges of the arm's lines in recordings, the current one up to ``released_line``."""
         ranges = list(self._kept[arm])
         if self.began is not None and self.stage in (Stage.RECORDING, Stage.REPLACED, Stage.LOST):
             ranges.append((self.began.first_line, max(self.began.first_line, released_line)))
@@ -192,30 +193,30 @@ class Lifecycle:
     # ---- commands
 
     def begin(self, begin: Begin) -> None:
-        """The recorder is asked for another recording. Raises StateError while there is one."""
+        """Note that a recording was requested of the recorder. Raises StateError while there is one."""
         self._go(Event.BEGIN)
         self.began = self.sealed = self.refused = self._cut_short = self._end_reason = None
         self.resumption = Resumption()
         self._begin = begin
 
     def end(self, reason: str) -> bool:
-        """Nobody wants more of it. True: what the recorder only begins is to be cancelled."""
+        """End the recording. Return whether a further segment that is only starting must be cancelled."""
         was = self._go(Event.END)
         self._end_reason = reason
         return self._close_pause(was)
 
     def extend(self, line: int) -> None:
-        """It does not end before ``line``, in whatever segment."""
+        """Do not end before ``line``, in whichever segment that is."""
         if self.began is None or self.began.end_line is None:
             return
         self.began = replace(self.began, end_line=max(line, self.began.end_line))
         if self.stage is Stage.PAUSED and self._begin is not None:
             self._begin = replace(self._begin, end_line=self.began.end_line)
 
-    # ---- what the recorder says
+    # ---- the recorder's messages
 
     def on_began(self, began: Began, now_s: float) -> str | None:
-        """It exists; for what reason it is to end at once all the same, if it is."""
+        """Note that the recording exists. Return the reason if it is to end at once all the same."""
         self._go(Event.BEGAN)
         assert self._begin is not None
         self.began, self.sealed, self._cut_short = began, None, None
@@ -224,7 +225,7 @@ class Lifecycle:
         return self._end_reason
 
     def on_refused(self, refused: Refused, now_s: float) -> bool:
-        """It, or its further segment, cannot be begun. True: and so it cannot go on at all."""
+        """Note that it, or its further segment, was refused. Return whether the recording is lost by that."""
         was = self._go(Event.REFUSED)
         if was is Stage.ASKED:
             self.refused = refused
@@ -235,7 +236,7 @@ class Lifecycle:
         return self.stage is Stage.LOST
 
     def on_sealed(self, sealed: Sealed, rows: Mapping[str, int], committed_lines: int, now_s: float) -> None:
-        """It is closed, with so many ``rows`` of each arm; ``committed_lines`` of them are on the disk."""
+        """Note that it is closed, with ``rows`` of each arm; ``committed_lines`` of them are on the disk."""
         began, begin, path = self.began, self._begin, self.path
         if began is None or begin is None or path is None:
             raise StateError(f"{Event.SEALED}: {MEANINGS[self.stage]}")
@@ -253,15 +254,15 @@ class Lifecycle:
             self._begin, self._cut_short = following, sealed
             self.resumption.ended(now_s, sealed.end_reason)
 
-    # ---- what becomes of the recorder, and of time
+    # ---- the recorder's death, faults, and time
 
     def on_overdue(self) -> None:
-        """The recorder has not answered in time: what it begins is to be cancelled."""
+        """Note that the recorder has not answered in time: the recording is cancelled."""
         self._go(Event.OVERDUE)
         self._end_reason = "cancelled"  # should it begin all the same
 
     def on_killed(self, death: str, committed_lines: int, now_s: float) -> Begin | None:
-        """Another process is in the recorder's place: what it is to begin, if it is to begin anything now."""
+        """Note that another recorder took over. Return the recording it is to begin now, if any."""
         was, begin = self._go(Event.KILLED), self._begin
         if begin is None or was in (Stage.NONE, Stage.SEALED, Stage.LOST):
             return None
@@ -273,7 +274,8 @@ class Lifecycle:
         if was is Stage.RECORDING and self.began is not None:
             self._begin = continuation(begin, self.began, committed_lines, death)
         else:
-            self._begin, committed_lines = once_more(begin), 0  # the counters may be neither's
+            # Killed again before it began: the counters may belong to neither recording.
+            self._begin, committed_lines = once_more(begin), 0
         if self._begin.path != begin.path:  # else it was killed before it had made anything
             why = f"its recorder was {death}; it goes on in {self._begin.path.name}"
             self._leave(Orphan(begin.path, why, committed_lines))
@@ -283,40 +285,41 @@ class Lifecycle:
         return self._begin
 
     def on_died(self) -> None:
-        """The recorder did, and nobody takes its place."""
+        """Note that the recorder died without a successor."""
         self._close_pause(self._go(Event.DIED))
 
     def on_fault(self) -> bool:
-        """The capture has failed, or is closed. True: what the recorder only begins is to be cancelled."""
+        """Note that the capture failed or is closed. Return whether the recorder must cancel a beginning."""
         was = self._go(Event.FAULT)
         self._failed = True
         return self._close_pause(was) or was is Stage.ASKED
 
     def due(self, now_s: float) -> Begin | None:
-        """The further segment that is to be tried now."""
+        """Return the further segment to be tried now, or None."""
         if self.stage is not Stage.PAUSED or self._begin is None or not self.resumption.is_due(now_s):
             return None
         self._begin = once_more(self._begin)
         return self._begin
 
     def mark_unsealed(self, why: str, committed_lines: int) -> None:
-        """Every process has ended: a recording that is not sealed now will not be."""
+        """Note that every process has ended: a recording that is not sealed now never will be."""
         self.on_died()
         known = {orphan.path for orphan in self._orphans}
         if self.stage is Stage.LOST and self._begin is not None and self._begin.path not in known:
-            lines = committed_lines if self._begin.path == self.path else 0  # else those of the one before
+            # A segment that never began has none: the counters are those of the segment before.
+            lines = committed_lines if self._begin.path == self.path else 0
             self._leave(Orphan(self._begin.path, why, lines))
 
     def _go(self, event: Event) -> Stage:
-        """Gives the stage before."""
+        """Move to the next stage; return the one before."""
         before, self.stage = self.stage, after(self.stage, event)
         return before
 
     def _leave(self, orphan: Orphan) -> None:
-        self._orphans.append(replace(orphan, told=tuple(self.told)))
+        self._orphans.append(replace(orphan, notes=tuple(self.notes)))
 
     def _close_pause(self, was: Stage) -> bool:
-        """Nobody wants the further segment any more that has not begun yet; says whether there was one."""
+        """Give up a further segment that has not begun yet; return whether there was one."""
         if was is not Stage.PAUSED:
             return False
         self.sealed, self._cut_short = self._cut_short, None

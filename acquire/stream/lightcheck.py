@@ -1,18 +1,18 @@
-"""Does the light follow the code? Held against the lines themselves, by the forward model of Eq. (1).
+"""Checks from the lines themselves whether the light follows the code, by the forward model of Eq. (1).
 
-Summed over its pixels, line ``l`` of an arm is the code seen through the scene's light per row, E * w::
+Summed over its pixels, line ``l`` of an arm is the code E convolved with the scene's light per row w::
 
     y(l) = Σ_k E(S·l + k) · h(k)         h = w(row) * (1, … 1)        (S ones: the sub-steps of a line)
 
-and what the light per row is, the *other* arm tells, whose pixels are this arm's rows. So each arm predicts
-how the other's lines go up and down with the code, to the sub-step, for any scene that has contrast; slow
-changes of the scene are taken out by differences from line to line. The correlation of what is predicted with
-what is seen, at all delays, is two Fourier transforms. Its peak, in standard deviations of the correlation
-with a code that has nothing to do with the light, says which of these it is::
+The light per row is known from the *other* arm, whose pixels are this arm's rows. So each arm predicts how
+the other's lines vary with the code, to the sub-step, for any scene that has contrast; slow changes of the
+scene cancel in differences from line to line. The correlation of prediction and measurement at all delays
+takes two Fourier transforms. Its peak, in standard deviations of the correlation with a code unrelated to the
+light, gives the verdict::
 
     verified     high at delay 0                      dark          no light, or none that follows a code
-    shifted      high elsewhere: by so many sub-steps wrong_code    light follows another code
-    inverted     as high, negative                    unknown       too little contrast to tell
+    shifted      high at another delay, in sub-steps  wrong_code    light follows another code
+    inverted     as high, negative                    unknown       too little contrast to decide
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ if TYPE_CHECKING:
     from acquire.fibre import Fibre
 
 CERTAIN = 14.0
-"""Standard deviations from which on a peak is one: of ten thousand delays, the highest by chance has six, or
-nine in a scene that flickers."""
+"""Standard deviations from which on a peak is significant: of ten thousand delays, the highest by chance has
+six, or nine in a scene that flickers."""
 _BETTER = 40.0
-"""By which the squares of two peaks differ for certain."""
+"""Smallest significant difference of the squares of two peaks."""
 _MUST_SHOW = 2 * CERTAIN
-"""Where so high a peak is to be expected, its absence is certain."""
+"""Expected peak from which on its absence is significant."""
 _FLAT = 3.0
-"""Light that varies so many times less than the code would have it follows none."""
+"""Light that varies less than predicted by this factor follows no code."""
 _DARK_SHARE = 0.002
-"""Of the camera's range: less light is none."""
+"""Share of the camera's range below which there is no light."""
 _NEVER_ZERO = 1e-12
 
 
 class Verdict(StrEnum):
-    """What the lines say of the code: see the module."""
+    """Result of the check: see the module."""
 
     UNKNOWN = "unknown"
     VERIFIED = "verified"
@@ -55,13 +55,13 @@ class Verdict(StrEnum):
 
     @property
     def doubtful(self) -> bool:
-        """The recorded code is not that of the light."""
+        """Whether the recorded code is not that of the light."""
         return self not in (Verdict.UNKNOWN, Verdict.VERIFIED)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sight:
-    """What one arm shows in consecutive lines, above the black level, in DN.
+    """Means of consecutive lines of one arm, above the black level, in DN.
 
     ``energy`` (line): mean of each line; ``profile`` (pixel): mean of each pixel.
     """
@@ -84,7 +84,7 @@ class Finding:
 
 
 def explain(found: dict[str, Finding], substeps: int) -> str:
-    """Both arms in words; where they are apart by whole lines, that one of them slipped."""
+    """Return both verdicts in words and, if the arms differ by whole lines, which one is behind."""
     words = ", ".join(f"arm {arm} {finding}" for arm, finding in found.items())
     a, b = found["a"], found["b"]
     seen = all(finding.verdict in (Verdict.VERIFIED, Verdict.SHIFTED) for finding in (a, b))
@@ -101,10 +101,10 @@ class Judge:
     Attributes
     ----------
     stages, substeps : M, S
-    code : the run's
+    code : the code of the run
     white_dn : the camera's range
-    registration : arm → sub-steps by which its lines are known to show late, as its image lies off
-    fibre : that lays several tiles of the scene on the same rows; None: a line's pixels see one scene
+    registration : arm → known delay of its lines in sub-steps, from the position of its image
+    fibre : fibre that images several tiles of the scene onto the same rows; None: one scene per line
     """
 
     stages: int
@@ -115,13 +115,13 @@ class Judge:
     fibre: Fibre | None = None
 
     def look(self, first_line: int, sights: dict[str, Sight]) -> dict[str, Finding]:
-        """The verdict on each arm from the same lines of both, ``first_line`` on."""
+        """Return the verdict on each arm from the same lines of both, from ``first_line`` on."""
         lines = len(sights["a"].energy)
         reach = min(4096, self.substeps * lines // 4)
         span = self.stages * self.substeps + self.substeps - 1
         start = self.substeps * first_line - reach
         bits = self.code.bits(start, self.substeps * lines + span + 2 * reach)
-        # Camera B's rows are the scene's columns from right to left: each sees the other's pixels that way.
+        # Camera B's rows are the scene's columns from right to left, hence the reversal of arm A's profile.
         profiles = {arm: sight.profile for arm, sight in sights.items()}
         if self.fibre is not None:
             profiles = {arm: self.fibre.folded(profile, arm) for arm, profile in profiles.items()}
@@ -134,17 +134,18 @@ class Judge:
     def _judge(
         self, sight: Sight, rows: NDArray[np.float64], bits: NDArray[np.uint8], nominal: int
     ) -> Finding:
-        # Darkness is judged first: noise correlates with anything. A code that leaves the light off for all
-        # of these lines expects it.
+        # Darkness is judged first: noise correlates with anything. It is expected if the code leaves the
+        # light off for all of these lines.
         least = _DARK_SHARE * self.white_dn
         light = float(sight.energy.mean())
         if light < least and bits.any():
             return Finding(Verdict.DARK)
-        if bits.min() == bits.max() or rows.mean() < least:  # neither code nor the other arm tells anything
+        # A constant code, or a dark other arm, predicts no variation.
+        if bits.min() == bits.max() or rows.mean() < least:
             return Finding(Verdict.UNKNOWN)
         predicted = predict(rows, bits, self.substeps)
         predicted *= light / predicted.mean()
-        # From line to line: what changes slowly, a lamp or the scene, drops out, and the code remains.
+        # Differences from line to line: slow changes of a lamp or the scene drop out, and the code remains.
         steps = predicted[self.substeps :] - predicted[: -self.substeps]
         seen = np.diff(sight.energy)
         contrast = float(steps.std() / max(seen.std(), _NEVER_ZERO))
@@ -152,9 +153,9 @@ class Judge:
 
 
 def predict(rows: NDArray[np.float64], bits: NDArray[np.uint8], substeps: int) -> NDArray[np.float64]:
-    """Energy of a line that begins at each of the sub-steps of ``bits``, as far as they reach.
+    """Return the energy of a line that begins at each sub-step of ``bits``, as far as the bits suffice.
 
-    ``rows`` (M,): light of the rows, S of them at a time, in any unit.
+    ``rows`` (M,): light per row, in any unit; charge stays in a row for S sub-steps.
     """
     response = np.convolve(np.repeat(rows, substeps), np.ones(substeps))
     size = _transform_size(len(bits))
@@ -164,7 +165,7 @@ def predict(rows: NDArray[np.float64], bits: NDArray[np.uint8], substeps: int) -
 
 
 def _correlate(seen: NDArray[Any], steps: NDArray[Any], substeps: int) -> NDArray[np.float64]:
-    """Of what is ``seen`` line by line with what is predicted sub-step by sub-step, at each delay."""
+    """Correlate ``seen`` (one value per line) with ``steps`` (predicted, one per sub-step) at all delays."""
     spread = np.zeros(substeps * len(seen))
     spread[::substeps] = seen - seen.mean()
     size = _transform_size(len(steps))
@@ -176,7 +177,7 @@ def _correlate(seen: NDArray[Any], steps: NDArray[Any], substeps: int) -> NDArra
 
 
 def _read(peaks: NDArray[np.float64], nominal: int, contrast: float, lines: int) -> Finding:
-    """``contrast``: how much the light should vary with the code, of how much it does."""
+    """Return the verdict. ``contrast``: predicted variation of the light relative to the measured one."""
     at = int(np.abs(peaks).argmax())
     # Noise alone puts the largest peak anywhere: another delay must explain clearly more than the nominal.
     if peaks[at] ** 2 - peaks[nominal] ** 2 < _BETTER:

@@ -1,8 +1,8 @@
-"""Which line a camera was reading out at a time of its own clock.
+"""Finds the line that a camera was reading out at a time of its own clock.
 
-The trigger issues lines at even intervals, and a camera stamps its blocks: from both the interval in the
-camera's time follows, and with it how fast the camera's clock runs against the trigger's (its drift). A
-camera that was away begins to count at 0 again; its time stamps say where it goes on.
+The trigger issues lines at even intervals, and a camera stamps its blocks. From both follows the line
+interval in the camera's time, and how much faster the camera's clock runs than the trigger's (its drift). A
+camera that was away counts from 0 again; its time stamps tell with which line it continues.
 """
 
 from __future__ import annotations
@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 _FRESH_LINES = 1 << 22
-"""Lines after which the measured interval is kept up to date by halves: drift follows temperature."""
+"""Lines after which the older half of the measurement is dropped, since drift follows temperature."""
 _CERTAIN = 0.25
-"""Of a line: what is further from a whole line than this is not known."""
+"""Largest distance from a whole line, and largest uncertainty, in lines, at which a line is certain."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +28,7 @@ class LineClock:
 
     Parameters
     ----------
-    line_period_ns : by the trigger's clock; 0: not told
+    line_period_ns : line period by the trigger's clock; 0: unknown
     """
 
     def __init__(self, line_period_ns: float) -> None:
@@ -39,20 +39,20 @@ class LineClock:
         self._jitter_ns = 0.0
 
     def take_over(self, line: int, time_ns: int, drift_ppb: int) -> None:
-        """Go on for a clock that had noted ``line`` last, and knew the drift."""
+        """Continue from a clock whose latest stamp and drift are known."""
         period_ns = self._nominal_ns * (1 + drift_ppb / 1e9)
-        # As if a stamp of long ago were known: of the earlier ones only the drift is left.
+        # A made-up stamp of long ago stands for the earlier ones, of which only the drift is left.
         self._first = self._middle = Stamp(line - _FRESH_LINES, time_ns - round(_FRESH_LINES * period_ns))
         self._last = Stamp(line, time_ns)
 
     def note(self, line: int, time_ns: int) -> None:
-        """A block that began at ``line``. Stamps come in order."""
+        """Add the stamp of a block that began at ``line``. Stamps come in order."""
         stamp = Stamp(line, time_ns)
         if self._first is None or self._last is None:
             self._first = self._middle = self._last = stamp
             return
         expected = self._last.time_ns + (line - self._last.line) * self.period_ns
-        # The worst of the last thousand blocks or so: one late stamp does not count for ever.
+        # The largest error of about the last thousand blocks: one late stamp does not count for ever.
         self._jitter_ns = max(abs(time_ns - expected), self._jitter_ns * 0.999)
         self._last = stamp
         assert self._middle is not None
@@ -62,7 +62,7 @@ class LineClock:
 
     @property
     def period_ns(self) -> float:
-        """A line's duration by the camera's clock: the trigger's until it has been measured."""
+        """Line period by the camera's clock; the trigger's until it has been measured."""
         if self._first is None or self._last is None or self._last.line == self._first.line:
             return self._nominal_ns
         return (self._last.time_ns - self._first.time_ns) / (self._last.line - self._first.line)
@@ -73,12 +73,12 @@ class LineClock:
         return round((self.period_ns / self._nominal_ns - 1) * 1e9) if self._nominal_ns else 0
 
     def line_at(self, time_ns: int) -> int | None:
-        """The line that began at a later ``time_ns``; None when it cannot be told for certain."""
+        """Return the line that began at ``time_ns``, after the latest stamp; None if it is not certain."""
         if self._first is None or self._last is None or time_ns <= self._last.time_ns or not self.period_ns:
             return None
         ahead = (time_ns - self._last.time_ns) / self.period_ns
         baseline = max(1, self._last.line - self._first.line)
-        doubt = self._jitter_ns / self.period_ns * (1 + ahead / baseline)
-        if abs(ahead - round(ahead)) > _CERTAIN or doubt > _CERTAIN:
+        uncertainty = self._jitter_ns / self.period_ns * (1 + ahead / baseline)
+        if abs(ahead - round(ahead)) > _CERTAIN or uncertainty > _CERTAIN:
             return None
         return self._last.line + round(ahead)

@@ -1,4 +1,4 @@
-"""Lines that never reached the recording: where, how many, and why."""
+"""Lines that never reached the recording: which, how many, and why."""
 
 from __future__ import annotations
 
@@ -8,27 +8,27 @@ from enum import StrEnum
 from acquire.camera.base import LossCause
 
 MAX_LOSSES = 8
-"""Losses that one ring slot can report about the lines before it."""
+"""Number of losses that one ring slot can report about the lines before it."""
 
 
 class Cause(StrEnum):
-    """Why lines are missing; the word that the recording's gaps carry."""
+    """Why lines are missing; the word that is stored with the recording's gaps."""
 
     CAMERA = "camera"
-    """The camera's own count jumped, for a reason that it did not tell."""
+    """The camera's own count jumped, for no stated reason."""
     NO_BUFFER = LossCause.NO_BUFFER.value
     INCOMPLETE = LossCause.INCOMPLETE.value
     ID_GAP = LossCause.ID_GAP.value
     MISSED_TRIGGER = LossCause.MISSED_TRIGGER.value
     DEVICE_LOST = LossCause.DEVICE_LOST.value
-    """What the camera told: see `acquire.camera.base.LossCause`."""
+    """Causes reported by the camera: see `acquire.camera.base.LossCause`."""
     GRABBER_LOST = "grabber_lost"
     """The grabber's process died; another took its place."""
     RECORDER_LOST = "recorder_lost"
-    """The recorder's process died with the line in its hands; the ring had it no more for the next one."""
+    """The recorder died before the line was on disk, and the ring no longer held it for its successor."""
     RING_FULL = "ring_full"
     """The recorder was late: the grabber found no free slot. A recording ends before the first such line; one
-    that goes on after its recorder was killed lists as a gap what found no slot meanwhile."""
+    that continues after its recorder was killed lists the lines that found no slot in between as a gap."""
     MIXED = "mixed"
     """Too many different losses at one place to tell them apart."""
     STALLED = "stalled"
@@ -55,10 +55,10 @@ class Loss:
 
 
 class LossLog:
-    """Losses since the last committed slot. They follow one another without a hole, so they stay few.
+    """Losses since the last committed slot. They are contiguous, and joined if their causes agree.
 
-    Past ``MAX_LOSSES`` the last one grows and becomes `Cause.MIXED`: bounded, and never silent. Where lines
-    found the ring full it becomes `Cause.RING_FULL`, since no recording goes past these.
+    Past ``MAX_LOSSES`` the last one grows and becomes `Cause.MIXED`: bounded, and never silent. If lines
+    found the ring full it becomes `Cause.RING_FULL`, since no recording goes past such a line.
     """
 
     def __init__(self) -> None:
@@ -79,7 +79,7 @@ class LossLog:
             self._losses[-1] = Loss(last.first_line, last.count + loss.count, cause)
 
     def take(self) -> tuple[Loss, ...]:
-        """All of them, in order; the log is empty afterwards."""
+        """Return all losses in order, and empty the log."""
         taken = tuple(self._losses)
         self._losses.clear()
         return taken

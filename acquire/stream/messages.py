@@ -1,4 +1,4 @@
-"""What the capture's owner and its processes say to each other. Few and rare: counts go by shared memory.
+"""The messages between the capture's owner and its processes. They are rare: counts go by shared memory.
 
 ::
 
@@ -28,8 +28,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class RunStarted:
-    """The trigger started; from now on its tags arrive. ``kept``: arm → ranges of lines, first and end, that
-    are in recordings already, for the successor of a recorder.
+    """The trigger has started; from now on its tags arrive.
+
+    ``kept``, for a recorder's successor: arm → ranges (first, end) of lines that recordings hold already.
     """
 
     clock: ClockFit
@@ -38,14 +39,14 @@ class RunStarted:
 
 @dataclass(frozen=True, slots=True)
 class Begin:
-    """A recording that is asked for, by whoever asks, down to the recorder.
+    """A request for a recording, passed from the caller down to the recorder.
 
     Attributes
     ----------
-    path, spec : where, and all that it says of itself but the first line, which the recorder sets
-    lines : its budget; None: until it is told to end
-    window : from the next line that both arms can give, unless it begins earlier
-    end_line : it does not go past this, wherever it begins
+    path, spec : where to record, and the recording's description without the first line
+    lines : the recording's budget; None: until it is ended by `End`
+    window : lines around an event; by default from the next line that both arms can give
+    end_line : the recording does not go past this line, wherever it begins
     """
 
     path: Path
@@ -56,19 +57,19 @@ class Begin:
 
     @property
     def budget_lines(self) -> int | None:
-        """Lines in all, those before the window's event counted; None: until it is told to end."""
+        """Total number of lines, including those before the window's event; None: until `End`."""
         after = self.window.post_lines
         return self.lines if after is None else self.window.pre_lines + after
 
 
 @dataclass(frozen=True, slots=True)
 class Cancel:
-    """Do not begin what was asked for last: the disk took too long; one that has begun ends."""
+    """Do not begin the recording requested last, because the disk took too long; one that has begun ends."""
 
 
 @dataclass(frozen=True, slots=True)
 class Note:
-    """Something happened at ``line``: for the events of every recording that holds it."""
+    """An event at ``line``, to be listed in every recording that holds the line."""
 
     line: int
     kind: str
@@ -77,7 +78,7 @@ class Note:
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """From ``first_line`` on the lines say something else of the light's code than before, in words."""
+    """The verdict on the light's code changes from ``first_line`` on; ``text`` states it in words."""
 
     first_line: int
     doubtful: bool
@@ -93,7 +94,7 @@ class Extend:
 
 @dataclass(frozen=True, slots=True)
 class Began:
-    """The recording exists; ``end_line``: where it ends by itself, if it does."""
+    """The recording exists; ``end_line``: where it ends without being stopped, if it does."""
 
     first_line: int
     end_line: int | None = None
@@ -101,14 +102,14 @@ class Began:
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """The recording cannot be made; nothing changed."""
+    """The recording cannot be created; nothing has changed."""
 
     error: AcquireError
 
 
 @dataclass(frozen=True, slots=True)
 class End:
-    """End the recording at ``line``, or at the newest one, for ``reason``."""
+    """End the recording for ``reason``, at ``line`` or at the newest line."""
 
     reason: str
     line: int | None = None
@@ -116,7 +117,7 @@ class End:
 
 @dataclass(frozen=True, slots=True)
 class Interrupt:
-    """End the recording early, for ``reason``; what the arms in ``lost`` owe is missing by ``cause``."""
+    """End the recording early, for ``reason``; arms in ``lost`` deliver no more, for ``cause``."""
 
     reason: str
     lost: tuple[str, ...] = ()
@@ -125,9 +126,9 @@ class Interrupt:
 
 @dataclass(frozen=True, slots=True)
 class Sealed:
-    """The recording is over and closed; not ``on_disk``, where that failed: somebody must recover it.
+    """The recording is closed. If sealing failed, ``on_disk`` is false and it must be recovered.
 
-    ``end_line`` is the line after its last one where the disk was too slow for more: it may go on.
+    ``end_line`` is the line after its last one if the disk was too slow for more: it may continue from there.
     """
 
     condition: RunCondition

@@ -1,14 +1,15 @@
 """A reader that the producer does not wait for: for previews, events and checks.
 
-An observer that is slow or dead costs nobody anything. The producer comes round and overwrites what it has
-not seen: that is counted, as the price of not being waited for, and the observer goes on with what is new::
+An observer that is slow or dead delays nobody. The producer comes round and overwrites the blocks that it has
+not read; these are counted as lost to this observer, which continues with newer ones::
 
     while (block := observer.acquire()) is not None:
         result = look_at(block)
         if observer.release():      # the block was whole until now
             keep(result)
 
-The last line is what makes torn reads impossible: what was overwritten while it was looked at is dropped.
+The check in `release` makes torn reads impossible: a result from a block that was overwritten in the meantime
+is dropped.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ _CURSOR, _PEAK, _LOST = range(3)
 
 @dataclass(frozen=True, slots=True)
 class ObserverStatistics:
-    """Of one observer, in blocks: what waits for it, the most that did, and what it never saw whole."""
+    """Counts of one observer, in blocks: waiting, most that ever waited, and never read whole."""
 
     fill: int
     peak: int
@@ -32,26 +33,27 @@ class ObserverStatistics:
 
 
 class Observer:
-    """Observer ``number`` of a ring; one process at a time. Who follows it goes on where it stopped."""
+    """Observer ``number`` of a ring; one process at a time. Its successor continues where it stopped."""
 
     def __init__(self, ring: Ring, number: int) -> None:
         self._ring = ring
         self._words = ring.observer_words(number)
 
     def acquire(self) -> RingBlock | None:
-        """The next block, or None when there is none now; the same one until released, if it lasts."""
+        """Return the next block, or None if there is none now; the same one until released or overwritten."""
         while (cursor := self._words[_CURSOR]) < (head := self._ring.head):
             waiting = head - cursor
             self._words[_PEAK] = max(self._words[_PEAK], min(waiting, self._ring.shape.slots))
-            # The slot of the oldest block is the producer's next.
+            # With all slots waiting, the oldest block's slot is the producer's next: too late to read it.
             block = self._ring.read(cursor) if waiting < self._ring.shape.slots else None
             if block is not None:
                 return block
+            # Skip to half a ring behind: the block after this one would be overtaken just as soon.
             self._lose(max(1, waiting - self._ring.shape.slots // 2))
         return None
 
     def release(self) -> bool:
-        """Go on to the next; says whether the block was whole all the while. If not, it counts as lost."""
+        """Advance to the next block; return whether this one stayed whole. If not, it counts as lost."""
         whole = self._ring.is_whole(self._words[_CURSOR])
         if whole:
             self._words[_CURSOR] += 1
@@ -60,7 +62,7 @@ class Observer:
         return whole
 
     def skip(self) -> int:
-        """Go on with the next block that comes; the blocks that were passed over, which are not lost."""
+        """Advance to the next block to come; return the number of blocks skipped, which are not lost."""
         head = self._ring.head
         passed = head - self._words[_CURSOR]
         self._words[_CURSOR] = head

@@ -1,4 +1,4 @@
-"""A recording that is being created: its lines, and what happened before that belongs to it."""
+"""A recording that is being created: its lines, and the earlier events that belong to it."""
 
 from __future__ import annotations
 
@@ -17,30 +17,30 @@ if TYPE_CHECKING:
     from acquire.stream.window import Span
 
 _MOST_NOTES = 1024
-"""Events that are remembered for recordings which begin later and hold their lines."""
+"""Number of events remembered for recordings that begin later and hold their lines."""
 
 
 @dataclass(frozen=True, slots=True)
 class Opening:
-    """A recording that is being created, for the lines in ``span``; None: for those that come then."""
+    """A recording that is being created, for the lines in ``span``; None: for those after its creation."""
 
     begin: Begin
     span: Span | None
     writer: Future[RecordingWriter]
 
     def is_over(self, first_line: int) -> bool:
-        """It would begin where it should have ended."""
+        """Return whether a recording from ``first_line`` on would begin at or after its end."""
         return self.begin.end_line is not None and first_line >= self.begin.end_line
 
     def lines_from(self, first_line: int) -> int | None:
-        """How many lines it takes from there on; None: until it is told to end."""
+        """Return the number of lines it takes from ``first_line`` on; None: until `End`."""
         if self.span is not None:
             return None if self.span.end_line is None else self.span.end_line - first_line
         return self.begin.lines if self.begin.end_line is None else self.begin.end_line - first_line
 
 
 class Notes:
-    """What happened lately, at which lines."""
+    """Recent events and their lines."""
 
     def __init__(self) -> None:
         self._notes: deque[Note] = deque(maxlen=_MOST_NOTES)
@@ -49,8 +49,9 @@ class Notes:
         self._notes.append(note)
 
     def before_and_since(self, first_line: int) -> list[Note]:
-        """For a recording that begins there: everything, and first of all which arms' code is in doubt there,
-        since it was in doubt before.
+        """Return all events for a recording that begins at ``first_line``.
+
+        They are preceded by the doubts about an arm's code that arose earlier and still hold at that line.
         """
         latest = {note.kind[-1]: note for note in self._notes if is_verdict(note, before=first_line)}
         doubts = [note for note in latest.values() if note.kind in DOUBTFUL.values()]
@@ -58,5 +59,5 @@ class Notes:
 
 
 def is_verdict(note: Note, *, before: int) -> bool:
-    """On the code of lines from before the line ``before`` on, and so of that line as well."""
+    """Return whether the note is a verdict on the code that began before the line ``before``."""
     return note.kind in CODE_EVENTS and note.line < before

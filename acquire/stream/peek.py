@@ -1,8 +1,8 @@
-"""A look at a ring from outside the capture: from any process of the same user, read-only, and nobody waits.
+"""A read-only view of a ring for any process of the same user, outside the capture. Nobody waits for it.
 
-What the memory is mapped for cannot be written through it, so that no defect of who looks can harm a line;
-its place in the ring is its own business and not in the ring. Slow or dead, it costs nobody anything: when
-the run ends, its owner empties the memory (`Ring.discard`), whoever still has it mapped.
+The memory is mapped read-only, so that no defect of the reader can harm a line; the reader's position is kept
+in its own process and not in the ring. A slow or dead reader delays nobody: when the run ends, its owner
+empties the memory (`Ring.discard`) even if a reader still has it mapped.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ if TYPE_CHECKING:
 
 
 class ForeignBytes(SharedBytes):
-    """Memory of another process, by the path that it tells; for reading only."""
+    """Memory of another process, mapped read-only by the path that its owner publishes."""
 
     def __init__(self, path: str, size: int) -> None:
-        """Raises DeviceError where it is not there any more, or not ours to read."""
+        """Map the memory. Raises DeviceError if it no longer exists, or may not be read."""
         self.name, self.size = path, size
         try:
             self._fd = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
         except OSError as error:
             raise DeviceError(
-                f"the lines cannot be looked at: {path}: {error.strerror}",
-                hint="be the daemon's user, on its host, with no fewer capabilities than it has",
+                f"the lines cannot be read: {path}: {error.strerror}",
+                hint="run as the daemon's user, on its host, with no fewer capabilities than it has",
             ) from error
         if os.fstat(self._fd).st_size != size:
             os.close(self._fd)
-            raise DeviceError(f"the lines cannot be looked at: {path} is not the memory of this ring")
+            raise DeviceError(f"the lines cannot be read: {path} is not the memory of this ring")
         try:
             self.map = mmap.mmap(self._fd, size, flags=mmap.MAP_SHARED, prot=mmap.PROT_READ)
         except BaseException:
@@ -58,14 +58,14 @@ class Peek:
     """
 
     def __init__(self, name: str, path: str, shape: RingShape) -> None:
-        """Raises DeviceError where the memory cannot be had."""
+        """Open the ring. Raises DeviceError if its memory cannot be mapped."""
         self._ring = Ring(name, shape, ForeignBytes(path, shape.size))
         self._number = self._ring.head
         self.lapped = 0
-        """Blocks that came and went unseen."""
+        """Number of blocks that were overwritten unread."""
 
     def next(self) -> RingBlock | None:
-        """The next block, or None when there is none now; the same one until `took`."""
+        """Return the next block, or None if there is none now; the same one until `took`."""
         slots = self._ring.shape.slots
         while (head := self._ring.head) > self._number:
             waiting = head - self._number
@@ -76,7 +76,7 @@ class Peek:
         return None
 
     def took(self) -> bool:
-        """Go on to the next; says whether the block was whole all the while. If not, it was not seen."""
+        """Advance to the next block; return whether this one stayed whole. If not, it counts as unread."""
         whole = self._ring.is_whole(self._number)
         if whole:
             self._number += 1
@@ -86,11 +86,11 @@ class Peek:
 
     @property
     def newest_line(self) -> int:
-        """The line after the last that has come; 0 before the first."""
+        """The line after the last committed one; 0 before the first."""
         return self._ring.newest_line
 
     def stretch(self, first_line: int, count: int) -> tuple[NDArray[Any], NDArray[np.uint16]] | None:
-        """A copy of ``count`` lines (line, pixel) of the past, and flags; None where one is missing."""
+        """Return a copy of ``count`` past lines (line, pixel) and their flags; None if a line is missing."""
         shape, head = self._ring.shape, self._ring.head
         pixels = np.empty((count, shape.width), shape.dtype)
         flags = np.empty(count, np.uint16)
@@ -98,7 +98,7 @@ class Peek:
         for number in range(head - 1, max(-1, head - shape.slots), -1):
             block = self._ring.read(number)
             if block is None or block.end_line < end:
-                return None  # overwritten, or lines are missing between
+                return None  # overwritten, or lines are missing in between
             start = max(first_line, block.first_line)
             rows, here = slice(start - first_line, end - first_line), slice(start - block.first_line, None)
             taken = end - start
@@ -106,7 +106,7 @@ class Peek:
                 pixels[rows] = block.pixels[here][:taken]
                 flags[rows] = block.flags[here][:taken]
                 end = start
-            del block
+            del block  # its views keep the memory mapped
             if not self._ring.is_whole(number):
                 return None
             if end <= first_line:

@@ -1,4 +1,4 @@
-"""What a capture is asked to do, and what it says about itself while it does it."""
+"""The settings of a capture, and its status."""
 
 from __future__ import annotations
 
@@ -20,53 +20,53 @@ if TYPE_CHECKING:
     from acquire.trigger.base import TriggerRun
 
 OBSERVERS = 2
-"""Readers of a ring that nobody waits for: the watcher is the first, a preview can be the second."""
+"""Number of observers of a ring: the watcher is the first, a preview can be the second."""
 
 MAX_SUBSTEPS = 8
 """A line's code is recorded in one byte."""
 
 TAG_DELAY_S = 0.5
-"""How late a tag may come."""
+"""Longest delay of a tag."""
 
 END_S = 30.0
-"""For what a capture has started to end in order, before it is ended by force."""
+"""Time for a capture's processes and trigger to end in order, before they are killed."""
 
 PATIENT_RINGS = 3
-"""A recorder is given up once lines of so many rings have come since its last sign of life."""
+"""A recorder is given up once this many rings of lines have come since its last sign of life."""
 
 SKEW_RINGS = 32
-"""An arm that lags behind the other by the lines of so many rings is taken for stalled."""
+"""An arm that lags behind the other by this many rings of lines counts as stalled."""
 
 
 @dataclass(frozen=True, slots=True)
 class CapturePlan:
-    """One run of the capture path. Picklable; refuses with UsageError what cannot work.
+    """Settings of one run of the capture path. Picklable; raises UsageError for settings that cannot work.
 
     Attributes
     ----------
-    run : what the trigger is asked to do
+    run : settings of the trigger
     stages, pixels, dtype : M; pixels per line; "uint8" or "uint16"
     block_lines, ring_slots : lines per ring slot; slots per arm
-    white_dn : a pixel that has this value is saturated
+    white_dn : value from which on a pixel is saturated
     openers : arm → how its camera is opened, in the grabber's process
-    stall_timeout_s : an arm that delivers nothing for so long ends the recording; while nothing is
+    stall_timeout_s : an arm that delivers nothing for this long ends the recording; while nothing is
         recorded it is a fault
-    patience_s : a recorder that waits for the disk for longer is a fault, and one that shows no life for
-        another reason is replaced; None: the disk as long as it takes, the recorder for `PATIENT_RINGS` times
-        what the rings hold, and for ``stall_timeout_s`` at least
-    goes_on : a recording that ended since the disk was too slow goes on in a further segment
-    seal_timeout_s : at the capture's end, a recording of which nothing more reaches the disk for so long is
-        given up: it is left to be recovered
+    patience_s : a recorder that waits longer for the disk is a fault, and one that shows no life for
+        another reason is replaced; None: wait for the disk without limit, and for the recorder
+        `PATIENT_RINGS` times as long as the rings hold lines, at least ``stall_timeout_s``
+    goes_on : a recording that ended because the disk was too slow continues in a further segment
+    seal_timeout_s : when the capture is closed, a recording of which nothing more reaches the disk for this
+        long is given up, and left to be recovered
     tag_wait_s : how long lines wait for the tag that confirms them, once it is due, before they are flagged
     reopen_timeout_s : how long a camera that is gone is waited for; less than ``stall_timeout_s``, or the
         arm counts as stalled first
-    line_period_ns : by the trigger's clock; 0: not told
-    realtime : grabbers run before everything else on the host, where that is allowed
+    line_period_ns : line period by the trigger's clock; 0: unknown
+    realtime : grabbers run ahead of everything else on the host, where that is allowed
     columns : compact layout: arm → first column and the one after the last, on the one camera that
         ``openers["a"]`` opens; empty: a camera per arm
     ring_reserve : slots that hold no history: see `RingShape`
-    watch : what is looked for in the lines while they pass; None: nothing
-    disk : that is written to; another than the local one behaves as a test wants
+    watch : checks of the lines while they pass; None: none
+    disk : file system that is written to; tests pass one that fails or is slow
     """
 
     run: TriggerRun
@@ -101,8 +101,8 @@ class CapturePlan:
             )
         if self.dtype not in ("uint8", "uint16"):
             raise UsageError(f"a capture cannot have {self.dtype!r} samples", possible="uint8, uint16")
-        # Lines wait for their tag in the ring, and no longer once half of it is full: a sixth is for a tag
-        # that comes late on a busy host.
+        # Lines wait in the ring for their tag until half of the ring is full. Of that half, a third of the
+        # ring is for the distance of tags, and a sixth for a tag that comes late on a busy host.
         most = self.ring_shape.slots * self.block_lines // 3
         if not 1 <= self.run.tag_every_lines <= most:
             raise UsageError(
@@ -113,7 +113,7 @@ class CapturePlan:
 
     @property
     def depth_lines(self) -> int:
-        """Lines that a camera delivers before the trigger's line 0."""
+        """Number of lines that a camera delivers before the trigger's line 0."""
         return Geometry(self.stages, self.run.substeps, 1).depth_lines
 
     @property
@@ -129,12 +129,12 @@ class CapturePlan:
 
     @property
     def ring_s(self) -> float:
-        """Seconds of lines that a ring holds at most; 0 where time is not told."""
+        """Seconds of lines that a ring holds at most; 0 if the line period is unknown."""
         return self.ring_slots * self.block_lines * self.line_period_ns / 1e9
 
     @property
     def hung_after_s(self) -> float:
-        """A recorder that shows no life for so long, and does not wait for the disk, is replaced."""
+        """Seconds without a sign of life after which a recorder is replaced, unless it waits for the disk."""
         if self.patience_s is not None:
             return self.patience_s
         return max(self.stall_timeout_s, PATIENT_RINGS * self.ring_s)
@@ -146,43 +146,46 @@ class CapturePlan:
 
     @property
     def margin_lines(self) -> int | None:
-        """Lines by which a camera may seem ahead of the trigger's tags; None where time is not told."""
+        """Lines by which a camera may be ahead of the trigger's tags; None if the line period is unknown."""
         if not self.line_period_ns:
             return None
         return self.run.tag_every_lines + round(TAG_DELAY_S * 1e9 / self.line_period_ns)
 
     @property
     def max_skew_lines(self) -> int:
-        """Lines by which one arm may be ahead of the other, and by which a camera's count may jump: after
-        a larger jump the other arm would be taken for stalled, and its rows would be written in one go.
+        """Lines by which one arm may be ahead of the other, and by which a camera's count may jump.
+
+        After a larger jump the other arm would count as stalled, and its rows would be written in one go.
         """
         return SKEW_RINGS * self.ring_slots * self.block_lines
 
 
 @dataclass(frozen=True, slots=True)
 class CaptureStatus:
-    """The capture at one moment; counts may be a few milliseconds apart. JSON, but for ``condition``.
+    """The state of the capture at one moment; counts may be a few milliseconds apart.
+
+    All of it is JSON except ``condition``.
 
     Attributes
     ----------
     recording : a recording is being written
     draining : its last line is known
     done : the latest recording is closed; ``condition``, ``end_reason`` and ``ledger`` are final
-    path : of the latest recording; another than was asked for, when its recorder was killed and replaced
+    path : path of the latest recording; not the one requested if its recorder was killed and replaced
     first_line : the trigger's number of its row 0, or None before the first recording
     recorded_lines, committed_lines : rows that both arms have; rows that a reader finds
     ring : arm → slots, fill, peak, drops (blocks), dropped_lines, all since arm
-    lines : arm → delivered, preroll, discarded (taken from the ring, but in no recording), and lost by
-        cause, since arm, and ``saturated`` in a pixel at least; and of the latest recording ``recorded``
-        rows, of which ``missing``. After `close`: delivered = preroll + lost["ring_full"] + discarded +
+    lines : arm → delivered, preroll, discarded (taken from the ring, but in no recording), lost by cause,
+        and ``saturated`` (in at least one pixel), all since arm; of the latest recording ``recorded`` rows,
+        of which ``missing``. After `close`: delivered = preroll + lost["ring_full"] + discarded +
         recorded − missing. Also how often the camera was ``reopened``, and its ``clock``: the latest stamp
         (line, its time by the camera) and how much faster it runs than the trigger's, in parts per billion;
-        all 0 where it tells no time. The ``check`` of the code, where it is made: verdict, shift, and the
-        line after the last looked at
+        all 0 if it has no time stamps. The ``check`` of the code, if one is made: verdict, shift, and the
+        line after the last one checked
     accounts : arm → what became of every pulse since arm
-    waiting : what is being waited for that takes longer than it should, in words; "" for nothing
-    fault : what failed first, or None
-    pids : process numbers: of the recorder, and of each grabber
+    waiting : an operation that takes longer than it should, in words; "" for none
+    fault : the first failure, or None
+    pids : process numbers of the recorder and of each grabber
     orphans : recordings that their recorder did not live to seal: to be recovered
     trigger : clock_hz, uncertainty_ns of its relation to UTC, pulses, and silent_s since it last answered
     """

@@ -1,15 +1,15 @@
 """The process that empties both rings: while armed it discards, while recording it writes.
 
-What it may do next is a table (`recorder_states`). Lines are discarded while a recording is opened as well:
-its first line is chosen when it can take lines. Unless it begins with what was before (`window`): that is
-taken back from the rings at once, and waits there.
-A block waits in its ring until a tag of the trigger confirms its lines, but not longer than ``tag_wait_s``
-and not once the ring is half full; then its lines are written flagged. A recording that cannot be written as
-fast as lines come ends, sealed, while the rings still hold all of it (`stalls.Backlog`).
+Its state machine is a table (`recorder_states`). Lines are also discarded while a recording is being created:
+its first line is chosen when it can take lines. If it begins with past lines (`window`), these are taken back
+from the rings at once, and wait there.
+A block waits in its ring until a tag of the trigger confirms its lines, but no longer than ``tag_wait_s`` and
+not once the ring is half full; then its lines are written flagged. A recording that cannot be written as fast
+as lines come ends, sealed, while the rings still hold all of it (`stalls.Backlog`).
 
-Creating and sealing a recording wait for the disk: a second thread does them, so that the rings are emptied
-meanwhile. What is counted is published in shared memory at every turn of the loop, so that nobody has to
-ask; only beginnings and ends are told.
+Creating and sealing a recording wait for the disk: a second thread does both, so that the rings are emptied
+in the meantime. Counts are published in shared memory at every turn of the loop, so that nobody has to
+request them; messages report only beginnings and ends.
 """
 
 from __future__ import annotations
@@ -45,20 +45,20 @@ if TYPE_CHECKING:
     from acquire.stream.recorder_plan import RecorderPlan
     from acquire.stream.ring import Ring, RingBlock
 
-# Bells end the wait as soon as lines come. This is for what has none: a commit that is due, silence.
+# Doorbells end the wait as soon as lines come. The limit is for events without one: a due commit, silence.
 _WAIT_S = 0.02
-# What `kill -9` may take, besides the chunks that are not whole yet.
+# The time that `kill -9` may cost, besides the chunks that are not complete yet.
 _COMMIT_INTERVAL_S = 0.1
 _COMMIT_SHARE = 4
-"""Commits take at most one part in so many of the time, however slow the disk."""
-# A recorder that lags behind must still commit, and hear that it is to end.
+"""Commits take at most this fraction (1/4) of the time, however slow the disk."""
+# A recorder that lags behind must still commit, and read its messages.
 _BLOCKS_PER_TURN = 8
 _CALM_BLOCKS = 2
-"""Waiting in a ring. With more, the disk is kept busy while blocks are made ready: two processors for one."""
+"""With more blocks waiting, the disk writes while the next blocks are prepared: two processors, not one."""
 _LONGEST_DRAIN_S = 0.05
-"""While messages and commits wait."""
+"""Longest time that messages and commits wait."""
 _CROSSING = {Cancel: RecorderEvent.CANCEL, Extend: RecorderEvent.EXTEND, End: RecorderEvent.END}
-"""Commands that may be on the way while a recording ends by itself: without a row they change nothing."""
+"""Commands that may be on their way when a recording ends: without a row in the table they are ignored."""
 
 
 def record(
@@ -69,9 +69,9 @@ def record(
     counters: Counters,
     others: dict[str, Counters],
 ) -> None:
-    """Life of the recorder: empty the rings, write recordings when told to, until told to end.
+    """Main function of the recorder: empty the rings and write recordings on request, until Quit.
 
-    ``others``: what ``trigger`` and ``watcher`` count, where there is one.
+    ``others``: counters of cameras, trigger and watcher, see `ExternalCounts`.
     """
     if plan.realtime:
         become_important()  # not in real time: it computes, and must not keep the grabbers waiting
@@ -127,13 +127,13 @@ class Recorder:
             self._waiting.register(source, select.POLLIN | select.POLLHUP)
 
     def turn(self) -> bool:
-        """One round over messages, disk, tags and rings; False when nothing is left to live for."""
+        """Do one round over messages, disk, tags and rings; return False once there is nothing left to do."""
         self._counters.add("turns", 1)
         try:
-            # The order matters: commands are not kept waiting by lines, and tags come before the lines that
-            # they confirm, which else would wait a turn for them.
-            self._listen()
-            self._look_at_disk()
+            # The order matters: lines must not keep commands waiting, and tags come before the lines that
+            # they confirm, which would otherwise wait a turn for them.
+            self._read_messages()
+            self._check_disk()
             while (block := self._tags.acquire()) is not None:
                 found = self._tagger.verify(block.pixels) if self._tagger else []
                 self._tags.release()
@@ -141,7 +141,7 @@ class Recorder:
                     self._session.mismatches(found)
             self._busy = self._drain()
             if self._session is not None:
-                self._look_after(self._session)
+                self._update(self._session)
         except (AcquireError, OSError) as error:
             if self._session is None:
                 raise
@@ -149,7 +149,7 @@ class Recorder:
         return self._owner or self._state in BUSY
 
     def wait(self) -> None:
-        """Until something may have come, at most for a moment; not at all while there is work."""
+        """Wait until something may have come, for `_WAIT_S` at most; not at all while there is work."""
         if self._busy:
             return
         self._waiting.poll(_WAIT_S * 1000)
@@ -158,18 +158,18 @@ class Recorder:
 
     # ---- messages
 
-    def _listen(self) -> None:
+    def _read_messages(self) -> None:
         try:
             while self._owner and (message := self._mailbox.take()) is not None:
                 event = _CROSSING.get(type(message))
                 if event is None or (self._state, event) in TABLE:
-                    self._obey(message)
+                    self._handle(message)
         except OwnerGone as gone:
             self._owner = False
             self._waiting.unregister(self._mailbox)
             self._interrupt(str(gone), dict.fromkeys(ARMS, Cause.INTERRUPTED))
 
-    def _obey(self, message: object) -> None:
+    def _handle(self, message: object) -> None:
         match message:
             case RunStarted(clock, kept):
                 for name, arm in self._arms.items():
@@ -198,12 +198,12 @@ class Recorder:
         self._counters["state"] = STATES.index(self._state)
 
     def _begin(self, begin: Begin) -> None:
-        """Lines go on being discarded until the recording can take them."""
+        """Have a recording created; lines are discarded until it can take them."""
         try:
-            after(self._state, RecorderEvent.BEGIN)  # before anything is touched
+            after(self._state, RecorderEvent.BEGIN)  # refuse before anything is touched
             lines = None
             if not begin.window.is_now:
-                # Taken back from the rings' history at once, before the cameras come round to it.
+                # Take lines back from the rings' history at once, before the cameras overwrite them.
                 held = hold(begin.window, {name: arm.ring for name, arm in self._arms.items()})
                 for name, blocks in held.taken.items():
                     for block in blocks:
@@ -212,8 +212,8 @@ class Recorder:
         except (StateError, UsageError) as error:
             self._mailbox.post(Refused(error))
             return
-        # Directories, locks and reserved space can take a busy disk seconds, in which the rings must be
-        # emptied.
+        # On a busy disk, directories, locks and reserved space can take seconds, during which the rings must
+        # be emptied.
         writer = self._disk.submit(
             self._waits.elsewhere, RecordingWriter.prepare, begin.path, begin.spec, self._plan.disk
         )
@@ -221,7 +221,7 @@ class Recorder:
         self._go(RecorderEvent.BEGIN)
 
     def _count(self, name: str, first: int, end: int, sign: int = 1) -> None:
-        """Lines of a block that leaves the ring; with ``sign`` -1, of one that was taken back."""
+        """Count the lines of a block that leaves the ring; with ``sign`` -1, of one that was taken back."""
         stored = self._arms[name].kept.count(first, end)
         self._counters.add(f"stored_{name}", sign * stored)
         self._counters.add(f"discarded_{name}", sign * (end - first - stored))
@@ -234,7 +234,7 @@ class Recorder:
             self._session.note(note.kind, note.line, note.text)
 
     def _interrupt(self, reason: str, lost: dict[str, Cause]) -> None:
-        """What is lost stays lost: a recording that is only being created will know."""
+        """End the recording early. The trouble also ends one that is still being created."""
         before = self._trouble[1] if self._trouble else {}
         self._trouble = reason, lost | before  # the first cause of an arm's loss stays
         if self._session is not None:
@@ -242,27 +242,27 @@ class Recorder:
             self._session.end(self._common_line(), reason, RunCondition.INTERRUPTED)
 
     def _newest_line(self) -> int:
-        """The line before which everything has come, from one arm at least."""
+        """Return the line up to which at least one arm has delivered."""
         return max(arm.ring.newest_line for arm in self._arms.values())
 
     def _common_line(self) -> int:
-        """The line up to which both arms have delivered."""
+        """Return the line up to which both arms have delivered."""
         return min(arm.ring.newest_line for arm in self._arms.values())
 
     # ---- the disk's answers
 
-    def _look_at_disk(self) -> None:
+    def _check_disk(self) -> None:
         if self._opening is not None and self._opening.writer.done() and self._is_ready_for(self._opening):
             opening, self._opening = self._opening, None
             self._opened(opening)
         if self._closing is not None and self._closing[1].done():
             (session, sealed), self._closing = self._closing, None
             self._go(RecorderEvent.SEALED)
-            self._publish(session)  # without what the disk did not keep
+            self._publish(session)  # the books no longer contain lines that the disk did not keep
             for name, lines in session.surplus.items():
                 self._forget(name, lines, session.end_line, "discarded")
             for name, lines in session.left_out.items():
-                # Of a block that was taken in part, all lines are counted as discarded.
+                # Negative: a block that was taken in part had all its lines counted as discarded.
                 self._forget(name, lines, session.end_line, "unsaved" if lines > 0 else "discarded")
             ended = sealed.result()
             if self._cut_short and ended.on_disk:
@@ -270,7 +270,7 @@ class Recorder:
             self._mailbox.post(ended)
 
     def _is_ready_for(self, opening: Opening) -> bool:
-        """What waits goes first: a recording must not begin with rings that are about to overflow."""
+        """Return whether the recording may begin: with a backlog, the rings might overflow at once."""
         if opening.span is not None or self._state is RecorderState.CANCELLED:
             return True
         if opening.writer.exception() is not None:
@@ -278,8 +278,9 @@ class Recorder:
         return all(2 * arm.ring.fill < arm.ring.shape.slots for arm in self._arms.values())
 
     def _forget(self, name: str, lines: int, end_line: int, place: str) -> None:
-        """The recording ends before so many lines that were taken for it: they belong to ``place``, unless an
-        earlier recording has them. Below 0: the disk kept more than was counted.
+        """Move ``lines`` taken for the recording, but not part of it, to the count ``place``.
+
+        Lines of an earlier recording stay. Negative: the disk kept more than was counted.
         """
         kept = self._arms[name].kept
         kept.end_at(end_line)
@@ -289,17 +290,16 @@ class Recorder:
         self._counters.add(f"{place}_{name}", lines)
 
     def _opened(self, opening: Opening) -> None:
-        """From the newest line on: both arms have still to deliver what comes after it; or from the past."""
+        """Begin the recording, once it is created, at its span or at the newest line of both arms."""
         if opening.span is not None:
             first_line = opening.span.first_line
         else:
-            # Past what found a ring full, too: a recording must not begin with lines that are lost already.
+            # Also after lines that found a ring full: a recording must not begin with lines lost already.
             dropped_end = max(arm.ring.dropped_end for arm in self._arms.values())
             first_line = max(self._newest_line(), dropped_end)
         try:
             writer = opening.writer.result()
             with self._waits.loop():
-                # Nobody wants it any more, or it would begin where it should have ended.
                 if self._state is RecorderState.CANCELLED or opening.is_over(first_line):
                     writer.abandon()
                     past = f"line {first_line} is past the recording's end"
@@ -318,7 +318,7 @@ class Recorder:
             arm.revive(time.monotonic())
             arm.backlog = Backlog()
             arm.kept.begin(arm.ring.history_line)
-        # The counters first: whoever hears that it began must not find those of the recording before.
+        # Counters first: the receiver of Began must not find those of the recording before.
         self._publish(self._session)
         end_line = self._session.end_line
         self._mailbox.post(Began(first_line, None if end_line == OPEN_END else end_line))
@@ -326,7 +326,7 @@ class Recorder:
             self._interrupt(*self._trouble)
 
     def _refuse(self, error: AcquireError) -> None:
-        if self._state is not RecorderState.CANCELLED:  # else nobody waits for the answer
+        if self._state is not RecorderState.CANCELLED:  # then nobody waits for the answer
             self._mailbox.post(Refused(error))
         self._go(RecorderEvent.REFUSED)
 
@@ -349,7 +349,7 @@ class Recorder:
         return session
 
     def _close(self, session: Session, error: Exception | None = None) -> None:
-        # Lent blocks lie in the rings: they are given back before another thread has the writer.
+        # Blocks lent to the writer are in the rings: release them before the other thread gets the writer.
         for name, arm in self._arms.items():
             try:
                 self._release(name, arm)
@@ -363,9 +363,9 @@ class Recorder:
     # ---- tags and lines
 
     def _drain(self) -> bool:
-        """Take what the rings have, some blocks at most; says whether there was any.
+        """Take a limited number of blocks from the rings; return whether there were any.
 
-        The arms take turns: in a hurry, one's block is made ready while the disk writes the other's.
+        The arms take turns: in a hurry, one arm's block is prepared while the disk writes the other's.
         """
         until_s = time.monotonic() + _LONGEST_DRAIN_S
         for taken in range(_BLOCKS_PER_TURN):
@@ -377,14 +377,14 @@ class Recorder:
         return True
 
     def _move(self, name: str, arm: Arm) -> bool:
-        """Release the arm's last block and take the next, if there is one that may go."""
+        """Release the arm's last block and take the next one; return False if none is ready."""
         self._release(name, arm)
         arm.watch(time.monotonic(), self._counters[f"awaited_{name}"])
         self._hold_ups.update()
         if self._opening is not None and self._opening.span is not None:
-            return False  # it waits for the recording
+            return False  # the blocks taken back wait for the recording
         block = arm.ring.acquire()
-        if block is None or not self._may_go(arm.ring, block):
+        if block is None or not self._is_ready(arm.ring, block):
             return False
         arm.lent = Lent(block.first_line, block.end_line)
         if self._session is None:
@@ -394,10 +394,10 @@ class Recorder:
         return True
 
     def _take(self, name: str, arm: Arm, block: RingBlock, session: Session) -> None:
-        """Write the block; end while all lines are still there, should the disk be too slow for them.
+        """Write the block; if the disk is too slow, end the recording while the rings still hold all lines.
 
-        Once the ring has overflowed, before the first line that it had no room for: whatever held us up, the
-        recording has every line that it covers.
+        Once a ring has overflowed, the recording ends before the first line that found no room: whatever held
+        the recorder up, the recording has every line that it covers.
         """
         assert arm.lent is not None
         if (line := session.overrun(name, block)) is not None:
@@ -412,7 +412,7 @@ class Recorder:
             arm.kept.add(end_line - written, end_line)
         fill, slots = arm.ring.fill, arm.ring.shape.slots
         if arm.backlog.grows(fill, slots) and not session.ending:
-            # Before the slot is released: nothing has been lost as long as the ring is not overtaken.
+            # Decided before the slot is released: nothing is lost until the ring overflows.
             self._cut_short = True
             waiting = f"{fill} of {slots} ring slots of arm {name} wait for disk or codec"
             reason = f"too slow to write: {waiting}{self._held_up}"
@@ -420,7 +420,7 @@ class Recorder:
         self._hold_ups.took(block.time_ns / 1e9)
 
     def _count_overrun(self, name: str, block: RingBlock, session: Session) -> None:
-        """Lines that found the ring full are lost where a recording lists them; each once."""
+        """Count lines that found the ring full and are a gap in a recording, each of them once."""
         for loss in block.losses:
             first = max(loss.first_line, session.books[name].next_line, self._counters[f"overrun_to_{name}"])
             end = min(loss.end_line, session.end_line)
@@ -429,7 +429,7 @@ class Recorder:
                 self._counters[f"overrun_to_{name}"] = end
 
     def _release(self, name: str, arm: Arm) -> None:
-        """Give the arm's last block back to its ring, once it is written."""
+        """Release the arm's last block to its ring, once it is written."""
         lent, arm.lent = arm.lent, None
         if lent is None:
             return
@@ -443,12 +443,12 @@ class Recorder:
 
     @property
     def _held_up(self) -> str:
-        """For an end reason."""
+        """The latest hold-up, in words for an end reason."""
         longest_s = self._hold_ups.longest_s
         return f", after {longest_s:.1f} s without an answer of the disk" if longest_s >= 1 else ""
 
-    def _may_go(self, ring: Ring, block: RingBlock) -> bool:
-        """Nothing is gained by letting the block wait any longer for its tag."""
+    def _is_ready(self, ring: Ring, block: RingBlock) -> bool:
+        """Return whether the block is confirmed, or need not wait any longer for its tag."""
         if self._session is None or self._tagger is None or block.end_line <= self._tagger.confirmed_end:
             return True
         # Once one block has waited in vain, those after it do not wait at all until a tag comes again.
@@ -460,14 +460,14 @@ class Recorder:
         overdue = self._waited_in_vain_for == self._tagger.confirmed_end
         return overdue or not self._owner
 
-    # ---- the recording under way
+    # ---- the current recording
 
-    def _look_after(self, session: Session) -> None:
+    def _update(self, session: Session) -> None:
         session.doubted = self._external.doubted()
         session.trigger, session.cameras = self._external.trigger(), self._external.cameras()
         session.verified = self._external.verified()
         for name, arm in self._arms.items():
-            # Once more: what came while this was held up by the disk is no silence.
+            # Once more: an arm whose lines came while the disk held up this loop is not silent.
             arm.watch(time.monotonic(), self._counters[f"awaited_{name}"])
             if name in session.lost and not arm.ring.fill:
                 session.give_up(name)
@@ -484,7 +484,7 @@ class Recorder:
                 session.commit()
             ended = time.monotonic()
             self._commit_s = ended + max(_COMMIT_INTERVAL_S, (_COMMIT_SHARE - 1) * (ended - begun))
-        # After the commit: what is published as committed is what survives a kill.
+        # After the commit: the lines published as committed must survive a kill.
         self._publish(session)
 
     def _publish(self, session: Session) -> None:

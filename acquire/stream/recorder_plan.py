@@ -1,4 +1,4 @@
-"""What the recorder is told when it is started, and what it publishes in shared memory."""
+"""The recorder's settings, and the counters that it publishes in shared memory."""
 
 from __future__ import annotations
 
@@ -17,19 +17,23 @@ COUNTERS = (
     *("unsaved_a", "unsaved_b", "overrun_a", "overrun_b", "overrun_to_a", "overrun_to_b"),
     *("disk_since_ns", "store_since_ns", "state"),
 )
-"""Of the latest recording: rows in both arms, rows that a reader finds, whether its last line is known; per
-arm the rows written and those of them that are missing. Since armed: per arm the lines taken from its ring
-that no recording holds, those that one does, and those that a disk which failed did not keep; those that
-found their ring full and are a gap in a recording, and the line after the last of these; turns of the loop,
-which stand still when it hangs or waits for the disk. Since when, by the monotonic clock, the loop waits for
-the disk, and the thread that creates and seals recordings is at work; 0 while they do not. What the recorder
-does: its place in `recorder_states.STATES`. The owner alone counts how often it has seen that an arm's next
-grabber is only starting: its silence means nothing then."""
+"""Of the latest recording: rows in both arms (``recorded``), rows that a reader finds (``committed``),
+whether its last line is known (``draining``), and per arm the rows written and how many of them are missing.
+
+Since arm, per arm: the lines taken from its ring into no recording (``discarded``), into one (``stored``),
+and those that a failed disk did not keep (``unsaved``); lines that found their ring full and are a gap in a
+recording (``overrun``), and the line after the last of these. ``turns`` of the loop stand still when it hangs
+or waits for the disk.
+
+``disk_since_ns``, ``store_since_ns``: since when, by the monotonic clock, the loop has been waiting for the
+disk, and the thread that creates and seals recordings has been at work; 0 while they do not. ``state``:
+index in `recorder_states.STATES`. ``awaited`` alone is written by the owner: how often it found an arm's new
+grabber still starting, in which case the arm's silence means nothing."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecorderPlan:
-    """What the recorder needs to know. Picklable."""
+    """The recorder's settings; see `CapturePlan`. Picklable."""
 
     run: TriggerRun
     stages: int

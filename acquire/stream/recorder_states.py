@@ -1,4 +1,4 @@
-"""What the recorder may do next: a table of (state, event) → state.
+"""The recorder's state machine: a table of (state, event) → state.
 
 ::
 
@@ -9,7 +9,7 @@
                       │  └─ REFUSED ── cancelled                                  │
                       └───────────────────────────────────────────────────────────┘
 
-Lines are discarded until a recording can take them: in `recording` alone they are written.
+Lines are discarded until a recording can take them: they are written in `recording` only.
 """
 
 from __future__ import annotations
@@ -31,24 +31,24 @@ class RecorderState(StrEnum):
 
 
 STATES = tuple(RecorderState)
-"""In shared memory a state is its place in here."""
+"""In shared memory a state is its index in this tuple."""
 
 MEANINGS = {
-    RecorderState.WAITING: "the recorder has not heard yet that the run has started",
+    RecorderState.WAITING: "the recorder has not been told yet that the run has started",
     RecorderState.DISCARDING: "nothing is being recorded",
     RecorderState.OPENING: "a recording is being created",
     RecorderState.CANCELLED: "a recording that was cancelled is being removed",
     RecorderState.RECORDING: "a recording is being written",
     RecorderState.SEALING: "a recording is being sealed",
 }
-"""For refusals and for the status."""
+"""Texts for refusals and for the status."""
 
 BUSY = frozenset(RecorderState) - {RecorderState.WAITING, RecorderState.DISCARDING}
-"""The recorder lives on in these when its owner has gone."""
+"""States in which the recorder keeps running although its owner is gone."""
 
 
 class RecorderEvent(StrEnum):
-    """What can happen to the recorder: the owner's messages, and what follows from disk and lines."""
+    """Events of the recorder: the owner's messages, and consequences of disk and lines."""
 
     RUN = "run"
     BEGIN = "start"
@@ -58,7 +58,7 @@ class RecorderEvent(StrEnum):
     CREATED = "created"
     REFUSED = "refused"
     LAST_LINE = "last line"
-    """Every line that the recording shall have is there, or a disk that failed takes no more."""
+    """Every line of the recording is there, or the disk failed and takes no more."""
     SEALED = "sealed"
 
 
@@ -70,7 +70,7 @@ TABLE: dict[tuple[RecorderState, RecorderEvent], RecorderState] = {
     (_S.OPENING, _E.REFUSED): _S.DISCARDING,
     (_S.OPENING, _E.CANCEL): _S.CANCELLED,
     (_S.CANCELLED, _E.REFUSED): _S.DISCARDING,
-    (_S.RECORDING, _E.CANCEL): _S.RECORDING,  # which ends as soon as what was taken is written
+    (_S.RECORDING, _E.CANCEL): _S.RECORDING,  # it ends as soon as the lines taken are written
     (_S.RECORDING, _E.END): _S.RECORDING,
     (_S.RECORDING, _E.EXTEND): _S.RECORDING,
     (_S.RECORDING, _E.LAST_LINE): _S.SEALING,
@@ -79,9 +79,9 @@ TABLE: dict[tuple[RecorderState, RecorderEvent], RecorderState] = {
 
 
 def after(state: RecorderState, event: RecorderEvent) -> RecorderState:
-    """The state that ``event`` leads to; StateError where the table has no row for it."""
+    """Return the state that ``event`` leads to. Raises StateError if the table has no row for it."""
     try:
         return TABLE[state, event]
     except KeyError:
-        hint = "again when that is over" if state in BUSY else ""
+        hint = "try again when that is over" if state in BUSY else ""
         raise StateError(f"{event}: {MEANINGS[state]}", hint=hint) from None

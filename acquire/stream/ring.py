@@ -12,20 +12,20 @@ observers that it does not.
                  ▼              ▼ tail        ▼ head
        │ reserve │   history    │   waiting   │ free, claimed next …   (block k lies in slot k mod slots)
 
-The producer claims a slot, fills it in place and commits it; with no slot free it is told so and counts
-the lines it drops. The reader acquires the oldest slot, reads it in place and releases it. What it has
-released stays where it is until the producer comes round: that is the ring's history, and `lease` takes it
-back. Between history and producer ``reserve`` slots are kept, so that the cameras can go on while the reader
-begins with what was.
+The producer claims a slot, fills it in place and commits it; if no slot is free it counts the lines that it
+drops. The reader acquires the oldest slot, reads it in place and releases it. Released blocks stay in place
+until the producer comes round: they are the ring's history, and `lease` takes them back. Between history and
+producer ``reserve`` slots are kept free, so that the cameras can continue while the reader begins with the
+history.
 
-An observer (`acquire.stream.observer`) reads without being waited for: dead or slow, it is lapped, and told
-how many slots it lost.
+An observer (`acquire.stream.observer`) reads without being waited for: if it is dead or slow the producer
+laps it, and it finds out how many slots it lost.
 
 The sequence number of block ``k`` is 2k + 1 while it is being filled and 2k + 2 when it is whole, so that a
-torn or stale read shows. Every word has one writer, and `head` and `tail` are stored last: a producer killed
-at any instant leaves whole blocks only, and its successor, given the same memory, goes on behind them.
-(Stores must be seen in order, as x86-64 does; elsewhere the doorbell's system call orders them. `lease` alone
-stores, then looks: two slots of reserve are more than a store can be late.)
+torn or stale read is detected. Every word has one writer, and `head` and `tail` are stored last: a producer
+killed at any instant leaves whole blocks only, and its successor, given the same memory, continues after
+them. (Other processes must see stores in order, as on x86-64; elsewhere the doorbell's system call orders
+them. Only `lease` stores and then reads: two slots of reserve are more than a store can be late.)
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _HEAD, _PEAK, _DROPPED_BLOCKS, _DROPPED_LINES, _NEWEST, _DROPPED_END = range(6)
-_TAIL = 8  # the reader's, in a line of its own
-_OBSERVERS = 16  # and each observer in one
-_LINE_WORDS = 8  # a cache line: writers in different processes do not wait for each other's
+_TAIL = 8  # the reader's, in a cache line of its own
+_OBSERVERS = 16  # each observer's words as well
+_LINE_WORDS = 8  # words in a cache line: writers in different processes do not contend for one
 _SEQUENCE, _FIRST_LINE, _COUNT, _TIME_NS, _TOTAL, _LOSS_COUNT, _LOSSES = range(7)
 _HEADER_WORDS = 32  # six, and three for each of MAX_LOSSES, in whole cache lines
 _PAGE_BYTES = 4096
@@ -64,7 +64,7 @@ LEAST_RESERVE = 2
 class RingShape:
     """``slots`` slots of up to ``rows`` rows of ``width`` samples of ``dtype``; room for ``observers``.
 
-    ``reserve`` slots are no history: they stay free for the producer while the reader begins with the past.
+    ``reserve`` slots are never history: they stay free for the producer while the reader begins with history.
     """
 
     slots: int
@@ -86,7 +86,7 @@ class RingShape:
 
     @property
     def history_slots(self) -> int:
-        """Most slots that can be taken back."""
+        """Largest number of slots that can be taken back."""
         return max(0, self.slots - self.reserve)
 
     @property
@@ -103,7 +103,7 @@ class RingShape:
 
     @property
     def slot_stride(self) -> int:
-        """Bytes from slot to slot; page-aligned, so that a slot can go to disk without a copy."""
+        """Bytes from slot to slot; page-aligned, so that a slot can be written to disk without a copy."""
         return _page_up(self.rows * self.width * np.dtype(self.dtype).itemsize)
 
     @property
@@ -113,10 +113,10 @@ class RingShape:
 
 @dataclass(frozen=True, slots=True)
 class RingStatistics:
-    """What happened to a ring since it was made; in blocks, but for ``dropped_lines``.
+    """Counts of a ring since it was created, in blocks, except ``dropped_lines``.
 
-    ``fill`` waits for the reader, and was ``peak`` at most; dropped is what found no free slot. ``history``
-    is what can be taken back.
+    ``fill``: blocks that wait for the reader; ``peak``: their maximum; dropped: blocks that found no free
+    slot; ``history``: blocks that can be taken back.
     """
 
     slots: int
@@ -154,7 +154,7 @@ class RingBlock:
 
 
 class Ring:
-    """See the module. One process produces, one consumes, any process may observe and read the statistics."""
+    """See the module. One process produces, one consumes, any may observe and read the statistics."""
 
     def __init__(
         self, name: str, shape: RingShape, memory: SharedBytes | None = None, bell: int = -1
@@ -175,24 +175,24 @@ class Ring:
     # ---- producer
 
     def claim(self) -> Slot | None:
-        """The next slot to fill, or None when the ring is full."""
+        """Return the next slot to fill, or None if the ring is full."""
         head = self._control[_HEAD]
         if head - self._control[_TAIL] == self.shape.slots:
             return None
         index = head % self.shape.slots
-        # Before a pixel is touched: an observer that still reads the slot's old block finds it odd
-        # afterwards.
+        # Before a pixel is touched: an observer that still reads the slot's old block then finds the number
+        # odd, and rejects the block.
         self._headers[index][_SEQUENCE] = 2 * head + 1
         return self._slots[index]
 
     def commit(self, first_line: int, count: int, losses: Sequence[Loss] = ()) -> None:
-        """Hand the claimed slot's first ``count`` rows over, as lines from ``first_line``."""
+        """Hand over the claimed slot's first ``count`` rows, as lines from ``first_line`` on."""
         head, total = self._control[_HEAD], self.committed_lines + count
         header = self._headers[head % self.shape.slots]
         header[_FIRST_LINE], header[_COUNT] = first_line, count
         header[_TIME_NS], header[_TOTAL] = time.monotonic_ns(), total
         _write_losses(header, losses)
-        # After the header's words: whoever finds it even finds what belongs to it.
+        # After the header's words: a reader that finds it even finds the words of this block.
         header[_SEQUENCE] = 2 * head + 2
         self._control[_NEWEST] = first_line + count
         self._control[_PEAK] = max(self._control[_PEAK], head + 1 - self._control[_TAIL])
@@ -208,7 +208,7 @@ class Ring:
     # ---- the reader that is waited for
 
     def acquire(self, timeout_s: float = 0.0) -> RingBlock | None:
-        """The oldest block, or None when none came within ``timeout_s``; the same one until released."""
+        """Return the oldest block, or None if none came within ``timeout_s``; the same one until released."""
         if not self._wait(timeout_s):
             return None
         tail = self._control[_TAIL]
@@ -225,14 +225,14 @@ class Ring:
         self._control[_TAIL] = tail + 1
 
     def lease(self, first_line: int) -> list[range]:
-        """Take released blocks back, from the one that holds ``first_line`` on; the lines of each.
+        """Take released blocks back, from the one that holds ``first_line`` on; return the lines of each.
 
-        Where the history begins later, all of it: see `history_line`. `acquire` gives them once more.
+        If the history begins later, all of it is taken: see `history_line`. `acquire` returns them again.
         """
         tail = self._control[_TAIL]
         oldest = min(tail, self._oldest())
-        self._control[_TAIL] = oldest  # first keep the producer away, then look what has been kept
-        # It may have claimed the oldest slots between our look at the head and this store.
+        self._control[_TAIL] = oldest  # first keep the producer away, then check which blocks are left
+        # The producer may have claimed the oldest slots between our read of the head and this store.
         while oldest < tail and not (self.is_whole(oldest) and self._end_line(oldest) > first_line):
             oldest += 1
             self._control[_TAIL] = oldest
@@ -240,7 +240,7 @@ class Ring:
         return [range(header[_FIRST_LINE], header[_FIRST_LINE] + header[_COUNT]) for header in headers]
 
     def empty(self) -> list[range]:
-        """Release everything that waits, unread; the lines of each block."""
+        """Release all waiting blocks unread; return the lines of each."""
         blocks = []
         while (block := self.acquire()) is not None:
             blocks.append(range(block.first_line, block.end_line))
@@ -248,12 +248,12 @@ class Ring:
         return blocks
 
     def fileno(self) -> int:
-        """The doorbell: readable when something was committed since `hush`."""
+        """The doorbell: readable if a block was committed since `hush`."""
         return self._bell
 
     def hush(self) -> None:
-        """Take note of the doorbell, after a wait on `fileno`."""
-        # Asked first: to read a bell that has not been rung is an error (EAGAIN).
+        """Reset the doorbell, after a wait on `fileno`."""
+        # Poll first: reading a bell that has not been rung is an error (EAGAIN).
         if self._ringing.poll(0):
             os.eventfd_read(self._bell)
 
@@ -261,19 +261,19 @@ class Ring:
 
     @property
     def path(self) -> str:
-        """A path to the memory, good while the process lives that made it."""
+        """A path to the memory, valid while the process that created it lives."""
         return self._memory.path
 
     @property
     def fill(self) -> int:
         """Blocks committed and not yet released."""
-        # Tail first: a head that is read later is never behind it, though both may go on in between.
+        # Tail first: a head that is read later is never behind it, though both may advance in between.
         tail = self._control[_TAIL]
         return int(min(self._control[_HEAD] - tail, self.shape.slots))
 
     @property
     def room_lines(self) -> int:
-        """Lines that find a free slot, if blocks stay as they were on the whole."""
+        """Lines that find a free slot, if blocks keep their average length."""
         head = int(self._control[_HEAD])
         rows = self.committed_lines / head if head else self.shape.rows
         return int((self.shape.slots - self.fill) * rows)
@@ -290,15 +290,15 @@ class Ring:
 
     @property
     def committed_lines(self) -> int:
-        """Lines that were committed so far; right after a producer's death at any instant, too."""
-        # From the last whole block's header: a counter of its own would be stored before or after the head,
-        # and a kill in between would leave the two apart.
+        """Lines committed so far; correct also after a producer's death at any instant."""
+        # From the last whole block's header: a separate counter would be stored before or after the head,
+        # and a kill in between would leave the two inconsistent.
         head = self._control[_HEAD]
         return int(self._header(head - 1)[_TOTAL]) if head else 0
 
     @property
     def released_lines(self) -> int:
-        """Lines in the blocks that the reader has released, and not taken back."""
+        """Lines in the blocks that the reader has released and not taken back."""
         tail = self._control[_TAIL]
         return int(self._header(tail - 1)[_TOTAL]) if tail else 0
 
@@ -310,26 +310,26 @@ class Ring:
 
     @property
     def oldest_block(self) -> RingBlock | None:
-        """The first that `lease` can take back, or that waits; None where there is none."""
+        """The first block that `lease` can take back, or that waits; None if there is none."""
         first = min(self._control[_TAIL], self._oldest())
         blocks = map(self.read, range(first, self._control[_HEAD]))
         return next((block for block in blocks if block is not None), None)
 
     @property
     def history_line(self) -> int:
-        """The first line that `lease` can take back, or that waits; `newest_line` where there is none."""
+        """The first line that `lease` can take back, or that waits; `newest_line` if there is none."""
         block = self.oldest_block
         return self.newest_line if block is None else block.first_line
 
     @property
     def head(self) -> int:
-        """Number of the next block; those before it were committed."""
+        """Number of the next block; all blocks before it were committed."""
         return int(self._control[_HEAD])
 
     def read(self, number: int) -> RingBlock | None:
-        """Block ``number`` in place, or None when it is not in the ring, or is being overwritten.
+        """Return block ``number`` in place, or None if it is not in the ring or is being overwritten.
 
-        Whoever is not waited for must ask `is_whole` again after having used it.
+        A reader that is not waited for must check `is_whole` again after having used the block.
         """
         header, slot = self._header(number), self._slots[number % self.shape.slots]
         if not self.is_whole(number):
@@ -342,15 +342,15 @@ class Ring:
             time_ns=header[_TIME_NS],
             losses=_read_losses(header) if header[_LOSS_COUNT] else (),
         )
-        return block if self.is_whole(number) else None  # its header may have been another's by then
+        return block if self.is_whole(number) else None  # the header may be another block's by now
 
     def is_whole(self, number: int) -> bool:
-        """The slot holds this block, and all of it."""
+        """Return whether the slot holds this block, completely."""
         sequence: int = self._header(number)[_SEQUENCE]
         return sequence == 2 * number + 2
 
     def observer_words(self, number: int) -> memoryview:
-        """What belongs to an observer alone; zero at first. The caller releases the view before `close`."""
+        """Return the words owned by one observer, initially 0. The caller must release it before `close`."""
         if not 0 <= number < self.shape.observers:
             raise UsageError(
                 f"ring {self.name} has no observer {number}", possible=f"0 to {self.shape.observers - 1}"
@@ -370,7 +370,7 @@ class Ring:
         )
 
     def discard(self) -> None:
-        """Give the memory back to the host, also where a process that stands still has it mapped."""
+        """Give the memory back to the host, even if a process that hangs still has it mapped."""
         self._memory.map.madvise(mmap.MADV_REMOVE)
 
     def close(self) -> None:
@@ -389,7 +389,7 @@ class Ring:
 
     def _wait(self, timeout_s: float) -> bool:
         deadline = time.monotonic() + timeout_s
-        # The counts decide and not the bell, which may have been rung for a block that is gone already.
+        # The counts decide, not the bell, which may have been rung for a block that was taken already.
         while self._control[_HEAD] == self._control[_TAIL]:
             remaining_s = deadline - time.monotonic()
             if remaining_s <= 0 or not self._ringing.poll(remaining_s * 1000):

@@ -1,7 +1,7 @@
 """One recording while it is written: every line of its range gets its row, from a ring or as missing.
 
-A session knows neither processes nor time. It is fed blocks, told where to end and which arms will not
-deliver any more, and keeps the books: per arm, rows = stored + missing by cause.
+A session depends neither on processes nor on time. It is given blocks, the line at which to end, and the arms
+that will deliver no more, and keeps the books: per arm, rows = stored + missing by cause.
 """
 
 from __future__ import annotations
@@ -34,16 +34,16 @@ TAINTING = (
     *("tags_wrong", "tags_repeated"),
     *("strobe_a_missed", "strobe_a_unexpected", "strobe_b_missed", "strobe_b_unexpected"),
 )
-"""Counts of the trigger that make lines doubtful: a camera that misses a pulse is a line behind after it."""
+"""Counts of the trigger that make lines doubtful: a camera that misses a pulse stays a line behind."""
 
 TAINTING_EVENTS = (
     *("missed_trigger_a", "missed_trigger_b", "unexpected_strobe_a", "unexpected_strobe_b"),
     "clock_lost",
 )
-"""Events of the run so far that do so."""
+"""Events of the run so far that make lines doubtful."""
 
 CODE_DOUBTS = frozenset(DOUBTFUL.values())
-"""Events of lines in the recording that do so, though they may have been written before the verdict."""
+"""Events that make lines of the recording doubtful, possibly after these lines were written."""
 
 # With a wrong code every tag is a mismatch, and a recording lists 4096 events in all.
 MAX_MISMATCH_EVENTS = 100
@@ -57,7 +57,7 @@ _BEST_FIRST = (
 
 
 class Writer(Protocol):
-    """What a session needs of `acquire.store.RecordingWriter`."""
+    """The part of `acquire.store.RecordingWriter` that a session needs."""
 
     @property
     def committed_lines(self) -> int: ...
@@ -105,13 +105,12 @@ class Book:
         return lines == self.stored + self.missing.total()
 
     def end_at(self, line: int, missed: Counter[Cause]) -> int:
-        """Forget what was taken from ``line`` on, ``missed`` of it missing; the lines that it cost."""
-        forgotten = self.next_line - line
+        """Remove all rows from ``line`` on, ``missed`` of them missing; return the stored lines removed."""
+        removed = self.next_line - line - missed.total()
         self.next_line = line
         self.missing -= missed
-        lost = forgotten - missed.total()
-        self.stored -= lost
-        return lost
+        self.stored -= removed
+        return removed
 
     def to_attrs(self, lines: int) -> dict[str, Any]:
         return {
@@ -127,20 +126,20 @@ class Book:
 
 
 class Session:
-    """See the module. Methods raise what the writer raises; then `close` is what remains.
+    """See the module. Methods raise the writer's errors; only `close` can follow then.
 
-    ``blank`` is (line, pixel) of zeros, the rows of a missing stretch of at most so many lines.
+    ``blank`` (line, pixel) is zeros: the rows of missing lines, written in pieces of this size.
 
     Attributes
     ----------
     lost : arm → why it will deliver no more
-    doubted : arms whose lines contradict the code at the moment: what comes is flagged
-    trigger : what the trigger counted while this was recorded
-    cameras : arm → what its camera counted since it was armed
+    doubted : arms whose lines contradict the code at the moment: their next lines are flagged
+    trigger : the trigger's counts during this recording
+    cameras : arm → the camera's counts since it was armed
     verified : arm → the line up to which it is known to follow the light's code
-    left_out : arm → lines that were taken, and that a disk which failed did not keep; below 0: which were
-        not taken, and are there all the same
-    surplus : arm → lines that were taken before the other arm's ring overflowed at an earlier line: no part
+    left_out : arm → lines that were taken, but that a failed disk did not keep; negative: lines that are on
+        disk although they were not counted as taken
+    surplus : arm → lines that were taken before the other arm's ring overflowed at an earlier line: not part
         of the recording
     bridges_to : lines up to this one that found their ring full are a gap, because there was no recorder;
         later ones end the recording
@@ -155,7 +154,7 @@ class Session:
         self.books = {arm: Book(first_line) for arm in ARMS}
         self.lost: dict[str, Cause] = {}
         self.before = Cause.MIXED
-        """Why lines are missing that an arm's first block leaves out without a word."""
+        """Cause of missing lines before an arm's first block for which the block states none."""
         self.doubted: set[str] = set()
         self.trigger: dict[str, int] = {}
         self.cameras: dict[str, dict[str, int]] = {}
@@ -170,23 +169,23 @@ class Session:
         self._mismatches = 0
         self._doubts: Counter[str] = Counter()
         self._gaps: list[tuple[str, range, Cause]] = []
-        """Those that are not committed yet."""
-        self._told_to_end = False
+        """Gaps that are not committed yet."""
+        self._end_known = False
         self._note("started", first_line, "")
 
     @property
     def done(self) -> bool:
-        """Every row is written."""
+        """Whether every row is written."""
         return all(self.reached(arm) for arm in ARMS)
 
     @property
     def ending(self) -> bool:
-        """The last line is known, or one arm has it already."""
-        return self._told_to_end or any(self.reached(arm) for arm in ARMS)
+        """Whether the last line is known, or one arm has it already."""
+        return self._end_known or any(self.reached(arm) for arm in ARMS)
 
     @property
     def skew(self) -> int:
-        """Lines by which the arms are apart."""
+        """Number of lines by which one arm is ahead of the other."""
         lines = [book.next_line for book in self.books.values()]
         return max(lines) - min(lines)
 
@@ -196,22 +195,22 @@ class Session:
         return self._writer.committed_lines
 
     def reached(self, arm: str) -> bool:
-        """The arm has all its rows."""
+        """Return whether the arm has all its rows."""
         return self.books[arm].next_line >= self.end_line
 
     def take(self, arm: str, block: RingBlock, *, hurry: bool = False) -> int:
-        """Write what was lost before the block, and what of the block is in range: so many lines.
+        """Write the block's losses, and its lines that are in range; return the number of these lines.
 
-        In a ``hurry`` it may still be on its way to the disk afterwards, and where it is packed to that: it
-        is lent until `give_back`.
+        In a ``hurry``, or if lines are packed, the block may still be on its way to the disk afterwards: it
+        is lent to the writer until `give_back`.
         """
         book = self.books[arm]
         if block.end_line <= book.next_line:
             return 0
         for loss in block.losses:
             self._miss_until(arm, loss.end_line, loss.cause)
-        untold = Cause.MIXED if book.stored or book.missing else self.before
-        self._miss_until(arm, block.first_line, untold)
+        unstated = Cause.MIXED if book.stored or book.missing else self.before
+        self._miss_until(arm, block.first_line, unstated)
         part = slice(book.next_line - block.first_line, self.end_line - block.first_line)
         if part.stop <= part.start:
             return 0
@@ -219,13 +218,13 @@ class Session:
         if arm in self.doubted:
             tagged = replace(tagged, flags=tagged.flags | np.uint16(LineFlag.CODE_CONTRADICTED))
             book.doubted += len(tagged)
-        # Packing takes longer than writing: it is done beside this, while the other arm's lines are taken.
+        # Packing takes longer than writing: it is done in parallel, while the other arm's lines are taken.
         (self._writer.lend if hurry or self._writer.packs else self._writer.append)(tagged)
         book.store(tagged.flags)
         return len(tagged)
 
     def overrun(self, arm: str, block: RingBlock) -> int | None:
-        """The first line before the block that this recording lacks because its ring was full."""
+        """Return the first line before the block that is lost because the ring was full, or None."""
         start = self.books[arm].next_line
         for loss in block.losses:
             first = max(loss.first_line, start)
@@ -235,18 +234,18 @@ class Session:
         return None
 
     def cut(self, line: int, reason: str) -> None:
-        """End before ``line``, although one arm may be past it: the other's ring had no room for it."""
+        """End before ``line``, which found its ring full, although the other arm may be past it."""
         if line >= self.end_line:
             return
         if self._floor is not RunCondition.INTERRUPTED:  # else the first reason stays
             self.end_reason = reason
             self._note("fault", line, reason)
         self.end_line = line
-        self._told_to_end = True
+        self._end_known = True
         self._floor = _worse(self._floor, RunCondition.INTERRUPTED)
 
     def give_back(self, arm: str) -> None:
-        """Wait until the block that the arm's `take` was given may be reused."""
+        """Wait until the block that was given to the arm's `take` may be reused."""
         self._writer.give_back(arm)
 
     def give_up(self, arm: str) -> None:
@@ -254,15 +253,15 @@ class Session:
         self._miss_until(arm, self.end_line, self.lost[arm])
 
     def end(self, line: int, reason: str, condition: RunCondition = RunCondition.GOOD) -> None:
-        """End before ``line``, or after what is written already; the condition is at best ``condition``."""
-        # Both arms get every row up to the last: what one has written already, the other must reach.
+        """End before ``line``, or after the last row written; the condition is at best ``condition``."""
+        # Both arms get every row up to the last: each must reach the rows that the other has written already.
         reach = max(book.next_line for book in self.books.values())
         last = min(self.end_line, max(reach, line))
         if last < self.end_line or _worse(self._floor, condition) is not self._floor:
             self.end_reason = reason
             self._note("stopped" if condition is RunCondition.GOOD else "fault", last, reason)
         self.end_line = last
-        self._told_to_end = True
+        self._end_known = True
         self._floor = _worse(self._floor, condition)
 
     def extend(self, line: int) -> None:
@@ -271,7 +270,7 @@ class Session:
             self.end_line = max(self.end_line, line)
 
     def note(self, kind: str, line: int, text: str) -> None:
-        """List an event of a line in range; others belong to other recordings, but may cast doubt on this."""
+        """List an event of a line in range. Earlier ones are not listed, but may taint this recording."""
         if kind in TAINTING_EVENTS and line < self.end_line:
             self._doubts[kind] += 1
         if self.first_line <= line < self.end_line:
@@ -280,22 +279,23 @@ class Session:
             self._note(kind, line, text)
 
     def mismatches(self, found: list[TagMismatch]) -> None:
-        """The trigger contradicts the count of lines; all are counted, the first are listed."""
+        """Note tags that contradict the line count; all are counted, the first ones are listed."""
         for mismatch in found[: max(0, MAX_MISMATCH_EVENTS - self._mismatches)]:
             self._writer.add_event("tag_mismatch", mismatch.tag.tick, mismatch.tag.line, str(mismatch))
         self._mismatches += len(found)
 
     def commit(self) -> None:
-        """Make what is written visible to readers; a disk that is nearly full ends the recording."""
+        """Make the written rows visible to readers; a disk that is nearly full ends the recording."""
         self._writer.commit()
-        # Gaps are kept for `close` after a write error: what the disk did not take is taken out of the books.
+        # Uncommitted gaps are kept for `close` after a write error, which removes rows that are not on disk
+        # from the books.
         committed = self.first_line + self._writer.committed_lines
         self._gaps = [gap for gap in self._gaps if gap[1].stop > committed]
-        if (reason := self._writer.nearly_full) is not None and not self._told_to_end:
+        if (reason := self._writer.nearly_full) is not None and not self._end_known:
             self.end(max(book.next_line for book in self.books.values()), reason, RunCondition.INTERRUPTED)
 
     def close(self, error: Exception | None = None) -> Sealed:
-        """Seal the recording; as aborted after a write ``error``, or one now, if the disk still allows it."""
+        """Seal the recording if the disk allows it; as aborted after a write ``error``, or if that fails."""
         if error is None:
             try:
                 if self.done:
@@ -314,23 +314,23 @@ class Session:
             return Sealed(RunCondition.ABORTED, reason, self._ledger(), on_disk=False)
 
     def _leave_out(self, rows: int) -> None:
-        """Only so many rows were taken by the disk."""
+        """Remove rows that the disk did not take from the books; it took the first ``rows``."""
         for arm, lines in self._end_at(rows).items():
             self.left_out[arm] = self.left_out.get(arm, 0) + lines
             self.books[arm].left_out += lines
 
     def _end_at(self, rows: int) -> dict[str, int]:
-        """No more than so many rows are in the books; arm → the lines that are not any more."""
+        """Keep the first ``rows`` rows in the books; return, per arm, the stored lines removed from them."""
         self.end_line = self.first_line + rows
-        forgotten = {}
+        removed = {}
         for arm, book in self.books.items():
             missed: Counter[Cause] = Counter()
             for of, lines, cause in self._gaps:
                 if of == arm:
                     missed[cause] += max(0, lines.stop - max(lines.start, self.end_line))
-            forgotten[arm] = book.end_at(self.end_line, +missed)  # +: without causes that have no line left
+            removed[arm] = book.end_at(self.end_line, +missed)  # +: drops causes that have no line left
         self._gaps = [(arm, lines, cause) for arm, lines, cause in self._gaps if lines.stop <= self.end_line]
-        return forgotten
+        return removed
 
     def _seal(self, condition: RunCondition, reason: str) -> Sealed:
         ledger = self._ledger()
@@ -344,7 +344,7 @@ class Session:
             return
         self._writer.add_gap(arm, book.next_line, count, cause)
         self._gaps.append((arm, range(book.next_line, book.next_line + count), cause))
-        # In pieces of one block: a gap may be many rings long, and the blank rows are memory.
+        # In pieces of one block: a gap may be many rings long, and blank rows take memory.
         while count:
             pixels = self._blank[:count]
             flags = np.full(len(pixels), LineFlag.MISSING, np.uint16)
@@ -355,7 +355,7 @@ class Session:
     def _condition(self) -> RunCondition:
         books = self.books.values()
         lines = self.end_line - self.first_line
-        # A recording without a line was stopped before it held anything.
+        # A recording without a line was interrupted before it held anything.
         found = RunCondition.GOOD if lines else RunCondition.INTERRUPTED
         if self._taints():
             found = _worse(found, RunCondition.TAINTED)
@@ -364,7 +364,7 @@ class Session:
         return _worse(found, self._floor)
 
     def _taints(self) -> dict[str, int]:
-        """Reasons to doubt lines that are there → how many times."""
+        """Return the reasons to doubt stored lines, each with its count."""
         reasons = {"tag_mismatches": self._mismatches, **self._doubts}
         for name in TAINTING:
             reasons[name] = self.trigger.get(name, 0)
@@ -395,7 +395,7 @@ class Session:
 
 
 def _words(error: Exception) -> str:
-    """What happened; what an error says to do about it is out of date once it is read in a recording."""
+    """Return the error without its advice, which is out of date by the time somebody reads the recording."""
     return error.message if isinstance(error, AcquireError) else str(error)
 
 

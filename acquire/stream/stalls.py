@@ -1,8 +1,8 @@
-"""Silence: when an arm counts as stalled, and when a process shows no life. And its opposite, too much.
+"""Stalls: when an arm has stalled, when a process shows no life, and when an arm delivers too many lines.
 
-The recorder judges the arms of its recording: silent for too long, or too far behind the other; and itself,
-by what waits in the rings. The supervisor judges by counters that must not stand still: the recorder always,
-the arms while nothing is recorded.
+The recorder judges the arms of its recording (silent for too long, or too far behind the other) and itself,
+by the blocks that wait in the rings. The supervisor watches counters that must not stand still: the
+recorder's always, the arms' while nothing is recorded.
 """
 
 from __future__ import annotations
@@ -26,18 +26,20 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 NEARLY_FULL = 0.9
-"""Of a ring: the recording is ended while the rest can still take what comes."""
+"""Share of a ring at which the recording is ended, while the rest can still take what comes."""
 PATIENCE_SHARE = 8
-"""A ring that is more than half full says nothing before one part in so many of its slots was emptied: it may
-have leapt there in a pause."""
+"""A ring more than half full is judged only after one slot in this many was emptied: it may have filled in a
+pause of the recorder."""
 HELD_UP_S = 0.25
-"""More than a busy host keeps a process waiting: what others said meanwhile has still to be heard."""
+"""More than a busy host keeps a process waiting. After such a hold-up, messages and tags that came in the
+meantime are still unread."""
 _LONGEST_LOOK_S = 0.5
+"""Longest time between two looks that counts as silence."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stall:
-    """Which arms will not be waited for any more, and what that makes of the recording."""
+    """The arms that are no longer waited for, and the recording's condition because of it."""
 
     arms: tuple[str, ...]
     reason: str
@@ -45,12 +47,13 @@ class Stall:
 
 
 class Backlog:
-    """Whether a ring fills up although it is being emptied: asked after every block that was taken from it.
+    """Detects a ring that fills up although it is being emptied; to be asked after every block taken from it.
 
-    A ring that leapt to full in a pause empties, and costs nothing more; so does one that begins full, with
-    what was before. One that is nearly full, and has not emptied since it was first seen more than half full,
-    will overflow. All is counted in blocks, so that it holds at any rate. A ring that overflows before that
-    is seen, since it is short or the pause long, ends the recording as well: see `Session.overrun`.
+    A ring that filled in a pause of the recorder empties again, and is no reason to end; so does one that
+    begins full, with lines from before. One that is nearly full, and has not emptied since it was first found
+    more than half full, will overflow. Everything is counted in blocks, so that it holds at any line rate. A
+    ring that overflows before that is detected, because it is short or the pause long, ends the recording as
+    well: see `Session.overrun`.
     """
 
     def __init__(self) -> None:
@@ -59,7 +62,7 @@ class Backlog:
         self._taken = 0
 
     def grows(self, fill: int, slots: int) -> bool:
-        """The next blocks would find no slot; ``fill`` of ``slots`` wait."""
+        """Return whether the next blocks would find no slot, when ``fill`` of ``slots`` blocks wait."""
         if 2 * fill < slots:
             self._caught_up, self._first_fill = True, None
             return False
@@ -72,19 +75,19 @@ class Backlog:
 
 
 class DiskWaits:
-    """Publishes since when the disk is waited for: by a process's loop, and by a thread beside it."""
+    """Publishes since when a process's loop, and its second thread, have been waiting for the disk."""
 
     def __init__(self, counters: Counters) -> None:
         self._counters = counters
 
     @contextmanager
     def loop(self) -> Iterator[None]:
-        """The loop itself waits, and shows no other life."""
+        """Mark a wait of the loop itself, which shows no other sign of life."""
         with self._publishing("disk_since_ns"):
             yield
 
     def elsewhere(self, work: Callable[..., T], *args: Any) -> T:
-        """Do what another thread was given."""
+        """Do ``work`` in the second thread, marked as a wait for the disk."""
         with self._publishing("store_since_ns"):
             return work(*args)
 
@@ -105,10 +108,10 @@ class HoldUps:
         self.over_s = 0.0
         """When the last hold-up was over."""
         self.longest_s = 0.0
-        """Of those that may have to do with the lines which are taken now."""
+        """The longest of the hold-ups that may concern the lines taken now."""
 
     def update(self) -> None:
-        """To be called between any two things that may take time."""
+        """Note a hold-up since the last call; to be called between any two actions that may take time."""
         now_s = time.monotonic()
         held_s, self._seen_s = now_s - self._seen_s, now_s
         if held_s > HELD_UP_S:
@@ -116,7 +119,7 @@ class HoldUps:
             self.longest_s = max(self.longest_s, held_s)
 
     def took(self, come_s: float) -> None:
-        """Lines were taken that had come at this moment: those that came in hold-ups before are done with."""
+        """Lines that came at ``come_s`` were taken: if that is after the last hold-up, it is dealt with."""
         if come_s > self.over_s:
             self.longest_s = 0.0
 
@@ -130,8 +133,8 @@ class Lent:
 
 
 class Arm:
-    """A ring as the recorder sees it: when it last showed life, what waits in it, what is being written, and
-    what recordings hold of its lines.
+    """The recorder's view of a ring: its last sign of life, its backlog, the block being written, and the
+    lines that recordings hold already.
     """
 
     def __init__(self, ring: Ring) -> None:
@@ -144,19 +147,19 @@ class Arm:
         self._awaited = 0
 
     def watch(self, now_s: float, awaited: int = 0) -> None:
-        """Note life: something new, something that still waits to be taken, or that ``awaited`` has grown."""
+        """Note a sign of life: a new line, a block that waits to be taken, or a growing ``awaited``."""
         newest = self.ring.newest_line
         if newest != self._newest or self.ring.fill or awaited != self._awaited:
             self._newest, self._awaited = newest, awaited
             self.alive_s = now_s
 
     def revive(self, now_s: float) -> None:
-        """Count silence from now."""
+        """Measure silence from now on."""
         self.alive_s = now_s
 
 
 class Heartbeat:
-    """A counter of another process, for how long it has stood still."""
+    """Measures for how long a counter of another process has stood still."""
 
     def __init__(self, counters: Counters, name: str) -> None:
         self._counters = counters
@@ -166,8 +169,8 @@ class Heartbeat:
         self.still_s = 0.0
 
     def update(self, now_s: float) -> float:
-        """Seconds without a beat; of a time between two looks, only so much as a look can take counts."""
-        # A host that did not let *us* run for seconds has probably stopped the other one as well.
+        """Return the seconds without a beat; time between two calls counts up to `_LONGEST_LOOK_S`."""
+        # A host that did not let *us* run for seconds has probably stopped the other process as well.
         self.still_s += min(now_s - self._looked_s, _LONGEST_LOOK_S)
         self._looked_s = now_s
         if (count := self._counters[self._name]) != self._count:
@@ -176,14 +179,14 @@ class Heartbeat:
         return self.still_s
 
     def revive(self) -> None:
-        """Count silence from now."""
+        """Measure silence from now on."""
         self.still_s = 0.0
 
 
 class Excess:
-    """An arm that counts lines which the trigger has not issued is not triggered by it.
+    """Detects an arm that counts lines which the trigger has not issued, and so is not triggered by it.
 
-    Tags come in steps and late, on a busy host by seconds: only what exceeds them by ``margin_lines`` for
+    Tags come in steps and late, on a busy host by seconds: only an excess of more than ``margin_lines`` for
     longer than ``limit_s`` counts.
     """
 
@@ -194,7 +197,7 @@ class Excess:
         self._since_s: float | None = None
 
     def update(self, newest_pulse: int, now_s: float) -> int:
-        """The arm's next line when it cannot be, else 0; ``newest_pulse`` is the latest tag's."""
+        """Return the arm's next line if it is impossible, else 0; ``newest_pulse``: the latest tag's line."""
         line = self._counters["next_line"]
         if line <= newest_pulse + self._margin_lines:
             self._since_s = None
@@ -204,17 +207,17 @@ class Excess:
 
 
 def find_stall(session: Session, arms: dict[str, Arm], limit_s: float, max_skew_lines: int) -> Stall | None:
-    """The stall that ends the recording, or None; arms that are given up already do not count again."""
+    """Return the stall that ends the recording, or None; arms given up already do not count again."""
     waited_for = [name for name in ARMS if not session.reached(name) and name not in session.lost]
     if not waited_for:
         return None
     now_s = time.monotonic()
     silent_s = {name: now_s - arm.alive_s for name, arm in arms.items()}
     if any(silent_s[name] > limit_s for name in waited_for):
-        # Arms that fall silent together do so to within a block: half the limit tells both from one.
+        # Arms that fall silent together do so to within a block: half the limit distinguishes both from one.
         silent = tuple(name for name in ARMS if silent_s[name] > limit_s / 2)
         return _stall(silent, f"no line for {limit_s:g} s")
-    # An arm may deliver, and never catch up: the rows that it lacks would be written in one go at the end.
+    # An arm may deliver and never catch up: all rows that it lacks would be written in one go at the end.
     if session.skew > max_skew_lines:
         late = min(waited_for, key=lambda name: session.books[name].next_line)
         return _stall((late,), f"{session.skew} lines behind the other")
@@ -222,7 +225,8 @@ def find_stall(session: Session, arms: dict[str, Arm], limit_s: float, max_skew_
 
 
 def _stall(arms: tuple[str, ...], text: str) -> Stall:
-    # Both at once is the trigger's, or the host's: nothing is missing between the arms, it only ended early.
+    # Both at once point to the trigger or the host: the arms have the same lines, and the recording only
+    # ended early.
     if len(arms) == len(ARMS):
         return Stall(arms, f"both arms stalled: {text}", RunCondition.INTERRUPTED)
     return Stall(arms, f"arm {arms[0]} stalled: {text}", RunCondition.INCOMPLETE)

@@ -1,17 +1,17 @@
-"""Who takes the place of a process that was killed, how often, and how the recording goes on.
+"""Successors of killed processes: who takes over, how often, and how the recording continues.
 
 ::
 
-    grabber killed   ─▶ another opens the camera; the line it goes on with follows from the time stamps,
-                        and what came between is a gap, `Cause.GRABBER_LOST`
-    recorder killed  ─▶ another begins a recording beside the one that was cut off, from the first line on
-                        that this one's last commit does not cover; what the ring does not hold any more
-                        is a gap, `Cause.RECORDER_LOST`; the one that was cut off is an `Orphan`
-    disk too slow    ─▶ the recording ends, sealed, and the same recorder begins another beside it as soon as
-                        the disk lets it; what came between is an outage, and part of neither
+    grabber killed   ─▶ another opens the camera; its first line's number follows from the time stamps, and
+                        the lines in between are a gap, `Cause.GRABBER_LOST`
+    recorder killed  ─▶ another begins a new segment next to the recording that was cut off, from the first
+                        line that the last commit does not cover; lines that the ring no longer holds are
+                        a gap, `Cause.RECORDER_LOST`; the recording that was cut off is an `Orphan`
+    disk too slow    ─▶ the recording ends, sealed, and the same recorder begins another segment as soon as
+                        the disk allows; the lines in between are an outage, and part of neither
 
-A process that ended with a word of its own (an error of its camera, a full disk) has said why it cannot go
-on; nobody takes its place.
+A process that reported an error before it ended (of its camera, or a full disk) has no successor: it would
+meet the same error.
 """
 
 from __future__ import annotations
@@ -35,32 +35,33 @@ if TYPE_CHECKING:
     from acquire.stream.messages import Began, Begin
 
 MOST = 5
-"""Successors of one process in a run: what dies more often has a reason."""
+"""Number of successors of one process in a run: one that dies more often has a permanent problem."""
 _SHORT_S = 60.0
-"""A segment that lasts for less says that the disk still has trouble."""
+"""A segment that lasts for less shows that the disk is still in trouble."""
 _LONGEST_WAIT_S = 60.0
 READY_S = 120.0
-"""How long a successor may take until it is ready."""
+"""How long a successor may take to become ready."""
 
 
 @dataclass(frozen=True, slots=True)
 class Orphan:
-    """A recording whose recorder did not live to seal it, and why; lines of it were acknowledged.
+    """A recording that its recorder did not live to seal, and why.
 
-    ``told``: what its recorder was told of, which it may not have written; lines of other recordings, too.
+    ``committed_lines`` of it were acknowledged. ``notes`` were sent to its recorder, which may not have
+    written them; some concern lines of other recordings.
     """
 
     path: Path
     why: str
     committed_lines: int = 0
-    told: tuple[Note, ...] = ()
+    notes: tuple[Note, ...] = ()
 
 
 class Resumption:
-    """When a recording that the disk has ended goes on in a further segment.
+    """When a recording that the disk has ended continues in a further segment.
 
-    At once, and ever later where the disk takes no segment for long: a disk that is too slow for good must
-    not be filled with short ones.
+    At first at once, then later and later while segments stay short: a permanently slow disk must not be
+    filled with short segments.
     """
 
     def __init__(self) -> None:
@@ -68,24 +69,24 @@ class Resumption:
         self._began_s = -math.inf
         self._due_s: float | None = None
         self.why = ""
-        """Why the recording has not gone on yet; "" where it has."""
+        """Why the recording has not continued yet; "" if it has."""
 
     def began(self, now_s: float) -> None:
-        """The recording goes on."""
+        """Note that a segment began."""
         self._began_s = now_s
         self._due_s, self.why = None, ""
 
     def ended(self, now_s: float, why: str) -> None:
-        """A segment ended, or could not begin."""
+        """Note that a segment ended, or could not begin."""
         self.why = why
-        # The first goes on at once, the next after 1 s, 2 s, 4 s … for as long as segments stay short.
+        # Resume at once the first time, then after 1 s, 2 s, 4 s … as long as segments stay short.
         self._failures = 0 if now_s - self._began_s > _SHORT_S else self._failures + 1
         self._began_s = now_s
         wait_s = 2.0 ** (self._failures - 2) if self._failures > 1 else 0.0
         self._due_s = now_s + min(wait_s, _LONGEST_WAIT_S)
 
     def is_due(self, now_s: float) -> bool:
-        """It is to be tried now; said once."""
+        """Return whether the next segment is to be tried now; True once per attempt."""
         if self._due_s is None or now_s < self._due_s:
             return False
         self._due_s = None
@@ -94,7 +95,7 @@ class Resumption:
 
 @dataclass(slots=True)
 class WorkerSlot:
-    """The processes that had one place, one after the other."""
+    """One role of the run, and the processes that filled it one after the other."""
 
     spawn: Callable[[], Worker | None]
     successors: int = 0
@@ -106,14 +107,14 @@ class Succession:
 
     Parameters
     ----------
-    spawn : name → starts a successor; gives None where nobody can go on
+    spawn : name → starts a successor, or returns None if none can continue
     """
 
     def __init__(self, spawn: Mapping[str, Callable[[], Worker | None]]) -> None:
         self._slots = {name: WorkerSlot(start) for name, start in spawn.items()}
 
     def successor(self, name: str) -> Worker | None:
-        """A new process in the place of one that was killed, or None."""
+        """Start a process in the place of one that was killed; None if that is not possible."""
         slot = self._slots.get(name)
         if slot is None or slot.successors >= MOST:
             return None
@@ -124,39 +125,40 @@ class Succession:
         return worker
 
     def is_starting(self, name: str) -> bool:
-        """A successor is not ready yet: its silence means nothing."""
+        """Return whether a successor is not ready yet, so that its silence means nothing."""
         return self._slots[name].ready_by_s is not None if name in self._slots else False
 
     def is_late(self, name: str) -> bool:
-        """A successor has not become ready in time."""
+        """Return whether a successor has not become ready in time."""
         ready_by_s = self._slots[name].ready_by_s if name in self._slots else None
         return ready_by_s is not None and time.monotonic() > ready_by_s
 
     def ready(self, name: str) -> None:
-        """The process has said that it is ready."""
+        """Note that the process has reported that it is ready."""
         if name in self._slots:
             self._slots[name].ready_by_s = None
 
 
 def continuation(begin: Begin, began: Began, committed_lines: int, why: str) -> Begin:
-    """What has a recorder go on with a recording that was cut off after ``committed_lines`` lines."""
+    """Return the request for the segment after a recording that was cut off after ``committed_lines``."""
     at = began.first_line + committed_lines
-    # One at least, as a window must have: all lines may be committed of a recording that was not sealed.
+    # At least one, as a window requires: all lines of a recording that was not sealed may be committed.
     left = None if began.end_line is None else max(1, began.end_line - at)
     cause = f"its recorder was {why}"
     text = f"goes on from {begin.path.name}: {cause}"
     window = Window(at, post_lines=left, exact=False, padded=True, kind="resumed", text=text)
     spec, before = begin.spec, begin.spec.continues
     first, number = (begin.path.name, 2) if before is None else (before.first, before.number + 1)
-    # Nobody may be kept waiting for the first recording: whoever recovers it lists its segments.
+    # Writing the list of segments into the first recording would delay this one: recovery does it later.
     follows = Continuation(first, number, at, readout_ns(spec, at), cause, listed=False)
     path = free_name(begin.path.with_name(first))
     return replace(begin, path=path, spec=replace(spec, continues=follows), lines=None, window=window)
 
 
 def resumed(begin: Begin, began: Began, end_line: int, why: str) -> Begin | None:
-    """What has a recorder go on with a recording that it sealed after ``end_line`` lines, if that has an end
-    to come: from the next line on, up to the same end.
+    """Return the request for the segment after a recording that was sealed at ``end_line``.
+
+    It begins with the next line and has the same end; None if that end is reached.
     """
     if began.end_line is not None and began.end_line <= end_line:
         return None
@@ -170,19 +172,20 @@ def resumed(begin: Begin, began: Began, end_line: int, why: str) -> Begin | None
 
 
 def once_more(following: Begin) -> Begin:
-    """A continuation that is tried again, since it could not begin."""
+    """Return the continuation with a free name, to be tried again since it could not begin."""
     assert following.spec.continues is not None
     return replace(following, path=free_name(following.path.with_name(following.spec.continues.first)))
 
 
 def free_name(path: Path) -> Path:
-    """The first of NAME-2, NAME-3 … beside ``path`` that does not exist."""
+    """Return the first of NAME-2, NAME-3 … next to ``path`` that does not exist."""
     number = 2
+    # lexists: a dangling link takes the name as well.
     while os.path.lexists(found := path.with_name(f"{path.stem}-{number}{path.suffix}")):
-        number += 1  # a link that leads nowhere has the name as well
+        number += 1
     return found
 
 
 def replacement_note(worker: str, why: str, line: int) -> Note:
-    """The event of a succession."""
+    """Return the note that ``worker`` was replaced."""
     return Note(line, "fault", f"{worker}: {why}; another took its place")

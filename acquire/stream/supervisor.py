@@ -1,5 +1,5 @@
-"""The thread of an armed run: it moves tags to the recorder, hears what the processes say, and notices when
-they are silent.
+"""The thread of an armed run: it moves tags to the recorder, reads the processes' messages, and notices when
+they fall silent.
 """
 
 from __future__ import annotations
@@ -32,26 +32,27 @@ if TYPE_CHECKING:
 RECORDER = "recorder"
 """Key of the recorder among the workers; the grabbers have their arms' names."""
 
-# The thread waits for tags alone, and looks at all else in between: so late is a death noticed.
+# The thread waits for tags only, and checks everything else in between: a death is noticed this much later.
 _TAG_WAIT_S = 0.02
 _ANSWER_S = 120.0
-"""For a recording to be created. A recorder that hangs, rather than waits for the disk, is noticed sooner."""
+"""Time for a recording to be created. A recorder that hangs, rather than waits for the disk, is replaced
+sooner."""
 _JOIN_S = 30.0
-# Between two looks of the service, tenths of a second: a trigger that floods must not fill the memory.
+# Kept between two polls of the service, tenths of a second: a flood of trigger events must not fill memory.
 _MOST_EVENTS = 1024
-# Questions share the trigger's link with its tags.
-_ASK_EVERY_S = 1.0
+# Queries share the trigger's link with its tags.
+_QUERY_EVERY_S = 1.0
 
 
 class Supervisor:
-    """Owns the thread. What it learnt can be read at any time.
+    """Owns the thread; its findings can be read at any time.
 
-    Where time is told, it holds the cameras' count of lines against the trigger's (`stalls.Excess`).
+    If the line period is known, it compares the cameras' line counts with the trigger's (`stalls.Excess`).
 
     Attributes
     ----------
-    life : what became of the latest recording
-    fault : what failed first
+    life : stage of the latest recording
+    fault : the first failure
     """
 
     def __init__(
@@ -76,21 +77,21 @@ class Supervisor:
         margin, limit_s = plan.margin_lines, plan.stall_timeout_s
         self._excess = {arm: Excess(counters[arm], margin, limit_s) for arm in ARMS if margin is not None}
         self._counters = counters
-        self._ask_s = 0.0
+        self._query_s = 0.0
         self._newest_pulse: int | None = None
         self._trigger_lost = False
-        self._trigger_told_s = time.monotonic()
+        self._trigger_heard_s = time.monotonic()
         self._events: deque[Note] = deque(maxlen=_MOST_EVENTS)
         self._dead: set[str] = set()
         self._hung: str | None = None
         self._last_words: dict[str, str] = {}
-        self._news = threading.Condition()  # on a lock that its holder may take again: `_note` may `_fail`
+        self._news = threading.Condition()  # its lock is re-entrant: `_note` may call `_fail`
         self._ending = threading.Event()
-        self._thread = threading.Thread(target=self._live, name="acquire-supervisor", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="acquire-supervisor", daemon=True)
 
     @property
     def recording(self) -> bool:
-        """A recording is open, as far as the living can tell."""
+        """Whether a recording is open, or will be continued."""
         return self.life.stage in UNDER_WAY
 
     @property
@@ -100,30 +101,30 @@ class Supervisor:
 
     @property
     def _committed_lines(self) -> int:
-        """That the recorder has acknowledged of the recording under way."""
+        """Lines of the current recording that the recorder has acknowledged."""
         return self._counters[RECORDER]["committed"]
 
     @property
     def dead(self) -> frozenset[str]:
-        """Processes that died, and whose place nobody took."""
+        """Processes that died and have no successor."""
         return frozenset(self._dead)
 
     @property
     def pulses(self) -> int:
-        """Issued by the trigger, as far as its tags tell."""
+        """Pulses issued by the trigger, according to its tags."""
         return 0 if self._newest_pulse is None else self._newest_pulse + 1
 
     @property
     def trigger_silent_s(self) -> float:
-        """Since the trigger last told anything: a tag, or the answer to a question."""
-        return time.monotonic() - self._trigger_told_s
+        """Seconds since the trigger's last tag or answer to a query."""
+        return time.monotonic() - self._trigger_heard_s
 
     def start(self) -> None:
-        self._trigger_told_s = time.monotonic()
+        self._trigger_heard_s = time.monotonic()
         self._thread.start()
 
     def end(self) -> None:
-        """End the thread. Raises TriggerError when the trigger holds it. Idempotent."""
+        """End the thread. Raises TriggerError if it is stuck in the trigger's driver. Idempotent."""
         self._ending.set()
         if self._thread.ident is not None:
             self._thread.join(_JOIN_S)
@@ -133,11 +134,11 @@ class Supervisor:
             )
 
     def mark_unsealed(self) -> None:
-        """Every process has ended: a recording that is not sealed now will not be."""
+        """Note that every process has ended: a recording that is not sealed now never will be."""
         self.life.mark_unsealed(self.fault or "its recorder did not end in time", self._committed_lines)
 
     def begin(self, message: Begin) -> None:
-        """Have the recorder begin; returns when it has. Raises what it refuses with."""
+        """Have the recorder begin; returns when it has. Raises the recorder's error if it refuses."""
         with self._news:
             self.life.begin(message)
             self._workers[RECORDER].post(message)
@@ -152,80 +153,82 @@ class Supervisor:
             if self.fault is not None:
                 raise DeviceError(f"start: {self.fault}")
         waits = self._counters[RECORDER]["disk_since_ns"] or self._counters[RECORDER]["store_since_ns"]
-        excuse = "it waits for the disk" if waits else f"no sign of life for {self.silent_s:.1f} s"
+        state = "it waits for the disk" if waits else f"no sign of life for {self.silent_s:.1f} s"
         raise DeviceError(
-            f"start: the recorder has not begun within {_ANSWER_S:g} s: {excuse}",
+            f"start: the recorder has not begun within {_ANSWER_S:g} s: {state}",
             possible="nothing was recorded",
             hint="start again once the disk answers",
         )
 
     def end_recording(self, reason: str, line: int) -> None:
-        """Have the recording end at ``line``; a recorder that is only starting will hear of it.
+        """Have the recording end at ``line``, also if its recorder is only starting.
 
-        Raises StateError where nothing has been recorded; one that has ended stays as it is.
+        Raises StateError if nothing has been recorded; a recording that has ended stays as it is.
         """
         with self._news:
             self._cancel_if(begins=self.life.end(reason))
         self._workers[RECORDER].post(End(reason, line))
 
     def interrupt_recording(self, reason: str) -> None:
-        """Have the recording end here and now, and not go on."""
+        """Have the recording end at once, without a further segment."""
         with self._news:
             self._cancel_if(begins=self.life.on_fault())
         self._workers[RECORDER].post(Interrupt(reason, ARMS, Cause.INTERRUPTED))
 
     def extend(self, line: int) -> None:
-        """Let the recording not end before ``line``, unless it is ending already."""
+        """Do not let the recording end before ``line``, unless it is ending already."""
         with self._news:
             self.life.extend(line)
         self._workers[RECORDER].post(Extend(line))
 
-    def happened(self, note: Note) -> None:
-        """Tell the recorder, and whoever asks with `take_events`.
+    def report(self, note: Note) -> None:
+        """Send a note to the recorder, and keep it for `take_events`.
 
-        A recorder that does not listen hears of the first of them only.
+        A recorder that does not read its messages gets only the first of them.
         """
         self._events.append(note)
         if self._workers[RECORDER].unsent < _MOST_EVENTS:
-            self.tell(note)
+            self.send(note)
 
-    def tell(self, note: Note) -> None:
-        """Tell the recorder. It may die before that is written: its successor hears it again, and so does who
-        seals what it leaves.
+    def send(self, note: Note) -> None:
+        """Send a note to the recorder.
+
+        The note is kept, since the recorder may die before it has written it: it is sent to the successor as
+        well, and given to the recovery of the orphan.
         """
         with self._news:
-            self.life.told.append(note)
+            self.life.notes.append(note)
             self._workers[RECORDER].post(note)
 
     def take_events(self) -> list[Note]:
-        """What happened since the last call; the latest, if it was too much."""
+        """Return the events since the last call; only the latest, if there were too many."""
         return [self._events.popleft() for _ in range(len(self._events))]
 
     def wait_sealed(self, deadline: float) -> bool:
-        """Until the recording is closed, or cannot be any more, or the monotonic ``deadline``."""
+        """Wait until the recording is closed or lost, or the monotonic ``deadline``; return whether it is."""
         with self._news:
             self._news.wait_for(lambda: not self.recording, max(0.0, deadline - time.monotonic()))
             return not self.recording
 
-    def _live(self) -> None:
+    def _run(self) -> None:
         try:
             while not self._ending.is_set():
                 begun = time.monotonic()
                 tags = self._take_tags()
-                self._ask_trigger(begun)
+                self._query_trigger(begun)
                 for name, worker in self._workers.items():
-                    self._hear(name, worker)
+                    self._read_messages(name, worker)
                     worker.flush()
-                # A recording that the disk ended goes on in a further segment.
+                # A recording that the disk ended continues in a further segment.
                 with self._news:
                     following = self.life.due(time.monotonic())
                 if following is not None:
                     self._workers[RECORDER].post(following)
                 if self.fault is None:
                     self._watch(time.monotonic())
-                if not tags:  # a trigger that does not wait by itself must not make this loop spin
+                if not tags:  # a trigger whose `tags` returns at once must not make this loop spin
                     self._ending.wait(max(0.0, begun + _TAG_WAIT_S - time.monotonic()))
-        except Exception as error:  # noqa: BLE001 - the outermost boundary of the thread: a fault, told
+        except Exception as error:  # noqa: BLE001 - the outermost boundary of the thread: reported as a fault
             self._fail(f"supervisor: {type(error).__name__}: {error}")
 
     def _take_tags(self) -> list[LineTag]:
@@ -233,44 +236,45 @@ class Supervisor:
             return []
         try:
             tags = self._trigger.tags(_TAG_WAIT_S)
-        except Exception as error:  # noqa: BLE001 - told; a driver's defect must not cost the recording
+        except Exception as error:  # noqa: BLE001 - a fault; a driver's defect must not cost the recording
             self._trigger_lost = True
             kind = "" if isinstance(error, AcquireError) else f"{type(error).__name__}: "
             self._fail(f"trigger: {kind}{error}")
             return []
         if tags:
             self._newest_pulse = tags[-1].line
-            self._trigger_told_s = time.monotonic()
+            self._trigger_heard_s = time.monotonic()
         for event in self._trigger.events():
-            self.happened(Note(event.line, event.kind, f"tick {event.tick}"))
+            self.report(Note(event.line, event.kind, f"tick {event.tick}"))
         rows = self._tags.shape.rows
         for at in range(0, len(tags), rows):
             some = tags[at : at + rows]
             slot = self._tags.claim()
             if slot is None:
-                # The recorder is too late to take them. Nobody waits: later tags confirm the same lines.
+                # The recorder is late. Do not wait for it: later tags confirm the same lines.
                 self._tags.drop(some[0].line, len(some))
                 continue
             slot.pixels[: len(some)] = tag_rows(some)
             self._tags.commit(0, len(some))
         return tags
 
-    def _ask_trigger(self, now_s: float) -> None:
-        """Publish what the trigger counts; one that cannot answer fails when it is asked for tags."""
-        if self._trigger_lost or now_s < self._ask_s:
+    def _query_trigger(self, now_s: float) -> None:
+        """Publish the trigger's counts."""
+        if self._trigger_lost or now_s < self._query_s:
             return
-        self._ask_s = now_s + _ASK_EVERY_S
+        self._query_s = now_s + _QUERY_EVERY_S
+        # A trigger that cannot answer fails in `_take_tags`, which reports it.
         with contextlib.suppress(AcquireError):
             counts = self._trigger.statistics()
             for name in TRIGGER_COUNTERS:
                 self._counters[TRIGGER][name] = int(counts.get(name, 0))
             if "link_lost" not in counts:
-                self._trigger_told_s = time.monotonic()
+                self._trigger_heard_s = time.monotonic()
 
     def _watch(self, now_s: float) -> None:
-        """A silent arm is a fault; in a recording, the recorder judges it."""
+        """Detect silent arms, which are a fault; during a recording, the recorder judges them."""
         limit_s = self._plan.stall_timeout_s
-        self._bear_with_successors()
+        self._wait_for_successors()
         self._watch_recorder(now_s)
         pulse = self._newest_pulse
         for arm, excess in self._excess.items() if pulse is not None else ():
@@ -287,7 +291,7 @@ class Supervisor:
             self._fail(f"arm {arms}: no line for {limit_s:g} s")
 
     def _watch_recorder(self, now_s: float) -> None:
-        """One that hangs is replaced. A disk is waited for: the rings keep what comes meanwhile."""
+        """Kill a recorder that hangs. One that waits for the disk may wait: the rings keep the lines."""
         silent_s, patience_s = self._loop.update(now_s), self._plan.patience_s
         if self._hung is not None:
             if silent_s > 2 * self._plan.hung_after_s:
@@ -301,56 +305,56 @@ class Supervisor:
 
     @property
     def waits_for_disk(self) -> bool:
-        """The recorder's loop does; not one that was stopped by a signal while it did."""
+        """Whether the recorder's loop waits for the disk, and was not stopped by a signal in that wait."""
         return bool(self._counters[RECORDER]["disk_since_ns"]) and not self._workers[RECORDER].is_stopped
 
-    def _bear_with_successors(self) -> None:
+    def _wait_for_successors(self) -> None:
         for name in self._workers:
             if self._succession.is_late(name):
                 self._fail(f"{self._workers[name].name}: its successor was not ready in time", name)
             elif self._succession.is_starting(name):
-                # A camera takes seconds to come back. Neither its arm nor the recorder, which waits for it
-                # in an open recording, is to be called stalled meanwhile.
+                # A camera takes seconds to come back. Until then neither its arm, nor the recorder that waits
+                # for it in an open recording, counts as stalled.
                 self._loop.revive()
                 for arm in self._arms_of.get(name, ()):
                     self._cameras[arm].revive()
                     self._counters[RECORDER].add(f"awaited_{arm}", 1)
 
-    def _hear(self, name: str, worker: Worker) -> None:
-        death = worker.death  # looked at before the messages: what a process said last counts
+    def _read_messages(self, name: str, worker: Worker) -> None:
+        death = worker.death  # read before the messages, so that the last message of a dead process is seen
         if death and name == RECORDER and self._hung is not None:
             death = f"{death} after {self._hung.partition(': ')[2]}"
         while (message := worker.message()) is not None:
             self._note(name, message)
         if death and name not in self._dead:
-            # One that said why it ends cannot go on; a successor would meet the same error.
-            if name not in self._last_words and self._succeed(name, worker, death):
+            # A process that reported an error has no successor, which would meet the same error.
+            if name not in self._last_words and self._replace(name, worker, death):
                 return
             self._dead.add(name)
             if name == RECORDER:
                 with self._news:
                     self.life.on_died()
             if name == WATCHER:
-                # Lines come and are recorded all the same; what it said last does not hold for them.
+                # Recording continues without it; its last verdict does not hold for the lines to come.
                 for arm in ARMS:
                     self._counters[WATCHER][f"verdict_{arm}"] = 0
                 why = self._last_words.get(name, death)
-                self.happened(Note((self._newest_pulse or 0) + 1, "unwatched", f"watcher: {why}"))
+                self.report(Note((self._newest_pulse or 0) + 1, "unwatched", f"watcher: {why}"))
                 return
             self._fail(f"{worker.name}: {self._last_words.get(name, death)}", name)
 
-    def _succeed(self, name: str, worker: Worker, death: str) -> bool:
-        """Put another process in the place of one that was killed."""
+    def _replace(self, name: str, worker: Worker, death: str) -> bool:
+        """Put another process in the place of one that was killed; return whether that was possible."""
         if self.fault is not None or self._ending.is_set():
             return False
         successor = self._succession.successor(name)
         if successor is None:
             return False
-        # Under the lock, since nobody may tell the one that is dead any more. A mark that was acknowledged
-        # and not yet written is told again: in a night with 48 kills, 11 of 254 were lost otherwise.
+        # Under the lock, so that no note is sent to the dead process any more. Marks that were acknowledged
+        # and not yet written are sent again: in a night with 48 kills, 11 of 254 were lost otherwise.
         with self._news:
             self._workers[name] = successor
-            for note in self.life.told if name == RECORDER else ():
+            for note in self.life.notes if name == RECORDER else ():
                 successor.post(note)
         worker.end(time.monotonic())
         self._hung = None
@@ -364,7 +368,7 @@ class Supervisor:
             if following is not None:
                 successor.post(following)
         newest = max(self._counters[arm]["next_line"] for arm in ARMS)
-        self.happened(replacement_note(worker.name, death, max(newest, 0)))
+        self.report(replacement_note(worker.name, death, max(newest, 0)))
         return True
 
     def _note(self, name: str, message: object) -> None:
@@ -384,23 +388,23 @@ class Supervisor:
                     rows = {arm: self._counters[RECORDER][f"rows_{arm}"] for arm in ARMS}
                     self.life.on_sealed(message, rows, self._committed_lines, time.monotonic())
                 case Note():
-                    self.happened(message)
+                    self.report(message)
                 case Checked(first_line, _, text):
-                    self.happened(Note(first_line, "code_check", text))
+                    self.report(Note(first_line, "code_check", text))
                 case Failed(error):
-                    # Those of a defect begin with the process's name already.
+                    # The text of an unexpected exception begins with the process's name already.
                     self._last_words[name] = str(error).removeprefix(f"{self._workers[name].name}: ")
             self._news.notify_all()
 
     def _cancel_if(self, *, begins: bool) -> None:
-        """Nobody wants what the recorder only begins."""
+        """Cancel the recording that the recorder is creating, if there is one."""
         if begins:
             self._workers[RECORDER].post(Cancel())
             self._news.notify_all()
 
     def _fail(self, text: str, name: str | None = None) -> None:
-        """Keep the first fault, and have the recording sealed if the recorder lives."""
-        with self._news:  # all commands wait on it: one that waits for a start hears of the fault at once
+        """Keep the first fault, and have the recording sealed if the recorder is alive."""
+        with self._news:  # a command that waits for a start must learn of the fault at once
             self.fault = self.fault or text
             self._cancel_if(begins=self.life.on_fault())
             self._news.notify_all()

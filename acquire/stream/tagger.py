@@ -1,7 +1,7 @@
-"""From line numbers to code, ticks and time; and from the trigger's tags to the certainty of it.
+"""Gives lines their code, ticks and time, and checks these against the trigger's tags.
 
-All of it follows from the line's number: line ``l`` begins at code index S·l and is read out from
-tick (S·l + n - 1)·substep_ticks on. A tag that says the same confirms every line up to its own. Pure: no I/O.
+They follow from the line's number: line ``l`` begins at code index S·l and is read out from tick
+(S·l + n - 1)·substep_ticks on. A tag that agrees confirms every line up to its own. No I/O.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ if TYPE_CHECKING:
 
 UNCONFIRMED = np.uint16(LineFlag.TIME_ESTIMATED | LineFlag.CODE_UNVERIFIED)
 
-# Code and times are computed for so many lines at once and for both arms: tables of what the one has had
-# and the other not yet are kept, as far as arms are apart in an ordinary run.
+# Code and times are computed for this many lines at once, for both arms. Enough tables are kept for the
+# distance between the arms in an ordinary run.
 _SPAN_LINES = 32768
 _SPANS_KEPT = 4
 
 
 @dataclass(frozen=True, slots=True)
 class TagMismatch:
-    """A tag of the trigger that contradicts the count of lines, and what it should have said."""
+    """A tag of the trigger that contradicts the line count, and the tag expected in its place."""
 
     tag: LineTag
     expected: LineTag
@@ -52,7 +52,7 @@ class TagMismatch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LineTable:
-    """What the trigger's run says about consecutive lines; arrays of one value per line."""
+    """Code, ticks and times of consecutive lines; arrays of one value per line."""
 
     code_index: NDArray[np.uint64]
     code: NDArray[np.uint8]
@@ -67,13 +67,13 @@ class LineTable:
 
 
 def tag_rows(tags: Sequence[LineTag]) -> NDArray[np.uint64]:
-    """Tags as (tag, 3) uint64: line, code index, tick."""
+    """Return tags as (tag, 3) uint64: line, code index, tick."""
     rows = np.array([(tag.line, tag.code_index, tag.tick) for tag in tags], np.uint64)
     return rows.reshape(len(tags), 3)
 
 
 class Tagger:
-    """Tags blocks of one run. ``confirmed_end`` is the line after the last that a tag confirmed."""
+    """Tags blocks of one run. ``confirmed_end`` is the line after the last one that a tag confirmed."""
 
     def __init__(self, run: TriggerRun, stages: int, clock: ClockFit) -> None:
         self._run = run
@@ -85,10 +85,10 @@ class Tagger:
         self.confirmed_end = 0
 
     def verify(self, rows: NDArray[np.uint64]) -> list[TagMismatch]:
-        """Hold tags (tag, 3), see `tag_rows`, against the prediction; return those that contradict it.
+        """Compare tags (tag, 3), see `tag_rows`, with the prediction; return those that contradict it.
 
-        A trigger that is right by itself but goes back in lines has started again: nothing after that is
-        confirmed any more.
+        Tags that are consistent but go back in lines show that the trigger started again: nothing after that
+        is confirmed any more.
         """
         lines = rows[:, 0]
         code_index = lines * np.uint64(self._run.substeps)
@@ -97,7 +97,7 @@ class Tagger:
             return []
         wrong = (rows != expected).any(axis=1)
         right = np.flatnonzero(~wrong)
-        counted = rows[right, 0].astype(np.int64)  # signed, as is the line before the first
+        counted = rows[right, 0].astype(np.int64)  # signed, since the line before the first is -1
         back = np.diff(counted, prepend=self._last_line) <= 0
         ahead = counted[~np.logical_or.accumulate(back)]
         if len(ahead) and not self._restarted:
@@ -108,7 +108,7 @@ class Tagger:
         return [TagMismatch(LineTag(*map(int, rows[k])), LineTag(*map(int, expected[k]))) for k in suspects]
 
     def _all_right(self, rows: NDArray[np.uint64], expected: NDArray[np.uint64]) -> bool:
-        """The common case, at a fraction of the cost: all tags as predicted, each ahead of the one before."""
+        """Handle the common case at a fraction of the cost: all tags as predicted and in order."""
         lines = rows[:, 0].tolist()
         ahead = all(before < line for before, line in pairwise((self._last_line, *lines)))
         if self._restarted or not ahead or not np.array_equal(rows, expected):
@@ -118,12 +118,12 @@ class Tagger:
         return True
 
     def tag(self, block: LineBlock) -> TaggedBlock:
-        """The block with code and time; lines that no tag confirmed so far are flagged."""
+        """Return the block with code and time; lines that no tag has confirmed so far are flagged."""
         table = self.table(block.first_line, len(block))
         flags = block.flags
         confirmed = max(0, self.confirmed_end - block.first_line)
         if confirmed < len(block):
-            flags = flags.copy()  # they are the ring's, and others look at them
+            flags = flags.copy()  # they are in the ring, where observers read them
             flags[confirmed:] |= UNCONFIRMED
         return TaggedBlock(
             arm=block.arm,
@@ -137,7 +137,7 @@ class Tagger:
         )
 
     def table(self, first_line: int, count: int) -> LineTable:
-        """The lines ``first_line .. first_line + count - 1``; both arms share the spans it is cut from."""
+        """Return the table of ``count`` lines from ``first_line`` on, a slice of one that both arms share."""
         for start, span in reversed(self._spans.items()):
             if start <= first_line and first_line + count <= start + len(span):
                 return span[first_line - start : first_line - start + count]
@@ -153,6 +153,6 @@ class Tagger:
         tick = (code_index + np.uint64(self._readout_substep)) * np.uint64(self._run.substep_ticks)
         bits = self._run.code.bits(first_bit, substeps * count)
         code = np.zeros(count, np.uint8)
-        for substep in range(substeps):  # packbits of rows this short takes several times as long
+        for substep in range(substeps):  # packbits takes several times as long on rows this short
             code |= bits[substep::substeps] << np.uint8(substep)
         return LineTable(code_index, code, tick, self._clock.time_ns(tick))

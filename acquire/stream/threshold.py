@@ -1,4 +1,4 @@
-"""When what the lines show crosses a level: with hysteresis, so that noise at the level is one event."""
+"""Detects when the lines' mean crosses a level, with hysteresis, so that noise at the level is one event."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 _MOST_COLUMNS = 64
-"""That a line's mean is taken over: evenly spaced ones tell enough."""
+"""Evenly spaced columns over which a line's mean is taken, at most."""
 
 
 @dataclass(frozen=True, slots=True)
 class ThresholdPlan:
-    """Level of the mean of ``average_lines`` lines of ``arm``; it counts again ``hysteresis_dn`` back."""
+    """Level for the mean of ``average_lines`` lines of ``arm``; re-armed ``hysteresis_dn`` back from it."""
 
     arm: str
     level_dn: float
@@ -26,18 +26,18 @@ class ThresholdPlan:
 
 
 class Threshold:
-    """Finds the crossings in lines that come block by block. The first lines only say on which side it is."""
+    """Finds the crossings in lines that come block by block. The first lines only fix the initial side."""
 
     def __init__(self, plan: ThresholdPlan) -> None:
         self.plan = plan
         self._beyond: bool | None = None
 
     def crossings(self, first_line: int, pixels: NDArray[Any]) -> list[int]:
-        """First line of every stretch in ``pixels`` (line, pixel) in which the level is crossed."""
+        """Return the first line of every averaged group in ``pixels`` (line, pixel) that has a crossing."""
         plan, sign = self.plan, 1.0 if self.plan.rising else -1.0
         found = []
-        # Means of average_lines lines each, and of what remains, over some of the columns: all of them would
-        # cost a wide sensor's processor, and a threshold needs no more.
+        # Means of average_lines lines each, and of the remainder, over some of the columns: a threshold needs
+        # no more, and all columns of a wide sensor would take a processor.
         step = -(-pixels.shape[1] // _MOST_COLUMNS)
         levels = pixels[:, ::step].mean(axis=1, dtype=np.float32)
         starts = np.arange(0, len(levels), plan.average_lines)

@@ -1,7 +1,7 @@
-"""The process that looks at the lines while they pass: does the light follow the code, was a level crossed.
+"""The process that checks lines while they pass: does the light follow the code, was a level crossed?
 
-It observes the rings and nobody waits for it; what it sees it tells the capture's owner. Dead or late, it
-costs no line: what it did not see is not checked, which the counters tell.
+It observes the rings, nobody waits for it, and it reports to the capture's owner. A dead or late watcher
+costs no line: lines that it missed are not checked, which its counters show.
 
 ::
 
@@ -41,25 +41,25 @@ COUNTERS = tuple(
     for arm in ARMS
     for name in ("verdict", "shift", "checked_line", "verified_line", "checks", "lapped")
 )
-"""Per arm: position in `VERDICTS`, shift in sub-steps, the line after the last that was checked, the first of
-the last check that was verified, how many checks there were; ring slots that came and went unseen."""
+"""Per arm: index in `VERDICTS`, shift in sub-steps, the line after the last one checked, the first line of
+the last check that was verified, the number of checks; the number of ring slots overwritten unread."""
 VERDICTS = tuple(Verdict)
 OBSERVER = 0
 """The watcher's place among a ring's observers."""
 
 _CHECK_EVERY_S = 0.5
 _LOOK_S = 0.02
-_TELL_EVERY_S = 0.1
-"""Crossings that follow sooner than this on one that was told are only counted."""
+_REPORT_EVERY_S = 0.1
+"""Crossings that follow sooner than this on a reported one are only counted."""
 _MOST_COLUMNS = 128
 _MOST_PROFILE_LINES = 256
 
 
 @dataclass(frozen=True, slots=True)
 class WatchPlan:
-    """What the watcher looks for. Picklable.
+    """Settings of the watcher. Picklable.
 
-    ``judge``: None: the code is not checked; ``lines``: that a check takes; ``black_dn``: arm → black level.
+    ``judge`` checks the code, None: no check; ``lines`` per check; ``black_dn``: arm → black level.
     """
 
     judge: Judge | None
@@ -69,7 +69,7 @@ class WatchPlan:
 
 
 def watch(mailbox: Mailbox, plan: WatchPlan, rings: dict[str, Ring], counters: Counters) -> None:
-    """Life of the watcher: look at what comes, until told to end."""
+    """Main function of the watcher: check the lines that come, until Quit."""
     watcher = Watcher(mailbox, plan, rings, counters)
     mailbox.post(Ready())
     waiting = select.poll()
@@ -91,20 +91,20 @@ class Watcher:
         self._observers = {arm: Observer(ring, OBSERVER) for arm, ring in rings.items()}
         self._threshold = None if plan.threshold is None else Threshold(plan.threshold)
         self._intakes: dict[str, Intake] = {}
-        self._told = dict.fromkeys(ARMS, Finding(Verdict.UNKNOWN))
+        self._reported = dict.fromkeys(ARMS, Finding(Verdict.UNKNOWN))
         self._doubted: dict[str, bool | None] = dict.fromkeys(ARMS)
-        """As it was told last; None: not yet."""
-        self._next_s = self._now_s = self._tell_s = 0.0
-        self._untold = 0
-        # A watcher that replaces another begins with what comes: it must not judge a ring's whole history.
+        """Whether doubt was reported last, per arm; None: nothing yet."""
+        self._next_s = self._now_s = self._report_s = 0.0
+        self._unreported = 0
+        # A watcher that replaces another begins with new lines: it must not check a ring's whole history.
         for observer in self._observers.values():
             observer.skip()
 
     def turn(self, now_s: float) -> None:
-        """Take what has come; judge when both arms have the lines for it."""
+        """Take the blocks that have come; judge the code once both arms have the lines of a check."""
         self._now_s = now_s
         if self._plan.judge is not None and not self._intakes and now_s >= self._next_s:
-            # From the first line on that neither arm has delivered yet.
+            # The check begins with the first line that neither arm has delivered yet.
             first_line = max(ring.newest_line for ring in self._rings.values())
             self._next_s = now_s + _CHECK_EVERY_S
             self._intakes = {
@@ -133,21 +133,21 @@ class Watcher:
             if intake is not None:
                 intake.take(block)
             if observer.release():
-                self._tell(crossed)
+                self._report_crossings(crossed)
             elif intake is not None:
                 intake.broken = True
         self._counters[f"lapped_{arm}"] = observer.statistics().lost
 
-    def _tell(self, crossed: list[int]) -> None:
-        for line in crossed:
-            if self._now_s < self._tell_s:
-                self._untold += 1
+    def _report_crossings(self, lines: list[int]) -> None:
+        for line in lines:
+            if self._now_s < self._report_s:
+                self._unreported += 1
                 continue
-            plan, self._tell_s = self._plan.threshold, self._now_s + _TELL_EVERY_S
+            plan, self._report_s = self._plan.threshold, self._now_s + _REPORT_EVERY_S
             assert plan is not None
             text = f"arm {plan.arm} {'above' if plan.rising else 'below'} {plan.level_dn:g} DN"
-            more = f", {self._untold} more times before" if self._untold else ""
-            self._untold = 0
+            more = f", {self._unreported} more times before" if self._unreported else ""
+            self._unreported = 0
             self._mailbox.post(Note(line, "threshold", text + more))
 
     def _judge(self, judge: Judge | None) -> None:
@@ -161,18 +161,18 @@ class Watcher:
             self._counters[f"shift_{arm}"] = finding.shift
             self._counters[f"checked_line_{arm}"] = first_line + self._plan.lines
             self._counters.add(f"checks_{arm}", 1)
-        # Told when a verdict changes, not when its certainty does, which differs from check to check.
-        told = {arm: (finding.verdict, finding.shift) for arm, finding in self._told.items()}
-        if any((finding.verdict, finding.shift) != told[arm] for arm, finding in found.items()):
-            self._told = found
+        # Report a change of verdict or shift, not of the peak, which differs from check to check.
+        last = {arm: (finding.verdict, finding.shift) for arm, finding in self._reported.items()}
+        if any((finding.verdict, finding.shift) != last[arm] for arm, finding in found.items()):
+            self._reported = found
             doubtful = any(finding.verdict.doubtful for finding in found.values())
             self._mailbox.post(Checked(first_line, doubtful, explain(found, judge.substeps)))
 
     def _locate(self, arm: str, finding: Finding, first_line: int) -> None:
-        """Tell from which line on an arm is in doubt, or no more.
+        """Report from which line on an arm's code is in doubt, or no longer in doubt.
 
-        A check whose lines slip half-way may say either, and nothing is known of the lines between checks:
-        doubt begins with the last check that saw none, and ends after the first.
+        If lines slip in the middle of a check its verdict may be either, and lines between checks are not
+        judged: doubt begins with the last check that found none, and ends after the first such check.
         """
         if finding.verdict is Verdict.UNKNOWN:
             return
@@ -188,7 +188,7 @@ class Watcher:
 
 
 class Intake:
-    """``lines`` consecutive lines of one arm from ``first_line`` on, as the check needs them: no pixels."""
+    """Means of ``lines`` consecutive lines of one arm from ``first_line`` on, as the check needs them."""
 
     def __init__(self, first_line: int, lines: int, black_dn: float) -> None:
         self.first_line = first_line
@@ -204,7 +204,7 @@ class Intake:
         return self._count == len(self._energy) and not self.broken
 
     def take(self, block: RingBlock) -> None:
-        """Lines that were lost make it `broken`: they cannot be judged."""
+        """Add the block's lines. A lost line sets `broken`: the check cannot be made."""
         expected = self.first_line + self._count
         if self.broken or self.full or block.end_line <= expected:
             return
@@ -212,7 +212,7 @@ class Intake:
             self.broken = True
             return
         pixels = block.pixels[expected - block.first_line :][: len(self._energy) - self._count]
-        # Evenly spaced columns and lines: the mean of all would cost a processor at 100 kHz, and the code
+        # Evenly spaced columns and lines: the mean of all would take a processor at 100 kHz, and the code
         # shows in any part of the line.
         energy = pixels[:, :: -(-pixels.shape[1] // _MOST_COLUMNS)].mean(axis=1)
         self._energy[self._count : self._count + len(energy)] = energy
@@ -220,6 +220,6 @@ class Intake:
         self._profile.append(pixels[:: self._profile_step].mean(axis=0, dtype=np.float64))
 
     def sight(self) -> Sight:
-        """What was taken, above the black level."""
+        """Return the means of the lines and of the pixels, above the black level."""
         profile = np.mean(self._profile, axis=0)
         return Sight(self._energy - self._black_dn, profile - self._black_dn)

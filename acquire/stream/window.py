@@ -1,4 +1,4 @@
-"""Which lines a recording takes around an event, and how they are taken back from what the rings still hold.
+"""Which lines a recording takes around an event, and how they are taken back from the rings' history.
 
 ::
 
@@ -6,9 +6,9 @@
        ├──────────────────┼────────────────────┤
        first line         at                   end            (``lines`` in all, post_lines, or endless)
 
-While armed, the recorder lets lines go as soon as they have come; they stay in the ring until it comes round.
-Everything else that a line's row needs (code, ticks, time) follows from its number and from what was fixed
-when the run was armed, so that a line from before the event is recorded as any other.
+While armed, the recorder releases lines as soon as they come; they stay in the ring until it comes round.
+Everything else that a line's row needs (code, ticks, time) follows from its number and from the settings of
+the armed run, so that a line from before the event is recorded like any other.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """Lines around the line ``at``: an event's, or None for the newest line when the recorder is told.
+    """Lines around the line ``at``: an event's, or None for the newest when the recorder gets the request.
 
     Attributes
     ----------
-    pre_lines : to be recorded before that line
-    post_lines : to be recorded from that line on; None: as many as the recording's budget says
-    exact : refuse where not all of ``pre_lines`` can be had; otherwise take those that there are
-    padded : begin there all the same; lines that the rings do not hold any more are missing
-    kind, text : what happened at the line, for the recording's events; "" where nothing did
+    pre_lines : lines to be recorded before ``at``
+    post_lines : lines to be recorded from ``at`` on; None: according to the recording's budget
+    exact : refuse if not all ``pre_lines`` are available; otherwise take those that are
+    padded : begin at the wanted line in any case; lines that the rings no longer hold are missing
+    kind, text : the event at the line, for the recording's list of events; "" for none
     """
 
     at: int | None = None
@@ -54,7 +54,7 @@ class Window:
 
     @property
     def is_now(self) -> bool:
-        """From the next line on, whichever that will be."""
+        """Whether the recording is to begin with the next line, whichever that will be."""
         return self.at is None and not self.pre_lines and self.post_lines is None
 
 
@@ -64,7 +64,7 @@ NOW = Window()
 
 @dataclass(frozen=True, slots=True)
 class Held:
-    """What the rings hold for a window at line ``at``: everything ``from_line`` on; blocks ``taken`` back."""
+    """The rings' lines for a window at ``at``: all from ``from_line`` on; arm → blocks ``taken`` back."""
 
     at: int
     from_line: int
@@ -73,7 +73,7 @@ class Held:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """Lines ``first_line .. end_line - 1`` around ``at``; end None: until told."""
+    """Lines ``first_line .. end_line - 1`` around ``at``; ``end_line`` None: until `End`."""
 
     first_line: int
     end_line: int | None
@@ -81,9 +81,9 @@ class Span:
 
 
 def hold(window: Window, rings: Mapping[str, Ring]) -> Held:
-    """Take back what the window asks for, as far as it is there, in another recording or in none.
+    """Take back the window's lines as far as the rings hold them, also those that a recording has already.
 
-    Nothing is taken where `span` will refuse, as far as that can be seen before.
+    Nothing is taken if it can be foreseen that `span` will refuse.
     """
     at = min(ring.newest_line for ring in rings.values()) if window.at is None else window.at
     there = _whole_from(window, rings, {name: ring.oldest_block for name, ring in rings.items()})
@@ -96,9 +96,9 @@ def hold(window: Window, rings: Mapping[str, Ring]) -> Held:
 
 
 def span(window: Window, lines: int | None, held: Held, line_rate_hz: float) -> Span:
-    """The lines to record, ``lines`` in all where that is given.
+    """Return the lines to record, ``lines`` in all if given.
 
-    UsageError, with what there is, for an exact window that reaches further back than what is held.
+    Raises UsageError, stating what is available, if an exact window reaches further back than the rings do.
     """
     wanted = held.at - window.pre_lines
     if wanted < held.from_line and window.exact:
@@ -116,12 +116,15 @@ def span(window: Window, lines: int | None, held: Held, line_rate_hz: float) -> 
 
 
 def _whole_from(window: Window, rings: Mapping[str, Ring], first: Mapping[str, RingBlock | None]) -> int:
-    """The line from which on everything is in the rings, or known to be lost, if these blocks come first."""
+    """Return the line from which on every line is in the rings, or known as lost.
+
+    ``first``: arm → oldest block.
+    """
     lines = [0]
     for name, ring in rings.items():
         block = first[name]
         lost = 0 if block is None else sum(loss.count for loss in block.losses)
         lines.append(ring.newest_line if block is None else block.first_line - lost)
-        if not window.padded:  # else what found its ring full is missing, as what the ring holds no more
+        if not window.padded:  # a padded window records lines that found their ring full as missing
             lines.append(ring.dropped_end)
     return max(lines)

@@ -1,1 +1,1 @@
-"""The sync trigger: what the daemon asks of it, whatever the transport or twin behind."""
+"""The sync trigger: its interface to the daemon, and the driver for any transport or twin."""

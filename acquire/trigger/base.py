@@ -1,8 +1,8 @@
 """The protocol of a sync trigger.
 
 At the pulse of line ``k`` the trigger is at code index ``S·k`` of its run: charge packet ``k`` enters the
-first row. It is read out M + 1 pulses later, so a camera armed before the start delivers M + 1 lines of
-no use first (`Geometry.depth_lines`).
+first row. It is read out M + 1 pulses later, so a camera armed before the start first delivers M + 1 useless
+lines (`Geometry.depth_lines`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class TriggerIdentity:
-    """Who answers: model, serial number, firmware version, its clock."""
+    """Identity of a trigger: model, serial number, firmware version, clock."""
 
     model: str
     serial: str
@@ -28,7 +28,7 @@ class TriggerIdentity:
 
 @dataclass(frozen=True, slots=True)
 class Delays:
-    """When light and camera lines start beside a line's own start, in ticks of the trigger's clock."""
+    """When light and camera lines start relative to a line's start, in ticks of the trigger's clock."""
 
     light_lead_ticks: int
     a_ticks: int
@@ -36,7 +36,7 @@ class Delays:
 
     @classmethod
     def of(cls, config: TriggerConfig) -> Delays:
-        """As a rig has them."""
+        """Return the delays of a rig."""
         return cls(config.light.lead_ticks, config.a.delay_ticks, config.b.delay_ticks)
 
 
@@ -49,14 +49,14 @@ class LightWindow:
 
     @classmethod
     def of(cls, config: TriggerConfig) -> LightWindow:
-        """As a rig has it."""
+        """Return the window of a rig."""
         light = config.light
         return cls(light.open_ticks, config.substep_ticks if light.close_ticks is None else light.close_ticks)
 
 
 @dataclass(frozen=True, slots=True)
 class TriggerRun:
-    """What one run asks of the trigger; a trigger that cannot honour it refuses in `Trigger.prepare`."""
+    """Settings of one run; a trigger that does not support them refuses in `Trigger.prepare`."""
 
     run_id: str
     code: Code
@@ -67,7 +67,7 @@ class TriggerRun:
     tag_every_lines: int
     delays: Delays | None = None
     window: LightWindow | None = None
-    """Delays and window in place of what the trigger was configured with."""
+    """Delays and window instead of those in the trigger's configuration."""
 
     @property
     def line_period_ticks(self) -> int:
@@ -76,7 +76,7 @@ class TriggerRun:
 
 @dataclass(frozen=True, slots=True)
 class LineTag:
-    """The trigger's word on one line: at the pulse of ``line`` it stood at ``code_index`` and ``tick``."""
+    """The trigger's message about a line: at the pulse of ``line`` it was at ``code_index`` and ``tick``."""
 
     line: int
     code_index: int
@@ -85,7 +85,7 @@ class LineTag:
 
 @dataclass(frozen=True, slots=True)
 class TagEvent:
-    """Something that the trigger noticed during ``line``: ``input``, ``missed_trigger_a`` and so on."""
+    """Event detected by the trigger during ``line``: ``input``, ``missed_trigger_a`` and so on."""
 
     line: int
     tick: int
@@ -98,7 +98,7 @@ class Trigger(Protocol):
     def identify(self) -> TriggerIdentity: ...
 
     def prepare(self, run: TriggerRun) -> None:
-        """Load code and timing; raise TriggerError for what cannot be honoured. The light stays off."""
+        """Load code and timing; raise TriggerError if they are not supported. The light stays off."""
         ...
 
     def start(self) -> ClockFit:
@@ -106,11 +106,11 @@ class Trigger(Protocol):
         ...
 
     def tags(self, timeout_s: float) -> list[LineTag]:
-        """Tags that arrived since the last call, in order; waits at most ``timeout_s`` for the first."""
+        """Return the tags since the last call, in order; wait at most ``timeout_s`` for the first."""
         ...
 
     def events(self) -> list[TagEvent]:
-        """What else the tags of all calls so far have told, each event once, in order."""
+        """Return the events reported by the tags of all calls so far, each event once, in order."""
         ...
 
     def stop(self) -> int:
@@ -118,7 +118,7 @@ class Trigger(Protocol):
         ...
 
     def statistics(self) -> dict[str, Any]:
-        """Counters of this trigger, at least ``pulses`` and ``tags``."""
+        """Return the counters of this trigger, at least ``pulses`` and ``tags``."""
         ...
 
     def close(self) -> None:

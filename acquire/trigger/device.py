@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from acquire.trigger.registers import Register
 
 ANSWER_S = 3.0
-"""What a device does at once has been done by then."""
-# The quickest is taken: what took longer was held up somewhere on the way, on either side of the answer.
+"""Time within which the device has done anything that it does at once."""
+# The quickest comparison is used: a slower one was delayed somewhere, before or after the device's reading.
 _COMPARISONS = 8
 _LOOK_AGAIN_S = 0.001
 _COUNTERS = (
@@ -35,7 +35,7 @@ _COUNTERS = (
 
 @dataclass(frozen=True, slots=True)
 class DeviceStatus:
-    """What the device does at this moment."""
+    """Current status of the device."""
 
     state: State
     run: int
@@ -50,7 +50,7 @@ class DeviceStatus:
 
     @property
     def at_rest(self) -> bool:
-        """No run is armed or running."""
+        """Whether no run is armed or running."""
         return self.state in (State.IDLE, State.ENDED)
 
     def __str__(self) -> str:
@@ -60,7 +60,7 @@ class DeviceStatus:
 
 
 class Device:
-    """The device behind ``link``; TriggerError unless it is one that this program knows.
+    """The device behind ``link``. Raises TriggerError unless this program supports it.
 
     Attributes
     ----------
@@ -73,11 +73,11 @@ class Device:
         link.window_bytes = self.capabilities.rx_bytes
 
     def read(self, register: Register) -> int:
-        """A register's value."""
+        """Return a register's value."""
         return _value(self.link.read(register.address, register.words))
 
     def status(self) -> DeviceStatus:
-        """What it does now, all of one moment but for STATUS itself."""
+        """Return the current status; everything is of one moment, except STATUS itself."""
         words = self.link.read_block(r.STATUS.address, r.CODE_STATE.address - r.STATUS.address)
         values = _values(r.STATUS.address, words)
         flags = r.STATUS.unpack(values[r.STATUS])
@@ -94,7 +94,7 @@ class Device:
         )
 
     def await_status(self, done: Callable[[DeviceStatus], bool], limit_s: float, what: str) -> DeviceStatus:
-        """Look until ``done``; TriggerError when it did not do ``what`` in time."""
+        """Poll until ``done``. Raises TriggerError if the device did not do ``what`` in time."""
         deadline_s = time.monotonic() + limit_s
         while not done(status := self.status()):
             if time.monotonic() > deadline_s:
@@ -103,12 +103,12 @@ class Device:
         return status
 
     def counters(self) -> dict[str, int]:
-        """Of this run, or since power-up: see the registers."""
+        """Return counters of this run, or since power-up: see the registers."""
         return {name.lower(): self.read(getattr(r, name)) for name in _COUNTERS}
 
     def configure(self, values: Mapping[Register, int]) -> None:
         """Write the config registers in one block, read them back, compare."""
-        # One frame, so that the device has the old configuration or the new one, and no mixture.
+        # One frame, so that the device has either the old configuration or the new one.
         first, last = r.CONFIGURATION[0], r.CONFIGURATION[-1]
         words = [0] * (last.address + last.words - first.address)
         for register in r.CONFIGURATION:
@@ -120,19 +120,19 @@ class Device:
                 raise TriggerError(f"{register.name} reads {have:#x} where {values[register]:#x} was written")
 
     def configuration(self) -> dict[Register, int]:
-        """What the config registers hold."""
+        """Return the values of the config registers."""
         first, last = r.CONFIGURATION[0], r.CONFIGURATION[-1]
         words = self.link.read(first.address, last.address + last.words - first.address)
         return _values(first.address, words)
 
     def command(self, command: Command, number: int = 0) -> None:
-        """One command, about run ``number``. It may be repeated on a bad link without harm."""
-        # Run id and command in one frame: two clients cannot put their commands between each other's. What a
-        # lost answer has sent twice meets the same run, and changes nothing.
+        """Send one command for run ``number``. Repetition on a bad link does no harm."""
+        # Run id and command in one frame, so that commands of two clients cannot interleave. A command that
+        # is sent twice because an answer was lost refers to the same run, and changes nothing.
         self.link.write(r.RUN_ID.address, [*r.RUN_ID.to_words(number), command])
 
     def load_code(self, bits: NDArray[np.uint8]) -> int:
-        """Load the code memory (0 or 1 per bit) and check it on the device; its CRC-32."""
+        """Load the code memory (0 or 1 per bit) and check it on the device; return its CRC-32."""
         room = self.capabilities.code_bits
         if not 0 < len(bits) <= room:
             raise TriggerError(
@@ -150,42 +150,45 @@ class Device:
         return crc
 
     def read_code(self, length: int) -> NDArray[np.uint8]:
-        """The first ``length`` bits of the code memory, 0 or 1 each."""
+        """Return the first ``length`` bits of the code memory, 0 or 1 each."""
         words = self.link.read_block(r.CODE_MEMORY, -(-length // 32))
         return np.unpackbits(np.array(words, "<u4").view(np.uint8), bitorder="little")[:length]
 
     def code_length(self) -> int:
-        """Bits of the code memory that were loaded; TriggerError if none were."""
+        """Return the loaded bits of the code memory. Raises TriggerError if there are none."""
         if not self.status().code_checked or not (length := self.read(r.CODE_LENGTH)):
             raise TriggerError("the code memory holds no checked code", hint="acquire trigger load")
         return length
 
     def self_test(self) -> dict[str, int]:
-        """Have the device test itself; the fields of SELF_TEST. What its code memory held is lost."""
+        """Have the device test itself; return the fields of SELF_TEST.
+
+        The code memory's contents are lost.
+        """
         self.command(Command.SELF_TEST)
         self.await_status(lambda status: not status.busy, ANSWER_S, "test itself")
         return r.SELF_TEST.unpack(self.read(r.SELF_TEST))
 
     def compare_clocks(self) -> tuple[int, int, int]:
-        """UTC (ns), the device's TIME at that moment, and how far the two may be apart (ns)."""
-        return min((self._compare_once() for _ in range(_COMPARISONS)), key=lambda found: found[2])
-
-    def _compare_once(self) -> tuple[int, int, int]:
-        # The device read its clock between question and answer, nobody knows when: in the middle, give or
-        # take half of the time (Cristian 1989). The difference is of the clock that is never set.
-        before_ns, utc_ns = time.monotonic_ns(), time.time_ns()
-        tick = self.read(r.TIME)
-        half_ns = (time.monotonic_ns() - before_ns) // 2
-        return utc_ns + half_ns, tick, half_ns
+        """Return UTC (ns), the device's TIME at that moment, and the uncertainty of their relation (ns)."""
+        found = []
+        for _ in range(_COMPARISONS):
+            # The device read its clock at an unknown moment between request and answer: in the middle, plus
+            # or minus half of the time (Cristian 1989). The time is measured with the monotonic clock.
+            before_ns, utc_ns = time.monotonic_ns(), time.time_ns()
+            tick = self.read(r.TIME)
+            half_ns = (time.monotonic_ns() - before_ns) // 2
+            found.append((utc_ns + half_ns, tick, half_ns))
+        return min(found, key=lambda one: one[2])
 
 
 def facts_of(status: DeviceStatus | Capabilities) -> dict[str, Any]:
-    """For printing: names instead of numbers."""
+    """Return values for printing, with names instead of numbers."""
     return {name: getattr(value, "name", value) for name, value in asdict(status).items()}
 
 
 def _shake_hands(link: Link) -> Capabilities:
-    """Read the constants; TriggerError names both sides where they do not match."""
+    """Read the constants. Raises TriggerError, naming both versions, if device and program do not match."""
     last = r.QUEUES
     values = _values(r.ID.address, link.read(r.ID.address, last.address + last.words))
     name = link.transport.name
@@ -205,7 +208,7 @@ def _shake_hands(link: Link) -> Capabilities:
 
 
 def _values(address: int, words: Sequence[int]) -> dict[Register, int]:
-    """Register → value, of those that lie wholly in ``words`` from ``address`` on."""
+    """Return the values of the registers that are completely in ``words`` from ``address`` on."""
     return {
         register: _value(words[register.address - address :][: register.words])
         for register in r.REGISTERS

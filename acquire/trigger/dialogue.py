@@ -1,4 +1,4 @@
-"""Requests and answers on the trigger's link: without I/O, without a thread and without a clock of its own.
+"""Requests and answers on the trigger's link, without I/O, thread or clock.
 
 ::
 
@@ -6,11 +6,11 @@
                 ▲                          │
                 └───── lost, overdue ──────┴── after the last attempt ──▶ given up
 
-Whoever holds a `Dialogue` brings it the bytes that came and the time, sends what it says, and calls `expire`
-when `deadline_s` has passed. Answers come in the order of the requests: an answer to a later one means that
-an earlier one, or its answer, was lost, and it is queued again; so is one whose deadline passes. The protocol
-lets every request be repeated. So that the device's queue cannot overflow, nor answers pile up, no more than
-``window_bytes`` of either are on the way.
+The owner of a `Dialogue` passes received bytes and the time to it, sends the bytes that it returns, and calls
+`expire` when `deadline_s` has passed. Answers come in the order of the requests: an answer to a later one
+means that an earlier one, or its answer, was lost, and it is queued again; so is one whose deadline passes.
+The protocol permits the repetition of every request. To keep the device's queue from overflowing and answers
+from piling up, no more than ``window_bytes`` of either are on the way.
 """
 
 from __future__ import annotations
@@ -37,11 +37,11 @@ if TYPE_CHECKING:
 
 _UNSENT = Frame(0, 0)
 _EMPTY_DATA_BYTES = len(encode(Frame(FrameType.DATA, 0, bytes(2))))
-"""Each word adds four: in frames as short as ours, COBS takes one byte whatever they hold."""
+"""Each word adds four: in frames as short as ours, COBS adds one byte whatever they contain."""
 
 
 class RefusedError(TriggerError):
-    """The device said no; ``code`` is its reason, ``address`` the word that it is about."""
+    """The device refused a request; ``code`` is its reason, ``address`` the word concerned."""
 
     def __init__(self, code: int, address: int) -> None:
         self.code, self.address = code, address
@@ -55,7 +55,7 @@ class RefusedError(TriggerError):
 
 
 class TagArrival(NamedTuple):
-    """A tag and the 16-bit number it came with: consecutive unless one was lost."""
+    """A tag and its 16-bit sequence number: consecutive unless a tag was lost."""
 
     number: int
     tag: TagRecord
@@ -63,15 +63,15 @@ class TagArrival(NamedTuple):
 
 @dataclass(slots=True, eq=False)
 class Call:
-    """One request and what became of it; ``frame`` has the sequence of its latest attempt.
+    """One request and its outcome; ``frame`` has the sequence of its latest attempt.
 
-    It is open until it has its ``answer``, or its ``failure`` where it was given up.
+    It is open until it has its ``answer``, or its ``failure`` if it was given up.
     """
 
     kind: FrameType
     payload: bytes
     size_bytes: int
-    """Of the longer one of request and answer, encoded."""
+    """Encoded size of the longer one of request and answer."""
     frame: Frame = _UNSENT
     attempts: int = 0
     begun_s: float = math.nan
@@ -85,21 +85,21 @@ class Call:
 
 
 class Dialogue:
-    """What is asked and answered over one link. All times are of one monotonic clock, which the caller reads.
+    """Requests and answers on one link. All times are of one monotonic clock, which the caller reads.
 
     Parameters
     ----------
-    name : of the way, for errors
-    bytes_per_s : what the way carries in one direction
-    silence_s : without an answer, after which a request is sent again, the way there and back not counted
+    name : name of the transport, for errors
+    bytes_per_s : rate of the transport in one direction
+    silence_s : time without an answer after which a request is repeated, without transmission times
     attempts : how often a request is sent before it is given up
     """
 
     def __init__(self, name: str, bytes_per_s: float, silence_s: float, attempts: int) -> None:
         self.window_bytes = MAX_ENCODED + 1
-        """Of unanswered requests, or of their answers; to be raised to what the device says that it holds."""
+        """Limit of unanswered requests, or of their answers; to be raised to the device's capacity."""
         self.longest_s = 0.0
-        """The longest that a request has waited for its answer, all its attempts together."""
+        """Longest time until a request had its answer, including all its attempts."""
         self._name, self._bytes_per_s = name, bytes_per_s
         self._silence_s, self._attempts = silence_s, attempts
         self._decoder = Decoder()
@@ -111,39 +111,39 @@ class Dialogue:
 
     @property
     def reply_s(self) -> float:
-        """An answer may take so long, the way there and back counted."""
+        """Longest time for an answer, including transmission times."""
         return self._silence_s + 2 * self.window_bytes / self._bytes_per_s
 
     @property
     def limit_s(self) -> float:
-        """A request has its answer by then, or is given up; `expire` that is called late may take longer."""
+        """Time after which a request is answered or given up; longer if `expire` is called late."""
         return self._attempts * self.reply_s
 
     @property
     def deadline_s(self) -> float:
-        """When `expire` has something to do, unless an answer comes before; inf with nothing on the way."""
+        """When `expire` must be called, unless an answer comes before; inf with nothing on the way."""
         return min(map(self._due_s, self._on_the_way.values()), default=math.inf)
 
     @property
     def can_send(self) -> bool:
-        """A request is queued that the window has room for."""
+        """Whether the window has room for the next queued request."""
         return bool(self._queued) and self._fits(self._queued[0], self._room_bytes)
 
     def ask(self, requests: Iterable[tuple[FrameType, bytes]]) -> list[Call]:
-        """Queue requests, type and payload, that do not depend on each other's order.
+        """Queue requests, type and payload, whose order does not matter.
 
-        Raises FrameLengthError for a payload that fits no frame; nothing is queued then.
+        Raises FrameLengthError for a payload that does not fit a frame; nothing is queued then.
         """
         calls = [Call(kind, payload, _size_bytes(kind, payload)) for kind, payload in requests]
         self._queued += calls
         return calls
 
     def to_send(self, now_s: float) -> bytes:
-        """As many requests as the window has room for, oldest first; they count as sent at ``now_s``."""
+        """Return requests for which the window has room, oldest first; they count as sent at ``now_s``."""
         return b"".join(self._launch(now_s))
 
     def receive(self, data: bytes, now_s: float) -> list[TagArrival]:
-        """Take bytes in any pieces: answers settle their calls, tags are returned, all else is counted."""
+        """Take bytes in any pieces: answers settle their calls, tags are returned, the rest is counted."""
         tags = []
         for frame in self._decoder.feed(data):
             if frame.type == FrameType.TAG and len(frame.payload) == TAG_BYTES:
@@ -153,7 +153,7 @@ class Dialogue:
         return tags
 
     def expire(self, now_s: float) -> bool:
-        """Send again, or give up, what is overdue; says whether there was any."""
+        """Repeat, or give up, overdue requests; return whether there were any."""
         overdue = [call for call in self._on_the_way.values() if self._due_s(call) <= now_s]
         for call in overdue:
             del self._on_the_way[call.frame.sequence]
@@ -162,14 +162,16 @@ class Dialogue:
         return bool(overdue)
 
     def forget(self, calls: Sequence[Call]) -> None:
-        """Nobody waits for these any more; an answer that still comes is counted as unexpected."""
+        """Drop calls for which nobody waits any more; a late answer is counted as unexpected."""
         forgotten = {call for call in calls if call.is_open}
         if forgotten:
             self._queued = deque(call for call in self._queued if call not in forgotten)
             self._on_the_way = {k: call for k, call in self._on_the_way.items() if call not in forgotten}
 
     def statistics(self) -> dict[str, float]:
-        """Frames received, dropped by error, requests repeated, lost and timed out, answers unexpected."""
+        """Return the counts of frames received and dropped by error, of repeated, lost and timed-out
+        requests, and of unexpected answers.
+        """
         counts = {"frames": self._decoder.frames, **self._decoder.faults, **self._counts}
         return {**counts, "longest_s": round(self.longest_s, 6)}
 
@@ -178,29 +180,30 @@ class Dialogue:
         return self.window_bytes - sum(call.size_bytes for call in self._on_the_way.values())
 
     def _fits(self, call: Call, room_bytes: int) -> bool:
-        """One request may always be on the way, whatever the device says that it holds."""
+        # One request may always be on the way, even if it exceeds the device's stated capacity.
         return call.size_bytes <= room_bytes or not self._on_the_way
 
     def _launch(self, now_s: float) -> Iterator[bytes]:
         room_bytes = self._room_bytes
         while self._queued and self._fits(self._queued[0], room_bytes):
             call = self._queued.popleft()
-            # Every attempt has a number of its own: a late answer to the one before is not taken for its.
+            # Every attempt has a new number, so that a late answer to the previous one is not taken for its.
             call.frame = Frame(call.kind, self._sequence, call.payload)
             call.begun_s, call.sent_s = call.begun_s if call.attempts else now_s, now_s
             call.attempts += 1
             self._counts["repeated"] += call.attempts > 1
             self._on_the_way[self._sequence] = call
-            # 16 bits of a frame, and far fewer requests in a window: no two on the way have the same.
+            # 16 bits, and far fewer requests in a window: no two on the way have the same number.
             self._sequence = self._sequence + 1 & 0xFFFF
             room_bytes -= call.size_bytes
             yield encode(call.frame)
 
     def _due_s(self, call: Call) -> float:
-        """While answers come, one that is missing will be found out by its successor's.
+        """Return when the call is overdue.
 
-        The last attempt does not wait for others beyond the limit, but always for its own answer: a host that
-        was late itself, or stopped for a while, still makes all its attempts.
+        While answers come, a missing one is detected by its successor, so the call waits on. The last attempt
+        does not wait for others beyond the limit, but always for its own answer: a host that was late itself,
+        or stopped for a while, still makes all its attempts.
         """
         others_s = self._progress_s + self.reply_s
         if call.attempts == self._attempts:
@@ -208,14 +211,14 @@ class Dialogue:
         return max(call.sent_s + self.reply_s, others_s)
 
     def _take_answer(self, frame: Frame, now_s: float) -> None:
-        """Answer the call it belongs to; those sent before it will not be answered any more."""
+        """Settle the answer's call; calls sent before it will not be answered any more."""
         call = self._on_the_way.get(frame.sequence)
         if call is None or not answers(call.frame, frame):
             self._counts["unexpected"] += 1
             return
-        # The device answers in order: what was sent before and has no answer yet will get none.
+        # The device answers in order: requests sent before without an answer are lost.
         lost = []
-        # Those of a dict come in the order in which they were put in: here, sent.
+        # A dict keeps the order of insertion, here of sending.
         for number, earlier in list(self._on_the_way.items()):
             del self._on_the_way[number]
             if earlier is call:
@@ -228,7 +231,7 @@ class Dialogue:
         self._send_again(lost)
 
     def _send_again(self, calls: list[Call]) -> None:
-        """Before all that has not been sent yet, the oldest first; what has had its attempts is given up."""
+        """Queue calls again, oldest first, before all unsent ones; give up those without attempts left."""
         for call in reversed(calls):
             if call.attempts < self._attempts:
                 self._queued.appendleft(call)
@@ -241,12 +244,15 @@ class Dialogue:
 
 
 def are_settled(calls: Sequence[Call]) -> bool:
-    """All are answered, or one is given up: then nobody needs the others."""
+    """Return whether all are answered, or one is given up, in which case the others are not needed."""
     return not any(call.is_open for call in calls) or any(call.failure for call in calls)
 
 
 def results(calls: Sequence[Call]) -> list[Frame]:
-    """The answers to settled calls. Raises what one was given up with, else the first refusal."""
+    """Return the answers to settled calls.
+
+    Raises the error of one that was given up, or the first refusal.
+    """
     for call in calls:
         if call.failure is not None:
             raise call.failure
@@ -255,7 +261,7 @@ def results(calls: Sequence[Call]) -> list[Frame]:
         if answer.type != FrameType.NAK:
             continue
         error, address = parse_nak(answer.payload)
-        if error == ErrorCode.BAD_VERSION:  # the only refusal that says nothing about the request itself
+        if error == ErrorCode.BAD_VERSION:  # the only refusal that does not concern the request itself
             raise TriggerError(
                 f"the trigger speaks protocol {answer.version}, this program {PROTOCOL_VERSION}",
                 hint="load the firmware that belongs to this program",
@@ -265,7 +271,7 @@ def results(calls: Sequence[Call]) -> list[Frame]:
 
 
 def _size_bytes(kind: FrameType, payload: bytes) -> int:
-    """Encoded bytes of the request, or of the answer to expect if that is longer."""
+    """Return the encoded size of the request, or of the expected answer if that is longer."""
     request = len(encode(Frame(kind, 0, payload)))
     if kind != FrameType.READ:
         return request

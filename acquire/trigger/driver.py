@@ -6,16 +6,15 @@
     start     clocks compared → START → the tick of line 0
     stop      STOP → the last line ends → lines counted
 
-Nothing is opened before it is needed. A link that dies raises TriggerError at once in whoever waits, and in
-every later call but three: `prepare` and `stop` reconnect on their own, since the light may still
-flash out there; `reopen` does so and says what became of the run.
+Nothing is opened before it is needed. When the link dies, TriggerError is raised at once in all waiting
+calls, and in every later call except three: `prepare` and `stop` reconnect automatically, since the light may
+still be flashing; `reopen` reconnects and reports the state of the run.
 
-The device's watchdog (``trigger.watchdog_s``) watches every run from its first clock. Requests keep it quiet:
-`start` makes them until line 0 has begun, and `tags` whenever they are due, so it is whoever takes the tags
-that keeps the light on. A host that hangs, dies or is unplugged falls silent, and so does one that has called
-`release`: the run ends after ``watchdog_s`` and the line that runs then, with the reason WATCHDOG. `stop` and
-`close` end it at once. An armed run whose host has gone stays armed, and dark; should an external edge start
-it, the watchdog ends it.
+The device's watchdog (``trigger.watchdog_s``) watches every run from its first clock. Requests reset it:
+`start` sends them until line 0 has begun, and `tags` whenever they are due, so the light stays on only while
+somebody takes the tags. If the host hangs, dies, is unplugged, or has called `release`, the run ends after
+``watchdog_s`` and the current line, with the reason WATCHDOG. `stop` and `close` end it at once. An armed run
+without its host stays armed, and dark; if an external edge starts it, the watchdog ends it.
 """
 
 from __future__ import annotations
@@ -44,23 +43,23 @@ if TYPE_CHECKING:
     from acquire.trigger.transports import Transport
 
 _DRIFT = 1e-4
-"""How far an ordinary oscillator may be off: the uncertainty that grows with the age of a comparison."""
-# A watchdog that bites ends the run: all but one may be lost, or late on a busy host.
+"""Relative error of an ordinary oscillator: the uncertainty that grows with the age of a comparison."""
+# The watchdog ends the run: on a busy host, all signs but one may be lost or late.
 _SIGNS_OF_LIFE_PER_WATCHDOG = 8
 _SIGN_OF_LIFE_S = 0.5
-"""At least as often as this: a simulated device's time may pass faster than the host's."""
+"""Longest time between two signs of life: a simulated device's time may pass faster than the host's."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reunion:
-    """What a driver finds when it connects again. ``str()`` says it in words."""
+    """State of the run when a driver reconnects. ``str()`` gives it in words."""
 
     run_id: str | None
-    """The run that it had prepared or started."""
+    """The run that the driver had prepared or started."""
     goes_on: bool
-    """It is still armed, running, or about to end."""
+    """Whether the run is still armed, running, or about to end."""
     lines: int | None
-    """Lines started in it; None where the device does not know of it any more."""
+    """Lines started in it; None if it is not the device's latest run any more."""
     status: DeviceStatus
 
     def __str__(self) -> str:
@@ -76,8 +75,8 @@ class TriggerDriver:
 
     Parameters
     ----------
-    open_transport : connects; called at the first need, and again after the link died
-    config : what the rig wants of the outputs
+    open_transport : connects; called when first needed, and again after the link died
+    config : the rig's configuration of the outputs
     """
 
     def __init__(self, open_transport: Callable[[], Transport], config: TriggerConfig) -> None:
@@ -89,10 +88,10 @@ class TriggerDriver:
         self._prepared: TriggerRun | None = None
         self._run: TriggerRun | None = None
         self._tags: TagReader | None = None
-        self._owed = 0  # the number of a run that could not be stopped for want of a link
+        self._owed = 0  # number of a run that could not be stopped without a link
         self._sign_of_life_s = 0.0
 
-    # The protocol of triggers.
+    # ---- the protocol of triggers
 
     def identify(self) -> TriggerIdentity:
         can = self.device().capabilities
@@ -110,7 +109,7 @@ class TriggerDriver:
                 self._take_over(run, status, values)
                 return
             if not status.at_rest:
-                # End what a stop of ours did not reach; refuse to end what nobody here has asked to.
+                # End a run that our stop did not reach, but no run that this driver was not asked to stop.
                 if status.run != self._owed:
                     raise TriggerError(
                         f"run {run.run_id!r} prepared while another one runs: "
@@ -123,13 +122,13 @@ class TriggerDriver:
             self._prepared, self._run, self._tags = run, None, None
 
     def start(self) -> ClockFit:
-        """Start, or wait for the external start or a stop; the fit of the device's clock to UTC."""
+        """Start, or wait for the external start or a stop; return the fit of the device's clock to UTC."""
         with self._lock:
             run = self._prepared
             if run is None:
                 raise TriggerError("a trigger cannot start without a run", hint="prepare one")
             device = self.device()
-            device.link.tags(0)  # of the run before
+            device.link.tags(0)  # drop those of the run before
             compared = device.compare_clocks()
             external = self._config.external_start != "off"
             if not external:
@@ -147,15 +146,15 @@ class TriggerDriver:
         with self._lock:
             self._tags = TagReader(run, run_number(run.run_id), start_tick)
             self._run, self._prepared = run, None
-        # UTC of the start follows from a comparison some time before it or after. How far the oscillator may
-        # have been off in between is added to what the comparison leaves open.
+        # UTC of the start follows from a comparison some time before or after it. The possible drift of the
+        # oscillator in between is added to the uncertainty of the comparison.
         (utc_ns, tick, uncertainty_ns), hz = compared, device.capabilities.clock_hz
         elapsed = signed_ticks(start_tick - tick)
         drift_ns = int(abs(elapsed) * NS_PER_S / hz * _DRIFT)
         return ClockFit(hz, utc_ns + elapsed * NS_PER_S // hz, uncertainty_ns + drift_ns + 1)
 
     def tags(self, timeout_s: float) -> list[LineTag]:
-        """Tags of lines since the last call; a stop ends the wait, a watchdog shortens it."""
+        """Return the tags of lines since the last call; a stop ends the wait, a watchdog shortens it."""
         device, tags = self._device, self._tags
         if device is None or tags is None:
             if device is not None and device.link.dead is not None:
@@ -167,18 +166,18 @@ class TriggerDriver:
             patience_s = self._show_life(device)
             return tags.take(device.link.tags(min(timeout_s, patience_s)))
         except TriggerError as error:
-            raise TriggerError(f"{error.message}; its tags have told of {tags}", hint=error.hint) from error
+            raise TriggerError(f"{error.message}; its tags have reported {tags}", hint=error.hint) from error
 
     def events(self) -> list[TagEvent]:
         return self._tags.events() if self._tags is not None else []
 
     def stop(self) -> int:
-        """End the run after a whole line; the number of lines. Idempotent."""
+        """End the run after a whole line; return the number of lines. Idempotent."""
         with self._lock:
             run, self._prepared = self._run or self._prepared, None
             if self._device is None:
                 return 0
-            # Noted before the link is tried: where it fails, the next `prepare` ends this run first.
+            # Noted before the link is used: if it fails, the next `prepare` ends this run first.
             self._owed = run_number(run.run_id) if run else 0
             device = self._living()
             device.command(Command.STOP, 0)
@@ -193,7 +192,7 @@ class TriggerDriver:
             return status.lines
 
     def statistics(self) -> dict[str, Any]:
-        """Counters of device, link and driver. Without a link: what was known last, and ``link_lost``."""
+        """Return counters of device, link and driver; without a link the latest ones, and ``link_lost``."""
         device, tags = self._device, self._tags
         known = tags.statistics() if tags else dict(TagReader.NOTHING)
         if device is None:
@@ -205,7 +204,7 @@ class TriggerDriver:
         return {"pulses": device.read(r.LINES), **known, **device.counters(), **link}
 
     def close(self) -> None:
-        """Stop, as far as the device can still be reached, and close it. Idempotent."""
+        """Stop, if the device can still be reached, and close it. Idempotent."""
         with self._lock:
             device = self._device
             try:
@@ -214,10 +213,10 @@ class TriggerDriver:
             finally:
                 self.release()
 
-    # Beyond it.
+    # ---- further methods
 
     def device(self) -> Device:
-        """The device's registers; connects at the first need. TriggerError once the link is dead."""
+        """Return the device, connecting when first needed. Raises TriggerError once the link is dead."""
         with self._lock:
             if self._device is None:
                 link = Link(self._open_transport())
@@ -231,7 +230,7 @@ class TriggerDriver:
             return self._device
 
     def reopen(self) -> Reunion:
-        """Connect again, and find out what became of the run. Nothing is started or stopped."""
+        """Reconnect, and return the state of the run. Nothing is started or stopped."""
         with self._lock:
             self.release()
             run, status = self._run or self._prepared, self.device().status()
@@ -243,21 +242,21 @@ class TriggerDriver:
             return Reunion(run.run_id, False, None, status)
 
     def release(self) -> None:
-        """Close the device and leave it as it is. Idempotent."""
+        """Close the link and leave the device as it is. Idempotent."""
         with self._lock:
             device, self._device = self._device, None
             if device is not None:
                 device.link.close()
 
     def _living(self) -> Device:
-        """As `device`; a dead link is replaced."""
+        """Return the device, replacing a dead link."""
         if self._device is not None and self._device.link.dead is not None:
             self.release()
         return self.device()
 
     def _take_over(self, run: TriggerRun, status: DeviceStatus, values: dict[r.Register, int]) -> None:
-        """The run is armed or running: as this driver has done it, or as another program has."""
-        # A daemon that was killed and started again finds its run alive, and may go on with it.
+        """Take over a run that is armed or running, started by this driver or another program."""
+        # A daemon that was killed and restarted finds its run alive, and may continue it.
         if run in (self._prepared, self._run):
             return
         if self.device().configuration() != values:
@@ -267,17 +266,17 @@ class TriggerDriver:
         self._prepared, self._run, self._tags = run, None, None
 
     def _show_life(self, device: Device) -> float:
-        """Keep the watchdog quiet while somebody asks for tags; for how long it is now."""
+        """Reset the watchdog while tags are taken; return after what time it is due again."""
         if not self._config.watchdog_s:
             return float("inf")
         patience_s = min(self._config.watchdog_s / _SIGNS_OF_LIFE_PER_WATCHDOG, _SIGN_OF_LIFE_S)
         if time.monotonic() > self._sign_of_life_s + patience_s:
-            device.read(r.STATUS)  # any request that the device understands will do
+            device.read(r.STATUS)  # any valid request resets it
             self._sign_of_life_s = time.monotonic()
         return patience_s
 
 
 def run_number(run_id: str) -> int:
-    """The device's 64-bit number of a run, never 0."""
-    # A hash and not a count: it survives restarts of host and device, and 0 is the device's word for no run.
+    """Return the device's 64-bit number of a run, never 0."""
+    # A hash, not a count, so that it survives restarts of host and device; 0 means no run to the device.
     return int.from_bytes(blake2b(run_id.encode(), digest_size=8).digest(), "little") or 1

@@ -1,4 +1,4 @@
-"""What a register is: its address, who may do what with it, and the fields within it."""
+"""Description of a register: its address, its access, and its fields."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Literal
 WORD_BITS = 32
 
 Access = Literal["constant", "read", "config", "operand", "command"]
-"""Who may do what:
+"""Access of a register:
 
 ``constant`` never changes; ``read`` changes by itself; ``config`` is written while no run is armed or
 running, and reads back; ``operand`` is written at any time and reads back; ``command`` acts when written
@@ -31,11 +31,11 @@ class Field:
         return (1 << self.width) - 1
 
     def of(self, value: int) -> int:
-        """This field of a register's value."""
+        """Return this field of a register's value."""
         return value >> self.low & self.limit
 
     def put(self, value: int) -> int:
-        """A register's value with only this field set; ValueError for what does not fit."""
+        """Return a register's value with only this field set. Raises ValueError if it does not fit."""
         if not 0 <= value <= self.limit:
             raise ValueError(f"{self.name} = {value} does not fit {self.width} bits")
         return value << self.low
@@ -68,22 +68,22 @@ class Register:
         return self.field(name)
 
     def field(self, name: str) -> Field:
-        """The field of that name; AttributeError if there is none."""
+        """Return the field of that name. Raises AttributeError if there is none."""
         for field in self.fields:
             if field.name == name:
                 return field
         raise AttributeError(f"register {self.name} has no field {name!r}")
 
     def pack(self, **values: int) -> int:
-        """A value with these fields; what is not named is 0."""
+        """Return a value with these fields; the others are 0."""
         return sum(self.field(name).put(value) for name, value in values.items())
 
     def unpack(self, value: int) -> dict[str, int]:
-        """Field → value."""
+        """Return the values of all fields by name."""
         return {field.name: field.of(value) for field in self.fields}
 
     def to_words(self, value: int) -> tuple[int, ...]:
-        """A value as words, the low one first; ValueError for what does not fit."""
+        """Return a value as words, the low one first. Raises ValueError if it does not fit."""
         if not 0 <= value < 1 << self.width:
             raise ValueError(f"{self.name} = {value} does not fit {self.width} bits")
         return tuple(value >> WORD_BITS * i & 0xFFFFFFFF for i in range(self.words))

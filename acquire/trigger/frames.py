@@ -1,11 +1,11 @@
-"""Bytes of the trigger's link ↔ frames; no I/O.
+"""Conversion between bytes of the trigger's link and frames; no I/O.
 
 ::
 
     [ version | type | sequence | payload | CRC-32 ] ──COBS──▶ no zero within, one zero at the end
 
-Whatever arrives, in whatever pieces: between two zeros there is a frame, or something that is dropped and
-counted by the name of what was wrong with it. The next zero is always a new beginning.
+Between two zeros there is either a frame, or bytes that are dropped and counted by the kind of error. After
+any noise, the next zero restores synchronisation.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ MAX_ENCODED = MAX_PAYLOAD + _OVERHEAD + 1
 
 
 class FrameError(TriggerError):
-    """Bytes that are no frame."""
+    """Bytes that are not a frame."""
 
 
 class FrameStuffingError(FrameError):
-    """Not COBS."""
+    """Bytes that are not COBS."""
 
 
 class FrameLengthError(FrameError):
@@ -46,11 +46,11 @@ class FrameLengthError(FrameError):
 
 
 class FrameChecksumError(FrameError):
-    """The CRC belongs to other bytes."""
+    """The CRC is wrong."""
 
 
 class Frame(NamedTuple):
-    """One frame of any version; ``type`` may be one that nobody knows."""
+    """One frame of any version; ``type`` may be unknown."""
 
     type: int
     sequence: int
@@ -59,7 +59,7 @@ class Frame(NamedTuple):
 
 
 def encode(frame: Frame) -> bytes:
-    """The frame's bytes, delimiter included. Raises FrameLengthError for too long a payload."""
+    """Return the frame's bytes with delimiter. Raises FrameLengthError if the payload is too long."""
     if len(frame.payload) > MAX_PAYLOAD:
         raise FrameLengthError(
             f"a payload cannot have {len(frame.payload)} bytes", possible=f"at most {MAX_PAYLOAD}"
@@ -69,7 +69,7 @@ def encode(frame: Frame) -> bytes:
 
 
 def decode(encoded: bytes) -> Frame:
-    """The frame between two zeros. Raises a FrameError that says what is wrong."""
+    """Return the frame between two zeros. Raises a FrameError for the kind of fault."""
     if not _OVERHEAD < len(encoded) <= MAX_ENCODED:
         raise FrameLengthError(
             f"an encoded frame cannot have {len(encoded)} bytes", possible=f"{_OVERHEAD + 1} to {MAX_ENCODED}"
@@ -80,18 +80,18 @@ def decode(encoded: bytes) -> Frame:
         raise FrameStuffingError(f"{len(encoded)} bytes are not COBS: {error}") from error
     if len(whole) < _OVERHEAD:
         raise FrameLengthError(f"a frame cannot have {len(whole)} bytes", possible=f"{_OVERHEAD} or more")
-    # CRC-32: with 16 bits, a false tag passed among bytes of which 5 % were wrong.
+    # CRC-32, since with a CRC of 16 bits a false tag passed when 5 % of the bytes were wrong.
     body, (crc,) = whole[: -_CRC.size], _CRC.unpack(whole[-_CRC.size :])
     if zlib.crc32(body) != crc:
-        raise FrameChecksumError(f"CRC {crc:#010x} where the bytes have {zlib.crc32(body):#010x}")
+        raise FrameChecksumError(f"CRC {crc:#010x} is wrong, the bytes have {zlib.crc32(body):#010x}")
     version, kind, sequence = _HEADER.unpack_from(body)
     return Frame(kind, sequence, body[_HEADER.size :], version)
 
 
 class Decoder:
-    """Takes bytes in any pieces, gives frames; ``faults`` counts what was dropped, by error name.
+    """Takes bytes in any pieces, returns frames; ``faults`` counts dropped ones by error name.
 
-    Never holds more than one frame's bytes: of anything longer only the length is remembered.
+    It never holds more than one frame's bytes: of anything longer it only remembers that it was too long.
     """
 
     def __init__(self) -> None:
@@ -101,14 +101,14 @@ class Decoder:
         self._overlong = False
 
     def feed(self, data: bytes) -> list[Frame]:
-        """The frames that are complete now."""
-        # COBS leaves no zero inside a frame: after any noise, the next zero is the end of something, and what
-        # follows it is whole again.
+        """Take bytes; return the frames that are complete now."""
+        # COBS leaves no zero inside a frame: after any noise, the next zero ends it, and the frame after it
+        # is intact again.
         *ended, rest = data.split(b"\0")
         found: list[Frame] = []
         for piece in ended:
             self._keep(piece)
-            # Zeros in a row are nothing: a sender may begin with one.
+            # Consecutive zeros are ignored: a sender may begin with one.
             encoded, overlong = bytes(self._rest), self._overlong
             self._rest.clear()
             self._overlong = False
@@ -131,7 +131,7 @@ class Decoder:
             self._rest += piece
 
 
-# What the payloads say.
+# ---- payloads
 
 
 def read_payload(address: int, count: int) -> bytes:
@@ -139,7 +139,7 @@ def read_payload(address: int, count: int) -> bytes:
 
 
 def write_payload(address: int, words: Sequence[int]) -> bytes:
-    """Address and words: a WRITE, and equally a DATA."""
+    """Return the payload, address and words, of a WRITE or a DATA."""
     if not 0 < len(words) <= MAX_WORDS:
         raise FrameLengthError(f"one frame cannot have {len(words)} words", possible=f"1 to {MAX_WORDS}")
     return struct.pack(f"<H{len(words)}I", address, *words)
@@ -150,7 +150,7 @@ def nak_payload(error: int, address: int) -> bytes:
 
 
 def parse_read(payload: bytes) -> tuple[int, int]:
-    """Address and count: of a READ, and equally of an ACK."""
+    """Return address and count of a READ or an ACK."""
     _demand(len(payload) == _ADDRESS_COUNT.size, payload)
     address, count = _ADDRESS_COUNT.unpack(payload)
     _demand(0 < count <= MAX_WORDS, payload)
@@ -158,7 +158,7 @@ def parse_read(payload: bytes) -> tuple[int, int]:
 
 
 def parse_write(payload: bytes) -> tuple[int, tuple[int, ...]]:
-    """Address and words: of a WRITE, and equally of a DATA."""
+    """Return address and words of a WRITE or a DATA."""
     count, rest = divmod(len(payload) - _ADDRESS.size, 4)
     _demand(rest == 0 and 0 < count <= MAX_WORDS, payload)
     address, *words = struct.unpack(f"<H{count}I", payload)
@@ -166,17 +166,18 @@ def parse_write(payload: bytes) -> tuple[int, tuple[int, ...]]:
 
 
 def parse_nak(payload: bytes) -> tuple[int, int]:
-    """Error and address."""
+    """Return error and address of a NAK."""
     _demand(len(payload) == _ERROR_ADDRESS.size, payload)
     error, address = _ERROR_ADDRESS.unpack(payload)
     return error, address
 
 
 def answers(request: Frame, answer: Frame) -> bool:
-    """Whether ``answer`` has the form of an answer to ``request``: type, address and count belong to it."""
+    """Return whether ``answer`` matches ``request`` in sequence, type, address and count."""
     if answer.sequence != request.sequence:
         return False
-    # The number alone is not enough: every program begins at 0, and the answer to the one before may be late.
+    # The sequence alone is not enough: every program begins at 0, and late answers to the previous one may
+    # come.
     try:
         return answer.type == FrameType.NAK or _matches(request, answer)
     except FrameLengthError:

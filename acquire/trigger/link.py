@@ -1,4 +1,4 @@
-"""A trigger's link: a thread that reads, callers that send and wait; what goes over it is in `dialogue`.
+"""A trigger's link: a thread that reads, callers that send and wait; `dialogue` has the protocol.
 
 ::
 
@@ -6,7 +6,7 @@
                    ▲            │ ▲
                    └────────────┘ └── reader thread ──▶ tags (bounded, counted)
 
-When the transport fails, everyone who waits hears it immediately.
+When the transport fails, all waiting callers get the error immediately.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from acquire.trigger.transports.base import Transport
 
-# Half a minute at 600 000 lines/s and a tag every 256; a host that is away for longer has other troubles.
+# Half a minute at 600 000 lines/s and a tag every 256 lines: longer than any tolerable pause of the host.
 _TAGS_KEPT = 1 << 16
 _END_S = 5.0
 
@@ -36,31 +36,32 @@ class Link:
 
     Parameters
     ----------
-    reply_s : silence after which a request is sent again, the way there and back not counted
+    reply_s : silence after which a request is repeated, without transmission times
     attempts : how often a request is sent before TriggerError
     """
 
     def __init__(self, transport: Transport, reply_s: float = 0.25, attempts: int = 8) -> None:
         self.transport = transport
         self._dialogue = Dialogue(transport.name, transport.bytes_per_s, reply_s, attempts)
-        self._news = threading.Condition()  # guards the dialogue, the tags and what ended the link
-        self._sending = threading.Lock()  # taken first: bytes are written in the order of their sequences
+        self._news = threading.Condition()  # guards the dialogue, the tags and the link's error
+        # Taken before `_news`, so that bytes are written in the order of their sequences.
+        self._sending = threading.Lock()
         self._tags: deque[TagArrival] = deque()
         self._tags_dropped = 0
         self._interrupted = False
         self._dead: TriggerError | None = None
         self._ending = threading.Event()
-        self._reader = threading.Thread(target=self._live, name="acquire-trigger-link", daemon=True)
+        self._reader = threading.Thread(target=self._read, name="acquire-trigger-link", daemon=True)
         self._reader.start()
 
     @property
     def dead(self) -> TriggerError | None:
-        """What ended the link, None while it lives."""
+        """The error that ended the link; None while it is alive."""
         return self._dead
 
     @property
     def window_bytes(self) -> int:
-        """Of unanswered requests, or of their answers; the driver raises it to what the device says."""
+        """Limit of unanswered requests, or of their answers; the driver sets it to the device's capacity."""
         return self._dialogue.window_bytes
 
     @window_bytes.setter
@@ -69,37 +70,37 @@ class Link:
 
     @property
     def limit_s(self) -> float:
-        """A request has its answer by then, or TriggerError is raised; a late host may take longer."""
+        """Time within which a request is answered, or TriggerError raised; a late host may take longer."""
         return self._dialogue.limit_s
 
     def read(self, address: int, count: int = 1) -> tuple[int, ...]:
-        """``count`` words from ``address`` on."""
+        """Read ``count`` words from ``address`` on."""
         return self.read_block(address, count)
 
     def write(self, address: int, words: Sequence[int]) -> None:
-        """Returns when the device has taken the words."""
+        """Write words; return when the device has taken them."""
         self.transact([(FrameType.WRITE, write_payload(address, words))])
 
     def read_block(self, address: int, count: int) -> tuple[int, ...]:
-        """Any number of words, in pipelined requests."""
+        """Read any number of words, in pipelined requests."""
         parts = [(a, min(MAX_WORDS, address + count - a)) for a in range(address, address + count, MAX_WORDS)]
         replies = self.transact([(FrameType.READ, read_payload(*part)) for part in parts])
         return tuple(word for reply in replies for word in parse_write(reply.payload)[1])
 
     def write_block(self, address: int, words: Sequence[int]) -> None:
-        """Any number of words, in pipelined requests; not necessarily in their order."""
+        """Write any number of words, in pipelined requests; not necessarily in order."""
         parts = [(address + at, words[at : at + MAX_WORDS]) for at in range(0, len(words), MAX_WORDS)]
         self.transact([(FrameType.WRITE, write_payload(*part)) for part in parts])
 
     def transact(self, requests: Iterable[tuple[FrameType, bytes]]) -> list[Frame]:
-        """Send requests, type and payload, that do not depend on each other's order; their answers.
+        """Send requests, type and payload, whose order does not matter; return their answers.
 
-        Raises RefusedError for the first that the device refuses, TriggerError when an answer does not
-        come or the link is dead.
+        Raises RefusedError for the first that the device refuses, TriggerError if an answer does not come or
+        the link is dead.
         """
         dialogue = self._dialogue
-        # Whoever waits also sends and repeats what others have queued: there is no thread for it, and the one
-        # that asked may be waiting for the lock.
+        # Waiting callers also send and repeat the requests of others: there is no thread for that, and the
+        # caller concerned may be waiting for the lock.
         with self._news:
             calls = dialogue.ask(requests)
         try:
@@ -122,7 +123,7 @@ class Link:
                 self._news.notify_all()
 
     def tags(self, timeout_s: float) -> list[TagArrival]:
-        """Tags since the last call; waits at most ``timeout_s`` for the first, or until `interrupt`."""
+        """Return the tags since the last call; wait up to ``timeout_s`` for the first, or for `interrupt`."""
         with self._news:
             self._interrupted = False
             self._news.wait_for(lambda: self._tags or self._dead or self._interrupted, timeout_s)
@@ -139,21 +140,22 @@ class Link:
             self._news.notify_all()
 
     def statistics(self) -> dict[str, float]:
-        """What `Dialogue.statistics` counts, and tags for which there was no room."""
+        """Return the counts of `Dialogue.statistics`, and of tags for which there was no room."""
         with self._news:
             return {**self._dialogue.statistics(), "tags_dropped": self._tags_dropped}
 
     def close(self) -> None:
-        """End the reader and the transport; everyone who waits gets TriggerError. Idempotent."""
-        # The reader ends before its transport does: a descriptor that is closed may be another file's next.
+        """End the reader and the transport; waiting callers get TriggerError. Idempotent."""
+        # The reader ends before its transport: the number of a closed descriptor may be reused for another
+        # file.
         self._ending.set()
         self._die(TriggerError(f"{self.transport.name} was closed"))
         self._reader.join(_END_S)
         self.transport.close()
 
     def _send(self) -> None:
-        """What the window has room for, whoever asked for it."""
-        # The write itself holds no lock that the reader needs: a device whose answers nobody takes may stop
+        """Send all queued requests, of any caller, for which the window has room."""
+        # The write itself holds no lock that the reader needs: a device whose answers are not read may stop
         # taking requests, and each side would wait for the other.
         with self._sending:
             with self._news:
@@ -167,20 +169,20 @@ class Link:
                     self._die(error)
                     raise
 
-    def _live(self) -> None:
+    def _read(self) -> None:
         try:
             while not self._ending.is_set():
                 if data := self.transport.read():
                     with self._news:
                         self._tags += self._dialogue.receive(data, time.monotonic())
-                        # The oldest go: a tag confirms every line up to its own.
+                        # Drop the oldest: a tag confirms every line up to its own.
                         while len(self._tags) > _TAGS_KEPT:
                             self._tags.popleft()
                             self._tags_dropped += 1
                         self._news.notify_all()
         except TriggerError as error:
             self._die(error)
-        except Exception as error:  # noqa: BLE001 - the outermost boundary of the thread: told to all who wait
+        except Exception as error:  # noqa: BLE001 - the outermost boundary of the thread: raised in callers
             self._die(TriggerError(f"{self.transport.name}: {type(error).__name__}: {error}"))
 
     def _die(self, error: TriggerError) -> None:

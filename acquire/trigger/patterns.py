@@ -1,4 +1,4 @@
-"""Test patterns of the light: square waves out of the code memory, for the eye and for an oscilloscope."""
+"""Test patterns of the light: square waves from the code memory, for the eye and for an oscilloscope."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SquareWave:
-    """Lit for ``half_substeps``, dark for as many, again and again; sub-steps of ``substep_ticks``."""
+    """Alternately lit and dark for ``half_substeps`` each; sub-steps of ``substep_ticks``."""
 
     half_substeps: int
     substep_ticks: int
@@ -32,8 +32,10 @@ class SquareWave:
 
 
 def blink(hz: float, substep_ticks: int, device: Capabilities) -> SquareWave:
-    """Of about ``hz``, in sub-steps of ``substep_ticks``, or of the next multiple with which the code memory
-    holds a period. UsageError for what is too fast or too slow for the device.
+    """Return a square wave of about ``hz``.
+
+    Its sub-steps have ``substep_ticks``, or the next multiple for which the code memory holds a period.
+    Raises UsageError if it is too fast or too slow for the device.
     """
     slowest = device.clock_hz / device.code_bits / device.substep_ticks_max
     fastest = device.clock_hz / (2 * substep_ticks)
@@ -49,7 +51,7 @@ def blink(hz: float, substep_ticks: int, device: Capabilities) -> SquareWave:
 
 
 def square(half_substeps: int, substep_ticks: int, device: Capabilities) -> SquareWave:
-    """UsageError for more than the code memory holds."""
+    """Return a square wave. Raises UsageError if it exceeds the code memory."""
     most = device.code_bits // 2
     if not 1 <= half_substeps <= most:
         raise UsageError(

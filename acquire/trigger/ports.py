@@ -1,4 +1,4 @@
-"""The drivers of a board with our gateware: at a serial port, or on USB."""
+"""The drivers of a board with this project's gateware, at a serial port or on USB."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 class SerialTrigger(GatewareTrigger):
-    """A board at a serial port, or at what pyserial opens beside it: socket://host:port."""
+    """A board at a serial port, or at anything else that pyserial opens, such as socket://host:port."""
 
     def transport(self, config: RigConfig, bench: Any) -> Callable[[], Transport]:  # noqa: ARG002
         trigger = config.trigger
@@ -29,7 +29,7 @@ class SerialTrigger(GatewareTrigger):
 
 
 class UsbTrigger(GatewareTrigger):
-    """A board whose gateware is a USB device of its own."""
+    """A board whose gateware is a USB device itself."""
 
     def transport(self, config: RigConfig, bench: Any) -> Callable[[], Transport]:  # noqa: ARG002
         return partial(UsbTransport, serial=config.trigger.serial)

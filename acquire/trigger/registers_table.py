@@ -105,7 +105,7 @@ def _rows(register: Register) -> Iterator[str]:
 
 
 def _reset(register: Register) -> str:
-    """At power-up; of a constant, what it is where all devices have the same."""
+    """Return the value at power-up; of a constant, its value if it is the same in all devices."""
     if register is registers.MAP:
         return f"{registers.MAP_CRC:#x}"
     known = register.access != "constant" or register.reset
@@ -115,10 +115,6 @@ def _reset(register: Register) -> str:
 def _enum_table(kind: type[IntEnum | IntFlag]) -> str:
     found = re.findall(r"^    (\w+) = .*\n    \"\"\"(.*?)\"\"\"", inspect.getsource(kind), re.MULTILINE)
     docs = dict(found)
-    rows = [f"| {_number(item)} | {item.name} | {docs[str(item.name)]} |\n" for item in kind]
+    form = "0x{:02x}" if kind is FrameType else "{}"  # types in hexadecimal, since their bits have a meaning
+    rows = [f"| {form.format(int(item))} | {item.name} | {docs[str(item.name)]} |\n" for item in kind]
     return "| value | name | |\n|---|---|---|\n" + "".join(rows)
-
-
-def _number(item: IntEnum | IntFlag) -> str:
-    """Types, whose bits matter, in hexadecimal."""
-    return f"0x{item:02x}" if isinstance(item, FrameType) else str(int(item))

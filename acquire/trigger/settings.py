@@ -1,7 +1,7 @@
 """From a run and the rig's configuration to the values of the trigger's registers, or to a refusal.
 
-Everything the device would refuse when armed is refused here first, in words: what was asked, what can be
-had, what to try.
+Everything that the device would refuse when armed is refused here first, with an explanation: what was
+requested, what is possible, what to try.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ if TYPE_CHECKING:
 
 _DEFAULT_WIDTH = 90  # 1 µs at 90 MHz
 _TWINS = (r.Board.NONE, r.Board.MODEL)
-"""Their light is simulated."""
+"""Boards with simulated light."""
 _TAG_FRAME_BYTES = r.TAG_BYTES + 10
-"""On the wire: header, CRC, COBS and delimiter."""
+"""Size on the wire, with header, CRC, COBS and delimiter."""
 _TAGS_SHARE = 0.5
-"""Of the link; answers need the rest, and it lets a FIFO that has filled empty again."""
+"""Share of the link for tags; the rest is for answers, and for emptying a FIFO that has filled up."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadedCode:
-    """What the code memory holds, as a run's code: it repeats. Bits are 0 or 1 each."""
+    """The repeating contents of the code memory, as a run's code. Bits are 0 or 1 each."""
 
     loaded: NDArray[np.uint8]
 
@@ -48,7 +48,7 @@ class LoadedCode:
 
 @dataclass(frozen=True, slots=True)
 class Capabilities:
-    """What a device says of itself. Ticks are clocks of the device."""
+    """Capabilities stated by a device. Ticks are clocks of the device."""
 
     clock_hz: int
     serial: str
@@ -64,11 +64,11 @@ class Capabilities:
     rx_bytes: int
     inputs: tuple[str, ...]
     light_active: Literal["high", "low", "any"]
-    """Level for which the output is dark from power-up on; any where no light is connected."""
+    """Active level for which the output is dark from power-up on; any if no light is connected."""
 
     @classmethod
     def read(cls, values: Mapping[r.Register, int]) -> Capabilities:
-        """From the constant registers."""
+        """Return the capabilities from the constant registers."""
         version, limits = r.VERSION.unpack(values[r.VERSION]), r.LIMITS.unpack(values[r.LIMITS])
         can, queues = r.CAPABILITIES.unpack(values[r.CAPABILITIES]), r.QUEUES.unpack(values[r.QUEUES])
         boards = {int(board): board.name.lower() for board in r.Board}
@@ -106,13 +106,16 @@ GATEWARE = Capabilities(
     inputs=("strobes", "pps", "scene_gate", "external_arm"),
     light_active="any",
 )
-"""The most that a device of this program's firmware can do: what is known before one is asked."""
+"""Maximal capabilities of a device with this program's firmware, used before one is connected."""
 
 
 def register_values(
     run: TriggerRun, config: TriggerConfig, device: Capabilities, bytes_per_s: float
 ) -> dict[r.Register, int]:
-    """Every config register's value. Raises TriggerError for what the device or its link cannot do."""
+    """Return every config register's value.
+
+    Raises TriggerError if the device or its link do not support it.
+    """
     if run.delays is not None:
         config = with_delays(config, run.delays)
     if run.window is not None:
@@ -130,7 +133,7 @@ def register_values(
             mode=r.LineMode.PER_SUBSTEP if config.line_start == "per-substep" else r.LineMode.PER_LINE,
             direction=config.a.direction == "reverse",
         ),
-        r.PHASE_CLOCKS: run.line_period_ticks // 6,  # six sub-phases a line, whatever S is
+        r.PHASE_CLOCKS: run.line_period_ticks // 6,  # six sub-phases per line, for any S
         **_light(config.light, run.substep_ticks, device),
         **_output(config.a, "A", distance, device),
         **_output(config.b, "B", distance, device),
@@ -145,7 +148,7 @@ def register_values(
 
 
 def with_delays(config: TriggerConfig, delays: Delays) -> TriggerConfig:
-    """The configuration with other delays."""
+    """Return the configuration with other delays."""
     return config.model_copy(
         update={
             "light": config.light.model_copy(update={"lead_ticks": delays.light_lead_ticks}),
@@ -156,7 +159,7 @@ def with_delays(config: TriggerConfig, delays: Delays) -> TriggerConfig:
 
 
 def with_window(config: TriggerConfig, window: LightWindow) -> TriggerConfig:
-    """The configuration with another window of the light."""
+    """Return the configuration with another window of the light."""
     light = {"open_ticks": window.open_ticks, "close_ticks": window.close_ticks}
     return config.model_copy(update={"light": config.light.model_copy(update=light)})
 
@@ -223,7 +226,7 @@ def _check_watchdog(config: TriggerConfig) -> None:
 
 
 def _code(attrs: Mapping[str, Any], device: Capabilities) -> dict[r.Register, int]:
-    """Source and parameters; what the source does not need is left as at power-up."""
+    """Return the registers of the code; those that its source does not need are as after power-up."""
     values = {r.CODE_SOURCE: 0, r.CODE_LENGTH: 0, r.PRBS_MASK: 0, r.PRBS_SEED: 0}
     kind = attrs.get("kind")
     if kind == "constant":
@@ -254,7 +257,7 @@ def _light(light: LightOutputConfig, substep_ticks: int, device: Capabilities) -
     if device.light_active not in {"any", light.active}:
         raise TriggerError(
             f"the light cannot be lit by a {light.active} level",
-            possible=f"{device.light_active}, as this board was built: else it is lit from power-up on",
+            possible=f"{device.light_active}, for which this board was built: others light it at power-up",
             hint=f"trigger.light.active, or firmware.build with --light-active {light.active}",
         )
     most = substep_ticks - device.lead_margin_ticks
@@ -277,7 +280,7 @@ def _light(light: LightOutputConfig, substep_ticks: int, device: Capabilities) -
 
 
 def pulse_width_ticks(configured: int | None, distance: int) -> int:
-    """Of a line trigger, whose pulses are ``distance`` ticks apart."""
+    """Return the pulse width of a line trigger whose pulses are ``distance`` ticks apart."""
     return configured or max(1, min(_DEFAULT_WIDTH, distance // 3))
 
 

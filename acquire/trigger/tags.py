@@ -1,4 +1,4 @@
-"""From what the device says of lines to the tags of a run: counted, checked, on one axis of ticks."""
+"""From the device's tags to those of a run: counted, checked, on one axis of ticks."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ EVENTS = {
 
 
 class TagReader:
-    """Reads the tags of ``run``, which the device knows by ``number`` and began at ``start_tick``.
+    """Reads the tags of ``run``, which has ``number`` in the device and began at ``start_tick``.
 
-    What it counts: ``tags`` received, those of events included; ``tags_missing``, made by the device but
-    not received, without whole turns of 65536 at once; ``tags_repeated``, older than the ones before;
-    ``tags_wrong``, whose code index does not belong to their line. The latter two are dropped.
+    It counts ``tags`` received, including those of events; ``tags_missing``, sent by the device but not
+    received, except whole turns of 65536 at once; ``tags_repeated``, older than earlier ones; ``tags_wrong``,
+    whose code index does not match their line. The latter two are dropped.
     """
 
     NOTHING: ClassVar[Mapping[str, int]] = {
@@ -48,7 +48,7 @@ class TagReader:
 
     def __init__(self, run: TriggerRun, number: int, start_tick: int) -> None:
         self.lines_known = 0
-        """Lines that have begun for certain."""
+        """Number of lines that have certainly begun."""
         self._run, self._number, self._start_tick = run, number % (1 << _RUN_BITS), start_tick
         self._next, self._newest_line = 0, -1
         self._counts = dict(self.NOTHING)
@@ -61,23 +61,23 @@ class TagReader:
         return dict(self._counts)
 
     def events(self) -> list[TagEvent]:
-        """Events among the tags taken since the last call."""
+        """Return the events among the tags taken since the last call."""
         taken = list(self._events)
         self._events.clear()
         return taken
 
     def take(self, arrivals: Iterable[TagArrival]) -> list[LineTag]:
-        """The tags of lines among them; not those of events and of other runs."""
+        """Return the tags of lines, without those of events and of other runs."""
         return [tag for arrival in arrivals if (tag := self._take(arrival))]
 
     def _take(self, arrival: TagArrival) -> LineTag | None:
         number, tag = arrival
-        if tag.run != self._number:  # of the run before: it was still under way in link or queue
+        if tag.run != self._number:  # of the previous run: it was still on its way in link or queue
             return None
-        # Two counters of the device that must agree: a check of the gateware, beside the frame's CRC.
+        # Two counters of the device that must agree: a check of the gateware, in addition to the frame's CRC.
         wrong = tag.code_index != tag.line * self._run.substeps
-        # Numbers of 16 bits come round: what seems more than half a turn ahead is behind, unless its line
-        # says that so many were lost.
+        # 16-bit numbers wrap: one that seems more than half a turn ahead is behind, unless its line is newer,
+        # which means that as many were lost.
         ahead = (number - self._next) % _NUMBERS
         if ahead >= _NUMBERS // 2 and (wrong or tag.line <= self._newest_line):
             self._counts["tags_repeated"] += 1
@@ -101,11 +101,11 @@ class TagReader:
         return LineTag(tag.line, tag.code_index, self._ticks_since_start(tag.timestamp, tag.line))
 
     def _ticks_since_start(self, timestamp: int, line: int) -> int:
-        """48 bits wrap after weeks: of all ticks that they can mean, the one nearest to the line's."""
+        """Return the ticks since the start, those nearest to the line's, since 48 bits wrap after weeks."""
         expected = line * self._run.line_period_ticks
         return expected + signed_ticks(timestamp - self._start_tick - expected)
 
 
 def signed_ticks(ticks: int) -> int:
-    """A difference of 48-bit time stamps, as the nearest to 0."""
+    """Return a difference of 48-bit time stamps as the value nearest to 0."""
     return (ticks + _WRAP // 2) % _WRAP - _WRAP // 2

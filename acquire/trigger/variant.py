@@ -1,4 +1,4 @@
-"""What a trigger driver is to a rig: options of its own, what it refuses, and what connects to the device."""
+"""A rig's view of a trigger driver: its options, its checks, and the connection to the device."""
 
 from __future__ import annotations
 
@@ -32,29 +32,29 @@ class TriggerVariant(FrozenModel, ABC):
 
     @abstractmethod
     def open(self, config: RigConfig, bench: Any) -> Trigger:
-        """The rig's trigger, connected when it is first used.
+        """Return the rig's trigger, which connects when it is first used.
 
-        ``bench`` is the rig's `acquire.sim.instrument.SimulatedDevices` where anything of it is simulated,
-        else None.
+        ``bench`` is the rig's `acquire.sim.instrument.SimulatedDevices` if anything of it is simulated,
+        otherwise None.
         """
 
-    def check(self, config: RigConfig) -> None:  # most can do all that a file may ask for
-        """Raise ConfigError for what this trigger cannot honour. Touches no device."""
+    def check(self, config: RigConfig) -> None:  # most triggers support everything that a file can request
+        """Raise ConfigError for settings that this trigger does not support. Touches no device."""
 
 
 class GatewareTrigger(TriggerVariant):
-    """Our gateware, or a twin of it, at the end of some way for bytes."""
+    """This project's gateware, or a twin of it, behind a transport."""
 
     @abstractmethod
     def transport(self, config: RigConfig, bench: Any) -> Callable[[], Transport]:
-        """What opens the way to the device."""
+        """Return the function that opens the transport to the device."""
 
-    def bytes_per_s(self, trigger: TriggerConfig) -> float:  # noqa: ARG002
-        """What the way carries; infinite where it is no limit."""
+    def bytes_per_s(self, trigger: TriggerConfig) -> float:  # noqa: ARG002 - used by subclasses
+        """Return the rate of the transport; infinite if it is no limit."""
         return float("inf")
 
     def possible(self, trigger: TriggerConfig) -> Capabilities:
-        """What such a device can do, as far as is known before it is asked."""
+        """Return the capabilities of such a device, as far as they are known before it is connected."""
         return replace(GATEWARE, clock_hz=trigger.clock_hz)
 
     def open(self, config: RigConfig, bench: Any) -> Trigger:

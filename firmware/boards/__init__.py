@@ -1,1 +1,1 @@
-"""The boards: which pin is what, where the 90 MHz come from, and how a bitstream or a netlist is made."""
+"""The boards: assignment of pins, source of the 90 MHz, and generation of a bitstream or a netlist."""

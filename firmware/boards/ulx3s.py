@@ -112,7 +112,7 @@ def constraints(sites: dict[str, str], light_low: bool = False) -> str:
 
 
 def pull_of(port: str, light_low: bool) -> str:
-    """Which way a pin goes that nothing drives: inputs to rest, light and triggers to off."""
+    """Return the pull of an undriven pin: inputs to rest, light and triggers to off."""
     if port == "rx" or (port == "led" and light_low):
         return "UP"
     if port in INPUTS or port in {"led", "trigger_a", "trigger_b"}:

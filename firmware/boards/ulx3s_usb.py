@@ -47,9 +47,9 @@ class Ulx3sUsb(Ulx3s):
 
 
 def _usb_pll(reference: Value, usb: Signal, usb_io: Signal) -> Instance:
-    """90 MHz / 9 is compared with 480 MHz / 48: the oscillator that 10 and 40 make 48 and 12 MHz of.
+    """The oscillator at 480 MHz, divided by 10 and 40 for 48 and 12 MHz; 480 / 48 is compared with 90 / 9.
 
-    From 25 MHz it could only be compared at 5 MHz; the maker wants 10.
+    From 25 MHz the comparison would be at 5 MHz; the maker requires 10.
     """
     feedback = Signal()
     return Instance(

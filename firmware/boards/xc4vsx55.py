@@ -45,7 +45,7 @@ class Xc4vsx55(Elaboratable):
 
 
 def files(light_low: bool = False) -> dict[str, str]:
-    """Name → text."""
+    """Return the generated files, name → text."""
     board = Xc4vsx55(light_low)
     return {
         "trigger.v": verilog.convert(board, name="trigger", ports=board.ports, emit_src=False),

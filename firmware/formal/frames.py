@@ -1,4 +1,4 @@
-r"""Of what comes over the link only whole frames are believed: the deframer, whatever bytes, at any pace.
+r"""Only whole frames are accepted from the link: the deframer, for any bytes at any pace.
 
 ::
 

@@ -1,4 +1,4 @@
-"""A gateware module, what its surroundings promise, what is claimed of it, and what helps to prove that."""
+"""A gateware module with assumptions about its surroundings, claims, and lemmas that help to prove them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _CHECK = re.compile(r'cell \$check \$\d+\n(\s+parameter \\FORMAT "(\w+)")')
 
 @dataclass(frozen=True, slots=True)
 class Proof:
-    """What `engine` needs: the design as RTLIL with its properties as cells ``check.NAME``."""
+    """Input of `engine`: the design as RTLIL with its properties as cells ``check.NAME``."""
 
     name: str
     rtlil: str
@@ -45,7 +45,7 @@ class Proof:
 
 
 class Harness:
-    """Claims and lemmas hold in every clock; both are asserted, only claims are what the proof is for.
+    """Claims and lemmas hold in every clock. Both are asserted; only claims are the purpose of the proof.
 
     ``m`` takes whatever registers the claims need to remember the past. Nothing has a reset but the
     initial values: a proof's first clock is the first after configuration.
@@ -72,7 +72,7 @@ class Harness:
         self.m.d.comb += Assert(~Value.cast(when).any() | Value.cast(then).any(), name)
 
     def fact(self, name: str, when: ValueLike, then: ValueLike) -> None:
-        """What another proof has shown, under assumptions that hold here as well."""
+        """A result of another proof, under assumptions that hold here as well."""
         self._take(name)
         self._facts += 1
         self.assume(~Value.cast(when).any() | Value.cast(then).any())
@@ -125,7 +125,7 @@ def opened(component: Any, *kinds: type) -> tuple[Any, ...]:
 def times(value: Value, factor: Value, most: int) -> Value:
     """``value · factor`` for a factor of 0 to ``most``.
 
-    By repeated addition: a solver sees at once that the next multiple is this one and ``value``.
+    By repeated addition: for a solver it is obvious that the next multiple is this one plus ``value``.
     """
     multiple: Value = Const(0, len(value) + most.bit_length())
     product = multiple
@@ -136,6 +136,6 @@ def times(value: Value, factor: Value, most: int) -> Value:
 
 
 def inputs_of(component: Any) -> list[Signal]:
-    """Ports whose level the surroundings choose, streams' included."""
+    """Return the ports whose level the surroundings choose, including those of streams."""
     members = component.signature.flatten(component)
     return [Value.cast(signal) for _, member, signal in members if member.flow == In]

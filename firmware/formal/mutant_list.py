@@ -1,4 +1,4 @@
-"""The mutants: for each the proof that must notice it, and the property that it breaks."""
+"""The mutants: for each the proof that must detect it, and the property that it breaks."""
 
 from __future__ import annotations
 

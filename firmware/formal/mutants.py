@@ -1,7 +1,7 @@
-"""Does a proof notice? The gateware, one line changed at a time, each of which must break one.
+"""Mutation test of the proofs: the gateware with one line changed at a time, which must break a proof.
 
-The changed source is imported beside the original, and proved like it. Asked first is the property that the
-change ought to break; only if that holds are all the others.
+The changed source is imported next to the original, and proved in the same way. The property that the change
+should break is checked first; the others only if it holds.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ SOURCES = Path(firmware.__file__).parent
 
 
 def broken_by(mutant: Mutant) -> tuple[str, ...]:
-    """Properties that the changed gateware breaks: at least one, or the proof is blind to the change."""
+    """Return the properties that the changed gateware breaks; none means that the proof misses the change."""
     with _changed(mutant):
         proof: Proof = import_module("firmware.formal.proofs").PROOFS[mutant.proof]()
     verdict = prove(proof, first=True, only=(mutant.breaks,))
@@ -42,13 +42,13 @@ def broken_by(mutant: Mutant) -> tuple[str, ...]:
 
 @contextmanager
 def _changed(mutant: Mutant) -> Iterator[None]:
-    """While this lasts, whatever is imported of the gateware is made of the changed source."""
+    """Within this context, modules of the gateware are imported from the changed source."""
     file = SOURCES / mutant.file
     text = file.read_text()
     if text.count(mutant.old) != 1:
         raise ToolError(f"{mutant.old!r} occurs {text.count(mutant.old)} times in {mutant.file}, not once")
     code = compile(text.replace(mutant.old, mutant.new), str(file), "exec", dont_inherit=True)
-    # All of the gateware is imported anew: a module that was imported before would still hold the original.
+    # Import all of the gateware again: modules imported before would still refer to the original.
     finder = _Finder(f"{firmware.__name__}.{file.stem}", code)
     original = {name: sys.modules.pop(name) for name in list(sys.modules) if _is_ours(name)}
     sys.meta_path.insert(0, finder)
@@ -66,7 +66,7 @@ def _is_ours(name: str) -> bool:
 
 
 class _Finder(MetaPathFinder, Loader):
-    """Gives one module other code than its file has."""
+    """Finder that replaces the source of one module."""
 
     def __init__(self, name: str, code: CodeType) -> None:
         self._name, self._code = name, code

@@ -1,7 +1,7 @@
-"""What `runs` and `settings` suppose of the host's side: how it writes registers and gives commands.
+"""Assumptions of `runs` and `settings` about the host's side: how it writes registers and gives commands.
 
-A configuration is never written but while nothing is armed or runs, has settled before an ARM can look at
-it, and a command holds still until it is answered.
+A configuration is written only while nothing is armed or running, and has settled before an ARM can check it;
+a command is constant until it is answered.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def requests_proof() -> Proof:
 
 
 def _heard(harness: Harness, host: Host, changes: Value) -> None:
-    """What keeps the watchdog quiet: one request of good form, once; never a host that says nothing."""
+    """Requests that reset the watchdog: each one of good form, once; a silent host never does."""
     m, claim = harness.m, harness.claim
     heard, asked = Signal(), Signal()
     with m.If(host.release):

@@ -1,7 +1,7 @@
-r"""Runs begin when they should, end when they must, and the state that the host reads is true.
+r"""Runs begin when they should, end when they must, and the state that the host reads is correct.
 
-`Commands`, `Timing`, `Watchdog` and `Light` as they are joined in `firmware.top`; commands, edges, signs of
-life of the host and the loss of the clock come at any time, all at once if they like::
+`Commands`, `Timing`, `Watchdog` and `Light` as connected in `firmware.top`; commands, edges, signs of life of
+the host and the loss of the clock come at any time, in any combination::
 
     edge or START, armed   ──▶ line 0 exactly START_CLOCKS + lead clocks later
     STOP, silence, clock   ──▶ one line more at most, then dark
@@ -25,7 +25,7 @@ from firmware.timing import Timing
 
 
 class Story:
-    """What the host may know: which run is armed, whether it has been told to stop, what has been told."""
+    """The host's knowledge: which run is armed, whether a stop was requested, and what was reported."""
 
     def __init__(self, harness: Harness, commands: Commands, timing: Timing) -> None:
         m = harness.m
@@ -81,7 +81,7 @@ def runs_proof() -> Proof:
 
 
 def _host(harness: Harness, commands: Commands, story: Story) -> None:
-    """One command at a time, which holds still until it is answered (`Host` waits for ``done``)."""
+    """One command at a time, which is constant until it is answered (`Host` waits for ``done``)."""
     operands = Cat(commands.command, commands.run)
     before = Signal(len(operands))
     harness.m.d.sync += before.eq(operands)

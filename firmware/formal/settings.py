@@ -1,11 +1,11 @@
-r"""What arming lets pass is what the other proofs suppose, and nothing else is refused.
+r"""Arming accepts exactly the settings that the other proofs assume.
 
 ::
 
     configuration  ==X held for SETTLED clocks ====
     Checks.error   ==?=?=?=?X 0: every claim below
 
-The claims say of the registers themselves what `firmware.checks` may have worked out in any way it likes.
+The claims are stated in terms of the registers, independently of how `firmware.checks` computes its result.
 """
 
 from __future__ import annotations

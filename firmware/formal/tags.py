@@ -27,7 +27,7 @@ SOON = 1
 
 
 class Ledger:
-    """What was put, lost and delivered, as somebody at the ports counts it."""
+    """Counts of tags put, lost and delivered, as observed at the ports."""
 
     def __init__(self, harness: Harness, tagger: Tagger, queue: Queue) -> None:
         m = harness.m
@@ -53,7 +53,7 @@ class Ledger:
 
 
 class Lines:
-    """When a line has to be told, and with what."""
+    """When a line has to be reported, and with which contents."""
 
     def __init__(self, harness: Harness, tagger: Tagger) -> None:
         m = harness.m
@@ -169,7 +169,7 @@ def _lemmas(harness: Harness, tagger: Tagger, queue: Queue, ledger: Ledger, insi
 
 
 def _queue_lemmas(harness: Harness, fifo: dict[str, Any]) -> None:
-    """The ring inside: its two ends are as far apart as it is full."""
+    """Lemma about the ring: the distance of its two ends is its fill level."""
     depth, level = fifo["inner_depth"], fifo["inner_level"]
     consume, produce = fifo["consume"], fifo["produce"]
     reach = consume + level

@@ -1,4 +1,4 @@
-r"""The heartbeat keeps time: claims about `firmware.timing`, for any setting, start and stop.
+r"""The time base is exact: claims about `firmware.timing`, for any setting, start and stop.
 
 ::
 
@@ -9,7 +9,7 @@ r"""The heartbeat keeps time: claims about `firmware.timing`, for any setting, s
             |<-latency>|<--period--->|<---period---->|              every distance the same: zero jitter
                        |<------- S · period -------->|              S code bits shown, no more, no fewer
 
-The settings are any, as long as arming lets them pass and they hold still from the start to the end of a run.
+Settings are arbitrary, as long as arming accepts them and they are constant from start to end of a run.
 Lines are counted to 2⁴⁸ − 3: five years of 1.8 MHz.
 """
 
@@ -32,7 +32,7 @@ LINE_CLOCK_BITS = CLOCK_BITS + 3
 
 
 class Observer:
-    """What somebody who watches the outputs writes down; it knows nothing of the inside."""
+    """Observations at the outputs, independent of the module's internals."""
 
     def __init__(self, harness: Harness, timing: Timing) -> None:
         m = harness.m
@@ -95,7 +95,7 @@ def timing_proof() -> Proof:
 
 
 def timing_facts(harness: Harness, timing: Timing, inside: dict[str, Signal]) -> Observer:
-    """All of this as facts for a proof about something larger, whose settings hold still as they do here."""
+    """Return these claims as facts for a proof about a larger design, whose settings are constant as well."""
     seen = Observer(harness, timing)
     harness.assume(seen.lines < (1 << 48) - 3)
     _claims(harness.fact, timing, seen)
@@ -104,7 +104,7 @@ def timing_facts(harness: Harness, timing: Timing, inside: dict[str, Signal]) ->
 
 
 def assume_settings(harness: Harness, timing: Timing, hold: Value) -> None:
-    """Settings that arming lets pass (`settings` proves it) and that stay as they are after ``hold``."""
+    """Assume settings that arming accepts (`settings` proves it), and that are constant after ``hold``."""
     settings = Cat(timing.substep_clocks, timing.substeps, timing.lead, timing.lines)
     before, held = Signal(len(settings)), Signal()
     harness.m.d.sync += [before.eq(settings), held.eq(hold)]
@@ -158,7 +158,7 @@ def _claims(claim: Claim, timing: Timing, seen: Observer) -> None:
 
 
 def _lemmas(lemma: Claim, timing: Timing, seen: Observer, inside: dict[str, Signal]) -> None:
-    """How the registers inside go with what was seen, clock by clock."""
+    """Relations between internal registers and observations, clock by clock."""
     left, leading = inside["left"], inside["leading"]
     counting, waiting = timing.running & ~leading, timing.running & leading
     lemma("started_once_counting", counting, seen.started | timing.line)

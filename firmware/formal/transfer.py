@@ -1,4 +1,4 @@
-r"""The charge goes one row per line, never two: six moves of the electrodes from one line to the next.
+r"""The charge moves one row per line, never two: six moves of the electrodes from one line to the next.
 
 ::
 
@@ -19,7 +19,7 @@ from firmware.timing import CLOCK_BITS, SUBSTEP_CLOCKS_MIN
 
 
 class Beat:
-    """Sub-steps and lines as `timing` proves them, any period and S: what drives the phases."""
+    """Sub-steps and lines as proved in `timing`, for any period and S: they drive the phases."""
 
     def __init__(self, harness: Harness, phases: Phases) -> None:
         m = harness.m
@@ -76,7 +76,7 @@ def transfer_proof() -> Proof:
 
 
 def follows(phases: Phases, shown: Signal) -> Value:
-    """Whether the levels are those that come after ``shown``."""
+    """Return whether the levels are the successors of ``shown``."""
     after: Value = Const(0, 3)
     for levels, following in zip(PATTERN, PATTERN[1:] + PATTERN[:1], strict=True):
         after = Mux(~phases.backwards & (shown == levels), following, after)

@@ -1,6 +1,6 @@
-"""The parts are joined as the other proofs suppose: the whole trigger, from the registers to the pins.
+"""The parts are connected as the other proofs assume: the whole trigger, from the registers to the pins.
 
-Only the link, the host's side and the source of the code are taken out; what they would say is anything.
+Only the link, the host's side and the source of the code are removed; their outputs are arbitrary.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def wiring_proof() -> Proof:
 
 
 def _free(kind: type, outputs: list[Signal]) -> type:
-    """The same ports and nothing behind them."""
+    """The same ports with nothing behind them."""
 
     class Free(kind):
         def elaborate(self, platform: object) -> Elaboratable:
@@ -114,7 +114,7 @@ def _watchdog(harness: Harness, trigger: SyncTrigger, watchdog: Watchdog) -> Non
 
 
 def _witnesses(harness: Harness, trigger: SyncTrigger, parts: Any) -> None:
-    """Strobes and seconds are those of their pins, and are told where the host looks for them."""
+    """Strobes and seconds are those of their pins, and are reported in the host's registers."""
     file, m, stamp = trigger.file, harness.m, trigger.timestamp
     for arm in "ab":
         check, letter = getattr(trigger, f"camera_{arm}"), arm.upper()
@@ -139,7 +139,7 @@ def _witnesses(harness: Harness, trigger: SyncTrigger, parts: Any) -> None:
 
 
 def _first_clock(harness: Harness) -> Value:
-    """The first clock: nothing is known of the one before."""
+    """The first clock: the one before it is unknown."""
     later = Signal()
     harness.m.d.sync += later.eq(1)
     return ~later

@@ -1,4 +1,4 @@
-r"""What the inputs show is reported exactly: strobes against pulses, and the instant of a second.
+r"""Inputs are reported exactly: strobes relative to pulses, and the instant of a second.
 
 ::
 

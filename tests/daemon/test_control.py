@@ -63,7 +63,7 @@ def test_device_error_keeps_its_class_and_words(daemon: Client, run: FakeRun) ->
 def test_impossible_start_is_refused_before_it_is_sent(daemon: Client) -> None:
     with pytest.raises(UsageError, match="lines"):
         daemon.start(lines=0)
-    with pytest.raises(UsageError, match="lines and duration_s are ways to say the same"):
+    with pytest.raises(UsageError, match="lines and duration_s exclude each other"):
         daemon.start(lines=1, duration_s=1.0)
     with pytest.raises(UsageError, match="pre_s is a part of duration_s"):
         daemon.start(duration_s=1.0, pre_s=1.0)

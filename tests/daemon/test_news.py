@@ -67,7 +67,7 @@ def status(arm: ArmStatus | None = None, run_id: str | None = "r", **more: Any) 
 def test_a_client_that_was_away_hears_what_it_missed() -> None:
     log = NewsLog()
     for text in "abc":
-        log.tell("mark", text)
+        log.add("mark", text)
     first = log.after(None)
     assert [one.text for one in first] == ["a", "b", "c"]
     assert [one.text for one in log.after(first[0].id)] == ["b", "c"]
@@ -76,10 +76,10 @@ def test_a_client_that_was_away_hears_what_it_missed() -> None:
 
 def test_what_is_not_kept_any_more_is_told_as_missed() -> None:
     log = NewsLog(kept=2)
-    log.tell("mark", "first")
+    log.add("mark", "first")
     seen = log.last_id
     for text in "abcd":
-        log.tell("mark", text)
+        log.add("mark", text)
     missed, *others = log.after(seen)
     assert (missed.kind, missed.text) == ("missed", "2 news are not kept any more")
     assert [one.text for one in others] == ["c", "d"]
@@ -88,7 +88,7 @@ def test_what_is_not_kept_any_more_is_told_as_missed() -> None:
 
 def test_news_of_another_life_of_the_daemon_are_not_taken_for_its_own() -> None:
     log = NewsLog()
-    log.tell("mark", "a")
+    log.add("mark", "a")
     for foreign in (f"{'0' * 8}-1", "nonsense", f"{log.life}-x"):
         missed, one = log.after(foreign)
         assert (missed.kind, one.text) == ("missed", "a")
@@ -98,11 +98,11 @@ def test_listeners_are_woken_until_they_are_forgotten() -> None:
     log, woken = NewsLog(), []
     wake = lambda: woken.append(1)  # noqa: E731
     log.listen(wake)
-    log.tell("mark", "a")
+    log.add("mark", "a")
     log.close()
     assert len(woken) == 2
     log.forget(wake)
-    log.tell("mark", "b")
+    log.add("mark", "b")
     assert len(woken) == 2
 
 

@@ -43,11 +43,11 @@ def test_a_command_is_told_faults_losses_and_the_disk_and_nothing_else(tmp_path:
     log, told = NewsLog(), tmp_path / "told"
     code = f"import sys; open({str(told)!r}, 'a').write(sys.stdin.read() + chr(10))"
     hooks = Hooks(HooksConfig(command=(sys.executable, "-c", code)), log, "rig")
-    log.tell("mark", "no")
-    log.tell("state", "armed", State.ARMED)
-    log.tell("loss", "arm a lost 5 lines: camera", level="error", lines=5)
-    log.tell("state", "fault: gone", State.FAULTED, level="error")
-    log.tell("state", "disarm", State.IDLE)
+    log.add("mark", "no")
+    log.add("state", "armed", State.ARMED)
+    log.add("loss", "arm a lost 5 lines: camera", level="error", lines=5)
+    log.add("state", "fault: gone", State.FAULTED, level="error")
+    log.add("state", "disarm", State.IDLE)
     found = until_written(told, 2)
     hooks.close()
     assert [one["text"] for one in found] == ["rig: arm a lost 5 lines: camera", "rig: fault: gone"]
@@ -60,7 +60,7 @@ def test_a_hook_that_hangs_or_fails_is_given_up(tmp_path: Path, caplog: pytest.L
         Hooks(HooksConfig(command=words, timeout_s=0.2), log, "rig")
         for words in (("sleep", "300"), ("false",), (str(tmp_path / "none"),))
     ]
-    log.tell("loss", "x", level="error")
+    log.add("loss", "x", level="error")
     deadline = time.monotonic() + 300
     while not all(word in caplog.text for word in ("timed out", "exit code 1", "No such file")):
         assert time.monotonic() < deadline
@@ -85,7 +85,7 @@ def test_a_webhook_gets_json() -> None:
         thread.start()
         log = NewsLog()
         hooks = Hooks(HooksConfig(webhook=f"http://127.0.0.1:{server.server_port}/x"), log, "rig")
-        log.tell("disk", "the disk is full in 2 min", level="error")
+        log.add("disk", "the disk is full in 2 min", level="error")
         thread.join(300)
         hooks.close()
     assert json.loads(bodies[0])["text"] == "rig: the disk is full in 2 min"

@@ -94,7 +94,7 @@ def test_default_directory_is_the_user_s_own(home: Path, monkeypatch: pytest.Mon
 @pytest.mark.parametrize("kind", ["link", "file"])
 def test_default_directory_is_no_link(home: Path, tmp_path: Path, kind: str) -> None:
     home.symlink_to(tmp_path) if kind == "link" else home.touch()
-    with pytest.raises(UsageError, match="no directory"):
+    with pytest.raises(UsageError, match="not a directory"):
         Endpoint(home / "acquire.sock")
     assert list(tmp_path.iterdir()) == []
 

@@ -57,7 +57,7 @@ def test_a_board_is_pulled_and_asked_for_the_level_it_was_built_for(built_low: b
     right, wrong = ("low", "high") if built_low else ("high", "low")
     values = register_values(RUN, TriggerConfig(light={"active": right}), said, 3e5)
     assert r.LED.invert.of(values[r.LED]) == built_low
-    with pytest.raises(TriggerError, match=f"possible: {right}, as this board was built: else it is lit"):
+    with pytest.raises(TriggerError, match=f"possible: {right}, for which this board was built"):
         register_values(RUN, TriggerConfig(light={"active": wrong}), said, 3e5)
 
 

@@ -178,7 +178,7 @@ def test_a_nursery_that_dies_is_replaced_and_its_workers_go_on(mortal: Own) -> N
 def test_a_worker_that_was_not_born_yet_is_told() -> None:
     one = Nursery()
     os.kill(one.pid, signal.SIGSTOP)
-    child = one.bear("one", leave, 0)
+    child = one.fork("one", leave, 0)
     assert (child.pid(0.01), child.exit_code()) == (None, None)
     one.close()
     assert child.exit_code(LIMIT_S) == 255

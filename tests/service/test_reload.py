@@ -100,7 +100,7 @@ def test_what_cannot_change_is_refused_as_a_whole(daemon: Daemon) -> None:
         ):
             assert f"{key} = {new}, it was {old}" in said
         assert "recording.retention" not in said.partition("possible:")[0]
-        assert "end the service when it is idle" in said
+        assert "restart the service when it is idle" in said
         assert client.setup().config == before
         assert "nothing was changed: cannot change while the service works" in told(client)
         assert client.status().state is State.ARMED

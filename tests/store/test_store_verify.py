@@ -271,7 +271,7 @@ def test_where_nothing_tells_whether_somebody_writes_it_is_left(path, monkeypatc
         fill(writer, 100)
         writer.commit()
     monkeypatch.setattr("fcntl.flock", no_locks)
-    with pytest.raises(StateError, match="no locks that would tell whether somebody writes it"):
+    with pytest.raises(StateError, match="no locks, which would show"):
         recover(path, known=Circumstances(alone=False))
     assert open_recording(path).state == "recording"
     assert recover(path).lines == 96

@@ -109,9 +109,7 @@ def test_after_a_longer_pause_the_recording_goes_on_in_a_further_segment(tmp_pat
         else:
             disk.gate.touch()
         until(lambda: overflow(capture), "full rings")
-        until(
-            lambda: "the rings are full: what comes now belongs to no rec" in capture.poll().waiting, "words"
-        )
+        until(lambda: "the rings are full: lines that come now belong" in capture.poll().waiting, "words")
         check_records(capture)
         held_up = capture.poll().path
         disk.gate.unlink(missing_ok=True)

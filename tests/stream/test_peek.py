@@ -93,7 +93,7 @@ def test_another_process_looks_and_the_memory_goes_with_its_owner(ring: Ring) ->
 
 
 def test_memory_that_is_not_a_ring_is_refused(ring: Ring, tmp_path: Path) -> None:
-    with pytest.raises(DeviceError, match="cannot be looked at"):
+    with pytest.raises(DeviceError, match="cannot be read"):
         Peek("a", str(tmp_path / "none"), SHAPE)
     (tmp_path / "file").write_bytes(b"x")
     with pytest.raises(DeviceError, match="is not the memory of this ring"):

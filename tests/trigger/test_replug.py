@@ -64,7 +64,7 @@ def lose_it(cable: Cable, driver: TriggerDriver) -> None:
     while lines < 100:
         lines = max([tag.line for tag in driver.tags(5.0)], default=0)
     cable.unplug()
-    with pytest.raises(TriggerError, match=r"is gone.*; its tags have told of run 'run' with \d+ lines"):
+    with pytest.raises(TriggerError, match=r"is gone.*; its tags have reported run 'run' with \d+ lines"):
         tags_for_ever(driver)
 
 

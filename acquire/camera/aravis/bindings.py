@@ -1,4 +1,4 @@
-"""Aravis' shared library: the functions that are used of it, and its errors."""
+"""Bindings of Aravis' shared library: the functions used here, and its errors."""
 
 from __future__ import annotations
 
@@ -107,7 +107,7 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
 
 @functools.cache
 def load() -> Any:
-    """Aravis' shared library. Raises CameraError where there is none."""
+    """Load Aravis' shared library. Raises CameraError if there is none."""
     for name in LIBRARIES:
         try:
             library = ctypes.CDLL(name)
@@ -132,7 +132,7 @@ class _GError(ctypes.Structure):
 
 @contextmanager
 def errors(what: str) -> Iterator[Any]:
-    """Gives a place for a GError; raises CameraError when one was put there."""
+    """Yield a place for a GError; raise CameraError if one was stored there."""
     place = POINTER(_GError)()
     yield byref(place)
     if ctypes.cast(place, c_void_p).value:

@@ -1,4 +1,4 @@
-"""One camera through Aravis: opened, set, armed; its buffers become blocks of lines."""
+"""One camera through Aravis: opening, settings, arming; its buffers become blocks of lines."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ FAKE = "Fake"
 _ALIVE_S = 0.5
 _SUCCESS, _ABORTED = 0, 7
 _NO_ID = 2**64 - 1
-"""Given to a buffer before it is filled. Only the packet that begins a frame brings its number, and a buffer
-whose frame lost that packet would still have the number of the frame before."""
+"""Set in a buffer before it is filled. Only the first packet of a frame carries its number: without this, a
+buffer whose frame lost that packet would still have the number of the previous frame."""
 _NO_PACKET_SOCKET = 1
-"""Aravis' packet socket, which it prefers where it may, takes packets of every other camera on the interface
-for its own until its filter is in place."""
+"""Aravis' packet socket, which it prefers where permitted, accepts packets of every other camera on the
+interface until its filter is in place."""
 _HEADERS_BYTES = 36
-"""Of IP, UDP and GVSP in every packet of a frame."""
+"""Headers of IP, UDP and GVSP in every packet of a frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,14 +97,14 @@ class AravisCamera:
         return read_settings(self.features())
 
     def features(self) -> dict[str, Features]:
-        """Of the camera itself, and the parameters of Aravis' stream."""
+        """Return the features of the camera itself, and the parameters of Aravis' stream."""
         return {"remote": self._features, "stream": self._parameters}
 
     def _format(self) -> FrameFormat:
         return frame_format({"remote": self._features})
 
     def _prepare(self) -> int:
-        """The stream of the next acquisition: its socket is new, and gets no packet of an earlier one."""
+        """Return the stream of the next acquisition, whose new socket gets no packet of an earlier one."""
         if self._stream is None:
             found = self._format()
             with errors(f"stream of camera {self._spec.serial}") as error:
@@ -132,14 +132,14 @@ class AravisCamera:
         stream = self._prepare()
         for _ in range(buffers):
             self._give(stream, library.arv_buffer_new_allocate(self._payload))
-        # Before the start, so that one that fails half-way is stopped as well.
+        # Set before the start, so that a start that fails half-way is stopped as well.
         self._armed = True
         with errors(what) as error:
             library.arv_camera_start_acquisition(self._camera, error)
         self._heard_s = time.monotonic()
 
     def _frame_ids(self) -> tuple[int, bool | None]:
-        """Bits of the ids, and whether they skip 0: as GigE Vision and USB3 Vision have them."""
+        """Return the bits of frame IDs, and whether they skip 0, as in GigE Vision and USB3 Vision."""
         if self._library.arv_camera_is_uv_device(self._camera):
             return self._spec.frame_id_bits or 64, False
         mode = self._features.find("GevGVSPExtendedIDMode")
@@ -147,24 +147,24 @@ class AravisCamera:
         return self._spec.frame_id_bits or (64 if extended else 16), True
 
     def _packets_per_frame(self) -> int:
-        """Over GigE Vision a frame that finds no buffer is counted once for each of its packets."""
+        # Over GigE Vision, a frame that finds no buffer is counted once for each of its packets.
         if not self._library.arv_camera_is_gv_device(self._camera):
             return 1
         with errors(f"arm camera {self._spec.serial}") as error:
             size = self._library.arv_camera_gv_get_packet_size(self._camera, error)
-        # Two more packets have no lines in them: the leader and the trailer.
+        # Two more packets, leader and trailer, have no lines.
         return 2 + math.ceil(self._payload / max(1, int(size) - _HEADERS_BYTES))
 
     def _give(self, stream: int, buffer: int) -> None:
-        """Let Aravis fill a buffer."""
+        """Queue a buffer for Aravis to fill."""
         self._library.arv_buffer_set_frame_id(buffer, _NO_ID)
         self._library.arv_buffer_set_timestamp(buffer, 0)
         self._library.arv_stream_push_buffer(stream, buffer)
 
     def next_block(self, timeout_s: float) -> CameraBlock | None:
-        """The next frame's lines; those of an incomplete frame are flagged."""
+        """Return the next frame's lines; those of an incomplete frame are flagged."""
         if not self._armed:
-            raise CameraError("a block was asked of a camera that is not armed", hint="arm it")
+            raise CameraError("a block was requested of a camera that is not armed", hint="arm it")
         if not self._ready:
             self._fetch(timeout_s)
         if not self._ready:
@@ -176,16 +176,16 @@ class AravisCamera:
         return block
 
     def _fetch(self, timeout_s: float) -> None:
-        """Put the buffers that have been filled in their places among the frames."""
-        # The next one, and those that wait already: the camera's counter of missed triggers is read over the
-        # network, and once for all of them. Read for each, a busy host had no buffer left in the end.
+        """Take the filled buffers, and assemble their frames to blocks."""
+        # The next one, and all that wait already: the camera's counter of missed triggers is read over the
+        # network, once for all of them. When it was read for each, a busy host ran out of buffers.
         buffers: list[int] = []
         buffer = self._library.arv_stream_timeout_pop_buffer(self._stream, round(timeout_s * 1e6))
         while buffer:
             buffers.append(buffer)
             buffer = self._library.arv_stream_try_pop_buffer(self._stream)
         if not buffers:
-            self._ask_alive()
+            self._check_alive()
             return
         self._heard_s = time.monotonic()
         assert self._stream is not None
@@ -225,11 +225,14 @@ class AravisCamera:
             missed,
             library.arv_buffer_get_timestamp(buffer) or None,
         )
-        # Aravis does not say how much of an incomplete frame has come.
+        # Aravis does not report how much of an incomplete frame has arrived.
         return Frame(buffer, memory, size.value if complete else self._payload, facts, complete)
 
-    def _ask_alive(self) -> None:
-        """A camera that was away for a moment answers, but obeys its host no more and sends nothing."""
+    def _check_alive(self) -> None:
+        """Raise CameraLostError if the silent camera is gone, or was away for a moment.
+
+        In the latter case it answers, but is no longer controlled by this host, and sends nothing.
+        """
         if time.monotonic() - self._heard_s < _ALIVE_S:
             return
         self._heard_s = time.monotonic()
@@ -241,7 +244,7 @@ class AravisCamera:
         if library.arv_camera_is_gv_device(self._camera) and not library.arv_gv_device_is_controller(
             self._device
         ):
-            raise CameraLostError(f"camera {self._spec.serial} is gone: it has started anew")
+            raise CameraLostError(f"camera {self._spec.serial} is gone: it has restarted")
 
     def release(self, block: CameraBlock) -> None:
         buffer = self._held.pop(block, None)
@@ -255,7 +258,7 @@ class AravisCamera:
         self._armed = False
         self._held.clear()
         self._ready.clear()
-        while self._taken:  # ours since the stream gave them; it frees the others itself
+        while self._taken:  # buffers popped from the stream are ours; it frees the others itself
             self._library.g_object_unref(self._taken.pop())
         try:
             with errors("stop") as error:
@@ -277,7 +280,7 @@ class AravisCamera:
 
 
 def list_cameras() -> list[tuple[str, str]]:
-    """Serial number and model of every camera that answers. Raises CameraError where there is no Aravis."""
+    """Return serial number and model of every camera that answers. Raises CameraError without Aravis."""
     library = load()
     library.arv_update_device_list()
     ask = (library.arv_get_device_serial_nbr, library.arv_get_device_model)
@@ -286,7 +289,7 @@ def list_cameras() -> list[tuple[str, str]]:
 
 
 def _find(library: Any, spec: GenicamSpec) -> bytes:
-    """The device with the serial number, of all that answer."""
+    """Return the device ID of the camera with the serial number, among all that answer."""
     if spec.cti == FAKE:
         library.arv_enable_interface(FAKE.encode())
     library.arv_update_device_list()
@@ -303,7 +306,7 @@ def _find(library: Any, spec: GenicamSpec) -> bytes:
 
 
 def _identify(features: AravisFeatures) -> CameraIdentity:
-    """By the camera's own features; older ones have the serial number as DeviceID."""
+    """Return the identity from the camera's features; older cameras have the serial number as DeviceID."""
     serial = _text(features, "DeviceSerialNumber") or _text(features, "DeviceID")
     firmware = _text(features, "DeviceFirmwareVersion") or _text(features, "DeviceVersion")
     return CameraIdentity(
@@ -317,7 +320,8 @@ def _text(features: AravisFeatures, name: str) -> str:
 
 
 def _check_identity(found: CameraIdentity, spec: GenicamSpec) -> None:
-    # An address may have become another camera's, and cameras that are swapped show in the video only.
+    # An address may have been given to another camera, and swapped cameras would be noticed only in the
+    # video.
     if found.serial != spec.serial:
         raise CameraError(f"the camera at {spec.cti} has serial number {found.serial!r}, not {spec.serial!r}")
     if spec.model and found.model != spec.model:

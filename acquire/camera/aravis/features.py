@@ -1,4 +1,4 @@
-"""What a camera describes of itself, as Aravis reads it."""
+"""Features of a camera's own description, through Aravis."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ _KINDS: tuple[tuple[bytes, Kind], ...] = (
     (b"ArvGcFloat", "float"),
     (b"ArvGcInteger", "integer"),
 )
-"""GObject types and interfaces, the first that a node has counting: there are more classes of nodes than ways
-to read one, and some have several (an enumeration is also an integer)."""
+"""GObject types and interfaces, of which the first that matches counts: there are more classes of nodes than
+ways to read one, and some match several (an enumeration is also an integer)."""
 
 _MOST = sys.float_info.max
 
@@ -41,7 +41,7 @@ class AravisFeatures:
         return AravisNode(self._library, self._device, node, name, kind) if kind else None
 
     def _kind(self, node: int) -> Kind | None:
-        """How the node is read and written; None for what is no feature but a category."""
+        """Return how the node is read and written; None for a category."""
         library = self._library
         if self._is_category(node):
             return None
@@ -76,7 +76,7 @@ class AravisFeatures:
 
 
 def _strings(node: int | None) -> Iterator[str]:
-    """The texts of a GSList."""
+    """Yield the texts of a GSList."""
     while node:
         data, node = (c_void_p * 2).from_address(node)
         if data:
@@ -112,14 +112,14 @@ class AravisNode:
 
     @property
     def selected(self) -> bool:
-        """Aravis does not say: what a selector points at is read back when it is written."""
+        # Aravis does not tell. True means that the value is read back only when it is written.
         return True
 
     def read(self) -> Value:
         with errors(f"read {self.name}") as error:
             get = getattr(self._library, f"arv_device_get_{self._word}_feature_value")
             value = get(self._device, self._key, error)
-        # ctypes gives a text that is empty, or not there, as None.
+        # ctypes returns None for a text that is empty or missing.
         return value.decode() if isinstance(value, bytes) else value or (0 if value is not None else "")
 
     def write(self, value: Value) -> None:
@@ -132,7 +132,7 @@ class AravisNode:
                 self._library.arv_device_execute_command(self._device, self._key, error)
 
     def limits(self) -> tuple[float, float, float]:
-        """Nodes that compute need not have any: then all that the type can hold."""
+        """Return minimum, maximum, increment; computed nodes may have none: then those of the type."""
         whole = self.kind == "integer"
         number = c_int64 if whole else c_double
         low, high = number(), number()
@@ -161,5 +161,5 @@ class AravisNode:
                 self._device, self._key, byref(count), error
             )
         names = [found[k].decode() for k in range(count.value)]
-        self._library.g_free(found)  # the list alone: its texts are the node's
+        self._library.g_free(found)  # the list only: its texts belong to the node
         return names

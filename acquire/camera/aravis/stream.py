@@ -1,8 +1,8 @@
-"""Parameters of Aravis' stream as features of the module "stream": how long it waits for packets and frames,
-whether it asks for lost packets again, how much the socket holds.
+"""Parameters of Aravis' stream as features of the module "stream": timeouts of packets and frames, requests
+for lost packets, size of the socket's buffer.
 
 They are properties of GObjects, under Aravis' own names (``frame-retention``, in microseconds), and exist
-only with a stream: `StreamParameters` remembers what was written, and gives it to every stream that is made.
+only with a stream: `StreamParameters` keeps the written values, and applies them to every new stream.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _KINDS: dict[bytes, Kind] = {
     b"GEnum": "enumeration",
 }
 _BASES = (b"ArvStream", b"ArvDevice")
-"""Their properties are Aravis' own affairs."""
+"""Classes whose properties are internal to Aravis."""
 
 
 class _ParamSpec(ctypes.Structure):
@@ -69,7 +69,7 @@ class _GValue(ctypes.Structure):
 
 @dataclass(frozen=True, slots=True)
 class _Property:
-    """One property of a GObject: its type, and what it can be."""
+    """One property of a GObject: its type, and its possible values."""
 
     name: str
     kind: Kind
@@ -84,9 +84,9 @@ class StreamParameters:
 
     Parameters
     ----------
-    device : whose own properties say how its packets are sized
-    stream : the stream that is there now, made if there is none
-    drop : takes that stream away; the packets of the next one are sized anew
+    device : device, whose own properties determine the size of packets
+    stream : returns the current stream, created if there is none
+    drop : removes the current stream; the packets of the next one are sized again
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class StreamParameters:
         self._no_resend = False
 
     def furnish(self, stream: int, usual: Mapping[str, Value]) -> None:
-        """Give a new stream what was written, and the ``usual`` parameters where it has them."""
+        """Apply the written values, and the ``usual`` parameters, to a new stream, as far as it has them."""
         known = _properties(self._library, stream)
         resend = known.get("packet-resend")
         self._no_resend = resend is not None and self._get(stream, resend) == "never"
@@ -123,13 +123,13 @@ class StreamParameters:
     def write(self, wanted: _Property, value: Value) -> None:
         if wanted.name in self._of_device:
             self._put(self._device, wanted, value)
-            self._drop()  # its packets have been sized
+            self._drop()  # its packets have been sized already
         else:
             self._put(self._stream(), wanted, value)
             self._written[wanted.name] = value
 
     def entries(self, wanted: _Property) -> list[str]:
-        """Aravis switches requests for lost packets off where the camera does not answer them."""
+        """Return the possible values; Aravis disables packet requests if the camera does not answer them."""
         self._stream()
         return ["never"] if wanted.name == "packet-resend" and self._no_resend else list(wanted.entries)
 
@@ -173,7 +173,7 @@ class StreamNode:
 
 
 def _properties(library: Any, owner: int) -> dict[str, _Property]:
-    """The properties of an object that can be read and written, but for those of every stream or device."""
+    """Return the readable and writable properties of an object, without those of every stream or device."""
     count = c_uint()
     specs = library.g_object_class_list_properties(c_void_p.from_address(owner).value, byref(count))
     found: dict[str, _Property] = {}
@@ -188,7 +188,7 @@ def _properties(library: Any, owner: int) -> dict[str, _Property]:
 
 
 def _describe(library: Any, at: int, spec: _ParamSpec, kind: Kind) -> _Property:
-    """What is behind the common part of a GParamSpec depends on its type."""
+    # The fields behind the common part of a GParamSpec depend on its type.
     behind = at + ctypes.sizeof(_ParamSpec)
     entries: dict[str, int] = {}
     limits = (0.0, 0.0)
@@ -196,7 +196,7 @@ def _describe(library: Any, at: int, spec: _ParamSpec, kind: Kind) -> _Property:
     if kind == "enumeration":
         known = _EnumClass.from_address(c_void_p.from_address(behind).value or 0)
         for k in range(known.count):
-            if known.values[k].value not in entries.values():  # else another name for the same
+            if known.values[k].value not in entries.values():  # not another name for the same value
                 entries[known.values[k].nick.decode()] = known.values[k].value
     elif kind != "boolean":
         field, number = _NUMBERS[library.g_type_name(spec.value_type)]
@@ -213,7 +213,7 @@ def _describe(library: Any, at: int, spec: _ParamSpec, kind: Kind) -> _Property:
 
 
 def _largest_socket() -> float:
-    """Bytes that the kernel gives a socket; it cuts more down without a word."""
+    """Return the largest socket buffer of the kernel, which silently reduces larger ones."""
     try:
         return float(_RMEM_MAX.read_text())
     except (OSError, ValueError):
@@ -229,8 +229,10 @@ _NUMBERS: dict[bytes, tuple[str, Any]] = {
 
 
 def usual_parameters(frame_period_s: float) -> dict[str, Value]:
-    """A frame of a slow line rate comes over a longer time than Aravis waits for its packets by default: it
-    would be given up half-way, or asked for before it is sent.
+    """Return timeouts for the frame period.
+
+    At a slow line rate a frame takes longer than Aravis waits for its packets by default: it would be given
+    up half-way, or requested before it is sent.
     """
     period_us = round(frame_period_s * 1e6)
     return {
@@ -240,5 +242,5 @@ def usual_parameters(frame_period_s: float) -> dict[str, Value]:
 
 
 _PACKET_TIMEOUT_US, _FRAME_RETENTION_US = 20_000, 100_000
-"""Aravis' own."""
+"""Aravis' defaults."""
 _MOST_US = 2**32 - 1

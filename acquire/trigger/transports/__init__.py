@@ -1,4 +1,4 @@
-"""Ways for bytes between host and trigger: serial ports and what pyserial can open, USB bulk."""
+"""Transports of bytes between host and trigger: serial ports and anything that pyserial opens, USB bulk."""
 
 from acquire.trigger.transports.base import Transport
 

@@ -1,11 +1,11 @@
-"""What a link asks of the thing that carries its bytes."""
+"""Interface of transports, which carry a link's bytes."""
 
 from __future__ import annotations
 
 from typing import Protocol
 
 READ_WAIT_S = 0.05
-"""How long one `Transport.read` may wait: also how long its reader takes to notice that it shall end."""
+"""How long one `Transport.read` may wait, and so how late its thread notices a request to end."""
 UDEV_HINT = "install the udev rule that comes with the firmware, or join the group dialout; then log in again"
 
 
@@ -13,12 +13,12 @@ class Transport(Protocol):
     """An open connection. One thread reads, one at a time writes. Raises TriggerError once it is gone."""
 
     name: str
-    """As the user wrote it: the port's URL, or the USB device."""
+    """The port's URL as the user wrote it, or the USB device."""
     bytes_per_s: float
-    """What the way can carry in one direction; inf where nothing is known to limit it."""
+    """Rate in one direction; inf if there is no known limit."""
 
     def read(self) -> bytes:
-        """What has come; waits at most `READ_WAIT_S` for the first byte, then returns b""."""
+        """Return the bytes that have come; wait at most `READ_WAIT_S` for the first, then return b""."""
         ...
 
     def write(self, data: bytes) -> None:

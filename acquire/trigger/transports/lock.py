@@ -1,6 +1,6 @@
-"""One user per port: an advisory lock that dies with its process, and says who holds it.
+"""One user per port: an advisory lock that ends with its process, and shows which process holds it.
 
-pyserial's own exclusive mode only keeps out programs that ask for it as well; USB has nothing of the kind.
+pyserial's own exclusive mode only keeps out programs that use it as well; USB has nothing comparable.
 """
 
 from __future__ import annotations
@@ -35,19 +35,20 @@ class PortLock:
             raise TriggerError(
                 f"{port} is in use by process {_describe(holder)}", hint="stop it, or ask its daemon"
             ) from error
-        # Who it is, for those that are refused.
+        # The process number, for the error of others.
         os.ftruncate(self._descriptor, 0)
         os.pwrite(self._descriptor, f"{os.getpid()}\n".encode(), 0)
 
     def release(self) -> None:
-        """Idempotent. The file stays: removing it would let two processes lock two files of one name."""
+        """Release the lock. Idempotent."""
+        # The file stays: removing it would let two processes lock two files of the same name.
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1
 
 
 def holder_of(port: str) -> str:
-    """``in use by process 1234 (…)``, or "": asked without waiting and without keeping the lock."""
+    """Return ``in use by process 1234 (…)``, or "", without waiting and without keeping the lock."""
     try:
         PortLock(port).release()
     except TriggerError as error:
@@ -56,14 +57,15 @@ def holder_of(port: str) -> str:
 
 
 def lock_directory() -> Path:
-    """Where locks of all users lie, else this host's directory for temporary files."""
+    """Return the directory of all users' locks, or else this host's directory for temporary files."""
     return SHARED if os.access(SHARED, os.W_OK) else Path(tempfile.gettempdir())
 
 
 def _open_for_all(path: Path) -> int:
-    """Other users take the same lock: they may write here, whatever the umask of the first.
+    """Open the lock file so that other users can use it as well, whatever the umask of the first.
 
-    Opened without O_CREAT where it exists: with it, the kernel refuses others' files in sticky directories.
+    An existing file is opened without O_CREAT, with which the kernel refuses other users' files in sticky
+    directories.
     """
     try:
         return os.open(path, os.O_RDWR | os.O_CLOEXEC)
@@ -74,7 +76,7 @@ def _open_for_all(path: Path) -> int:
 
 
 def _describe(pid: str) -> str:
-    """``1234 (acquire serve rig.toml)``."""
+    """Return a text such as ``1234 (acquire serve rig.toml)``."""
     try:
         command = Path("/proc", pid, "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
     except OSError:

@@ -1,4 +1,5 @@
-"""Bytes over whatever pyserial opens: a port, ``socket://host:port``, ``loop://``, a pseudo-terminal."""
+"""Transport over anything that pyserial opens: a port, ``socket://host:port``, ``loop://``, a pseudo-
+terminal."""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ _READ_BYTES = 4096
 
 @dataclass(frozen=True, slots=True)
 class FoundPort:
-    """A serial port of this host; ``held_by`` says who uses it, as far as it locks ports as we do."""
+    """A serial port of this host; ``held_by``: its user, if that locks ports in the same way."""
 
     device: str
     description: str
@@ -30,10 +31,10 @@ class FoundPort:
 
 
 def list_ports() -> list[FoundPort]:
-    """The ports that are there; none is opened."""
+    """Return the existing ports, without opening any."""
     found = []
     for port in sorted(comports()):
-        description = "" if port.description == "n/a" else port.description  # pyserial's word for nothing
+        description = "" if port.description == "n/a" else port.description  # pyserial's text for none
         held_by = holder_of(_lock_name(port.device))
         found.append(FoundPort(port.device, description, port.serial_number or "", held_by))
     return found
@@ -42,21 +43,21 @@ def list_ports() -> list[FoundPort]:
 class SerialTransport:
     """An open serial port, locked against a second user.
 
-    Modem lines are used for ``rts_cts`` only: pseudo-terminals and many boards have none. Raises
-    TriggerError when the port is not there or in use.
+    Modem lines are used for ``rts_cts`` only: pseudo-terminals and many boards have none. Raises TriggerError
+    if the port is not there, or in use.
     """
 
     def __init__(self, url: str, baud: int, *, rts_cts: bool = False) -> None:
         self.name = url
         self._local = local = "://" not in url
         self.bytes_per_s = baud / BITS_PER_BYTE if local else float("inf")
-        # Locked before it is opened: who opens a port that another reads already takes some of its bytes.
+        # Lock before opening: opening a port that another program reads takes some of its bytes.
         self._lock = PortLock(_lock_name(url) if local else url)
         try:
             self._port = serial.serial_for_url(
                 url, baudrate=baud, timeout=READ_WAIT_S, write_timeout=_WRITE_S, rtscts=rts_cts
             )
-            self._port.reset_input_buffer()  # answers to whoever had the port before
+            self._port.reset_input_buffer()  # drops answers to the previous user of the port
         except (OSError, ValueError) as error:  # SerialException is an OSError
             self._lock.release()
             raise _not_opened(url, error, local) from error
@@ -65,7 +66,7 @@ class SerialTransport:
         try:
             if self._local:
                 return bytes(self._port.read(self._port.in_waiting or 1))
-            # A socket does not say how much waits; asked without a time limit, it gives what it has.
+            # A socket does not report how much is waiting; with timeout 0 it returns what it has.
             data = bytes(self._port.read(1))
             if data:
                 self._port.timeout = 0
@@ -87,7 +88,7 @@ class SerialTransport:
         remote = getattr(self._port, "_socket", None)
         self._port.close()
         if remote is not None:
-            remote.close()  # pyserial leaves it open if the other end has gone
+            remote.close()  # pyserial leaves it open if the other end is gone
         self._lock.release()
 
     def _gone(self, error: OSError) -> TriggerError:
@@ -95,12 +96,12 @@ class SerialTransport:
 
 
 def _lock_name(path: str) -> str:
-    """One name per port, whichever link leads there."""
+    """Return one name per port, also for links to it."""
     return str(Path(path).resolve())
 
 
 def _not_opened(url: str, error: OSError | ValueError, local: bool) -> TriggerError:
-    """What to try depends on why: nothing is there, or it is not ours to open."""
+    """Return the error with advice for its cause: no permission, a wrong address, or a missing port."""
     if getattr(error, "errno", None) in (errno.EACCES, errno.EPERM):
         return TriggerError(f"{url} may not be opened: permission denied", hint=UDEV_HINT)
     if not local:

@@ -1,4 +1,4 @@
-"""Bytes over the two bulk endpoints of a USB device."""
+"""Transport over the two bulk endpoints of a USB device."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from acquire.trigger.transports.base import READ_WAIT_S, UDEV_HINT
 from acquire.trigger.transports.lock import PortLock
 
 VENDOR, PRODUCT = 0x1209, 0x0001
-"""pid.codes' pair for private testing."""
+"""The IDs of pid.codes for private testing."""
 _WRITE_S = 2.0
 _READ_BYTES = 16384
 _IN = usb.util.ENDPOINT_IN
@@ -28,7 +28,7 @@ _HINTS = {
 
 @dataclass(frozen=True, slots=True)
 class FoundDevice:
-    """A trigger on the bus; ``lacks`` says why it cannot be used."""
+    """A trigger on the bus; ``lacks`` states why it cannot be used."""
 
     name: str
     serial: str
@@ -36,7 +36,7 @@ class FoundDevice:
 
 
 def list_devices(backend: Any = None) -> list[FoundDevice]:
-    """Every trigger on the bus; none is claimed. Raises TriggerError where there is no libusb."""
+    """Return every trigger on the bus, without claiming any. Raises TriggerError without libusb."""
     try:
         found = list(usb.core.find(find_all=True, idVendor=VENDOR, idProduct=PRODUCT, backend=backend) or ())
     except usb.core.NoBackendError as error:
@@ -45,11 +45,11 @@ def list_devices(backend: Any = None) -> list[FoundDevice]:
 
 
 def _look(device: Any) -> FoundDevice:
-    """Reading a serial number needs the right to open the device."""
+    # Reading a serial number requires permission to open the device.
     name = f"usb {VENDOR:04x}:{PRODUCT:04x}"
     try:
         serial = str(device.serial_number or "")
-    except (usb.core.USBError, ValueError) as error:  # ValueError: no language that we may read
+    except (usb.core.USBError, ValueError) as error:  # ValueError: no permission to read the languages
         return FoundDevice(name, "", f"it may not be opened ({error}); try: {UDEV_HINT}")
     finally:
         usb.util.dispose_resources(device)
@@ -57,10 +57,10 @@ def _look(device: Any) -> FoundDevice:
 
 
 class UsbTransport:
-    """The device ``vendor:product``, of one ``serial`` number if several hang on the bus.
+    """The device ``vendor:product``, with a ``serial`` number if several are on the bus.
 
-    Uses the first interface that has a bulk endpoint each way. Raises TriggerError when it is not there, or
-    is not ours to open.
+    Uses the first interface with a bulk endpoint in each direction. Raises TriggerError if the device is not
+    there, or may not be opened.
     """
 
     def __init__(
@@ -98,7 +98,7 @@ class UsbTransport:
             raise TriggerError(f"{self.name} took no byte for {_WRITE_S:g} s") from error
         except usb.core.USBError as error:
             raise self._gone(error) from error
-        # A transfer may end short without an error; what is left, sent later, would be no frame.
+        # A transfer may end short without an error; the rest, sent later, would not be a frame.
         if sent != len(data):
             raise TriggerError(f"{self.name} took {sent} of {len(data)} bytes")
 
@@ -107,7 +107,7 @@ class UsbTransport:
         self._lock.release()
 
     def _find(self, vendor: int, product: int, serial: str, backend: Any) -> Any:
-        """Serial numbers are asked for only where one is wanted: reading one needs the right to open it."""
+        # Read serial numbers only if one is given: it requires permission to open every device.
         found = list(usb.core.find(find_all=True, idVendor=vendor, idProduct=product, backend=backend) or ())
         if found and not serial:
             return found[0]
