@@ -21,7 +21,7 @@ from PIL import Image
 from acquire.evaluate import tradeoff_page
 from acquire.evaluate.host import Busyness
 from acquire.evaluate.paper import page as paper_page
-from acquire.evaluate.paper.against import Row, captured, finer, same, sooner, words
+from acquire.evaluate.paper.comparison import Row, captured, faster, finer, same, statement
 from acquire.evaluate.paper.drawing import strip
 from acquire.evaluate.paper.studio import PaperFigure, Picture, Studio
 from acquire.evaluate.rendering import Look, Panel, render
@@ -137,11 +137,11 @@ def paper(directory: Path) -> Path:
     rows = (
         finer("resolves", "group 3, element 5", "group 3, element 6", 1),
         same("video", "64 × 64 × 598", "64 × 64 × 598", equal=True),
-        sooner("time", "“ten more minutes”", "900 s", 900.0, 600.0, "on another processor"),
+        faster("time", "“ten more minutes”", "900 s", 900.0, 600.0, "on another processor"),
         captured(
             "300 kHz pulses, intra-line; true picture, camera noise", "captured with high fidelity", 0.98
         ),
-        words("bars", "#B significantly better", "none", "#B 1 element coarser", hold=False),
+        statement("bars", "#B significantly better", "none", "#B 1 element coarser", hold=False),
         Row("accuracy", "–", "39.8 dB, SSIM 0.98 in 33.3 s"),
     )
     figure = PaperFigure(
