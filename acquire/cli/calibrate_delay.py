@@ -123,7 +123,7 @@ def _found(out: str, exposures: list[Exposure], *, whole: bool) -> Finding:
         if known is not None and known.uncertainty.max() < ticks:
             raise UsageError(
                 f"this part of a sweep has an uncertainty of {ticks:.1f} ticks, more than the "
-                f"{known.uncertainty.max():.1f} in {out}",
+                f"{known.uncertainty.max():.2g} in {out}",
                 hint="the whole sweep; the earlier result is kept",
             )
     return save_finding(out, exposures[0], lambda _: found)

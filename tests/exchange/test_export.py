@@ -124,7 +124,7 @@ def test_the_error_that_a_video_tells_is_taken_along(cli: Cli, told: Path, tmp_p
 def test_a_file_without_a_place_for_the_error_is_told_of(cli: Cli, told: Path, tmp_path: Path) -> None:
     for name in ("v.mp4", "v.npy", "v.tif"):
         assert (
-            f"{name} has no place for the estimated error of regions"
+            f"{name} does not hold the estimated error of the regions"
             in cli("export", told, tmp_path / name)[2]
         )
     _, out, _ = cli("export", told, tmp_path / "w.mp4", "--json")

@@ -198,7 +198,7 @@ def test_lines_from_the_middle_of_a_run_have_its_code(
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["short.npy", "b.npy", *SIZES], "--lines 149 takes so many of each"),
+        (["short.npy", "b.npy", *SIZES], "--lines 149, to take this number of each"),
         (["a.npy", "b.npy", *SIZES, "--stages", 9], "lines of arm a have 8 pixels, with 9 stages"),
         (["a.npy", "b.npy", *SIZES[:-1], "bits:0xff00"], "the code has 16 bits, and 150 lines touch 315"),
         (["a.npy", "b.npy", *SIZES[:-1], "prbs:64"], "possible: prbs:DEGREE:SEED"),
@@ -213,7 +213,7 @@ def test_lines_from_the_middle_of_a_run_have_its_code(
         (["a.npy", *SIZES, "--columns-a", "0:9"], "0:8 or a part of it"),
         (["float.npy", *SIZES], "float.npy holds float64"),
         (["flat.npy", *SIZES], "has the shape 150"),
-        (["three.npy", *SIZES], "(arm, line, pixel) of two arms"),
+        (["three.npy", *SIZES], "(arm, line, pixel) with two arms"),
         (["text.npy", *SIZES], "cannot be read as NumPy"),
         (["text.h5", *SIZES], "cannot be read as HDF5"),
         (["text.tif", *SIZES], "cannot be read as TIFF"),
